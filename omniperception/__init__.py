@@ -1,0 +1,1 @@
+"""OmniPerception: learn collision avoidance for legged robots from raw LiDAR point clouds."""

@@ -1,0 +1,193 @@
+"""The package's only module that knows Hydra: compose, validate, instantiate, save and load configurations."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from omniperception.learning.config import PerceptionConfig, PPOConfig
+from omniperception.task.env import EnvConfig
+
+CONFIG_DIR = Path(__file__).resolve().parents[1] / "conf"
+CONFIG_FILE = "config.yaml"
+OUTPUTS = Path("outputs")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot run; the message is one line that says what to change."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """A run, assembled from its composed configuration.
+
+    Attributes:
+        env: the task.
+        perception: the actor's view of the LiDAR, or None.
+        ppo: the learning settings.
+        composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
+    """
+
+    env: EnvConfig
+    perception: PerceptionConfig | None
+    ppo: PPOConfig
+    composed: dict
+
+
+def compose(overrides: Sequence[str]) -> DictConfig:
+    """Composes `conf/config.yaml` with overrides as on the command line."""
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
+            return hydra_compose("config", overrides=list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_one_line(error)) from None
+
+
+def assemble(config: DictConfig) -> RunConfig:
+    """Instantiates and validates every part of a composed configuration."""
+    try:
+        _check_groups(config)
+        composed = OmegaConf.to_container(config, resolve=True)
+        parts = {key: _instantiate(key, value) for key, value in composed.items() if isinstance(value, dict)}
+        perception, ppo = parts.pop("perception"), parts.pop("ppo")
+        env = EnvConfig(
+            num_envs=composed["num_envs"],
+            seed=composed["seed"],
+            sampler=perception.sampler if perception else None,
+            frame_history=perception.history if perception else 0,
+            height_target=bool(perception and perception.height_weight > 0),
+            log_interval=ppo.num_steps_per_env,
+            **parts,
+        )
+    except (OmegaConfBaseException, InstantiationException) as error:
+        raise ConfigError(_one_line(error)) from None
+    except (TypeError, ValueError) as error:
+        raise ConfigError(_one_line(error)) from None
+    return RunConfig(env, perception, ppo, composed)
+
+
+def check(overrides: Sequence[str]) -> None:
+    """Composes and validates every job that command-line overrides (with sweeps) stand for, before any is started."""
+    values = [o for o in overrides if not o.startswith("-")]
+    try:
+        parsed = OverridesParser.create().parse_overrides(values)
+    except HydraException as error:
+        raise ConfigError(_one_line(error)) from None
+    if "-m" in overrides or "--multirun" in overrides:
+        jobs = [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
+    else:
+        jobs = [values]
+    for job in jobs:
+        assemble(compose([o for o in job if not o.startswith("hydra")]))
+
+
+def save(composed: dict, run_dir: Path) -> None:
+    """Writes the resolved configuration into the run directory."""
+    run_dir.mkdir(parents=True, exist_ok=True)
+    (run_dir / CONFIG_FILE).write_text(yaml.safe_dump(composed, sort_keys=False))
+
+
+def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
+    """The configuration of a run; group overrides (obstacles=static) replace whole groups, dotted ones single values."""
+    path = run_dir / CONFIG_FILE
+    if not path.is_file():
+        raise ConfigError(f"{run_dir} is not a run directory: it has no {CONFIG_FILE}; run=latest finds the newest run")
+    config = OmegaConf.load(path)
+    groups = [o for o in overrides if (CONFIG_DIR / o.split("=", 1)[0]).is_dir()]
+    if groups:
+        fresh = compose(groups)
+        for override in groups:
+            group = override.split("=", 1)[0]
+            if group == "experiment":
+                raise ConfigError(f"{override}: a run keeps its experiment; override the groups that should differ")
+            config[group] = fresh[group]
+    for override in overrides:
+        if override not in groups:
+            _set(config, override)
+    return config
+
+
+def find_run(name: str) -> Path:
+    """The run directory that `run=...` names: a path, or `latest` for the newest under outputs/."""
+    if name != "latest":
+        path = Path(name)
+        if not path.is_dir():
+            raise ConfigError(f"run={name} does not exist; give a run directory or run=latest")
+        return path
+    runs = sorted(OUTPUTS.glob(f"**/{CONFIG_FILE}"), key=lambda path: path.stat().st_mtime)
+    if not runs:
+        raise ConfigError("run=latest finds no run under outputs/; train one with python train.py first")
+    return runs[-1].parent
+
+
+def split_arguments(arguments: Sequence[str], known: dict[str, str]) -> tuple[dict[str, str], list[str]]:
+    """Takes an entry point's own `key=value` arguments (with defaults) out of a list of overrides."""
+    own, overrides = dict(known), []
+    for argument in arguments:
+        key, separator, value = argument.partition("=")
+        if not separator and not argument.startswith("-"):
+            raise ConfigError(f"argument '{argument}' is not of the form key=value")
+        if key in own:
+            own[key] = value
+        else:
+            overrides.append(argument)
+    return own, overrides
+
+
+@contextlib.contextmanager
+def one_line_errors(*also: type[Exception]) -> Iterator[None]:
+    """Turns a wrong configuration, or one of `also`, into one line on standard error and exit code 2."""
+    try:
+        yield
+    except (ConfigError, *also) as error:
+        print(f"error: {_one_line(error)}", file=sys.stderr, flush=True)
+        sys.exit(2)
+
+
+def _check_groups(config: DictConfig) -> None:
+    if config.perception and not config.lidar:
+        raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
+
+
+def _instantiate(key: str, value: dict) -> object | None:
+    if not value:
+        return None
+    try:
+        return instantiate(value, _convert_="all")
+    except InstantiationException as error:
+        cause = error.__cause__ or error
+        raise ConfigError(f"{key}: {_one_line(cause)}") from None
+
+
+def _set(config: DictConfig, override: str) -> None:
+    key, separator, value = override.partition("=")
+    if not separator:
+        raise ConfigError(f"argument '{override}' is not of the form key=value")
+    if OmegaConf.select(config, key, default=_MISSING) is _MISSING:
+        parent = OmegaConf.select(config, key.rpartition(".")[0]) if "." in key else config
+        known = ", ".join(map(str, parent)) if isinstance(parent, DictConfig) else "nothing"
+        raise ConfigError(f"unknown override '{override}'; known there: {known}")
+    OmegaConf.update(config, key, yaml.safe_load(value))
+
+
+_MISSING = object()
+
+
+def _one_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines) or type(error).__name__

@@ -1,0 +1,154 @@
+"""Checkpoint files: written atomically, read with ``weights_only``, found by iteration number."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+FORMAT = "omniperception-checkpoint"
+VERSION = 1
+
+_NAME = re.compile(r"model_(\d+)\.pt")
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint is missing, damaged, foreign or does not fit what it is loaded into."""
+
+
+def checkpoint_path(run_dir: str | os.PathLike, iteration: int) -> Path:
+    """``run_dir/checkpoints/model_<iteration>.pt``; ``iteration`` is the number of completed iterations."""
+    return Path(run_dir) / "checkpoints" / f"model_{iteration}.pt"
+
+
+def list_checkpoints(run_dir: str | os.PathLike) -> list[Path]:
+    """Complete checkpoints of a run, oldest first; half-written temporary files are not among them."""
+    folder = Path(run_dir) / "checkpoints"
+    found = [
+        (int(match[1]), path) for path in folder.glob("model_*.pt") if (match := _NAME.fullmatch(path.name))
+    ]
+    return [path for _, path in sorted(found)]
+
+
+def latest_checkpoint(run_dir: str | os.PathLike) -> Path:
+    """The checkpoint of a run with the most iterations."""
+    found = list_checkpoints(run_dir)
+    if not found:
+        raise CheckpointError(
+            f"no checkpoint in {Path(run_dir) / 'checkpoints'}: give a run directory that has"
+            " saved one, or start without resuming"
+        )
+    return found[-1]
+
+
+def prune_checkpoints(run_dir: str | os.PathLike, keep: int) -> None:
+    """Delete all but the last ``keep`` checkpoints of a run."""
+    for path in list_checkpoints(run_dir)[:-keep]:
+        path.unlink(missing_ok=True)
+
+
+def save_checkpoint(path: str | os.PathLike, state: Mapping) -> None:
+    """Write ``state`` so that ``path`` is always either absent, the old file or the complete new one."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    content = {"format": FORMAT, "version": VERSION, **portable(state)}
+    try:
+        with open(temporary, "wb") as file:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    if os.name == "posix":
+        _sync_directory(path.parent)
+
+
+def load_checkpoint(path: str | os.PathLike, map_location: str | torch.device | None = None) -> dict:
+    """Read a checkpoint without running any code from it."""
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint at {path}")
+    try:
+        content = torch.load(path, weights_only=True, map_location=map_location)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
+        reason = str(error).strip().splitlines()
+        raise CheckpointError(
+            f"{path} is damaged or no checkpoint of this program"
+            f" ({reason[0][:120] if reason else type(error).__name__}); use an older one"
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is no checkpoint of this program: it has no format '{FORMAT}'")
+    if content["version"] != VERSION:
+        raise CheckpointError(
+            f"{path} has checkpoint version {content['version']}, this program reads {VERSION}"
+        )
+    return content
+
+
+def portable(value, where: str = "state"):
+    """``value`` with NumPy arrays as tensors; an error names what ``weights_only`` loading would refuse.
+
+    Tensors, numbers, strings, bytes and None may be nested in dicts, lists and tuples. Tensors that are views
+    of a larger storage are copied, so that only their own elements are written.
+    """
+    if isinstance(value, torch.Tensor):
+        tensor = value.detach()
+        whole = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
+        return tensor if whole else tensor.clone()
+    if isinstance(value, np.ndarray):
+        if value.dtype == object:
+            raise CheckpointError(f"cannot save {where}: an array of Python objects; use numbers")
+        return torch.from_numpy(np.array(value, copy=True))
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {key: portable(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        items = [portable(item, f"{where}[{i}]") for i, item in enumerate(value)]
+        return items if isinstance(value, list) else tuple(items)
+    if value is None or isinstance(value, bool | int | float | str | bytes):
+        return value
+    raise CheckpointError(
+        f"cannot save {where}: a {type(value).__name__}; use tensors, arrays, numbers, strings,"
+        " lists or dicts"
+    )
+
+
+def rng_state() -> dict:
+    """States of the global random generators of torch (all devices), NumPy and Python."""
+    name, keys, position, has_gauss, gauss = np.random.get_state()
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [name, torch.from_numpy(keys.astype(np.int64)), position, has_gauss, gauss],
+        "python": random.getstate(),
+    }
+
+
+def set_rng_state(state: dict) -> None:
+    """Restore what :func:`rng_state` returned; states of devices that are not there are skipped."""
+    torch.set_rng_state(state["torch"].cpu())
+    if torch.cuda.is_available():
+        for device, cuda_state in enumerate(state["cuda"][: torch.cuda.device_count()]):
+            torch.cuda.set_rng_state(cuda_state.cpu(), device)
+    name, keys, position, has_gauss, gauss = state["numpy"]
+    np.random.set_state((name, keys.cpu().numpy().astype(np.uint32), position, has_gauss, gauss))
+    version, internal, gauss_next = state["python"]
+    random.setstate((version, tuple(internal), gauss_next))
+
+
+def _sync_directory(folder: Path) -> None:
+    """Make a rename durable."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

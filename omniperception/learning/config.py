@@ -1,0 +1,155 @@
+"""Settings of the perception network and of PPO, and their translation to rsl_rl's runner configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from torch import nn
+
+from omniperception.perception import Sampler
+
+
+@dataclass(frozen=True)
+class PerceptionConfig:
+    """How the actor reads the LiDAR.
+
+    Attributes:
+        sampler: makes the sampler that reduces one frame to points.
+        network: makes the network that embeds a history of frames.
+        history: LiDAR frames that the network sees.
+        height_weight: weight of the height supervision in the loss; 0 leaves it out.
+    """
+
+    sampler: Callable[[], Sampler]
+    network: Callable[[], nn.Module]
+    history: int
+    height_weight: float
+
+    def __post_init__(self) -> None:
+        if self.history < 1:
+            raise ValueError(f"perception.history={self.history} must be at least 1")
+        if self.height_weight < 0:
+            raise ValueError(f"perception.height_weight={self.height_weight} must not be negative")
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """PPO after the paper's Table 'PPO Hyperparameters'.
+
+    Attributes:
+        max_iterations: iterations at which training ends.
+        max_minutes: wall time (min) after which it ends, over all resumptions; None for no limit.
+        save_interval: iterations between checkpoints.
+        keep_checkpoints: how many of the newest checkpoints stay.
+        num_steps_per_env: control steps per environment and iteration.
+        hidden_dims: hidden layers of the actor and of the critic.
+        init_std: initial standard deviation of the actions.
+        obs_normalization: whether observations are normalised by running statistics.
+        The others are rsl_rl's PPO arguments.
+    """
+
+    max_iterations: int
+    max_minutes: float | None
+    save_interval: int
+    keep_checkpoints: int
+    num_steps_per_env: int
+    num_learning_epochs: int
+    num_mini_batches: int
+    clip_param: float
+    gamma: float
+    lam: float
+    learning_rate: float
+    schedule: str
+    desired_kl: float
+    value_loss_coef: float
+    use_clipped_value_loss: bool
+    entropy_coef: float
+    max_grad_norm: float
+    hidden_dims: Sequence[int]
+    activation: str
+    init_std: float
+    obs_normalization: bool
+
+    def __post_init__(self) -> None:
+        for name in (
+            "max_iterations",
+            "save_interval",
+            "keep_checkpoints",
+            "num_steps_per_env",
+            "num_learning_epochs",
+            "num_mini_batches",
+        ):
+            if getattr(self, name) < 1:
+                raise ValueError(f"ppo.{name}={getattr(self, name)} must be at least 1")
+        for name in ("clip_param", "learning_rate", "max_grad_norm", "init_std", "desired_kl"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive")
+        for name in ("gamma", "lam"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"ppo.{name}={getattr(self, name)} must lie in [0, 1]")
+        if self.max_minutes is not None and self.max_minutes <= 0:
+            raise ValueError(f"ppo.max_minutes={self.max_minutes} must be positive or null")
+        if self.schedule not in ("adaptive", "fixed"):
+            raise ValueError(f"ppo.schedule={self.schedule} must be adaptive or fixed")
+
+
+def runner_config(
+    ppo: PPOConfig,
+    perception: PerceptionConfig | None,
+    actor_groups: Sequence[str],
+    critic_groups: Sequence[str],
+    steps_per_frame: int,
+) -> dict:
+    """rsl_rl's runner configuration.
+
+    Args:
+        ppo: learning settings.
+        perception: the actor's view of the LiDAR, or None.
+        actor_groups: observation groups of the actor.
+        critic_groups: observation groups of the critic.
+        steps_per_frame: control steps between two LiDAR frames.
+    """
+    network = {"hidden_dims": list(ppo.hidden_dims), "activation": ppo.activation}
+    network["obs_normalization"] = ppo.obs_normalization
+    actor = {
+        **network,
+        "class_name": "rsl_rl.models:MLPModel",
+        "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": ppo.init_std},
+    }
+    if perception is not None:
+        actor["class_name"] = "omniperception.learning.models:PerceptionActor"
+        actor["perception"] = perception.network
+        actor["height_loss_weight"] = perception.height_weight
+    return {
+        "num_steps_per_env": ppo.num_steps_per_env,
+        "save_interval": ppo.save_interval,
+        "keep_checkpoints": ppo.keep_checkpoints,
+        "max_minutes": ppo.max_minutes,
+        "steps_per_frame": steps_per_frame,
+        "obs_groups": {"actor": list(actor_groups), "critic": list(critic_groups)},
+        "actor": actor,
+        "critic": {**network, "class_name": "rsl_rl.models:MLPModel"},
+        "algorithm": {
+            "class_name": "omniperception.learning.ppo:PerceptivePpo",
+            "num_learning_epochs": ppo.num_learning_epochs,
+            "num_mini_batches": ppo.num_mini_batches,
+            "clip_param": ppo.clip_param,
+            "gamma": ppo.gamma,
+            "lam": ppo.lam,
+            "learning_rate": ppo.learning_rate,
+            "schedule": ppo.schedule,
+            "desired_kl": ppo.desired_kl,
+            "value_loss_coef": ppo.value_loss_coef,
+            "use_clipped_value_loss": ppo.use_clipped_value_loss,
+            "entropy_coef": ppo.entropy_coef,
+            "max_grad_norm": ppo.max_grad_norm,
+        },
+        "console_metrics": [
+            "velocity_error",
+            "yaw_rate_error",
+            "collision_rate",
+            "fall_rate",
+            "obstacle_level",
+        ],
+    }

@@ -1,0 +1,178 @@
+"""The actor that reads LiDAR frames: one embedding per frame, shared by the control steps that see it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules import HiddenState
+from tensordict import TensorDict
+from torch import nn
+
+from omniperception.learning.storage import WindowedObservations
+from omniperception.perception import PerceptionNetwork
+
+HEIGHT_TARGET = "height_target"
+"""Observation group (N, 187) that the proximal embedding is regressed on: base height minus terrain height,
+metres."""
+
+
+class _AddLoss(torch.autograd.Function):
+    """Identity on the features whose backward pass also starts that of an auxiliary loss, at unit scale."""
+
+    @staticmethod
+    def forward(ctx, features: torch.Tensor, loss: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(loss)
+        return features.view_as(features)
+
+    @staticmethod
+    def backward(ctx, gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        (loss,) = ctx.saved_tensors
+        return gradient, torch.ones_like(loss)
+
+
+class PerceptionActor(MLPModel):
+    """An MLP on one-dimensional observation groups and the embedding of the LiDAR history.
+
+    While experience is collected (no gradients) the embedding is computed once per LiDAR tick and reused
+    until the next tick or parameter change. In updates each distinct window of a
+    :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the
+    network's embedding of an empty history.
+
+    With ``height_loss_weight`` the mean squared error between ``perception.height_prediction`` and the
+    observation group ``height_target``, over the steps that have a frame, joins whatever loss is
+    back-propagated through the actor (paper, Sec. 3.3.1: privileged height supervision).
+    """
+
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        perception: PerceptionNetwork | Callable[[], PerceptionNetwork],
+        height_loss_weight: float = 0.0,
+        **mlp_options,
+    ) -> None:
+        """Build the actor.
+
+        Args:
+            obs: example observations.
+            obs_groups: groups of each observation set.
+            obs_set: this model's set; only one-dimensional groups, LiDAR frames are read besides.
+            output_dim: number of actions.
+            perception: the network, or a function without arguments that builds it.
+            height_loss_weight: weight of the height regression; 0 leaves it out.
+            mlp_options: ``hidden_dims``, ``activation``, ``obs_normalization`` (of the one-dimensional
+                groups) and ``distribution_cfg`` of rsl_rl's ``MLPModel``.
+        """
+        network = perception if isinstance(perception, nn.Module) else perception()
+        if height_loss_weight < 0.0:
+            raise ValueError(f"height_loss_weight must not be negative, got {height_loss_weight}")
+        self._feature_dim = network.feature_dim  # read by _get_latent_dim while the base class builds the MLP
+        super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
+        self.perception: PerceptionNetwork = network
+        self.height_loss_weight = height_loss_weight
+        if height_loss_weight > 0.0:
+            self._check_height_target(obs)
+        self._cache_key: tuple | None = None
+        self._cached = torch.empty(0)
+        self._cached_empty = torch.empty(0)
+        self._height_losses: list[torch.Tensor] = []
+
+    @property
+    def extra_groups(self) -> list[str]:
+        """Observation groups that the actor's losses read besides its inputs."""
+        return [HEIGHT_TARGET] if self.height_loss_weight > 0.0 else []
+
+    def get_latent(
+        self,
+        obs: TensorDict | WindowedObservations,
+        masks: torch.Tensor | None = None,
+        hidden_state: HiddenState = None,
+    ) -> torch.Tensor:
+        """Normalised one-dimensional groups and the embedding, concatenated."""
+        if isinstance(obs, WindowedObservations):
+            features = self._update_features(obs)
+        else:
+            features = self._rollout_features(obs)
+        return torch.cat([super().get_latent(obs, masks, hidden_state), features], dim=-1)
+
+    def pop_height_loss(self) -> float | None:
+        """Mean squared height error since the last call, square metres; ``None`` if there was none."""
+        if not self._height_losses:
+            return None
+        mean = torch.stack(self._height_losses).mean().item()
+        self._height_losses.clear()
+        return mean
+
+    def _get_latent_dim(self) -> int:
+        return self.obs_dim + self._feature_dim
+
+    def _empty_features(self, frames: torch.Tensor) -> torch.Tensor:
+        """(1, D) embedding of a history without a valid frame."""
+        shape = (1, self.perception.history, *frames.shape[2:])
+        return self.perception(
+            frames.new_zeros(shape), torch.zeros(1, 1, dtype=torch.long, device=frames.device)
+        )[0]
+
+    def _rollout_features(self, obs: TensorDict) -> torch.Tensor:
+        """(N, D) embeddings of the current histories, from the cache if nothing they depend on has
+        changed."""
+        frames, count = obs["frames"], obs["frame_count"]
+        if torch.is_grad_enabled():
+            features, empty = self.perception(frames, count)[:, 0], self._empty_features(frames)
+        else:
+            key = self._state_key(obs)
+            if key != self._cache_key:
+                self._cached = self.perception(frames, count)[:, 0]
+                self._cached_empty = self._empty_features(frames)
+                self._cache_key = key
+            features, empty = self._cached, self._cached_empty
+        return torch.where(count > 0, features, empty)
+
+    def _state_key(self, obs: TensorDict) -> tuple:
+        """What the embeddings depend on; a few points of the newest frame tell one environment from
+        another."""
+        frames = obs["frames"]
+        probe = frames[:, -1, :2].sum(dtype=torch.float64)
+        tick, value = torch.stack([obs["frame_tick"].flatten()[0].double(), probe]).tolist()
+        versions = tuple((id(p), p._version) for p in self.perception.parameters())
+        return (
+            int(tick),
+            value,
+            tuple(frames.shape),
+            frames.device,
+            torch.is_inference_mode_enabled(),
+            versions,
+        )
+
+    def _update_features(self, obs: WindowedObservations) -> torch.Tensor:
+        """(B, D) embeddings of a mini-batch's steps; starts the height loss if there is one."""
+        windows = self.perception(obs.frames, obs.window_count).flatten(0, 1)  # (E W, D)
+        table = torch.cat([windows, self._empty_features(obs.frames)])
+        has_frame = obs.step_count > 0
+        features = table[torch.where(has_frame, obs.step_window, windows.shape[0])]
+        if self.height_loss_weight > 0.0 and torch.is_grad_enabled():
+            error = self.perception.height_prediction(features) - obs[HEIGHT_TARGET]
+            per_step = error.square().mean(dim=-1) * has_frame
+            loss = per_step.sum() / has_frame.sum().clamp(min=1)
+            self._height_losses.append(loss.detach())
+            features = _AddLoss.apply(features, self.height_loss_weight * loss)
+        return features
+
+    def _check_height_target(self, obs: TensorDict) -> None:
+        prediction = self.perception.height_prediction(torch.zeros(1, self._feature_dim))
+        if prediction is None:
+            raise ValueError(
+                f"{type(self.perception).__name__} predicts no heights; set height_loss_weight=0 or use"
+                " PD-RiskNet"
+            )
+        size = obs[HEIGHT_TARGET].shape[-1] if HEIGHT_TARGET in obs.keys() else 0
+        if size != prediction.shape[-1]:
+            raise ValueError(
+                f"height_loss_weight={self.height_loss_weight} needs an observation '{HEIGHT_TARGET}' of"
+                f" {prediction.shape[-1]} values, the environment gives {size}; set the weight to 0 or"
+                " match the height grid"
+            )

@@ -1,0 +1,131 @@
+"""PPO with shared LiDAR frames, height supervision and a stop at the first non-finite number."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.env import VecEnv
+from rsl_rl.extensions import resolve_rnd_config, resolve_symmetry_config
+from rsl_rl.utils import resolve_class, resolve_obs_groups
+from tensordict import TensorDict
+
+from omniperception.learning.models import PerceptionActor
+from omniperception.learning.storage import PerceptiveStorage
+
+
+class TrainingDiverged(RuntimeError):
+    """A loss, gradient or parameter is no longer finite; no step has been taken with it."""
+
+
+class PerceptivePpo(PPO):
+    """rsl_rl's PPO on a :class:`PerceptiveStorage`.
+
+    Gradients are checked before each optimiser step and parameters after each update; a non-finite number
+    raises :class:`TrainingDiverged`, so weights are never overwritten with it.
+    """
+
+    storage: PerceptiveStorage
+
+    def __init__(self, *args, **kwargs) -> None:
+        """Arguments of rsl_rl's PPO."""
+        super().__init__(*args, **kwargs)
+        self.num_updates = 0
+        self.optimizer.register_step_pre_hook(lambda *_: self._check_gradients())
+
+    @staticmethod
+    def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PerceptivePpo:
+        """Build models, storage and algorithm from the runner's configuration.
+
+        ``cfg["steps_per_frame"]`` (default 1) is the least number of control steps between two LiDAR frames.
+        """
+        alg_class, alg_cfg = resolve_class(cfg["algorithm"])
+        actor_class, actor_cfg = resolve_class(cfg["actor"])
+        critic_class, critic_cfg = resolve_class(cfg["critic"])
+        default_sets = ["actor", "critic"] + (["rnd_state"] if alg_cfg.get("rnd_cfg") else [])
+        with contextlib.redirect_stdout(io.StringIO()):
+            cfg["obs_groups"] = resolve_obs_groups(obs, cfg["obs_groups"], default_sets)
+        alg_cfg = resolve_rnd_config(alg_cfg, obs, cfg["obs_groups"], env)
+        alg_cfg = resolve_symmetry_config(alg_cfg, env)
+
+        actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
+        critic = critic_class(obs, cfg["obs_groups"], "critic", 1, **critic_cfg).to(device)
+        perceptive = isinstance(actor, PerceptionActor)
+        if perceptive and (alg_cfg.get("rnd_cfg") or alg_cfg.get("symmetry_cfg")):
+            raise ValueError(
+                "rnd_cfg and symmetry_cfg work on one-dimensional observations only; leave them out with"
+                " a perceptive actor"
+            )
+
+        groups = {group for names in cfg["obs_groups"].values() for group in names}
+        stored = sorted(groups | set(actor.extra_groups if perceptive else ()))
+        storage = PerceptiveStorage(
+            env.num_envs,
+            cfg["num_steps_per_env"],
+            obs,
+            stored,
+            env.num_actions,
+            device,
+            frames=perceptive,
+            steps_per_frame=cfg.get("steps_per_frame", 1),
+        )
+        alg = alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])
+        alg.compile(cfg.get("torch_compile_mode"))
+        return alg
+
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Sample actions; LiDAR frames are copied now because the environment may reuse their memory."""
+        self.storage.record_frames(obs)
+        return super().act(obs)
+
+    def update(self) -> dict[str, float]:
+        """One PPO update; mean losses, among them ``height`` with height supervision."""
+        losses = super().update()
+        self.num_updates += 1
+        if isinstance(self._raw_actor, PerceptionActor):
+            height = self._raw_actor.pop_height_loss()
+            if height is not None:
+                losses["height"] = height
+        self._check_parameters()
+        return losses
+
+    def _check_gradients(self) -> None:
+        for name, model in (("actor", self._raw_actor), ("critic", self._raw_critic)):
+            if not _all_finite([p.grad for p in model.parameters() if p.grad is not None]):
+                raise TrainingDiverged(
+                    f"update {self.num_updates}: the gradient of the {name} is not finite"
+                    f" ({self._diagnosis()}); the weights are those of the last good step"
+                )
+
+    def _check_parameters(self) -> None:
+        for name, model in (("actor", self._raw_actor), ("critic", self._raw_critic)):
+            tensors = [t for t in (*model.parameters(), *model.buffers()) if t.is_floating_point()]
+            if not _all_finite(tensors):
+                bad = next(n for n, t in model.state_dict().items() if not torch.isfinite(t).all())
+                raise TrainingDiverged(
+                    f"update {self.num_updates}: {name} parameter '{bad}' is not finite ({self._diagnosis()})"
+                )
+
+    def _diagnosis(self) -> str:
+        """Which stored quantity is not finite, or advice if all are."""
+        storage = self.storage
+        stored: dict[str, torch.Tensor] = {f"observation '{k}'": v for k, v in storage.observations.items()}
+        if storage.has_frames:
+            stored["observation 'frames'"] = storage.frames
+        stored |= {
+            name: getattr(storage, name) for name in ("rewards", "actions", "values", "returns", "advantages")
+        }
+        for name, tensor in stored.items():
+            finite = torch.isfinite(tensor)
+            if not finite.all():
+                return f"{int((~finite).sum())} non-finite numbers in the rollout's {name}"
+        return f"rollout finite, learning rate {self.learning_rate:.2e}: lower it, or max_grad_norm"
+
+
+def _all_finite(tensors: list[torch.Tensor]) -> bool:
+    """Whether every element is finite, with one read-back."""
+    if not tensors:
+        return True
+    return bool(torch.isfinite(torch.stack(torch._foreach_norm(tensors, float("inf")))).all())

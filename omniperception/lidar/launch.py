@@ -1,0 +1,98 @@
+"""Recorded kernel launches: one on a GPU, split over environments and threads on a CPU."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import torch
+import warp as wp
+
+wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no line per compiled kernel
+
+CHUNKS_PER_THREAD = 4
+MIN_CHUNK_WORK = 4096
+
+
+def default_num_threads() -> int:
+    """How many CPU cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@cache
+def thread_pool(num_workers: int) -> ThreadPoolExecutor:
+    """The pool of ``num_workers`` helper threads that all launches of that width share."""
+    return ThreadPoolExecutor(num_workers, thread_name_prefix="lidar")
+
+
+def split(num_envs: int, work_per_env: int, num_threads: int) -> list[tuple[int, int]]:
+    """(first environment, number of environments) of each chunk; no more chunks than the work is worth."""
+    worth = max(1, num_envs * work_per_env // MIN_CHUNK_WORK)
+    num_chunks = min(num_envs, worth, 1 if num_threads == 1 else num_threads * CHUNKS_PER_THREAD)
+    edges = [num_envs * k // num_chunks for k in range(num_chunks + 1)]
+    return [(low, high - low) for low, high in zip(edges, edges[1:], strict=False)]
+
+
+class SplitLaunch:
+    """A kernel launch over ``(num_envs, *inner)`` recorded once and replayed by calling it.
+
+    The kernel's first argument must be its first environment (``env_offset``); ``args`` are the others. The
+    arrays are those given here: what they hold may change, where they lie may not.
+    """
+
+    def __init__(
+        self,
+        kernel: wp.Kernel,
+        num_envs: int,
+        inner: Sequence[int],
+        args: Sequence[Any],
+        device: torch.device,
+        num_threads: int,
+        work_per_env: int = 1,
+    ) -> None:
+        self.cuda_device = device if device.type == "cuda" else None
+        threads = 1 if self.cuda_device else num_threads
+        chunks = split(num_envs, work_per_env, threads) if num_envs else []
+        self.commands = [
+            wp.launch(
+                kernel, dim=(count, *inner), inputs=[first, *args], device=wp_device(device), record_cmd=True
+            )
+            for first, count in chunks
+        ]
+        self.pool = thread_pool(threads - 1) if len(chunks) > 1 else None
+        self.width = min(threads, len(chunks))
+
+    def __call__(self) -> None:
+        if self.cuda_device is not None:
+            stream = wp.stream_from_torch(torch.cuda.current_stream(self.cuda_device))
+            for command in self.commands:
+                command.launch(stream=stream)
+        elif self.pool is None:
+            for command in self.commands:
+                command.launch()
+        else:
+            self._run_in_threads()
+
+    def _run_in_threads(self) -> None:
+        queue = iter(self.commands)  # next() of a list iterator is atomic: each command is run by one thread
+
+        def drain() -> None:
+            for command in queue:
+                command.launch()
+
+        helpers = [self.pool.submit(drain) for _ in range(self.width - 1)]
+        drain()
+        for helper in helpers:
+            helper.result()
+
+
+def wp_device(device: torch.device) -> wp.Device:
+    """The Warp device of a torch device."""
+    if device.type == "cuda":
+        return wp.get_device(
+            f"cuda:{device.index if device.index is not None else torch.cuda.current_device()}"
+        )
+    return wp.get_device(device.type)

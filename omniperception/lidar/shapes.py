@@ -1,0 +1,103 @@
+"""Analytic shapes that rays can meet, described with MuJoCo's size conventions."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class ShapeKind(IntEnum):
+    """Kinds of shapes; the values are what the kernels branch on."""
+
+    PLANE = 0
+    BOX = 1
+    SPHERE = 2
+    CYLINDER = 3
+    CAPSULE = 4
+    ELLIPSOID = 5
+
+
+SIZE_NAMES = {
+    ShapeKind.PLANE: (),
+    ShapeKind.BOX: ("half_x", "half_y", "half_z"),
+    ShapeKind.SPHERE: ("radius",),
+    ShapeKind.CYLINDER: ("radius", "half_length"),
+    ShapeKind.CAPSULE: ("radius", "half_length"),
+    ShapeKind.ELLIPSOID: ("half_x", "half_y", "half_z"),
+}
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One rigid analytic shape, carried by a moving body or fixed in its environment.
+
+    Attributes:
+        kind: What the shape is.
+        size: Metres. Sphere ``(radius,)``; cylinder and capsule ``(radius, half_length)`` along the local z
+            axis; box and ellipsoid half extents; plane ``()``: infinite, normal along the local +z axis.
+        body: Index of the moving body that carries the shape; -1 is fixed in the environment's frame.
+        pos: Position in that body's frame, metres.
+        quat: Orientation in that body's frame, (w, x, y, z), unit length.
+        class_id: What a hit on this shape is reported as, >= 0.
+    """
+
+    kind: ShapeKind
+    size: tuple[float, ...] = ()
+    body: int = -1
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    class_id: int = 0
+
+    def __post_init__(self) -> None:
+        kind = _as_kind(self.kind)
+        object.__setattr__(self, "kind", kind)
+        names = SIZE_NAMES[kind]
+        for field, length in (("size", len(names)), ("pos", 3), ("quat", 4)):
+            object.__setattr__(
+                self, field, finite_tuple(f"shape.{field}", getattr(self, field), length, names)
+            )
+        if any(value <= 0.0 for value in self.size):
+            raise ValueError(f"shape.size={self.size} of a {kind.name.lower()} must be positive: {names}")
+        norm = math.sqrt(sum(value * value for value in self.quat))
+        if abs(norm - 1.0) > 1e-3:
+            raise ValueError(
+                f"shape.quat={self.quat} must be a unit quaternion (w, x, y, z); its norm is {norm:.6g}"
+            )
+        if self.body < -1:
+            raise ValueError(f"shape.body={self.body} must be a body index >= 0, or -1 for a fixed shape")
+        if self.class_id < 0:
+            raise ValueError(f"shape.class_id={self.class_id} must be >= 0; -1 is reserved for misses")
+
+    @property
+    def bounding_radius(self) -> float:
+        """Radius of the sphere around ``pos`` that holds the whole shape, metres; infinite for a plane."""
+        if self.kind == ShapeKind.PLANE:
+            return math.inf
+        if self.kind == ShapeKind.BOX:
+            return math.hypot(*self.size)
+        if self.kind == ShapeKind.CYLINDER:
+            return math.hypot(*self.size)
+        if self.kind == ShapeKind.CAPSULE:
+            return sum(self.size)
+        return max(self.size)
+
+
+def finite_tuple(
+    key: str, value: Sequence[float], length: int, names: Sequence[str] = ()
+) -> tuple[float, ...]:
+    """``value`` as a tuple of ``length`` finite floats, or a ValueError that names ``key``."""
+    result = tuple(float(item) for item in value)
+    if len(result) != length:
+        hint = f" {tuple(names)}" if key.endswith("size") else ""
+        raise ValueError(f"{key}={result} must have {length} values{hint}, got {len(result)}")
+    if not all(math.isfinite(item) for item in result):
+        raise ValueError(f"{key}={result} must be finite")
+    return result
+
+
+def _as_kind(kind: int) -> ShapeKind:
+    try:
+        return ShapeKind(kind)
+    except ValueError:
+        known = ", ".join(item.name for item in ShapeKind)
+        raise ValueError(f"shape.kind={kind!r} must be one of ShapeKind: {known}") from None

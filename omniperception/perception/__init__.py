@@ -1,0 +1,17 @@
+"""Point-cloud sampling (FPS, averaging, sorting) and the networks that read sampled LiDAR histories."""
+
+from omniperception.perception.networks import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
+from omniperception.perception.pd_risknet import PdRiskNet
+from omniperception.perception.sampling import FpsSampler, PdSampler, RawSampler, Sampler
+
+__all__ = [
+    "DirectMlp",
+    "FpsGru",
+    "FpsMlp",
+    "FpsSampler",
+    "PdRiskNet",
+    "PdSampler",
+    "PerceptionNetwork",
+    "RawSampler",
+    "Sampler",
+]

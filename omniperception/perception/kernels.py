@@ -1,0 +1,344 @@
+"""Warp kernels of the point-cloud samplers: partition, farthest points, sorting and averaging, one source for
+all devices."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+RADIX_BITS = 8
+RADIX_SIZE = 1 << RADIX_BITS
+PHI_BITS = 16
+MAX_RING = (1 << (31 - PHI_BITS)) - 1
+"""Largest ring index that fits a sort key of 31 bits beside the quantised azimuth."""
+
+_HALF_PI = wp.constant(1.5707963267948966)
+_PI = wp.constant(3.141592653589793)
+
+
+@wp.struct
+class Scratch:
+    """Work memory of one sampler; N environments, R rays, K points to pick, arrays one row per
+    environment."""
+
+    x: wp.array2d(dtype=wp.float32)  # (N, R) coordinates of the proximal hits / max range
+    y: wp.array2d(dtype=wp.float32)
+    z: wp.array2d(dtype=wp.float32)
+    ray: wp.array2d(dtype=wp.int32)  # (N, R) ray index of each proximal hit
+    distance: wp.array2d(dtype=wp.int32)  # (N, R) bits of the squared distance to the picked points
+    picked: wp.array2d(dtype=wp.int32)  # (N, K) positions in x, y, z
+    num_proximal: wp.array(dtype=wp.int32)  # (N,) proximal hits
+    keys: wp.array3d(dtype=wp.int32)  # (2, N, R) sort keys, read from one half and written to the other
+    items: wp.array3d(dtype=wp.int32)  # (2, N, R) what is sorted by them
+    histogram: wp.array2d(dtype=wp.int32)  # (N, RADIX_SIZE)
+
+
+_FARTHEST_POINTS = r"""
+    const int n = num_proximal.data[env];
+    const int k = n < num_picks ? n : num_picks;
+    int* P = picked.data + (size_t)env * (picked.strides[0] / sizeof(int));
+    if (n <= num_picks) {
+        for (int i = lane; i < n; i += num_lanes) P[i] = i;
+        return;
+    }
+    const size_t row = (size_t)env * (x.strides[0] / sizeof(float));
+    const float* __restrict__ X = x.data + row;
+    const float* __restrict__ Y = y.data + row;
+    const float* __restrict__ Z = z.data + row;
+    int* __restrict__ D = distance.data + row;
+    for (int i = lane; i < n; i += num_lanes) D[i] = 0x7f7fffff;
+    int current = 0;
+#if defined(__CUDA_ARCH__)
+    // One block per environment; three slots so that a slot is cleared two barriers before its next use.
+    __shared__ unsigned long long best[3];
+    __syncthreads();
+    if (lane < 3) best[lane] = 0ull;
+    __syncthreads();
+    for (int s = 0; s < k; ++s) {
+        if (lane == 0) { P[s] = current; best[(s + 1) % 3] = 0ull; }
+        if (lane == current % num_lanes) D[current] = -1;
+        const float cx = X[current], cy = Y[current], cz = Z[current];
+        unsigned long long mine = 0ull;
+        for (int i = lane; i < n; i += num_lanes) {
+            const float dx = X[i] - cx, dy = Y[i] - cy, dz = Z[i] - cz;
+            const int d = min(D[i], __float_as_int(dx * dx + dy * dy + dz * dz));
+            D[i] = d;
+            if (d >= 0) {
+                const unsigned long long key = ((unsigned long long)d << 32) | (unsigned int)~i;
+                if (key > mine) mine = key;
+            }
+        }
+        for (int step = 16; step > 0; step >>= 1) {
+            const unsigned long long other = __shfl_down_sync(0xffffffffu, mine, step);
+            if (other > mine) mine = other;
+        }
+        if ((lane & 31) == 0) atomicMax(&best[s % 3], mine);
+        __syncthreads();
+        current = (int)~(unsigned int)(best[s % 3] & 0xffffffffull);
+    }
+#else
+    // Non-negative floats order like their bits: integer minima and maxima vectorise without fast-math.
+    for (int s = 0; s < k; ++s) {
+        P[s] = current;
+        D[current] = -1;
+        const float cx = X[current], cy = Y[current], cz = Z[current];
+        int farthest = -1;
+        for (int i = 0; i < n; ++i) {
+            const float dx = X[i] - cx, dy = Y[i] - cy, dz = Z[i] - cz;
+            const float squared = dx * dx + dy * dy + dz * dz;
+            int bits;
+            memcpy(&bits, &squared, sizeof(bits));
+            const int d = D[i] < bits ? D[i] : bits;
+            D[i] = d;
+            farthest = farthest > d ? farthest : d;
+        }
+        current = 0;
+        while (current < n - 1 && D[current] != farthest) ++current;
+    }
+#endif
+"""
+
+
+@wp.func_native(_FARTHEST_POINTS)
+def farthest_points(
+    x: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+    z: wp.array2d(dtype=wp.float32),
+    distance: wp.array2d(dtype=wp.int32),
+    picked: wp.array2d(dtype=wp.int32),
+    num_proximal: wp.array(dtype=wp.int32),
+    num_picks: int,
+    env: int,
+    lane: int,
+    num_lanes: int,
+): ...
+
+
+@wp.func
+def is_hit(distance: float) -> bool:
+    """A miss is infinite; a non-finite range is never a point."""
+    return wp.isfinite(distance)
+
+
+@wp.func
+def sort_key(theta: float, phi: float, ring: float) -> int:
+    """(theta ring, phi) as one integer: ring index above PHI_BITS bits of azimuth counted from -pi."""
+    row = wp.clamp(int(wp.floor((theta + _HALF_PI) / ring)), 0, MAX_RING)
+    turn = (phi + _PI) / (2.0 * _PI)
+    turn -= wp.floor(turn)
+    column = wp.min(int(turn * float(1 << PHI_BITS)), (1 << PHI_BITS) - 1)
+    return (row << PHI_BITS) | column
+
+
+@wp.func
+def radix_sort(env: int, n: int, scratch: Scratch) -> int:
+    """Stable sort of the first n items of half 0 by key; returns the half that holds the result."""
+    half = wp.int32(0)
+    for digit in range(4):
+        shift = digit * RADIX_BITS
+        for b in range(RADIX_SIZE):
+            scratch.histogram[env, b] = 0
+        for i in range(n):
+            b = (scratch.keys[half, env, i] >> shift) & (RADIX_SIZE - 1)
+            scratch.histogram[env, b] = scratch.histogram[env, b] + 1
+        first = wp.int32(0)
+        if n > 0:
+            first = (scratch.keys[half, env, 0] >> shift) & (RADIX_SIZE - 1)
+        if scratch.histogram[env, first] < n:  # otherwise this digit is the same everywhere
+            start = wp.int32(0)
+            for b in range(RADIX_SIZE):
+                count = scratch.histogram[env, b]
+                scratch.histogram[env, b] = start
+                start += count
+            for i in range(n):
+                key = scratch.keys[half, env, i]
+                b = (key >> shift) & (RADIX_SIZE - 1)
+                slot = scratch.histogram[env, b]
+                scratch.histogram[env, b] = slot + 1
+                scratch.keys[1 - half, env, slot] = key
+                scratch.items[1 - half, env, slot] = scratch.items[half, env, i]
+            half = 1 - half
+    return half
+
+
+@wp.kernel
+def raw_points(
+    env_offset: int,
+    ranges: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.vec3),
+    scale: float,
+    points_out: wp.array2d(dtype=wp.vec3),
+):
+    """Every ray's point; a miss is zero."""
+    thread, ray = wp.tid()
+    env = env_offset + thread
+    point = wp.vec3(0.0, 0.0, 0.0)
+    if is_hit(ranges[env, ray]):
+        point = (ranges[env, ray] * scale) * directions[env, ray]
+    points_out[env, ray] = point
+
+
+@wp.kernel
+def gather_proximal(
+    env_offset: int,
+    ranges: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.vec3),
+    elevation: wp.array2d(dtype=wp.float32),
+    split: float,
+    scale: float,
+    scratch: Scratch,
+):
+    """Collect the hits with theta above the split, in ray order."""
+    env = env_offset + wp.tid()
+    n = wp.int32(0)
+    for ray in range(ranges.shape[1]):
+        if is_hit(ranges[env, ray]) and elevation[env, ray] > split:
+            point = (ranges[env, ray] * scale) * directions[env, ray]
+            scratch.x[env, n] = point[0]
+            scratch.y[env, n] = point[1]
+            scratch.z[env, n] = point[2]
+            scratch.ray[env, n] = ray
+            n += 1
+    scratch.num_proximal[env] = n
+
+
+@wp.kernel
+def pick_farthest(env_offset: int, num_picks: int, num_lanes: int, scratch: Scratch):
+    """Exact farthest point sampling from the first hit in ray order; no point is picked twice."""
+    thread, lane = wp.tid()
+    farthest_points(
+        scratch.x,
+        scratch.y,
+        scratch.z,
+        scratch.distance,
+        scratch.picked,
+        scratch.num_proximal,
+        num_picks,
+        env_offset + thread,
+        lane,
+        num_lanes,
+    )
+
+
+@wp.kernel
+def write_proximal(
+    env_offset: int,
+    elevation: wp.array2d(dtype=wp.float32),
+    azimuth: wp.array2d(dtype=wp.float32),
+    ring: float,
+    num_picks: int,
+    scratch: Scratch,
+    points_out: wp.array2d(dtype=wp.vec3),
+):
+    """Write the picked points sorted by (theta ring, phi), then zeros."""
+    env = env_offset + wp.tid()
+    n = wp.min(scratch.num_proximal[env], num_picks)
+    for i in range(n):
+        ray = scratch.ray[env, scratch.picked[env, i]]
+        scratch.keys[0, env, i] = sort_key(elevation[env, ray], azimuth[env, ray], ring)
+        scratch.items[0, env, i] = scratch.picked[env, i]
+    half = radix_sort(env, n, scratch)
+    for i in range(n):
+        p = scratch.items[half, env, i]
+        points_out[env, i] = wp.vec3(scratch.x[env, p], scratch.y[env, p], scratch.z[env, p])
+    for i in range(n, num_picks):
+        points_out[env, i] = wp.vec3(0.0, 0.0, 0.0)
+
+
+@wp.func
+def mean_hit(
+    env: int,
+    half: int,
+    first: int,
+    last: int,
+    scale: float,
+    ranges: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.vec3),
+    scratch: Scratch,
+) -> wp.vec3:
+    """Mean of the hits among sorted rays first..last-1; their mean direction at maximum range if there is
+    none."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    direction = wp.vec3(0.0, 0.0, 0.0)
+    hits = wp.float32(0.0)
+    for i in range(first, last):
+        ray = scratch.items[half, env, i]
+        direction += directions[env, ray]
+        if is_hit(ranges[env, ray]):
+            total += (ranges[env, ray] * scale) * directions[env, ray]
+            hits += 1.0
+    if hits > 0.0:
+        return total / hits
+    return wp.normalize(direction)
+
+
+@wp.func
+def middle_hit(
+    env: int,
+    half: int,
+    first: int,
+    last: int,
+    scale: float,
+    ranges: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.vec3),
+    scratch: Scratch,
+) -> wp.vec3:
+    """The middle one of the hits among sorted rays first..last-1; the middle ray at maximum range if there is
+    none."""
+    hits = wp.int32(0)
+    for i in range(first, last):
+        if is_hit(ranges[env, scratch.items[half, env, i]]):
+            hits += 1
+    if hits == 0:
+        return directions[env, scratch.items[half, env, first + (last - first) // 2]]
+    seen = wp.int32(0)
+    point = wp.vec3(0.0, 0.0, 0.0)
+    for i in range(first, last):
+        ray = scratch.items[half, env, i]
+        if is_hit(ranges[env, ray]):
+            if seen == hits // 2:
+                point = (ranges[env, ray] * scale) * directions[env, ray]
+            seen += 1
+    return point
+
+
+@wp.kernel
+def write_distal(
+    env_offset: int,
+    ranges: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.vec3),
+    elevation: wp.array2d(dtype=wp.float32),
+    azimuth: wp.array2d(dtype=wp.float32),
+    split: float,
+    ring: float,
+    scale: float,
+    first_slot: int,
+    num_bins: int,
+    bin_rays: int,
+    pick_middle: int,
+    scratch: Scratch,
+    points_out: wp.array2d(dtype=wp.vec3),
+):
+    """One point per bin of consecutive distal points (or rays, with bin_rays) in (theta ring, phi) order,
+    then zeros."""
+    env = env_offset + wp.tid()
+    n = wp.int32(0)
+    for ray in range(ranges.shape[1]):
+        if elevation[env, ray] <= split and (bin_rays != 0 or is_hit(ranges[env, ray])):
+            scratch.keys[0, env, n] = sort_key(elevation[env, ray], azimuth[env, ray], ring)
+            scratch.items[0, env, n] = ray
+            n += 1
+    half = radix_sort(env, n, scratch)
+    bins = wp.min(n, num_bins)
+    for b in range(bins):
+        first = b * n // bins
+        last = (b + 1) * n // bins
+        if pick_middle != 0:
+            points_out[env, first_slot + b] = middle_hit(
+                env, half, first, last, scale, ranges, directions, scratch
+            )
+        else:
+            points_out[env, first_slot + b] = mean_hit(
+                env, half, first, last, scale, ranges, directions, scratch
+            )
+    for b in range(bins, num_bins):
+        points_out[env, first_slot + b] = wp.vec3(0.0, 0.0, 0.0)

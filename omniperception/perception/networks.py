@@ -1,0 +1,104 @@
+"""The perception network interface and the ablation networks (paper, Table 'PD-RiskNet Ablation Results')."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+from omniperception.perception.windows import WindowedGru, WindowedLinear
+
+FEATURE_DIM = 251
+"""Size of PD-RiskNet's embedding, 187 + 64 (paper, App. PD-RiskNet Architecture); the ablations match it."""
+
+
+class PerceptionNetwork(nn.Module):
+    """Embeds sliding windows over a sequence of sampled LiDAR frames.
+
+    Attributes:
+        num_points: P, points per frame.
+        history: H, frames per window.
+        feature_dim: D, size of the embedding.
+    """
+
+    num_points: int
+    history: int
+    feature_dim: int
+
+    def __init__(self, num_points: int, history: int, feature_dim: int = FEATURE_DIM) -> None:
+        super().__init__()
+        for name, value in (("num_points", num_points), ("history", history), ("feature_dim", feature_dim)):
+            if value < 1:
+                raise ValueError(f"{type(self).__name__}: {name} must be at least 1, got {value}")
+        self.num_points = num_points
+        self.history = history
+        self.feature_dim = feature_dim
+
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        """Embed every window.
+
+        Args:
+            frames: (B, F, P, 3) sampled points in the sensor frame / maximum range, oldest first, F = H - 1 +
+                W.
+            count: (B, W) integers in 0..H; only the newest ``count[b, w]`` frames of window w (frames
+                w..w+H-1) are valid.
+
+        Returns:
+            (B, W, D) embeddings.
+        """
+        raise NotImplementedError
+
+    def height_prediction(self, features: torch.Tensor) -> torch.Tensor | None:
+        """The part of ``features`` (..., D) to be regressed on the height grid; ``None`` if there is none."""
+        return None
+
+
+class FpsGru(PerceptionNetwork):
+    """One GRU over farthest-point samples of the whole cloud."""
+
+    def __init__(self, num_points: int, history: int = 10, feature_dim: int = FEATURE_DIM) -> None:
+        super().__init__(num_points, history, feature_dim)
+        self.gru = WindowedGru(3 * num_points, feature_dim, history)
+
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        """See :meth:`PerceptionNetwork.forward`."""
+        return self.gru(frames.flatten(2), count)
+
+
+class FpsMlp(PerceptionNetwork):
+    """An MLP over a window's farthest-point samples, flattened; invalid frames are zeros."""
+
+    def __init__(
+        self,
+        num_points: int,
+        history: int = 10,
+        hidden: Sequence[int] = (256,),
+        feature_dim: int = FEATURE_DIM,
+    ) -> None:
+        """Args: num_points: P; history: H; hidden: sizes of the hidden layers; feature_dim: D."""
+        super().__init__(num_points, history, feature_dim)
+        sizes = [*hidden, feature_dim]
+        self.first = WindowedLinear(3 * num_points, sizes[0], history)
+        rest: list[nn.Module] = []
+        for fan_in, fan_out in zip(sizes, sizes[1:], strict=False):
+            rest += [nn.ELU(), nn.Linear(fan_in, fan_out)]
+        self.rest = nn.Sequential(*rest)
+
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        """See :meth:`PerceptionNetwork.forward`."""
+        return self.rest(self.first(frames.flatten(2), count))
+
+
+class DirectMlp(FpsMlp):
+    """The same MLP over the raw cloud, every ray in ray order with misses as zeros."""
+
+    def __init__(
+        self,
+        num_rays: int,
+        history: int = 10,
+        hidden: Sequence[int] = (256,),
+        feature_dim: int = FEATURE_DIM,
+    ) -> None:
+        """Args: num_rays: rays per frame; history: H; hidden: sizes of the hidden layers; feature_dim: D."""
+        super().__init__(num_rays, history, hidden, feature_dim)

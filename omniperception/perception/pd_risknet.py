@@ -1,0 +1,51 @@
+"""PD-RiskNet: a proximal and a distal GRU over sampled LiDAR frames (paper, Sec. 3.3.1 and App.
+architecture)."""
+
+from __future__ import annotations
+
+import torch
+
+from omniperception.perception.networks import PerceptionNetwork
+from omniperception.perception.windows import WindowedGru
+
+
+class PdRiskNet(PerceptionNetwork):
+    """Two GRUs, one over the proximal and one over the distal points; their last states are the embedding.
+
+    One frame's sampled, sorted and flattened points are one time step. The proximal state itself is regressed
+    on the height grid (17 x 11 = 187 values in -1..1, as a GRU's state), so supervision needs no extra layer.
+    """
+
+    def __init__(
+        self,
+        num_proximal: int = 256,
+        num_distal: int = 128,
+        history: int = 10,
+        proximal_dim: int = 187,
+        distal_dim: int = 64,
+    ) -> None:
+        """Configure both paths.
+
+        Args:
+            num_proximal: points of the proximal half, first in a frame.
+            num_distal: points of the distal half, after them.
+            history: H, frames per window.
+            proximal_dim: size of the proximal embedding and of the height grid.
+            distal_dim: size of the distal embedding.
+        """
+        super().__init__(num_proximal + num_distal, history, proximal_dim + distal_dim)
+        self.num_proximal = num_proximal
+        self.proximal_dim = proximal_dim
+        self.proximal = WindowedGru(3 * num_proximal, proximal_dim, history)
+        self.distal = WindowedGru(3 * num_distal, distal_dim, history)
+
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        """See :meth:`PerceptionNetwork.forward`."""
+        near = self.proximal(frames[:, :, : self.num_proximal].flatten(2), count)
+        far = self.distal(frames[:, :, self.num_proximal :].flatten(2), count)
+        return torch.cat([near, far], dim=-1)
+
+    def height_prediction(self, features: torch.Tensor) -> torch.Tensor:
+        """Proximal embedding (..., proximal_dim): base height minus terrain height on the grid, metres, in
+        -1..1."""
+        return features[..., : self.proximal_dim]

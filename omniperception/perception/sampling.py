@@ -1,0 +1,262 @@
+"""Samplers that turn one LiDAR frame into a fixed number of points: raw, farthest points, proximal and
+distal."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+
+from omniperception.perception import kernels
+from omniperception.perception.launch import launch_over_envs, view
+
+_FPS_LANES = 128
+"""CUDA threads that share one environment's farthest point sampling."""
+
+vec3, float32, int32 = kernels.wp.vec3, kernels.wp.float32, kernels.wp.int32
+
+
+class Sampler(ABC):
+    """Writes a fixed number of points per environment from one frame of rays.
+
+    Attributes:
+        num_points: P, points written per environment.
+        max_range: metres; points are divided by it.
+    """
+
+    num_points: int
+    max_range: float
+
+    def __init__(self, num_points: int, max_range: float, num_threads: int | None = None) -> None:
+        if num_points < 1:
+            raise ValueError(f"a sampler needs at least one point, got num_points={num_points}")
+        if not (math.isfinite(max_range) and max_range > 0.0):
+            raise ValueError(f"max_range must be a positive length in metres, got {max_range}")
+        self.num_points = num_points
+        self.max_range = float(max_range)
+        self.num_threads = num_threads
+
+    def __call__(
+        self,
+        ranges: torch.Tensor,
+        directions_s: torch.Tensor,
+        elevation: torch.Tensor,
+        azimuth: torch.Tensor,
+        out: torch.Tensor,
+    ) -> None:
+        """Sample one frame; every element of ``out`` is written.
+
+        Args:
+            ranges: (N, R) float32, metres; infinity is a miss. Misses are no points.
+            directions_s: (N, R, 3) float32, unit vectors in the sensor frame.
+            elevation: (N, R) float32, theta in the sensor frame, radians.
+            azimuth: (N, R) float32, phi in the sensor frame, radians, any branch.
+            out: (N, P, 3) float32, points in the sensor frame divided by ``max_range``; may be a strided
+                slice.
+        """
+        n, r = ranges.shape
+        expected = {
+            "directions_s": (n, r, 3),
+            "elevation": (n, r),
+            "azimuth": (n, r),
+            "out": (n, self.num_points, 3),
+        }
+        given = {"directions_s": directions_s, "elevation": elevation, "azimuth": azimuth, "out": out}
+        for name, shape in expected.items():
+            if tuple(given[name].shape) != shape:
+                raise ValueError(f"sampler: {name} must have shape {shape}, got {tuple(given[name].shape)}")
+        for name, tensor in {"ranges": ranges, **given}.items():
+            if tensor.dtype != torch.float32 or tensor.device != ranges.device:
+                raise ValueError(
+                    f"sampler: {name} must be float32 on {ranges.device}, got {tensor.dtype} on"
+                    f" {tensor.device}"
+                )
+        self._sample(ranges, directions_s, elevation, azimuth, out)
+
+    @abstractmethod
+    def _sample(self, ranges, directions_s, elevation, azimuth, out) -> None:
+        """Write ``out`` from checked tensors."""
+
+
+class RawSampler(Sampler):
+    """Every ray's point in ray order, a miss as zeros: the input of the direct MLP."""
+
+    def __init__(self, num_rays: int, *, max_range: float, num_threads: int | None = None) -> None:
+        """Args: num_rays: R of every frame; max_range: metres."""
+        super().__init__(num_rays, max_range, num_threads)
+
+    def _sample(self, ranges, directions_s, elevation, azimuth, out) -> None:
+        inputs = [view(ranges, float32), view(directions_s, vec3), 1.0 / self.max_range, view(out, vec3)]
+        launch_over_envs(
+            kernels.raw_points,
+            ranges.shape[0],
+            inputs,
+            ranges.device,
+            inner=self.num_points,
+            num_threads=self.num_threads,
+        )
+
+
+class PdSampler(Sampler):
+    """PD-RiskNet's proximal and distal sampling (Sec. 3.3.1 of the paper).
+
+    The cloud is split by elevation in the sensor frame: proximal where theta > ``split_deg``, distal
+    elsewhere. Proximal points are thinned by exact farthest point sampling, which starts at the first
+    proximal hit in ray order and never picks a point twice (of equally far points the first in ray order).
+    Distal points are sorted and cut into bins of consecutive points, one output point per bin. Both halves
+    are ordered by (theta ring, phi), where ring = floor((theta + pi / 2) / ring_deg) and phi starts at -pi in
+    steps of 2 pi / 65536. With fewer points than slots each point has its own slot and the remaining slots
+    are zero.
+
+    ``distal_bins="points"`` bins the hits, as the paper does: where a bin looks depends on how many hits
+    there are before it in the order. ``distal_bins="rays"`` bins the distal rays instead, hit or not: a bin
+    then always covers the same rays of a repeating scan, and about the same solid angle of another, so a
+    network input keeps its direction. Such a bin is the mean of its hits; one without a hit holds its rays'
+    mean direction at maximum range, because there "nothing seen" means free space up to the maximum range,
+    whereas a zero would say "touching".
+    """
+
+    def __init__(
+        self,
+        num_proximal: int = 256,
+        num_distal: int = 128,
+        *,
+        max_range: float,
+        split_deg: float,
+        ring_deg: float = 2.0,
+        reduce: str = "average",
+        distal_bins: str = "points",
+        num_threads: int | None = None,
+    ) -> None:
+        """Configure the two halves.
+
+        Args:
+            num_proximal: slots of the proximal half, written first.
+            num_distal: slots of the distal half.
+            max_range: metres; points are divided by it.
+            split_deg: elevation in the sensor frame that separates the halves, degrees.
+            ring_deg: height of a theta ring for sorting, degrees.
+            reduce: "average" takes a bin's mean, "pick" its middle point.
+            distal_bins: "points" or "rays".
+            num_threads: CPU threads; all cores by default.
+        """
+        if num_proximal < 0 or num_distal < 0:
+            raise ValueError(
+                f"num_proximal and num_distal must not be negative, got {num_proximal} and {num_distal}"
+            )
+        super().__init__(num_proximal + num_distal, max_range, num_threads)
+        if not 180.0 / kernels.MAX_RING < ring_deg <= 180.0:
+            raise ValueError(f"ring_deg must lie in (0.006, 180], got {ring_deg}")
+        if reduce not in ("average", "pick"):
+            raise ValueError(f"reduce must be 'average' or 'pick', got '{reduce}'")
+        if distal_bins not in ("points", "rays"):
+            raise ValueError(f"distal_bins must be 'points' or 'rays', got '{distal_bins}'")
+        if math.isnan(split_deg):
+            raise ValueError("split_deg must be a number of degrees, got nan")
+        self.num_proximal = num_proximal
+        self.num_distal = num_distal
+        self.split = math.radians(split_deg)
+        self.ring = math.radians(ring_deg)
+        self.pick_middle = int(reduce == "pick")
+        self.bin_rays = int(distal_bins == "rays")
+        self._scratch: kernels.Scratch | None = None
+        self._scratch_key: tuple | None = None
+        self._tensors: dict[str, torch.Tensor] = {}
+
+    def _sample(self, ranges, directions_s, elevation, azimuth, out) -> None:
+        n, r = ranges.shape
+        scratch = self._scratch_for(n, r, ranges.device)
+        ranges_v, directions_v = view(ranges, float32), view(directions_s, vec3)
+        theta, phi, points = view(elevation, float32), view(azimuth, float32), view(out, vec3)
+        scale = 1.0 / self.max_range
+
+        def launch(kernel, *inputs, **options) -> None:
+            launch_over_envs(kernel, n, list(inputs), ranges.device, num_threads=self.num_threads, **options)
+
+        if self.num_proximal:
+            lanes = _FPS_LANES if ranges.device.type == "cuda" else 1
+            launch(
+                kernels.gather_proximal,
+                ranges_v,
+                directions_v,
+                theta,
+                self.split,
+                scale,
+                scratch,
+                block_dim=32,
+            )
+            launch(kernels.pick_farthest, self.num_proximal, lanes, scratch, inner=lanes, block_dim=lanes)
+            launch(
+                kernels.write_proximal,
+                theta,
+                phi,
+                self.ring,
+                self.num_proximal,
+                scratch,
+                points,
+                block_dim=32,
+            )
+        if self.num_distal:
+            launch(
+                kernels.write_distal,
+                ranges_v,
+                directions_v,
+                theta,
+                phi,
+                self.split,
+                self.ring,
+                scale,
+                self.num_proximal,
+                self.num_distal,
+                self.bin_rays,
+                self.pick_middle,
+                scratch,
+                points,
+                block_dim=32,
+            )
+
+    def _scratch_for(self, n: int, r: int, device: torch.device) -> kernels.Scratch:
+        """Work memory for N environments of R rays, allocated when the shape or device is new."""
+        if self._scratch_key == (n, r, device):
+            return self._scratch
+        sizes = {
+            "picked": (n, max(self.num_proximal, 1)),
+            "num_proximal": (n,),
+            "keys": (2, n, r),
+            "items": (2, n, r),
+            "histogram": (n, kernels.RADIX_SIZE),
+            "ray": (n, r),
+            "distance": (n, r),
+        }
+        self._tensors = {
+            name: torch.empty(size, dtype=torch.int32, device=device) for name, size in sizes.items()
+        }
+        self._tensors |= {name: torch.empty(n, r, device=device) for name in "xyz"}
+        scratch = kernels.Scratch()
+        for name, tensor in self._tensors.items():
+            setattr(scratch, name, view(tensor, float32 if name in "xyz" else int32))
+        self._scratch, self._scratch_key = scratch, (n, r, device)
+        return scratch
+
+
+class FpsSampler(PdSampler):
+    """Exact farthest point sampling over all hits, then sorted by (theta ring, phi); zeros after the last
+    point.
+
+    The sampling starts at the first hit in ray order, so a frame always gives the same points.
+    """
+
+    def __init__(
+        self, num_points: int, *, max_range: float, ring_deg: float = 2.0, num_threads: int | None = None
+    ) -> None:
+        """Args: num_points: slots; max_range: metres; ring_deg: height of a theta ring for sorting,
+        degrees."""
+        super().__init__(
+            num_points,
+            0,
+            max_range=max_range,
+            split_deg=-math.inf,
+            ring_deg=ring_deg,
+            num_threads=num_threads,
+        )

@@ -1,0 +1,102 @@
+"""What the task needs from a physics engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+
+from omniperception.world import World
+
+_INTEGRATORS = ("euler", "implicitfast", "implicit", "rk4")
+_CONES = ("pyramidal", "elliptic")
+
+
+@dataclass(frozen=True)
+class SimConfig:
+    """Physics settings.
+
+    Attributes:
+        timestep: physics step (s).
+        decimation: physics steps per control step.
+        integrator: 'euler', 'implicitfast', 'implicit' or 'rk4'.
+        iterations: iterations of the constraint solver.
+        ls_iterations: line-search iterations of the solver.
+        cone: friction cone, 'pyramidal' or 'elliptic'.
+        num_threads: CPU threads; 0 uses every core.
+    """
+
+    timestep: float = 0.005
+    decimation: int = 4
+    integrator: str = "implicitfast"
+    iterations: int = 10
+    ls_iterations: int = 20
+    cone: str = "pyramidal"
+    num_threads: int = 0
+
+    def __post_init__(self) -> None:
+        if self.timestep <= 0:
+            raise ValueError(f"sim.timestep={self.timestep} must be positive")
+        for name in ("decimation", "iterations", "ls_iterations"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"sim.{name}={getattr(self, name)} must be at least 1")
+        if self.num_threads < 0:
+            raise ValueError(f"sim.num_threads={self.num_threads} must be 0 (every core) or a positive number")
+        if self.integrator not in _INTEGRATORS:
+            raise ValueError(f"sim.integrator={self.integrator} is unknown; known: {', '.join(_INTEGRATORS)}")
+        if self.cone not in _CONES:
+            raise ValueError(f"sim.cone={self.cone} is unknown; known: {', '.join(_CONES)}")
+
+    @property
+    def control_dt(self) -> float:
+        """Control step (s)."""
+        return self.timestep * self.decimation
+
+
+class Simulator(Protocol):
+    """Many copies of one world, stepped together. Tensors are live; all are (num_envs, ...)."""
+
+    world: World
+    num_envs: int
+    device: torch.device
+    qpos: torch.Tensor
+    """(num_envs, 7 + num_joints) float64: base position (m, environment frame), quaternion (w, x, y, z), joints (rad)."""
+    qvel: torch.Tensor
+    """(num_envs, 6 + num_joints) float64: base linear velocity (m/s, world), angular velocity (rad/s, base), joints."""
+    mocap_pos: torch.Tensor
+    """(num_envs, num_placed_obstacles, 3) float64: positions (m) of the kinematic bodies."""
+    mocap_quat: torch.Tensor
+    """(num_envs, num_placed_obstacles, 4) float64."""
+    failed: torch.Tensor
+    """(num_envs,) bool: simulations whose state became non-finite or raised an error since the last reset."""
+
+    def step(self, joint_target: torch.Tensor) -> None:
+        """One physics step with (num_envs, num_joints) joint position targets (rad)."""
+
+    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Puts some environments into a state, (n, nq) and (n, nv)."""
+
+    def joint_torque(self) -> torch.Tensor:
+        """(num_envs, num_joints) actuator torque (N m) of the last physics step."""
+
+    def contact_sensor(self, kind: str) -> torch.Tensor:
+        """(num_envs, width) readings of one kind of contact sensor in the last physics step."""
+
+    def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions (num_envs, n, 3) (m) and quaternions (num_envs, n, 4) of bodies at the current state, float32."""
+
+    def model_field(self, name: str) -> torch.Tensor:
+        """(num_envs, ...) per-environment values of a model field, made per-environment on the first call."""
+
+    def state_dict(self) -> dict:
+        """Everything that the physics needs to go on exactly."""
+
+    def load_state_dict(self, state: dict) -> None:
+        """Goes on from a `state_dict` of the same world and number of environments."""
+
+    def detect_failures(self) -> None:
+        """Marks simulations whose state has become non-finite in `failed`."""
+
+    def update_model(self, env_ids: torch.Tensor) -> None:
+        """Recomputes what the engine derives from model fields that were written for some environments."""

@@ -1,0 +1,126 @@
+"""MuJoCo on CPU cores: `mujoco.batch.Batch` behind the Simulator protocol."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch, SimulationError
+
+from omniperception.sim.base import SimConfig
+from omniperception.world import World
+
+_INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+_CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+_STAGE_POS = mujoco.mjtStage.mjSTAGE_POS.value
+_MAX_SPEED = 1e3
+"""A generalised velocity (m/s or rad/s) beyond this is a diverged simulation."""
+
+
+class MujocoSimulator:
+    """`num_envs` simulations on a native thread pool; only what is asked for is copied out of the engine.
+
+    State tensors are views of the engine's own memory. Contact sensors and torques describe the state before the last
+    physics step, as `mj_step` leaves them; body poses are recomputed for the current state.
+    """
+
+    def __init__(self, world: World, config: SimConfig, num_envs: int) -> None:
+        self.world, self.config, self.num_envs = world, config, num_envs
+        self.device = torch.device("cpu")
+        apply_options(world.model, config)
+        self.batch = Batch(world.model, num_envs, config.num_threads)
+        self.qpos = torch.from_numpy(self.batch.bind("qpos"))
+        self.qvel = torch.from_numpy(self.batch.bind("qvel"))
+        self.mocap_pos = torch.from_numpy(self.batch.bind("mocap_pos"))
+        self.mocap_quat = torch.from_numpy(self.batch.bind("mocap_quat"))
+        self.failed = torch.zeros(num_envs, dtype=torch.bool)
+        self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
+        self._sensordata = self.batch.bind("sensordata") if world.sensors else None
+        self._contacts = {kind: np.zeros((num_envs, _width(world, kind))) for kind in world.sensors}
+        self._fields: dict[str, torch.Tensor] = {}
+        self._torque: np.ndarray | None = None
+        self._poses: tuple[np.ndarray, np.ndarray] | None = None
+
+    def step(self, joint_target: torch.Tensor) -> None:
+        self._ctrl.copy_(joint_target)
+        try:
+            self.batch.step()
+        except SimulationError as error:
+            self.failed[torch.from_numpy(np.asarray(error.ids))] = True
+        for kind, values in self._contacts.items():
+            values[:] = self._sensordata[:, self.world.sensor_slice(kind)]
+
+    def detect_failures(self) -> None:
+        """Marks simulations whose state is no longer finite or faster than anything physical."""
+        speed = self.qvel.abs().amax(dim=1)
+        finite = (speed < _MAX_SPEED) & torch.isfinite(self.qpos.sum(dim=1))
+        self.failed |= ~finite
+
+    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        mocap_pos, mocap_quat = self.mocap_pos[env_ids].clone(), self.mocap_quat[env_ids].clone()
+        self.batch.reset(env_ids.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self.mocap_pos[env_ids], self.mocap_quat[env_ids] = mocap_pos, mocap_quat
+        self.qpos[env_ids] = qpos.double()
+        self.qvel[env_ids] = qvel.double()
+        self.failed[env_ids] = False
+        for values in self._contacts.values():
+            values[env_ids.numpy()] = 0.0
+
+    def joint_torque(self) -> torch.Tensor:
+        if self._torque is None:
+            self._torque = self.batch.bind("actuator_force")
+        return torch.from_numpy(self._torque.astype(np.float32))
+
+    def contact_sensor(self, kind: str) -> torch.Tensor:
+        return torch.from_numpy(self._contacts[kind].astype(np.float32))
+
+    def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        if self._poses is None:
+            self._poses = self.batch.bind("xpos"), self.batch.bind("xquat")
+        self.batch.forward(stage=_STAGE_POS)
+        index = np.asarray(bodies)
+        pos, quat = (field[:, index].astype(np.float32) for field in self._poses)
+        return torch.from_numpy(pos), torch.from_numpy(quat)
+
+    def model_field(self, name: str) -> torch.Tensor:
+        if name not in self._fields:
+            self._fields[name] = torch.from_numpy(self.batch.expand(name))
+        return self._fields[name]
+
+    def update_model(self, env_ids: torch.Tensor) -> None:
+        self.batch.set_const(env_ids.numpy())
+
+    def state_dict(self) -> dict:
+        """State rows of all simulations and the model fields that differ between them."""
+        return {
+            "state": torch.from_numpy(self.batch.state.copy()),
+            "fields": {name: value.clone() for name, value in self._fields.items()},
+            "failed": self.failed.clone(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        self.batch.state[:] = state["state"].numpy()
+        self.failed.copy_(state["failed"])
+        for name, value in state["fields"].items():
+            self.model_field(name).copy_(value)
+        if "body_mass" in state["fields"]:
+            self.update_model(torch.arange(self.num_envs))
+
+
+def apply_options(model: mujoco.MjModel, config: SimConfig) -> None:
+    """Writes the physics settings into a compiled model."""
+    model.opt.timestep = config.timestep
+    model.opt.integrator = _INTEGRATORS[config.integrator]
+    model.opt.cone = _CONES[config.cone]
+    model.opt.iterations = config.iterations
+    model.opt.ls_iterations = config.ls_iterations
+
+
+def _width(world: World, kind: str) -> int:
+    columns = world.sensor_slice(kind)
+    return columns.stop - columns.start

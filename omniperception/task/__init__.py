@@ -1,0 +1,1 @@
+"""The learning task: commands, observations, rewards, terminations and randomization around a simulator."""

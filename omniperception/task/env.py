@@ -1,0 +1,414 @@
+"""The vectorized environment: one control step from actions to observations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from omniperception.random import EnvRandom
+from omniperception.sim import MujocoSimulator, SimConfig
+from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
+from omniperception.task.heights import relative_heights
+from omniperception.task.metrics import EpisodeMetrics
+from omniperception.task.observations import GroupBuffer, ObservationsConfig
+from omniperception.task.randomization import RandomizationConfig, Randomizer
+from omniperception.task.rewards import RewardsConfig, avoidance_velocity
+from omniperception.task.rotations import rotate_yaw, yaw_quat
+from omniperception.task.sensing import LidarSensing, SensingNeeds, SensorConfig
+from omniperception.task.state import Kinematics
+from omniperception.task.terminations import TerminationsConfig
+from omniperception.task.timing import StageTimer
+from omniperception.world import ObstacleField, ObstaclesConfig, RobotConfig, TerrainConfig, build_world
+from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
+
+MAX_ACTION = 100.0
+"""Actions beyond this magnitude are clipped; a policy that gets here has diverged."""
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Everything that defines the task.
+
+    Attributes:
+        num_envs: parallel environments.
+        seed: seed of every random stream of the task.
+        robot, terrain, obstacles, commands, observations, rewards, terminations, randomization, sim: the presets.
+        lidar: the sensor, or None.
+        sampler: makes the point sampler, or None when no network looks at the cloud.
+        frame_history: LiDAR frames kept for the network.
+        height_target: whether the network is supervised with heights.
+        log_interval: control steps between two reports of the metrics.
+        initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
+    """
+
+    num_envs: int
+    seed: int
+    robot: RobotConfig
+    terrain: TerrainConfig
+    obstacles: ObstaclesConfig
+    commands: VelocityCommandConfig | GoalCommandConfig
+    observations: ObservationsConfig
+    rewards: RewardsConfig
+    terminations: TerminationsConfig
+    randomization: RandomizationConfig
+    sim: SimConfig
+    lidar: SensorConfig | None = None
+    sampler: Callable | None = None
+    frame_history: int = 0
+    height_target: bool = False
+    log_interval: int = 24
+    initial_obstacle_level: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs={self.num_envs} must be at least 1")
+        if self.log_interval < 1:
+            raise ValueError(f"log_interval={self.log_interval} must be at least 1")
+        if self.lidar is None:
+            if self.sampler is not None:
+                raise ValueError("lidar=none gives the perception network nothing to see; use lidar=mid360 or perception=none")
+            unmet = sorted(self.fields_read() & {"sectors", "rays"})
+            if unmet:
+                raise ValueError(
+                    f"rewards or observations read {', '.join(unmet)} from the LiDAR, but lidar=none;"
+                    " use lidar=mid360 or rewards=walk observations=walk"
+                )
+
+    def fields_read(self) -> frozenset[str]:
+        """Optional fields that some reward or observation of this task reads."""
+        fields = self.rewards.fields_read() | self.observations.fields_read()
+        if self.height_target:
+            fields |= {"heights"}
+        if self.obstacles.num_obstacles:
+            fields |= {"obstacle_contact"}
+        return fields
+
+    @property
+    def uses_lidar(self) -> bool:
+        """Whether anything reads the LiDAR; otherwise it is not built."""
+        return self.lidar is not None and (self.sampler is not None or bool(self.fields_read() & {"sectors", "rays"}))
+
+
+class OmniEnv(VecEnv):
+    """`num_envs` robots among obstacles behind rsl_rl's VecEnv contract.
+
+    One control step: `decimation` physics steps, before each of which the obstacles move -> robot state -> at the
+    LiDAR's rate a frame is cast, given noise and sampled -> rewards and terminations -> finished environments are
+    reset -> observations. Contact forces and torques describe the state before the last physics step (5 ms old);
+    contacts with obstacles are those of all physics steps of the control step.
+    """
+
+    def __init__(self, config: EnvConfig) -> None:
+        self.cfg = self.config = config
+        self.robot, self.num_envs = config.robot, config.num_envs
+        self.num_actions = config.robot.num_joints
+        self.control_dt = config.sim.control_dt
+        self.max_episode_length = round(config.terminations.episode_length_s / self.control_dt)
+        self.timer = StageTimer()
+        fields = config.fields_read()
+        self._reads = fields
+        sensors = {FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT} & fields
+        self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
+        self.sim = MujocoSimulator(self.world, config.sim, config.num_envs)
+        self.device = self.sim.device
+        self.random = EnvRandom(config.seed, config.num_envs, self.device)
+        self.command = config.commands.build(config.num_envs, self.device, self.random)
+        self.randomizer = Randomizer(config.randomization, self.sim, self.random)
+        self.obstacles: ObstacleField | None = None
+        if config.obstacles.placed_slots():
+            self.obstacles = ObstacleField(config.obstacles, self.sim.mocap_pos, self.sim.mocap_quat, self.random)
+            if config.initial_obstacle_level is not None:
+                self.obstacles.level = config.initial_obstacle_level
+        self.sensing = self._build_sensing(fields) if config.uses_lidar else None
+        self._allocate()
+        self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
+        self.step_count = 0
+        self._all_envs = torch.arange(self.num_envs, device=self.device)
+        self._reset(self._all_envs)
+        self._read_state()
+        self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
+        self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        self._sense()
+        self.observations = self._observe()
+
+    # ---- rsl_rl's contract -------------------------------------------------------------------------------------------
+
+    def get_observations(self) -> TensorDict:
+        return self.observations
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """One control step with actions (num_envs, num_actions); see rsl_rl.env.VecEnv."""
+        actions = actions.clamp(-MAX_ACTION, MAX_ACTION)
+        self.actions = (actions, self.actions[0], self.actions[1])
+        self.last_joint_vel = self.kinematics.joint_vel
+        self.step_count += 1
+        self.episode_length_buf += 1
+        self._advance_physics(actions)
+        with self.timer.stage("state"):
+            self._read_state()
+        if self.sensing is not None and self.sensing.due(self.step_count):
+            self._sense()
+        with self.timer.stage("rewards"):
+            outcomes, done = self._terminate()
+            rewards = self._reward()
+            self._record(done, outcomes)
+        with self.timer.stage("resets"):
+            self.command.advance(self.control_dt, self.kinematics)
+            self._fresh = done
+            ids = done.nonzero().flatten()
+            if len(ids):
+                self._reset(ids)
+                self._read_state()
+        with self.timer.stage("observations"):
+            self.observations = self._observe()
+        extras: dict = {"time_outs": outcomes["time_out"].float()}
+        if self.step_count % self.config.log_interval == 0:
+            extras["log"] = self._report()
+        return self.observations, rewards, done.long(), extras
+
+    def state_dict(self) -> dict:
+        """Everything that a resumed run needs to go on exactly."""
+        parts = {name: part.state_dict() for name, part in self._parts().items()}
+        return {
+            **parts,
+            "random": self.random.counter,
+            "step_count": self.step_count,
+            "episode_length": self.episode_length_buf,
+            "actions": list(self.actions),
+            "delayed": [list(entry) for entry in self._delayed or []],
+            "histories": {name: group.buffer for name, group in self._groups.items()},
+            "observations": {name: self.observations[name] for name in self._groups},
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Goes on from the `state_dict` of an environment with the same configuration."""
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        self.random.counter.copy_(state["random"])
+        self.step_count = state["step_count"]
+        self.episode_length_buf.copy_(state["episode_length"])
+        self.actions = tuple(state["actions"])
+        if self._delayed is not None:
+            self._delayed = [tuple(entry) for entry in state["delayed"]]
+        for name, buffer in state["histories"].items():
+            self._groups[name].buffer = buffer
+        self._read_state()
+        self.observations = self._collect(dict(state["observations"]))
+
+    # ---- the parts of a step -----------------------------------------------------------------------------------------
+
+    def _advance_physics(self, actions: torch.Tensor) -> None:
+        target = self.default_joint_pos + self.robot.action_scale * actions
+        if self.randomizer.joint_offset is not None:
+            target = target + self.randomizer.joint_offset
+        self.touching.zero_()
+        for _ in range(self.config.sim.decimation):
+            if self.obstacles is not None:
+                with self.timer.stage("obstacles"):
+                    self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
+            with self.timer.stage("physics"):
+                self.sim.step(target)
+            if OBSTACLE_CONTACT in self.world.sensors:
+                self.touching |= (self.sim.contact_sensor(OBSTACLE_CONTACT) > 0).any(1)
+            if self._delayed is not None:
+                self._delayed.append((self.sim.qpos.float(), self.sim.qvel.float()))
+                del self._delayed[0]
+        self.sim.detect_failures()
+
+    def _read_state(self) -> None:
+        self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)
+        self.sensed = self.kinematics if self._delayed is None else self._late_kinematics()
+        if "joint_torque" in self._reads:
+            self.joint_torque = self.sim.joint_torque()
+        if "foot_force" in self._reads:
+            self.foot_force = self.sim.contact_sensor(FOOT_FORCE).unflatten(1, (-1, 3))
+        if "link_force" in self._reads:
+            self.link_force = self.sim.contact_sensor(LINK_FORCE).unflatten(1, (-1, 3))
+        if "heights" in self._reads:
+            self.heights = relative_heights(self.kinematics.base_pos_w[:, 2], 0.0)
+        if "obstacles" in self._reads:
+            self._locate_obstacles()
+
+    def _late_kinematics(self) -> Kinematics:
+        """The state `delay` physics steps ago, by environment."""
+        qpos = torch.stack([entry[0] for entry in self._delayed])
+        qvel = torch.stack([entry[1] for entry in self._delayed])
+        index = len(self._delayed) - 1 - self.randomizer.delay
+        return Kinematics.of(qpos[index, self._all_envs], qvel[index, self._all_envs])
+
+    def _locate_obstacles(self) -> None:
+        if self.obstacles is None:
+            self.obstacle_rel_pos_yaw = torch.zeros(self.num_envs, 1, 2, device=self.device)
+            self.obstacle_vel_yaw = torch.zeros_like(self.obstacle_rel_pos_yaw)
+            self.obstacle_radius = torch.zeros(1, device=self.device)
+            self.obstacle_active = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+            return
+        yaw, field = self.kinematics.yaw, self.obstacles
+        offset = field.pos_w[..., :2].float() - self.kinematics.base_pos_w[:, None, :2]
+        self.obstacle_rel_pos_yaw = rotate_yaw(-yaw, offset)
+        self.obstacle_vel_yaw = rotate_yaw(-yaw, field.velocity_w.float())
+        self.obstacle_radius = field.radius.float()
+        self.obstacle_active = field.active
+
+    def _sense(self) -> None:
+        if self.sensing is None:
+            return
+        with self.timer.stage("rays"):
+            self.sensing.cast(self.step_count * self.control_dt)
+        with self.timer.stage("sampling"):
+            self.sensing.sample()
+        with self.timer.stage("sectors"):
+            self.sensing.measure_sectors()
+
+    @property
+    def avoidance_velocity(self) -> torch.Tensor:
+        """(num_envs, 2) m/s in the yaw-aligned frame, from the sector distances of the newest frame."""
+        return avoidance_velocity(self.sensing.sector_distance, self.config.rewards.avoidance)
+
+    def _terminate(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Why environments end, each environment for one reason, and whether they do."""
+        diverged = self.sim.failed.clone()
+        collided = self.touching if self.config.terminations.on_collision else torch.zeros_like(diverged)
+        reached = self.command.reached(self.kinematics)
+        causes = {
+            "diverged": diverged,
+            "fall": self.config.terminations.fallen(self.kinematics),
+            "collision_end": collided,
+            "goal": torch.zeros_like(diverged) if reached is None else reached,
+            "time_out": self.episode_length_buf >= self.max_episode_length,
+        }
+        done = torch.zeros_like(diverged)
+        outcomes = {}
+        for name, happened in causes.items():
+            outcomes[name] = happened & ~done
+            done = done | happened
+        self.outcomes, self.done = outcomes, done
+        return outcomes, done
+
+    def _reward(self) -> torch.Tensor:
+        """Weighted sum times the control step; a diverged environment's step counts nothing."""
+        healthy = ~self.sim.failed
+        total = torch.zeros(self.num_envs, device=self.device)
+        for index, term in enumerate(self.config.rewards.terms.values()):
+            weighted = torch.where(healthy, term.func(self), 0.0) * (term.weight * self.control_dt)
+            self.metrics.record_rewards(index, weighted)
+            total += weighted
+        return total
+
+    def _record(self, done: torch.Tensor, outcomes: dict[str, torch.Tensor]) -> None:
+        healthy = ~self.sim.failed
+        lin_error = (self.kinematics.base_lin_vel_yaw - self.command.value[:, :2]).norm(dim=1)
+        yaw_error = (self.kinematics.base_ang_vel_b[:, 2] - self.command.value[:, 2]).abs()
+        lin_error, yaw_error = torch.where(healthy, lin_error, 0.0), torch.where(healthy, yaw_error, 0.0)
+        self.velocity_error, self.yaw_rate_error = lin_error, yaw_error
+        self.metrics.record_tracking(lin_error, yaw_error, self.no_obstacle_near())
+        self.metrics.record_contacts(self.touching)
+        self.metrics.record_ends(done, outcomes)
+
+    def no_obstacle_near(self) -> torch.Tensor | None:
+        """(num_envs,) bool: no obstacle within the avoidance threshold in any sector; None without obstacles."""
+        if self.sensing is None or self.sensing.sector_distance is None:
+            return None
+        return (self.sensing.sector_distance >= self.config.rewards.avoidance.threshold).all(1)
+
+    def _reset(self, env_ids: torch.Tensor) -> None:
+        """Starts a new episode in some environments; the others are not touched."""
+        spawn = self.config.commands.spawn
+        low = torch.tensor([spawn.x[0], spawn.y[0], torch.pi / 180 * spawn.yaw_deg[0]], device=self.device)
+        high = torch.tensor([spawn.x[1], spawn.y[1], torch.pi / 180 * spawn.yaw_deg[1]], device=self.device)
+        pose = low + self.random.uniform(env_ids, (3,)) * (high - low)
+        height = torch.full((len(env_ids), 1), self.robot.base_height, device=self.device)
+        joints = self.default_joint_pos.expand(len(env_ids), -1)
+        qpos = torch.cat((pose[:, :2], height, yaw_quat(pose[:, 2]), joints), 1)
+        qvel = torch.zeros(len(env_ids), self.sim.qvel.shape[1], device=self.device)
+        if self.obstacles is not None:
+            self.obstacles.reset(env_ids, pose[:, :2])
+        self.sim.reset(env_ids, qpos, qvel)
+        self.randomizer.reset(env_ids)
+        if self._delayed is not None:
+            for past_qpos, past_qvel in self._delayed:
+                past_qpos[env_ids], past_qvel[env_ids] = qpos, qvel
+        self.command.reset(env_ids, Kinematics.of(self.sim.qpos, self.sim.qvel))
+        self.episode_length_buf[env_ids] = 0
+        self.actions = tuple(a.index_fill(0, env_ids, 0.0) for a in self.actions)
+        self.touching[env_ids] = False
+        if self.sensing is not None:
+            self.sensing.reset(env_ids)
+
+    def _observe(self) -> TensorDict:
+        return self._collect({name: buffer.update(self, self._fresh) for name, buffer in self._groups.items()})
+
+    def _collect(self, groups: dict[str, torch.Tensor]) -> TensorDict:
+        """Adds the LiDAR frames and the height target to the observation groups."""
+        if self.sensing is not None and self.sensing.frames is not None:
+            groups["frames"] = self.sensing.frames
+            groups["frame_count"] = self.sensing.frame_count.clone()
+            groups["frame_tick"] = self.sensing.frame_tick.clone()
+        if self.config.height_target:
+            groups["height_target"] = self.heights
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+
+    def _report(self) -> dict[str, float]:
+        if self.obstacles is not None and self.config.initial_obstacle_level is None:
+            seconds = self.config.log_interval * self.control_dt
+            self.obstacles.raise_level(self.metrics.free_velocity_error(), seconds)
+        log = self.metrics.drain()
+        if self.obstacles is not None:
+            log["Metrics/obstacle_level"] = self.obstacles.level
+        seconds = self.timer.drain()
+        steps = self.config.log_interval * self.num_envs
+        for stage, spent in seconds.items():
+            log[f"Time/{stage}_us_per_env_step"] = 1e6 * spent / steps
+        return log
+
+    def _parts(self) -> dict:
+        parts = {
+            "sim": self.sim,
+            "command": self.command,
+            "randomizer": self.randomizer,
+            "obstacles": self.obstacles,
+            "sensing": self.sensing,
+            "metrics": self.metrics,
+        }
+        return {name: part for name, part in parts.items() if part is not None}
+
+    # ---- construction ------------------------------------------------------------------------------------------------
+
+    def _build_sensing(self, fields: frozenset[str]) -> LidarSensing:
+        config = self.config
+        needs = SensingNeeds(
+            sectors=config.rewards.avoidance.num_sectors if "sectors" in fields else 0,
+            sector_max=config.lidar.sensor.max_range,
+            rays="rays" in fields,
+        )
+        return LidarSensing(
+            config.lidar,
+            self.sim,
+            self.control_dt,
+            needs,
+            config.randomization.noise,
+            config.seed,
+            config.sim.num_threads or None,
+            config.sampler() if config.sampler is not None else None,
+            config.frame_history,
+        )
+
+    def _allocate(self) -> None:
+        robot, model = self.robot, self.world.model
+        joint_ids = [model.joint(name).id for name in robot.joints]
+        limits = torch.tensor(model.jnt_range[joint_ids], dtype=torch.float32, device=self.device)
+        self.joint_lower, self.joint_upper = limits[:, 0], limits[:, 1]
+        self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
+        zero = torch.zeros(self.num_envs, self.num_actions, device=self.device)
+        self.actions: tuple[torch.Tensor, ...] = (zero, zero, zero)
+        self.last_joint_vel = zero
+        self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        self._delayed: list[tuple[torch.Tensor, torch.Tensor]] | None = None
+        if self.randomizer.delay is not None:
+            entry = self.sim.qpos.float(), self.sim.qvel.float()
+            self._delayed = [tuple(x.clone() for x in entry) for _ in range(self.randomizer.max_delay + 1)]

@@ -1,0 +1,29 @@
+"""Privileged terrain heights around the robot: 17 x 11 points, 0.1 m apart."""
+
+from __future__ import annotations
+
+import torch
+
+NUM_X, NUM_Y, SPACING = 17, 11, 0.1
+NUM_HEIGHTS = NUM_X * NUM_Y
+
+
+def height_grid(device: torch.device | str = "cpu") -> torch.Tensor:
+    """(187, 2) points (m) in the yaw-aligned frame, x from -0.8 to 0.8 (slow), y from -0.5 to 0.5 (fast)."""
+    x = (torch.arange(NUM_X, device=device) - NUM_X // 2) * SPACING
+    y = (torch.arange(NUM_Y, device=device) - NUM_Y // 2) * SPACING
+    return torch.stack(torch.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+
+
+def relative_heights(base_height: torch.Tensor, terrain_height: torch.Tensor | float) -> torch.Tensor:
+    """Base height minus terrain height, clipped to +-1 m.
+
+    Args:
+        base_height: (n,) m.
+        terrain_height: (n, 187) m at the grid's points, or one height for flat ground.
+
+    Returns:
+        (n, 187) m.
+    """
+    heights = base_height[:, None] - terrain_height
+    return heights.expand(-1, NUM_HEIGHTS).clamp(-1.0, 1.0)

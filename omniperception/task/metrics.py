@@ -1,0 +1,85 @@
+"""Running sums of what training reports: reward terms, tracking errors, episode outcomes, anomalies."""
+
+from __future__ import annotations
+
+import torch
+
+OUTCOMES = ("time_out", "fall", "goal", "collision_end", "diverged")
+"""How an episode can end."""
+
+
+class EpisodeMetrics:
+    """Sums on the device, read out every `period` steps so that the step itself never waits.
+
+    Attributes:
+        collided: (num_envs,) bool: whether the current episode has had a contact with an obstacle.
+    """
+
+    def __init__(self, num_envs: int, device: torch.device, reward_terms: tuple[str, ...]) -> None:
+        self._names = reward_terms
+        self._rewards = torch.zeros(len(reward_terms), device=device)
+        self._errors = torch.zeros(5, device=device)
+        self._outcomes = torch.zeros(len(OUTCOMES) + 2, device=device)
+        self._steps = 0
+        self.collided = torch.zeros(num_envs, dtype=torch.bool, device=device)
+
+    def record_rewards(self, index: int, weighted: torch.Tensor) -> None:
+        self._rewards[index] += weighted.mean()
+
+    def record_tracking(self, lin_error: torch.Tensor, yaw_error: torch.Tensor, free: torch.Tensor | None) -> None:
+        """Absolute errors (m/s, rad/s); `free` marks environments with no obstacle near, None means all."""
+        self._errors[0] += lin_error.mean()
+        self._errors[1] += yaw_error.mean()
+        if free is None:
+            self._errors[2] += lin_error.mean()
+            self._errors[3] += 1.0
+        else:
+            self._errors[2] += (lin_error * free).mean()
+            self._errors[3] += free.float().mean()
+        self._steps += 1
+
+    def record_contacts(self, touching: torch.Tensor) -> None:
+        self.collided |= touching
+        self._errors[4] += touching.float().mean()
+
+    def record_ends(self, done: torch.Tensor, outcomes: dict[str, torch.Tensor]) -> None:
+        self._outcomes += torch.stack(
+            [outcomes[name].sum() for name in OUTCOMES] + [(done & self.collided).sum(), done.sum()]
+        )
+        self.collided &= ~done
+
+    def free_velocity_error(self) -> float:
+        """Mean linear velocity error (m/s) away from obstacles since the last drain."""
+        return float(self._errors[2] / self._errors[3].clamp(min=1e-6)) if self._steps else float("inf")
+
+    def state_dict(self) -> dict:
+        sums = {"rewards": self._rewards, "errors": self._errors, "outcomes": self._outcomes}
+        return {**sums, "steps": self._steps, "collided": self.collided}
+
+    def load_state_dict(self, state: dict) -> None:
+        self._rewards.copy_(state["rewards"])
+        self._errors.copy_(state["errors"])
+        self._outcomes.copy_(state["outcomes"])
+        self.collided.copy_(state["collided"])
+        self._steps = state["steps"]
+
+    def drain(self) -> dict[str, float]:
+        """Means since the last call, and clears them."""
+        steps = max(self._steps, 1)
+        rewards, errors, outcomes = (x.tolist() for x in (self._rewards / steps, self._errors, self._outcomes))
+        log = {f"Reward/{name}": value for name, value in zip(self._names, rewards, strict=True)}
+        log["Metrics/velocity_error"] = errors[0] / steps
+        log["Metrics/yaw_rate_error"] = errors[1] / steps
+        log["Metrics/free_velocity_error"] = errors[2] / max(errors[3], 1e-6)
+        log["Metrics/contact_share"] = errors[4] / steps
+        episodes = outcomes[-1]
+        if episodes:
+            for name, count in zip(OUTCOMES, outcomes, strict=False):
+                if name != "diverged":
+                    log[f"Metrics/{name}_rate"] = count / episodes
+            log["Metrics/collision_rate"] = outcomes[-2] / episodes
+        log["Anomalies/diverged"] = outcomes[OUTCOMES.index("diverged")]
+        for tensor in (self._rewards, self._errors, self._outcomes):
+            tensor.zero_()
+        self._steps = 0
+        return log

@@ -1,0 +1,151 @@
+"""Domain randomization: the thirteen rows of the paper's table, each absent when its range is null."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+
+from omniperception.lidar import DistanceNoise, MaskNoise
+from omniperception.random import EnvRandom
+from omniperception.sim import Simulator
+from omniperception.world.terrain import damping_ratio
+
+Range = Sequence[float] | None
+
+
+@dataclass(frozen=True)
+class RandomizationConfig:
+    """Ranges (low, high) drawn uniformly per environment at every reset; null leaves a row out altogether.
+
+    Attributes:
+        lidar_mask: points replaced by short distances.
+        lidar_distance: multiplicative noise of the measured distances.
+        added_mass: mass (kg) added to the base at its centre of mass.
+        payload_mass: mass (kg) carried at `payload_position`.
+        com_x, com_y, com_z: displacement (m) of the base's centre of mass.
+        ground_friction: sliding friction coefficient.
+        ground_restitution: coefficient of restitution.
+        motor_strength: factor on the PD torque; the torque limit stays.
+        joint_offset: calibration error (rad) of every joint, added to the joint targets.
+        gravity_offset: acceleration (m/s^2) added to each axis of gravity.
+        latency_s: age (s) of the proprioception that the actor sees.
+        payload_position: where the payload sits in the base frame (m).
+    """
+
+    lidar_mask: MaskNoise | None = None
+    lidar_distance: DistanceNoise | None = None
+    added_mass: Range = None
+    payload_mass: Range = None
+    com_x: Range = None
+    com_y: Range = None
+    com_z: Range = None
+    ground_friction: Range = None
+    ground_restitution: Range = None
+    motor_strength: Range = None
+    joint_offset: Range = None
+    gravity_offset: Range = None
+    latency_s: Range = None
+    payload_position: Sequence[float] = (0.0, 0.0, 0.1)
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name.startswith("lidar_") or item.name == "payload_position" or value is None:
+                continue
+            if len(value) != 2 or value[0] > value[1]:
+                raise ValueError(f"randomization.{item.name}={list(value)} must be [low, high] or null")
+            object.__setattr__(self, item.name, (float(value[0]), float(value[1])))
+        for name in ("ground_friction", "ground_restitution", "motor_strength", "latency_s"):
+            value = getattr(self, name)
+            if value is not None and value[0] < 0:
+                raise ValueError(f"randomization.{name}={list(value)} must not be negative")
+
+    @property
+    def noise(self) -> tuple[MaskNoise | DistanceNoise, ...]:
+        """The LiDAR noise models, in the order in which they act."""
+        return tuple(noise for noise in (self.lidar_distance, self.lidar_mask) if noise is not None)
+
+
+class Randomizer:
+    """Draws each environment's physical parameters at its resets and writes them into the simulator's model."""
+
+    def __init__(self, config: RandomizationConfig, sim: Simulator, random: EnvRandom) -> None:
+        self.config, self._sim, self._random = config, sim, random
+        self._model = model = sim.world.model
+        self._base = sim.world.base_body
+        self._ground = model.geom("ground").id
+        self._mass = any(getattr(config, n) for n in ("added_mass", "payload_mass", "com_x", "com_y", "com_z"))
+        self.joint_offset: torch.Tensor | None = None
+        """(num_envs, num_joints) rad added to the joint targets; None when not randomized."""
+        self.delay: torch.Tensor | None = None
+        """(num_envs,) int64 physics steps by which proprioception is late; None when not randomized."""
+        if config.joint_offset:
+            self.joint_offset = torch.zeros(sim.num_envs, sim.world.robot.num_joints, device=sim.device)
+        if config.latency_s:
+            self.delay = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
+
+    @property
+    def max_delay(self) -> int:
+        """The largest delay in physics steps that can be drawn."""
+        return round(self.config.latency_s[1] / self._sim.world.model.opt.timestep) if self.config.latency_s else 0
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Draws new parameters for some environments."""
+        config = self.config
+        if config.ground_friction:
+            self._sim.model_field("geom_friction")[env_ids, self._ground, 0] = self._draw(env_ids, "ground_friction")
+        if config.ground_restitution:
+            ratio = [damping_ratio(float(e)) for e in self._draw(env_ids, "ground_restitution")]
+            self._sim.model_field("geom_solref")[env_ids, self._ground, 1] = torch.tensor(ratio).double()
+        if config.motor_strength:
+            self._scale_motors(env_ids)
+        if config.gravity_offset:
+            nominal = torch.as_tensor(self._model.opt.gravity)
+            self._sim.model_field("opt.gravity")[env_ids] = nominal + self._draw(env_ids, "gravity_offset", (3,))
+        if self.joint_offset is not None:
+            self.joint_offset[env_ids] = self._draw(env_ids, "joint_offset", self.joint_offset.shape[1:]).float()
+        if self.delay is not None:
+            steps = self._draw(env_ids, "latency_s") / self._model.opt.timestep
+            self.delay[env_ids] = steps.round().long()
+        if self._mass:
+            self._set_masses(env_ids)
+
+    def state_dict(self) -> dict:
+        """Parameters that live outside the physics model."""
+        return {"joint_offset": self.joint_offset, "delay": self.delay}
+
+    def load_state_dict(self, state: dict) -> None:
+        for mine, saved in ((self.joint_offset, state["joint_offset"]), (self.delay, state["delay"])):
+            if mine is not None:
+                mine.copy_(saved)
+
+    def _draw(self, env_ids: torch.Tensor, name: str, shape: Sequence[int] = ()) -> torch.Tensor:
+        low, high = getattr(self.config, name)
+        return self._random.range(env_ids, low, high, tuple(shape)).double()
+
+    def _draw_or_zero(self, env_ids: torch.Tensor, name: str) -> torch.Tensor:
+        if getattr(self.config, name) is None:
+            return torch.zeros(len(env_ids), dtype=torch.float64, device=env_ids.device)
+        return self._draw(env_ids, name)
+
+    def _scale_motors(self, env_ids: torch.Tensor) -> None:
+        scale = self._draw(env_ids, "motor_strength", (self._model.nu, 1))
+        gain, bias = torch.as_tensor(self._model.actuator_gainprm), torch.as_tensor(self._model.actuator_biasprm)
+        self._sim.model_field("actuator_gainprm")[env_ids] = gain * scale
+        self._sim.model_field("actuator_biasprm")[env_ids] = bias * scale
+
+    def _set_masses(self, env_ids: torch.Tensor) -> None:
+        """Mass and centre of mass of base, added mass and payload together; the base's inertia stays nominal."""
+        base_mass = float(self._model.body_mass[self._base])
+        body = base_mass + self._draw_or_zero(env_ids, "added_mass")
+        payload = self._draw_or_zero(env_ids, "payload_mass")
+        offset = torch.stack([self._draw_or_zero(env_ids, name) for name in ("com_x", "com_y", "com_z")], 1)
+        centre = torch.as_tensor(self._model.body_ipos[self._base]) + offset
+        position = torch.tensor(self.config.payload_position, dtype=torch.float64, device=env_ids.device)
+        total = body + payload
+        self._sim.model_field("body_mass")[env_ids, self._base] = total
+        combined = (body[:, None] * centre + payload[:, None] * position) / total[:, None]
+        self._sim.model_field("body_ipos")[env_ids, self._base] = combined
+        self._sim.update_model(env_ids)

@@ -1,0 +1,32 @@
+"""Quaternion algebra on tensors; (w, x, y, z), unit norm, batch first."""
+
+from __future__ import annotations
+
+import torch
+
+
+def rotate_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Expresses a world vector (n, 3) in the frame whose orientation in the world is `quat` (n, 4)."""
+    w, q = quat[:, :1], quat[:, 1:]
+    t = 2.0 * torch.linalg.cross(q, vec)
+    return vec - w * t + torch.linalg.cross(q, t)
+
+
+def yaw_of(quat: torch.Tensor) -> torch.Tensor:
+    """Heading (rad) of the body's x axis in the world's horizontal plane, (n,)."""
+    w, x, y, z = quat.unbind(-1)
+    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def yaw_quat(yaw: torch.Tensor) -> torch.Tensor:
+    """Quaternion (n, 4) of a rotation by `yaw` (n,) about the vertical."""
+    zero = torch.zeros_like(yaw)
+    return torch.stack(((yaw / 2).cos(), zero, zero, (yaw / 2).sin()), -1)
+
+
+def rotate_yaw(yaw: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Turns horizontal vectors (n, ..., 2) by the angles `yaw` (n,)."""
+    shape = (-1,) + (1,) * (vec.dim() - 2)
+    cos, sin = yaw.cos().reshape(shape), yaw.sin().reshape(shape)
+    x, y = vec.unbind(-1)
+    return torch.stack((cos * x - sin * y, sin * x + cos * y), -1)

@@ -1,0 +1,188 @@
+"""The LiDAR of the task: casts at its own rate, samples each frame once, keeps the history of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from omniperception.lidar import Lidar, LidarConfig, LidarFrame, Noise, RayScene, ScanPattern, sector_distances
+from omniperception.sim import Simulator
+from omniperception.world import ray_shapes
+from omniperception.world.rays import HitClass
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """A LiDAR on the robot.
+
+    Attributes:
+        sensor: rays, rate, range limits and mount.
+        pattern: makes the scan pattern.
+        exclude_geoms: geoms of the robot that its rays pass through: the housing around the sensor.
+        distal_below_deg: rays whose elevation in the sensor frame is below this count for `capped_ray_distance`.
+    """
+
+    sensor: LidarConfig
+    pattern: Callable[[], ScanPattern]
+    exclude_geoms: Sequence[str] = ()
+    distal_below_deg: float = 20.0
+
+
+@dataclass(frozen=True)
+class SensingNeeds:
+    """What the composed task reads from the LiDAR; nothing else is computed.
+
+    Attributes:
+        sectors: number of azimuth sectors of obstacle distances, or 0.
+        sector_max: distance (m) of a sector without an obstacle.
+        rays: whether the mean distal range is read.
+    """
+
+    sectors: int
+    sector_max: float
+    rays: bool
+
+
+class LidarSensing:
+    """Casts a frame every `period_steps` control steps, for all environments at the same moment.
+
+    A reset empties an environment's history; its next frame comes with the sensor's next tick.
+
+    Attributes:
+        frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
+            newest last; None without a sampler.
+        frame_count: (num_envs, 1) int64 how many of the newest frames are valid.
+        frame_tick: (num_envs, 1) int64 number of the newest frame, the same for all environments.
+        sector_distance: (num_envs, num_sectors) horizontal distance (m) from the base to the nearest obstacle hit,
+            without noise, in the yaw-aligned frame; None when nobody reads it.
+    """
+
+    def __init__(
+        self,
+        config: SensorConfig,
+        sim: Simulator,
+        control_dt: float,
+        needs: SensingNeeds,
+        noise: Sequence[Noise],
+        seed: int,
+        num_threads: int | None,
+        sampler: Callable | None = None,
+        history: int = 0,
+    ) -> None:
+        ratio = config.sensor.period_s / control_dt
+        self.period_steps = round(ratio)
+        if abs(ratio - self.period_steps) > 1e-6 or self.period_steps < 1:
+            raise ValueError(
+                f"lidar.sensor.period_s={config.sensor.period_s} must be a multiple of the control step {control_dt} s"
+            )
+        self._sim, self._needs, self._sampler = sim, needs, sampler
+        shapes = ray_shapes(sim.world)
+        self._bodies = shapes.bodies
+        self._base = shapes.bodies.index(sim.world.base_body)
+        self.config = config
+        self.scene = RayScene(
+            shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
+        )
+        self.lidar = Lidar(
+            config.sensor,
+            config.pattern(),
+            self.scene,
+            mount_body=self._base,
+            exclude_shapes=shapes.indices(tuple(config.exclude_geoms)),
+            noise=tuple(noise),
+            seed=seed,
+        )
+        self.frame: LidarFrame | None = None
+        self.tick = 0
+        self.frame_count = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
+        self.frame_tick = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
+        self.frames: torch.Tensor | None = None
+        if sampler is not None:
+            self._newest = torch.zeros(sim.num_envs, sampler.num_points, 3, device=sim.device)
+            self.frames = torch.zeros(sim.num_envs, history, sampler.num_points, 3, device=sim.device)
+        self.sector_distance: torch.Tensor | None = None
+        if needs.sectors:
+            shape = (sim.num_envs, needs.sectors)
+            self.sector_distance = torch.full(shape, needs.sector_max, device=sim.device)
+        self._distal_range: dict[float, torch.Tensor] = {}
+
+    def due(self, step: int) -> bool:
+        """Whether a frame ends with control step number `step`."""
+        return step % self.period_steps == 0
+
+    def cast(self, time_s: float) -> None:
+        """Casts the frame that ends at simulation time `time_s` from the current poses."""
+        pos, quat = self._sim.body_poses(self._bodies)
+        self.scene.body_pos.copy_(pos)
+        self.scene.body_quat.copy_(quat)
+        time = torch.full((self._sim.num_envs,), time_s, dtype=torch.float64, device=self._sim.device)
+        self.frame = self.lidar.cast(time)
+        self.tick += 1
+        self.frame_tick.fill_(self.tick)
+        self._distal_range.clear()
+
+    def sample(self) -> None:
+        """Appends the sampled points of the newest frame to the history."""
+        if self.frames is None:
+            return
+        self._sampler(
+            self.frame.ranges, self.frame.directions_s, self.frame.elevation, self.frame.azimuth, self._newest
+        )
+        self.frames = torch.cat((self.frames[:, 1:], self._newest[:, None]), 1)
+        self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
+
+    def measure_sectors(self) -> None:
+        """Distances to the nearest obstacle per azimuth sector."""
+        if self.sector_distance is not None:
+            self.sector_distance = sector_distances(
+                self.frame.true_ranges,
+                self.frame.directions_s,
+                self.frame.class_id,
+                self.scene.body_quat[:, self._base],
+                self.config.sensor.mount_pos,
+                self.config.sensor.quat,
+                obstacle_class=int(HitClass.OBSTACLE),
+                max_distance=self._needs.sector_max,
+                num_sectors=self._needs.sectors,
+            )
+
+    def mean_distal_range(self, max_distance: float) -> torch.Tensor:
+        """(num_envs,) mean of the noise-free distal ranges (m), each capped at `max_distance`."""
+        if max_distance not in self._distal_range:
+            if self.frame is None:
+                return torch.full((self._sim.num_envs,), max_distance, device=self._sim.device)
+            distal = self.frame.elevation < torch.pi / 180 * self.config.distal_below_deg
+            capped = self.frame.true_ranges.clamp(max=max_distance) * distal
+            self._distal_range[max_distance] = capped.sum(1) / distal.sum(1).clamp(min=1)
+        return self._distal_range[max_distance]
+
+    def state_dict(self) -> dict:
+        return {
+            "tick": self.tick,
+            "noise_frame": self.lidar.frame_count,
+            "frame_count": self.frame_count,
+            "frames": self.frames,
+            "sector_distance": self.sector_distance,
+            "distal_range": {str(key): value for key, value in self._distal_range.items()},
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        self.tick = state["tick"]
+        self.frame_tick.fill_(self.tick)
+        self.lidar.frame_count.copy_(state["noise_frame"])
+        self.frame_count.copy_(state["frame_count"])
+        if self.frames is not None:
+            self.frames = state["frames"].clone()
+        if self.sector_distance is not None:
+            self.sector_distance = state["sector_distance"].clone()
+        self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Forgets what some environments have seen."""
+        self.frame_count[env_ids] = 0
+        if self.frames is not None:
+            self.frames[env_ids] = 0.0
+        if self.sector_distance is not None:
+            self.sector_distance[env_ids] = self._needs.sector_max

@@ -1,0 +1,18 @@
+"""One description of robot, terrain and obstacles, from which the physics model and the ray scene are built."""
+
+from omniperception.world.build import World, build_world
+from omniperception.world.obstacles import ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.world.rays import ray_shapes
+from omniperception.world.robot import RobotConfig
+from omniperception.world.terrain import TerrainConfig
+
+__all__ = [
+    "ObstacleField",
+    "ObstacleGroup",
+    "ObstaclesConfig",
+    "RobotConfig",
+    "TerrainConfig",
+    "World",
+    "build_world",
+    "ray_shapes",
+]

@@ -1,0 +1,57 @@
+"""The ground: a plane with friction and restitution."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+
+
+@dataclass(frozen=True)
+class TerrainConfig:
+    """A flat ground plane at height 0 of every environment.
+
+    Attributes:
+        kind: 'flat'.
+        friction: sliding friction coefficient of the ground; it holds for every contact with the ground.
+        restitution: coefficient of restitution e in [0, 1].
+    """
+
+    kind: str = "flat"
+    friction: float = 0.8
+    restitution: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.kind != "flat":
+            raise ValueError(f"terrain.kind={self.kind} is unknown; known: flat")
+        if self.friction < 0:
+            raise ValueError(f"terrain.friction={self.friction} must not be negative")
+        if not 0 <= self.restitution <= 1:
+            raise ValueError(f"terrain.restitution={self.restitution} must lie in [0, 1]")
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Adds the ground geom, whose contact parameters take priority over the robot's."""
+        spec.worldbody.add_geom(
+            name="ground",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[0, 0, 1],
+            contype=1,
+            conaffinity=0,
+            condim=3,
+            priority=1,
+            friction=[self.friction, 0.005, 0.0001],
+            solref=[0.02, float(damping_ratio(self.restitution))],
+        )
+
+
+def damping_ratio(restitution: float) -> float:
+    """Damping ratio of a contact whose rebound speed is `restitution` times the impact speed.
+
+    A linear spring-damper with ratio z rebounds with e = exp(-pi z / sqrt(1 - z^2)), so
+    z = -ln(e) / sqrt(pi^2 + ln(e)^2); e = 0 is critical damping.
+    """
+    if restitution <= 0:
+        return 1.0
+    log_e = math.log(restitution)
+    return -log_e / math.hypot(math.pi, log_e)

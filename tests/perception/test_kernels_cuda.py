@@ -1,0 +1,29 @@
+"""The kernels compile for CUDA where Warp brings its compiler, and agree with the CPU where there is a GPU."""
+
+import pytest
+import torch
+import warp as wp
+from test_sampling import MAX_RANGE, random_rays, sample
+
+from omniperception.perception import PdSampler, kernels
+
+
+def test_kernels_compile_for_cuda(tmp_path):
+    wp.init()
+    try:
+        files = wp.compile_aot_module(kernels, arch=80, module_dir=tmp_path)
+    except RuntimeError as error:
+        if "CUDA" in str(error) and "compil" not in str(error).lower():
+            pytest.skip(f"no CUDA compiler in this Warp: {error}")
+        raise
+    assert files and all(path.stat().st_size > 0 for path in files)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("distal_bins", ["points", "rays"])
+def test_cuda_equals_cpu(distal_bins):
+    rays = random_rays(37, 500, seed=1)
+    sampler = PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0, distal_bins=distal_bins)
+    on_gpu = torch.empty(37, 96, 3, device="cuda")
+    sampler(*(t.cuda() for t in rays), on_gpu)
+    assert torch.allclose(on_gpu.cpu(), sample(sampler, rays), atol=1e-5)

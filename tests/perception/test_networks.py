@@ -1,0 +1,126 @@
+"""Windowed layers against the plain network run on each window by itself."""
+
+import pytest
+import torch
+from torch import nn
+
+from omniperception.perception import DirectMlp, FpsGru, FpsMlp, PdRiskNet
+from omniperception.perception.windows import WindowedGru, WindowedLinear
+
+H, W, B = 5, 4, 3
+
+
+def sequence(points=6, dtype=torch.float32, seed=0):
+    torch.manual_seed(seed)
+    return torch.randn(B, H - 1 + W, points, 3, dtype=dtype)
+
+
+def counts():
+    """Every count from 0 to H occurs."""
+    return torch.tensor([[0, 1, 2, 3], [4, 5, 0, 1], [5, 5, 5, 5]])
+
+
+def gru_by_window(gru, frames, count):
+    """nn.GRU on the valid frames of each window, one at a time."""
+    rows = []
+    for b in range(B):
+        for w in range(W):
+            n = int(count[b, w])
+            window = frames[b : b + 1, w + H - n : w + H].flatten(2)
+            rows.append(gru(window)[1][0, 0] if n else frames.new_zeros(gru.hidden_size))
+    return torch.stack(rows).view(B, W, -1)
+
+
+def plain_gru(windowed):
+    plain = nn.GRU(windowed.input_size, windowed.hidden_size, batch_first=True).to(windowed.weight_ih_l0.dtype)
+    plain.load_state_dict(windowed.state_dict())
+    return plain
+
+
+def relative(a, b):
+    return ((a - b).norm() / b.norm()).item()
+
+
+@pytest.mark.parametrize("partial", [False, True])
+def test_windowed_gru_equals_gru_on_each_window(partial):
+    frames = sequence().requires_grad_()
+    count = counts() if partial else torch.full((B, W), H)
+    windowed = WindowedGru(18, 7, H)
+    plain = plain_gru(windowed)
+    got, expected = windowed(frames.flatten(2), count), gru_by_window(plain, frames, count)
+    assert torch.allclose(got, expected, atol=1e-5)
+
+    weights = torch.randn_like(expected)
+    got_grads = torch.autograd.grad((got * weights).sum(), [frames, *windowed.parameters()])
+    expected_grads = torch.autograd.grad((expected * weights).sum(), [frames, *plain.parameters()])
+    for a, b in zip(got_grads, expected_grads, strict=True):
+        assert relative(a, b) < 1e-5
+
+
+def test_invalid_frames_have_no_influence():
+    network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3)
+    frames, count = sequence(), counts()
+    poisoned = frames.clone()
+    poisoned[0, :H] = 1e3  # windows 0 and 1 of environment 0 have 0 and 1 valid frames
+    a, b = network(frames, count), network(poisoned, count)
+    assert torch.equal(a[0, 0], b[0, 0]) and (a[0, 0] == 0).all()
+
+
+def test_pd_risknet_splits_the_points():
+    network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3)
+    frames, count = sequence(), counts()
+    got = network(frames, count)
+    near = gru_by_window(plain_gru(network.proximal), frames[:, :, :4], count)
+    far = gru_by_window(plain_gru(network.distal), frames[:, :, 4:], count)
+    assert torch.allclose(got, torch.cat([near, far], -1), atol=1e-5)
+    assert torch.equal(network.height_prediction(got), got[..., :5])
+
+
+def test_paper_dimensions():
+    network = PdRiskNet()
+    assert (network.num_points, network.history, network.feature_dim) == (384, 10, 251)
+    with torch.no_grad():
+        features = network(torch.zeros(2, 10, 384, 3), torch.tensor([[0], [10]]))
+    assert features.shape == (2, 1, 251)
+    assert network.height_prediction(features).shape == (2, 1, 187)
+    assert (features[0] == 0).all()
+
+
+def test_windowed_linear_equals_linear_on_each_window():
+    frames, count = sequence(), counts()
+    layer = WindowedLinear(18, 7, H)
+    for b in range(B):
+        for w in range(W):
+            window = frames[b, w : w + H].flatten(1).clone()
+            window[: H - int(count[b, w])] = 0.0
+            expected = layer.linear(window.flatten())
+            assert torch.allclose(layer(frames.flatten(2), count)[b, w], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [FpsGru(6, H, 9), FpsMlp(6, H, (8, 7), 9), DirectMlp(6, H, (8,), 9), FpsMlp(6, H, (), 9)],
+    ids=["FpsGru", "FpsMlp", "DirectMlp", "linear"],
+)
+def test_ablations_share_the_interface(network):
+    frames = sequence()
+    full = network(frames, counts())
+    assert full.shape == (B, W, 9) and network.height_prediction(full) is None
+    for w in range(W):  # a window by itself gives the same
+        alone = network(frames[:, w : w + H], counts()[:, w : w + 1])
+        assert torch.allclose(alone[:, 0], full[:, w], atol=1e-6)
+    full.sum().backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.parameters())
+
+
+def test_gradient_in_float64():
+    frames, count = sequence(2, torch.float64).requires_grad_(), counts()
+    gru = WindowedGru(6, 3, H).double()
+    assert torch.autograd.gradcheck(lambda f: gru(f.flatten(2), count), frames)
+
+
+def test_wrong_counts_are_refused():
+    with pytest.raises(ValueError, match="count must have shape"):
+        FpsGru(6, H, 9)(sequence(), torch.full((B, W + 1), H))
+    with pytest.raises(ValueError, match="at least 1"):
+        FpsGru(0, H)

@@ -1,0 +1,256 @@
+"""Samplers against brute force in NumPy, and on degenerate clouds."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from omniperception.perception import FpsSampler, PdSampler, RawSampler
+
+MAX_RANGE = 8.0
+
+
+def rays_from_points(points):
+    """Rays (ranges, directions, theta, phi), each (1, R, ...), that hit the given sensor-frame points (R, 3)."""
+    points = torch.as_tensor(points, dtype=torch.float32).reshape(1, -1, 3)
+    ranges = points.norm(dim=-1)
+    directions = points / ranges.unsqueeze(-1)
+    theta = torch.asin(directions[..., 2].clamp(-1, 1))
+    return ranges, directions, theta, torch.atan2(points[..., 1], points[..., 0])
+
+
+def random_rays(num_envs, num_rays, seed=0, miss=0.2):
+    """Random rays whose elevations stay away from the borders of 2-degree rings."""
+    rng = np.random.default_rng(seed)
+    rows = rng.integers(-20, 30, (num_envs, num_rays))
+    theta = np.radians(2.0 * rows + rng.uniform(0.2, 1.8, rows.shape))
+    phi = rng.uniform(-np.pi, np.pi, rows.shape)
+    directions = np.stack([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.sin(theta)], -1)
+    ranges = rng.uniform(0.2, MAX_RANGE, rows.shape)
+    ranges[rng.uniform(size=rows.shape) < miss] = np.inf
+    return tuple(torch.tensor(a, dtype=torch.float32) for a in (ranges, directions, theta, phi))
+
+
+def sample(sampler, rays):
+    """Sampled points, from an output full of NaN so that an unwritten element shows."""
+    out = torch.full((rays[0].shape[0], sampler.num_points, 3), math.nan)
+    sampler(*rays, out)
+    assert torch.isfinite(out).all()
+    return out
+
+
+def brute_force_fps(points, k):
+    """Indices of exact farthest point sampling in float64 from point 0, ties to the lowest index."""
+    points = np.asarray(points, dtype=np.float64)
+    chosen = [0]
+    while len(chosen) < min(k, len(points)):
+        gap = ((points[:, None] - points[None, chosen]) ** 2).sum(-1).min(1)
+        gap[chosen] = -1.0
+        chosen.append(int(gap.argmax()))
+    return chosen[: min(k, len(points))]
+
+
+def order(theta, phi, ring_deg=2.0):
+    """Stable order by (theta ring, phi)."""
+    ring = np.floor((np.asarray(theta, dtype=np.float64) + np.pi / 2) / np.radians(ring_deg))
+    return np.lexsort((np.asarray(phi, dtype=np.float64), ring))
+
+
+def as_set(points):
+    return sorted(map(tuple, np.round(np.asarray(points, dtype=np.float64), 6).tolist()))
+
+
+class TestFarthestPoints:
+    @pytest.mark.parametrize("k", [1, 2, 7, 30])
+    def test_equals_brute_force_on_a_lattice(self, k):
+        """On small integers squared distances are exact, so ties must be broken as documented too."""
+        rng = np.random.default_rng(k)
+        points = rng.integers(1, 9, (60, 3)).astype(np.float32)
+        rays = rays_from_points(points)
+        expected = points[brute_force_fps(points, k)]
+        got = sample(FpsSampler(k, max_range=1.0), rays)[0].numpy()
+        reference = brute_force_fps((rays[0][..., None] * rays[1])[0].numpy(), k)
+        assert as_set(got) == as_set((rays[0][..., None] * rays[1])[0].numpy()[reference])
+        assert len(expected) == k
+
+    def test_every_pick_is_farthest(self):
+        """Coverage radius of the sample equals that of the brute force."""
+        ranges, directions, theta, phi = random_rays(3, 400, seed=4)
+        got = sample(FpsSampler(40, max_range=MAX_RANGE), (ranges, directions, theta, phi))
+        for env in range(3):
+            hits = torch.isfinite(ranges[env])
+            cloud = (ranges[env, hits, None] * directions[env, hits] / MAX_RANGE).double().numpy()
+            chosen = cloud[brute_force_fps(cloud, 40)]
+            assert as_set(got[env]) == as_set(chosen.astype(np.float32))
+
+    def test_sorted_by_ring_then_azimuth(self):
+        rays = random_rays(4, 300, seed=2)
+        got = sample(FpsSampler(64, max_range=MAX_RANGE), rays).double()
+        theta = torch.asin(got[..., 2] / got.norm(dim=-1))
+        phi = torch.atan2(got[..., 1], got[..., 0])
+        for env in range(4):
+            assert (order(theta[env], phi[env]) == np.arange(64)).all()
+
+    def test_duplicates_are_picked_once_each(self):
+        points = np.tile([[1.0, 2.0, 2.0]], (10, 1))
+        got = sample(FpsSampler(4, max_range=3.0), rays_from_points(points))[0]
+        assert torch.allclose(got, torch.tensor([1.0, 2.0, 2.0]) / 3.0)
+
+
+class TestDegenerateClouds:
+    SAMPLERS = [
+        FpsSampler(5, max_range=MAX_RANGE),
+        RawSampler(20, max_range=MAX_RANGE),
+        PdSampler(3, 4, max_range=MAX_RANGE, split_deg=10.0),
+        PdSampler(3, 4, max_range=MAX_RANGE, split_deg=10.0, reduce="pick"),
+    ]
+
+    @pytest.mark.parametrize("sampler", SAMPLERS, ids=lambda s: type(s).__name__)
+    def test_empty_cloud_is_zero_even_after_a_full_one(self, sampler):
+        ranges, *rest = random_rays(3, 20, miss=0.0)
+        out = torch.empty(3, sampler.num_points, 3)
+        sampler(ranges, *rest, out)
+        assert (out != 0).any()
+        sampler(torch.full_like(ranges, math.inf), *rest, out)
+        assert (out == 0).all()
+
+    def test_single_point(self):
+        rays = rays_from_points([[2.0, 0.0, 2.0]])  # 45 degrees up
+        near = sample(PdSampler(3, 2, max_range=4.0, split_deg=10.0), rays)[0]
+        assert torch.allclose(near[0], torch.tensor([0.5, 0.0, 0.5])) and (near[1:] == 0).all()
+        far = sample(PdSampler(3, 2, max_range=4.0, split_deg=60.0), rays)[0]
+        assert torch.allclose(far[3], torch.tensor([0.5, 0.0, 0.5])) and (far[[0, 1, 2, 4]] == 0).all()
+
+    def test_fewer_points_than_slots_keeps_all_sorted_then_zeros(self):
+        rays = random_rays(1, 6, miss=0.0, seed=3)
+        got = sample(FpsSampler(9, max_range=MAX_RANGE), rays)[0]
+        cloud = (rays[0][..., None] * rays[1] / MAX_RANGE)[0].numpy()
+        expected = cloud[order(rays[2][0], rays[3][0])]
+        np.testing.assert_allclose(got[:6], expected, atol=1e-6)
+        assert (got[6:] == 0).all()
+
+    def test_nan_range_is_no_point(self):
+        ranges, *rest = random_rays(1, 20, miss=0.0)
+        out = sample(RawSampler(20, max_range=MAX_RANGE), (torch.full_like(ranges, math.nan), *rest))
+        assert (out == 0).all()
+
+
+class TestDistal:
+    SPLIT = 15.0
+
+    def distal(self, rays, env):
+        """Indices of the distal rays of one environment in (ring, phi) order."""
+        theta, phi = rays[2][env].double().numpy(), rays[3][env].double().numpy()
+        ids = np.flatnonzero(theta <= np.radians(self.SPLIT))
+        return ids[order(theta[ids], phi[ids])]
+
+    @pytest.mark.parametrize("reduce", ["average", "pick"])
+    def test_bins_of_consecutive_points(self, reduce):
+        rays = random_rays(5, 250, seed=7)
+        got = sample(PdSampler(8, 16, max_range=MAX_RANGE, split_deg=self.SPLIT, reduce=reduce), rays)
+        for env in range(5):
+            ids = [i for i in self.distal(rays, env) if torch.isfinite(rays[0][env, i])]
+            cloud = (rays[0][env, ids, None] * rays[1][env, ids] / MAX_RANGE).numpy()
+            edges = [b * len(ids) // 16 for b in range(17)]
+            bins = [cloud[a:b] for a, b in zip(edges, edges[1:], strict=False)]
+            expected = [b.mean(0) if reduce == "average" else b[len(b) // 2] for b in bins]
+            np.testing.assert_allclose(got[env, 8:], expected, atol=1e-5)
+
+    def test_bins_of_rays_cover_the_same_rays_whatever_is_hit(self):
+        rays = random_rays(2, 250, seed=8, miss=0.0)
+        sampler = PdSampler(8, 16, max_range=MAX_RANGE, split_deg=self.SPLIT, distal_bins="rays")
+        full = sample(sampler, rays)
+        ids = self.distal(rays, 0)
+        free = ids[: len(ids) // 16]  # the first bin sees nothing
+        ranges = rays[0].clone()
+        ranges[0, free] = math.inf
+        got = sample(sampler, (ranges, *rays[1:]))
+        assert torch.equal(got[0, 9:], full[0, 9:]) and torch.equal(got[1], full[1])
+        direction = rays[1][0, free].mean(0)
+        assert torch.allclose(got[0, 8], direction / direction.norm(), atol=1e-5)
+
+    def test_bins_of_rays_without_any_hit_are_free_space(self):
+        ranges, *rest = random_rays(2, 250, seed=9)
+        for reduce in ("average", "pick"):
+            sampler = PdSampler(8, 16, max_range=MAX_RANGE, split_deg=self.SPLIT, distal_bins="rays", reduce=reduce)
+            got = sample(sampler, (torch.full_like(ranges, math.inf), *rest))
+            assert (got[:, :8] == 0).all()
+            assert torch.allclose(got[:, 8:].norm(dim=-1), torch.ones(2, 16), atol=1e-5)
+
+    def test_partition_by_elevation(self):
+        rays = random_rays(3, 300, seed=10)
+        got = sample(PdSampler(32, 32, max_range=MAX_RANGE, split_deg=self.SPLIT, reduce="pick"), rays).double()
+        theta = torch.rad2deg(torch.asin(got[..., 2] / got.norm(dim=-1)))
+        assert (theta[:, :32] > self.SPLIT).all() and (theta[:, 32:] <= self.SPLIT).all()
+
+
+class TestInterface:
+    def test_raw_points_in_ray_order(self):
+        rays = random_rays(3, 50)
+        got = sample(RawSampler(50, max_range=MAX_RANGE), rays)
+        expected = torch.where(torch.isfinite(rays[0])[..., None], rays[0][..., None] * rays[1] / MAX_RANGE, 0.0)
+        assert torch.allclose(got, expected, atol=1e-6)
+
+    @pytest.mark.parametrize("num_envs", [1, 2, 7, 33])
+    def test_threads_do_not_change_the_result(self, num_envs):
+        rays = random_rays(num_envs, 120, seed=num_envs)
+        results = []
+        for threads in (1, 2, 3, 5):
+            sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0, num_threads=threads)
+            results.append(sample(sampler, rays))
+        assert all(torch.equal(results[0], other) for other in results[1:])
+
+    def test_environments_are_independent(self):
+        rays = random_rays(6, 120, seed=5)
+        sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
+        full = sample(sampler, rays)
+        alone = sample(sampler, tuple(t[3:4].clone() for t in rays))
+        assert torch.equal(full[3:4], alone)
+
+    def test_writes_into_a_slice_of_a_history(self):
+        rays = random_rays(6, 120, seed=6)
+        sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
+        history = torch.full((6, 4, 24, 3), 7.0)
+        sampler(*rays, history[:, -1])
+        assert torch.equal(history[:, -1], sample(sampler, rays)) and (history[:, :-1] == 7.0).all()
+
+    def test_shared_scan_expanded_over_environments(self):
+        ranges, directions, theta, phi = random_rays(4, 60, seed=11)
+        shared = directions[:1].expand(4, -1, -1), theta[:1].expand(4, -1), phi[:1].expand(4, -1)
+        sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
+        assert torch.equal(sample(sampler, (ranges, *shared)), sample(sampler, (ranges, *(t.clone() for t in shared))))
+
+    def test_azimuth_branch_does_not_matter(self):
+        ranges, directions, theta, phi = random_rays(2, 60, seed=12)
+        sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
+        wrapped = torch.where(phi < 0, phi + 2 * math.pi, phi)
+        a, b = sample(sampler, (ranges, directions, theta, phi)), sample(sampler, (ranges, directions, theta, wrapped))
+        assert torch.allclose(a, b)
+
+    def test_no_environment(self):
+        sampler = PdSampler(2, 2, max_range=MAX_RANGE, split_deg=0.0)
+        sampler(torch.empty(0, 5), torch.empty(0, 5, 3), torch.empty(0, 5), torch.empty(0, 5), torch.empty(0, 4, 3))
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            {"ring_deg": 0.0},
+            {"reduce": "median"},
+            {"distal_bins": "cells"},
+            {"num_proximal": -1},
+            {"num_proximal": 0, "num_distal": 0},
+            {"max_range": 0.0},
+        ],
+    )
+    def test_wrong_options_are_refused_in_one_line(self, options):
+        with pytest.raises(ValueError) as error:
+            PdSampler(**{"max_range": 1.0, "split_deg": 0.0, **options})
+        assert "\n" not in str(error.value)
+
+    def test_wrong_shapes_are_refused(self):
+        ranges, directions, theta, phi = random_rays(2, 10)
+        with pytest.raises(ValueError, match="out must have shape"):
+            FpsSampler(4, max_range=1.0)(ranges, directions, theta, phi, torch.empty(2, 5, 3))
+        with pytest.raises(ValueError, match="float32"):
+            FpsSampler(4, max_range=1.0)(ranges, directions, theta.double(), phi, torch.empty(2, 4, 3))

@@ -1,0 +1,55 @@
+"""Trains a policy: compose the configuration, assemble what it needs, learn. `run=<dir>` resumes a run."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from omniperception import config
+from omniperception.assembly import build_runner
+from omniperception.learning import CheckpointError, TrainingDiverged, latest_checkpoint
+
+
+def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
+    """Trains a run to its end in `run_dir`."""
+    runner = build_runner(run, run_dir)
+    if resume:
+        runner.load(str(latest_checkpoint(run_dir)))
+        print(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
+    else:
+        print(f"run directory: {run_dir}")
+    runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0))
+    print(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
+
+
+@hydra.main(config_path="conf", config_name="config", version_base="1.3")
+def train(composed: DictConfig) -> None:
+    with config.one_line_errors(CheckpointError, TrainingDiverged):
+        run_dir = Path(HydraConfig.get().runtime.output_dir).relative_to(Path.cwd())
+        run = config.assemble(composed)
+        config.save(run.composed, run_dir)
+        learn(run, run_dir, resume=False)
+
+
+def resume(name: str, overrides: list[str]) -> None:
+    run_dir = config.find_run(name)
+    learn(config.assemble(config.load(run_dir, overrides)), run_dir, resume=True)
+
+
+def main() -> None:
+    arguments = sys.argv[1:]
+    with config.one_line_errors(CheckpointError, TrainingDiverged):
+        own, overrides = config.split_arguments(arguments, {"run": ""})
+        if own["run"]:
+            resume(own["run"], overrides)
+            return
+        config.check(overrides)
+    train()
+
+
+if __name__ == "__main__":
+    main()
