@@ -169,7 +169,7 @@ class PerceptionActor(MLPModel):
                 f"{type(self.perception).__name__} predicts no heights; set height_loss_weight=0 or use"
                 " PD-RiskNet"
             )
-        size = obs[HEIGHT_TARGET].shape[-1] if HEIGHT_TARGET in obs.keys() else 0
+        size = obs[HEIGHT_TARGET].shape[-1] if HEIGHT_TARGET in obs else 0
         if size != prediction.shape[-1]:
             raise ValueError(
                 f"height_loss_weight={self.height_loss_weight} needs an observation '{HEIGHT_TARGET}' of"

@@ -47,18 +47,17 @@ class PerceptivePpo(PPO):
         default_sets = ["actor", "critic"] + (["rnd_state"] if alg_cfg.get("rnd_cfg") else [])
         with contextlib.redirect_stdout(io.StringIO()):
             cfg["obs_groups"] = resolve_obs_groups(obs, cfg["obs_groups"], default_sets)
+        perceptive = isinstance(actor_class, type) and issubclass(actor_class, PerceptionActor)
+        if perceptive and (alg_cfg.get("rnd_cfg") or alg_cfg.get("symmetry_cfg")):
+            raise ValueError(
+                "rnd_cfg and symmetry_cfg work on one-dimensional observations only; leave them out with a"
+                " perceptive actor"
+            )
         alg_cfg = resolve_rnd_config(alg_cfg, obs, cfg["obs_groups"], env)
         alg_cfg = resolve_symmetry_config(alg_cfg, env)
 
         actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
         critic = critic_class(obs, cfg["obs_groups"], "critic", 1, **critic_cfg).to(device)
-        perceptive = isinstance(actor, PerceptionActor)
-        if perceptive and (alg_cfg.get("rnd_cfg") or alg_cfg.get("symmetry_cfg")):
-            raise ValueError(
-                "rnd_cfg and symmetry_cfg work on one-dimensional observations only; leave them out with"
-                " a perceptive actor"
-            )
-
         groups = {group for names in cfg["obs_groups"].values() for group in names}
         stored = sorted(groups | set(actor.extra_groups if perceptive else ()))
         storage = PerceptiveStorage(

@@ -42,7 +42,7 @@ class WindowedObservations:
         return self.groups[group]
 
     def __contains__(self, group: str) -> bool:
-        return group in self.groups.keys()
+        return group in self.groups
 
 
 def max_windows(num_steps: int, steps_per_frame: int) -> int:
@@ -100,7 +100,7 @@ class PerceptiveStorage(RolloutStorage):
         self.has_frames = frames
         if not frames:
             return
-        missing = [name for name in FRAME_GROUPS if name not in obs.keys()]
+        missing = [name for name in FRAME_GROUPS if name not in obs]
         if missing:
             raise ValueError(
                 f"the actor reads LiDAR frames but the environment gives no observations {missing};"

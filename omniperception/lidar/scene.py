@@ -95,8 +95,6 @@ class RayScene:
 
     Attributes:
         shapes: The shapes; a shape id is an index into this tuple.
-        body_pos: Body positions in the environment's frame, metres, (num_envs, num_bodies, 3) float32.
-        body_quat: Body orientations in the environment's frame, (w, x, y, z), (num_envs, num_bodies, 4).
         device: Where the tensors live.
         num_threads: CPU threads per cast; unused on a GPU.
 
@@ -131,11 +129,21 @@ class RayScene:
         self._upload_shapes()
         self._placed: dict[frozenset[int], PlacedShapes] = {}
 
+    @property
+    def body_pos(self) -> torch.Tensor:
+        """Body positions in the environment's frame, metres, (num_envs, num_bodies, 3); write in place."""
+        return self._body_pos
+
+    @property
+    def body_quat(self) -> torch.Tensor:
+        """Body orientations in the environment's frame, (w, x, y, z), (num_envs, num_bodies, 4); in place."""
+        return self._body_quat
+
     def _place_bodies(self) -> None:
         rows = max(self.num_bodies, 1)  # Warp needs an address even where there is no body
         pos = torch.zeros(self.num_envs, rows, 3, device=self.device)
         quat = torch.tensor(IDENTITY_QUAT, device=self.device).repeat(self.num_envs, rows, 1)
-        self.body_pos, self.body_quat = pos[:, : self.num_bodies], quat[:, : self.num_bodies]
+        self._body_pos, self._body_quat = pos[:, : self.num_bodies], quat[:, : self.num_bodies]
         self.wp_body_pos = wp.from_torch(pos, dtype=wp.vec3)
         self.wp_body_quat = wp.from_torch(quat, dtype=wp.vec4)
 

@@ -126,7 +126,7 @@ class Lidar:
     ) -> None:
         if not -1 <= mount_body < scene.num_bodies:
             raise ValueError(
-                f"lidar.mount_body={mount_body} must be in 0..{scene.num_bodies - 1}, or -1 for a fixed sensor"
+                f"lidar.mount_body={mount_body} must be in 0..{scene.num_bodies - 1}, or -1 (fixed sensor)"
             )
         stride = pattern.stride(config.period_s, config.num_rays)
         self.config, self.pattern, self.scene = config, pattern, scene

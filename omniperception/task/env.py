@@ -305,7 +305,8 @@ class OmniEnv(VecEnv):
         yaw_error = (self.kinematics.base_ang_vel_b[:, 2] - self.command.value[:, 2]).abs()
         lin_error, yaw_error = torch.where(healthy, lin_error, 0.0), torch.where(healthy, yaw_error, 0.0)
         self.velocity_error, self.yaw_rate_error = lin_error, yaw_error
-        self.metrics.record_tracking(lin_error, yaw_error, self.no_obstacle_near())
+        self.contacts, self.free = self.touching.clone(), self.no_obstacle_near()
+        self.metrics.record_tracking(lin_error, yaw_error, self.free)
         self.metrics.record_contacts(self.touching)
         self.metrics.record_ends(done, outcomes)
 

@@ -10,7 +10,7 @@ import torch
 from omniperception.lidar import DistanceNoise, MaskNoise
 from omniperception.random import EnvRandom
 from omniperception.sim import Simulator
-from omniperception.world.terrain import damping_ratio
+from omniperception.world.terrain import contact_solref
 
 Range = Sequence[float] | None
 
@@ -97,8 +97,8 @@ class Randomizer:
         if config.ground_friction:
             self._sim.model_field("geom_friction")[env_ids, self._ground, 0] = self._draw(env_ids, "ground_friction")
         if config.ground_restitution:
-            ratio = [damping_ratio(float(e)) for e in self._draw(env_ids, "ground_restitution")]
-            self._sim.model_field("geom_solref")[env_ids, self._ground, 1] = torch.tensor(ratio).double()
+            solref = [contact_solref(float(e)) for e in self._draw(env_ids, "ground_restitution")]
+            self._sim.model_field("geom_solref")[env_ids, self._ground] = torch.tensor(solref, dtype=torch.float64)
         if config.motor_strength:
             self._scale_motors(env_ids)
         if config.gravity_offset:

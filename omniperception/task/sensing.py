@@ -186,3 +186,5 @@ class LidarSensing:
             self.frames[env_ids] = 0.0
         if self.sector_distance is not None:
             self.sector_distance[env_ids] = self._needs.sector_max
+        for max_distance, mean in self._distal_range.items():
+            mean[env_ids] = max_distance

@@ -20,6 +20,8 @@ _GEOM_TYPES = {
 _NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
 PARKED_HEIGHT = -100.0
 """Height (m) at which an obstacle that takes no part waits, below the ground where no ray and no contact finds it."""
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+_PUSH_OFF_TURNS = 16
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,7 @@ class ObstacleField:
         u = self._random.uniform(env_ids, (6, *shape)).double()
         anchor = robot_xy_w.double()[:, None] if self.config.boundary == "wrap" else 0.0
         xy = self._low + torch.stack((u[:, 0], u[:, 1]), -1) * (self._high - self._low) + anchor
-        xy = self._push_off(xy, robot_xy_w.double(), u[:, 2])
+        xy = self._push_off(xy, robot_xy_w.double())
         speed = (self._speed_low + u[:, 3] * (self._speed_high - self._speed_low)) * self.level
         heading, yaw = 2 * math.pi * u[:, 4], 2 * math.pi * u[:, 2]
         active = u[:, 5] < self.level
@@ -249,15 +251,18 @@ class ObstacleField:
         self.active.copy_(state["active"])
         self.level = state["level"]
 
-    def _push_off(self, xy: torch.Tensor, robot_xy: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-        """Moves obstacles that would stand on the robot radially out of its clearance, staying inside the area."""
+    def _push_off(self, xy: torch.Tensor, robot_xy: torch.Tensor) -> torch.Tensor:
+        """Moves obstacles that would stand on the robot radially out of its clearance, inside the area."""
         keep = self.config.clearance + self.radius
-        for shift in range(8):  # another direction each time, for robots close to the area's edge
-            offset = xy - robot_xy[:, None]
-            distance = offset.norm(dim=-1)
-            angle = torch.atan2(offset[..., 1], offset[..., 0]) + (2 * math.pi * u if shift else 0.0) * shift
+        offset = xy - robot_xy[:, None]
+        bearing = torch.atan2(offset[..., 1], offset[..., 0])
+        for turn in range(_PUSH_OFF_TURNS):  # another direction each time, for robots close to an edge
+            near = (xy - robot_xy[:, None]).norm(dim=-1) < keep
+            if not near.any():
+                break
+            angle = bearing + turn * _GOLDEN_ANGLE
             outside = robot_xy[:, None] + torch.stack((angle.cos(), angle.sin()), -1) * (keep + 1e-6)[:, None]
-            xy = torch.where((distance < keep)[..., None], outside, xy)
+            xy = torch.where(near[..., None], outside, xy)
             if self.config.boundary == "bounce":
                 xy = xy.clamp(self._low, self._high)
         return xy

@@ -41,8 +41,21 @@ class TerrainConfig:
             condim=3,
             priority=1,
             friction=[self.friction, 0.005, 0.0001],
-            solref=[0.02, float(damping_ratio(self.restitution))],
+            solref=list(contact_solref(self.restitution)),
         )
+
+
+_CONTACT_FREQUENCY = 50.0
+"""Natural frequency (rad/s) of the ground contact: MuJoCo's default, slow enough for a 5 ms physics step."""
+
+
+def contact_solref(restitution: float) -> tuple[float, float]:
+    """MuJoCo's (-stiffness, -damping) of a ground contact with a coefficient of restitution.
+
+    The stiffness is the same for every restitution: in MuJoCo's other format, (time constant, damping ratio),
+    it grows as the damping ratio falls, and a lively contact then gains energy at usual step sizes.
+    """
+    return -(_CONTACT_FREQUENCY**2), -2.0 * damping_ratio(restitution) * _CONTACT_FREQUENCY
 
 
 def damping_ratio(restitution: float) -> float:

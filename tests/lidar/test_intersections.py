@@ -140,6 +140,7 @@ def single(shape, origin, direction, **options):
 
 
 K = ShapeKind
+EIGHTH_TURN = (math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8))
 CLOSED_FORMS = [
     ("plane from above", Shape(K.PLANE), (0, 0, 2), (0, 0, -1), 2.0),
     ("plane at 45 degrees", Shape(K.PLANE), (0, 0, 2), (1, 0, -1), 2.0 * math.sqrt(2.0)),
@@ -163,8 +164,7 @@ CLOSED_FORMS = [
     ("capsule, parallel beside it", Shape(K.CAPSULE, (0.5, 1.0)), (0.6, 0, 4), (0, 0, -1), math.inf),
     ("ellipsoid", Shape(K.ELLIPSOID, (1.0, 2.0, 3.0)), (0, 0, 5), (0, 0, -1), 2.0),
     ("ellipsoid inside", Shape(K.ELLIPSOID, (1.0, 2.0, 3.0)), (0, 0, 0), (0, 1, 0), 2.0),
-    ("turned box", Shape(K.BOX, (1, 1, 1), quat=(math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8))), (-3, 0, 0),
-     (1, 0, 0), 3.0 - math.sqrt(2.0)),
+    ("turned box", Shape(K.BOX, (1, 1, 1), quat=EIGHTH_TURN), (-3, 0, 0), (1, 0, 0), 3.0 - math.sqrt(2.0)),
 ]  # fmt: skip
 
 

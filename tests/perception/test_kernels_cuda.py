@@ -1,9 +1,10 @@
-"""The kernels compile for CUDA where Warp brings its compiler, and agree with the CPU where there is a GPU."""
+"""The kernels compile for CUDA where Warp brings its compiler, and agree with the CPU where there is a
+GPU."""
 
 import pytest
 import torch
 import warp as wp
-from test_sampling import MAX_RANGE, random_rays, sample
+from clouds import MAX_RANGE, random_rays, sample
 
 from omniperception.perception import PdSampler, kernels
 

@@ -1,0 +1,6 @@
+"""Evaluation of trained policies: counted episodes with confidence intervals, and videos."""
+
+from omniperception.evaluation.episodes import Episodes, run_episodes
+from omniperception.evaluation.statistics import wilson
+
+__all__ = ["Episodes", "run_episodes", "wilson"]

@@ -1,0 +1,239 @@
+"""Draws pictures of one environment by casting camera rays with the LiDAR toolkit; no graphics library."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from omniperception.lidar import RayScene
+from omniperception.world.rays import HitClass, RayShapes
+
+COLOURS = {HitClass.TERRAIN: (0.60, 0.61, 0.62), HitClass.OBSTACLE: (0.82, 0.71, 0.50), HitClass.ROBOT: (0.10, 0.11, 0.14)}
+"""Linear RGB reflectance by what a ray has met; the terrain's is that of the lighter squares."""
+DARK_SQUARES = 0.72
+SQUARE_M = 0.5
+PROXIMAL, DISTAL = (0.95, 0.09, 0.03), (0.02, 0.22, 0.95)
+"""Linear RGB of the LiDAR's points above and below the split elevation."""
+COMMAND, VELOCITY = (0.05, 0.55, 0.16), (0.98, 0.80, 0.05)
+"""Linear RGB of the arrows of the commanded and of the actual velocity."""
+HORIZON, ZENITH = (0.78, 0.85, 0.92), (0.22, 0.42, 0.72)
+SUN, SKY_LIGHT, GROUND_LIGHT = (0.88, 0.83, 0.74), (0.34, 0.38, 0.44), (0.20, 0.19, 0.17)
+TO_SUN = (-0.42, 0.46, 0.78)
+FOG_M = 28.0
+"""Distance (m) at which the ground has faded to 1/e into the horizon."""
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """An arrow painted on the ground.
+
+    Attributes:
+        start_w: (2,) where it begins, m.
+        vector_w: (2,) from there to its tip, m.
+        width: of its shaft, m.
+        colour: linear RGB.
+    """
+
+    start_w: torch.Tensor
+    vector_w: torch.Tensor
+    width: float
+    colour: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class View:
+    """Everything that one picture shows, in the environment's frame.
+
+    Attributes:
+        eye_w: (3,) position of the camera, m.
+        target_w: (3,) where it looks, m.
+        body_pos: (num_bodies, 3) positions of the moving bodies in the order of `RayShapes.bodies`, m.
+        body_quat: (num_bodies, 4) their orientations.
+        points_w: (P, 3) LiDAR points, m.
+        proximal: (P,) bool which of them are proximal.
+        arrows: painted in this order.
+    """
+
+    eye_w: torch.Tensor
+    target_w: torch.Tensor
+    body_pos: torch.Tensor
+    body_quat: torch.Tensor
+    points_w: torch.Tensor
+    proximal: torch.Tensor
+    arrows: tuple[Arrow, ...] = ()
+
+
+class Renderer:
+    """A pinhole camera. The picture is cut into strips, environments of a ray scene, that CPU threads share.
+
+    Attributes:
+        width, height: size of the picture, pixels.
+    """
+
+    def __init__(
+        self,
+        shapes: RayShapes,
+        width: int = 640,
+        height: int = 360,
+        samples: int = 1,
+        fov_deg: float = 42.0,
+        device: str | torch.device = "cpu",
+        num_threads: int | None = None,
+    ) -> None:
+        """
+        Args:
+            shapes: what there is to see.
+            width, height: size of the picture, pixels.
+            samples: rays per pixel along each axis, averaged.
+            fov_deg: vertical field of view.
+            device: of the rays.
+            num_threads: CPU threads; None for all cores.
+        """
+        self.width, self.height, self._samples = width, height, samples
+        self._columns, self._rows = width * samples, height * samples
+        self._focal = 0.5 * self._rows / math.tan(math.radians(fov_deg) / 2)
+        strips = max(n for n in range(1, min(self._rows, 32) + 1) if self._rows % n == 0)
+        self._scene = RayScene(shapes.shapes, strips, len(shapes.bodies), device, num_threads)
+        device = self._scene.device
+        classes = [shape.class_id for shape in shapes.shapes]
+        self._terrain = tuple(k for k, c in enumerate(classes) if c == HitClass.TERRAIN)
+        self._class = torch.tensor([*classes, -1], device=device)  # a miss, shape -1, takes the last entry
+        self._albedo = torch.tensor([*(COLOURS[HitClass(c)] for c in classes), (0.0,) * 3], device=device)
+        x = torch.arange(self._columns, device=device) + 0.5 - self._columns / 2
+        y = torch.arange(self._rows, device=device) + 0.5 - self._rows / 2
+        y, x = torch.meshgrid(y, x, indexing="ij")
+        rays = torch.stack((x, y, torch.full_like(x, self._focal)), -1).flatten(0, 1)
+        self._rays_c = rays / rays.norm(dim=1, keepdim=True)
+        self._to_sun = _vector(TO_SUN, device) / math.hypot(*TO_SUN)
+
+    def render(self, view: View) -> torch.Tensor:
+        """The picture, (height, width, 3) uint8 on the CPU."""
+        self._scene.body_pos.copy_(view.body_pos)
+        self._scene.body_quat.copy_(view.body_quat)
+        axes = _camera_axes(view.eye_w, view.target_w)
+        rays = self._rays_c @ axes
+        ranges, classes, colour = self._shade(view, rays)
+        colour = torch.where((classes >= 0)[:, None], colour, _sky(rays))
+        colour = colour.clamp(0.0, 1.0).pow(1 / 2.2).unflatten(0, (self._rows, self._columns))
+        self._draw_points(colour, ranges.unflatten(0, (self._rows, self._columns)), view, axes)
+        if self._samples > 1:
+            colour = torch.nn.functional.avg_pool2d(colour.permute(2, 0, 1), self._samples).permute(1, 2, 0)
+        return (colour * 255.0 + 0.5).to(torch.uint8).cpu()
+
+    def _shade(self, view: View, rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Distance (m), class and linear colour of what each ray has met."""
+        strips = (self._scene.num_envs, -1)
+        origins = view.eye_w.expand_as(rays)
+        hits = self._scene.cast(origins.unflatten(0, strips), rays.unflatten(0, strips), normals=True)
+        ranges, shape = hits.ranges.flatten(), hits.shape_id.flatten().long()
+        normals, classes = hits.normals_w.flatten(0, 1), self._class[shape]
+        points = view.eye_w + torch.where(classes >= 0, ranges, 0.0)[:, None] * rays
+        albedo = self._albedo[shape]
+        ground = (classes == HitClass.TERRAIN).nonzero().flatten()
+        footprint = ranges[ground] / self._focal
+        stretched = footprint / rays[ground, 2].abs().clamp(min=1e-3)
+        albedo[ground] = self._paint_ground(albedo[ground], points[ground, :2], footprint, stretched, view.arrows)
+        facing = normals @ self._to_sun
+        light = facing.clamp(min=0.0) * ~self._shadowed(points, normals, (classes >= 0) & (facing > 0))
+        up = (0.5 + 0.5 * normals[:, 2:]).clamp(0.0, 1.0)
+        device = rays.device
+        ambient = _vector(GROUND_LIGHT, device) + up * (_vector(SKY_LIGHT, device) - _vector(GROUND_LIGHT, device))
+        colour = albedo * (light[:, None] * _vector(SUN, device) + ambient)
+        clear = torch.where(classes >= 0, torch.exp(-((ranges / FOG_M) ** 2)), 0.0)[:, None]
+        return ranges, classes, colour * clear + _vector(HORIZON, device) * (1 - clear)
+
+    def _paint_ground(
+        self,
+        albedo: torch.Tensor,
+        xy_w: torch.Tensor,
+        footprint: torch.Tensor,
+        stretched: torch.Tensor,
+        arrows: tuple[Arrow, ...],
+    ) -> torch.Tensor:
+        albedo = albedo * (DARK_SQUARES + (1 - DARK_SQUARES) * _checkers(xy_w / SQUARE_M, stretched / SQUARE_M))[:, None]
+        for arrow in arrows:
+            cover = (0.5 - _arrow_distance(xy_w, arrow) / footprint).clamp(0.0, 1.0)[:, None]
+            albedo = albedo + cover * (_vector(arrow.colour, albedo.device) - albedo)
+        return albedo
+
+    def _shadowed(self, points: torch.Tensor, normals: torch.Tensor, lit: torch.Tensor) -> torch.Tensor:
+        """Which of the points that face the sun something else hides from it."""
+        shadowed = torch.zeros_like(lit)
+        ids = lit.nonzero().flatten()
+        strips = self._scene.num_envs
+        padding = -len(ids) % strips
+        if len(ids) == 0:
+            return shadowed
+        ids = torch.cat((ids, ids[:1].expand(padding)))
+        origins = (points[ids] + 2e-3 * normals[ids]).unflatten(0, (strips, -1))
+        towards = self._to_sun.expand_as(origins)
+        hits = self._scene.cast(origins, towards, max_range=12.0, exclude_shapes=self._terrain)
+        shadowed[ids] = hits.shape_id.flatten() >= 0
+        return shadowed
+
+    def _draw_points(self, colour: torch.Tensor, ranges: torch.Tensor, view: View, axes: torch.Tensor) -> None:
+        """Draws the LiDAR points that nothing hides, nearer ones over farther ones."""
+        offset = view.points_w - view.eye_w
+        distance = offset.norm(dim=1)
+        right, down, ahead = (offset @ axes.T).unbind(1)
+        column = (self._focal * right / ahead.clamp(min=1e-6) + self._columns / 2).floor().long()
+        row = (self._focal * down / ahead.clamp(min=1e-6) + self._rows / 2).floor().long()
+        radius = max(1, round(self._rows / 360))
+        inside = (ahead > 0.1) & (column >= radius) & (column < self._columns - radius)
+        inside &= (row >= radius) & (row < self._rows - radius)
+        column, row, distance, proximal = column[inside], row[inside], distance[inside], view.proximal[inside]
+        seen = distance <= ranges[row, column] * 1.02 + 0.06
+        order = distance[seen].argsort(descending=True)
+        column, row, proximal = column[seen][order], row[seen][order], proximal[seen][order]
+        device = colour.device
+        dots = torch.where(proximal[:, None], _vector(PROXIMAL, device), _vector(DISTAL, device)).pow(1 / 2.2)
+        for down_px in range(-radius, radius + 1):
+            for right_px in range(-radius, radius + 1):
+                if math.hypot(down_px, right_px) <= radius + 0.25:
+                    colour[row + down_px, column + right_px] = dots
+
+
+def _camera_axes(eye_w: torch.Tensor, target_w: torch.Tensor) -> torch.Tensor:
+    """(3, 3) the camera's axes in rows: right, down, ahead; z is up in the world."""
+    ahead = target_w - eye_w
+    ahead = ahead / ahead.norm()
+    right = torch.linalg.cross(ahead, _vector((0.0, 0.0, 1.0), ahead.device))
+    right = right / right.norm()
+    return torch.stack((right, torch.linalg.cross(ahead, right), ahead))
+
+
+def _sky(rays: torch.Tensor) -> torch.Tensor:
+    height = rays[:, 2:].clamp(0.0, 1.0).sqrt()
+    horizon = _vector(HORIZON, rays.device)
+    return horizon + height * (_vector(ZENITH, rays.device) - horizon)
+
+
+def _checkers(xy: torch.Tensor, width: torch.Tensor) -> torch.Tensor:
+    """A board of unit squares of 0 and 1 averaged over boxes of a width, so that it fades out far away.
+
+    The closed form is Inigo Quilez's 'Filtering the checkerboard pattern'.
+    """
+    width = width.clamp(min=1e-4)[:, None]
+    low, high = (xy - 0.5 * width) / 2, (xy + 0.5 * width) / 2
+    mean = 2.0 * (((low - low.floor()) - 0.5).abs() - ((high - high.floor()) - 0.5).abs()) / width
+    return 0.5 - 0.5 * mean.prod(1)
+
+
+def _arrow_distance(xy_w: torch.Tensor, arrow: Arrow) -> torch.Tensor:
+    """Signed distance (m) of points on the ground to an arrow's outline, negative inside."""
+    length = float(arrow.vector_w.norm())
+    along_w = arrow.vector_w / max(length, 1e-6)
+    offset = xy_w - arrow.start_w
+    along = offset @ along_w
+    across = (offset[:, 0] * along_w[1] - offset[:, 1] * along_w[0]).abs()
+    head, half_head = min(2.4 * arrow.width, length), 1.3 * arrow.width
+    neck = length - head
+    shaft = torch.maximum(across - arrow.width / 2, torch.maximum(-along, along - neck))
+    slope = (across * head - half_head * (length - along)) / math.hypot(head, half_head)
+    return torch.minimum(shaft, torch.maximum(slope, neck - along))
+
+
+def _vector(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
+    return torch.tensor(values, device=device)

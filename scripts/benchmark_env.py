@@ -1,0 +1,107 @@
+"""How much of the bare physics rate is left for the environment, and for the whole PPO iteration.
+
+    python scripts/benchmark_env.py [what=step|iteration] [repeats=7] [experiment=... overrides]
+
+Both are timed in turn with bare `Batch.step` (same model, states, actions, decimation and threads, nothing bound), and
+the median of the paired ratios is printed with the time of each stage.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+import torch
+from mujoco.batch import Batch
+
+from omniperception import config
+from omniperception.assembly import build_runner, seed_everything
+from omniperception.task.env import OmniEnv
+
+BLOCK = 25
+"""Control steps per timed block: a multiple of the LiDAR's period."""
+
+
+def bare_physics(env: OmniEnv) -> Callable[[], float]:
+    """Seconds that bare `Batch.step` needs for a block of control steps from the environment's current states."""
+    batch = Batch(env.world.model, env.num_envs, env.config.sim.num_threads)
+    ctrl = batch.bind("ctrl")
+
+    def block() -> float:
+        batch.state[:] = env.sim.batch.state
+        targets = [env.default_joint_pos + 0.1 * torch.randn(env.num_envs, env.num_actions) for _ in range(BLOCK)]
+        start = time.perf_counter()
+        for target in targets:
+            ctrl[:] = target.numpy()
+            batch.step(nstep=env.config.sim.decimation)
+        return time.perf_counter() - start
+
+    return block
+
+
+def environment_steps(env: OmniEnv) -> Callable[[], float]:
+    """Seconds for a block of `env.step` with random actions."""
+
+    def block() -> float:
+        actions = [0.4 * torch.randn(env.num_envs, env.num_actions) for _ in range(BLOCK)]
+        start = time.perf_counter()
+        with torch.inference_mode():
+            for action in actions:
+                env.step(action)
+        return time.perf_counter() - start
+
+    return block
+
+
+def report(name: str, num_envs: int, seconds: list[float], bare: list[float], steps: int) -> None:
+    ratios = [steps / BLOCK * b / s for s, b in zip(seconds, bare, strict=True)]
+    bare_rate, rate = num_envs * BLOCK / statistics.median(bare), num_envs * steps / statistics.median(seconds)
+    print(f"bare Batch.step     {bare_rate:10,.0f} env steps/s")
+    print(f"{name:<19} {rate:10,.0f} env steps/s")
+    print(
+        f"ratio               {statistics.median(ratios):10.2f} (median of {len(ratios)} pairs,"
+        f" {min(ratios):.2f} to {max(ratios):.2f})"
+    )
+
+
+def benchmark_step(run: config.RunConfig, repeats: int) -> None:
+    seed_everything(run.env.seed)
+    env = OmniEnv(run.env)
+    bare, steps = bare_physics(env), environment_steps(env)
+    bare(), steps()
+    env.timer.drain()
+    pairs = [(steps(), bare()) for _ in range(repeats)]
+    report("env.step", env.num_envs, [p[0] for p in pairs], [p[1] for p in pairs], BLOCK)
+    total = repeats * BLOCK * env.num_envs
+    for stage, seconds in env.timer.drain().items():
+        print(f"  {stage:<17} {1e6 * seconds / total:8.2f} us per env step")
+
+
+def benchmark_iteration(run: config.RunConfig, repeats: int) -> None:
+    runner = build_runner(run, None)
+    env, rollout = runner.env, run.ppo.num_steps_per_env
+    bare = bare_physics(env)
+    runner.learn(2)
+    seconds, bares = [], []
+    for _ in range(repeats):
+        before = runner.total_time
+        runner.learn(1)
+        seconds.append(runner.total_time - before)
+        bares.append(bare())
+    report("PPO iteration", env.num_envs, seconds, bares, rollout)
+
+
+def main() -> None:
+    with config.one_line_errors():
+        own, overrides = config.split_arguments(sys.argv[1:], {"what": "step", "repeats": "7"})
+        run = config.assemble(config.compose(overrides or ["experiment=quickstart"]))
+        if own["what"] not in ("step", "iteration"):
+            raise config.ConfigError(f"what={own['what']} must be step or iteration")
+        print(f"{run.env.num_envs} environments, {torch.get_num_threads()} torch threads, {' '.join(overrides)}")
+        {"step": benchmark_step, "iteration": benchmark_iteration}[own["what"]](run, int(own["repeats"]))
+
+
+if __name__ == "__main__":
+    main()

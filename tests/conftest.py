@@ -1,0 +1,26 @@
+"""Fixtures shared by all tests."""
+
+import pytest
+
+from omniperception import config
+from omniperception.task.env import OmniEnv
+
+BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
+"""Overrides of a run without LiDAR."""
+
+
+@pytest.fixture(scope="session")
+def make_env():
+    """Builds a real environment from overrides on the command line; `blind=True` leaves the LiDAR out."""
+
+    def make(*overrides: str, num_envs: int = 4, blind: bool = False) -> OmniEnv:
+        given = (*(BLIND if blind else ()), *overrides, f"num_envs={num_envs}")
+        return OmniEnv(config.assemble(config.compose(given)).env)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_config():
+    """Assembles a configuration from overrides on the command line."""
+    return lambda *overrides: config.assemble(config.compose(overrides))

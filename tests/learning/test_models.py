@@ -1,0 +1,167 @@
+"""The perceptive actor: caching, windows of an update, height supervision."""
+
+import functools
+
+import pytest
+import torch
+from toy_env import HISTORY, ToyEnv, rollout
+
+from omniperception.learning import PerceptionActor, PerceptiveStorage
+from omniperception.perception import FpsMlp, PdRiskNet
+
+NETWORKS = {
+    "pd": functools.partial(PdRiskNet, 2, 1, HISTORY, proximal_dim=5, distal_dim=3),
+    "mlp": functools.partial(FpsMlp, 3, HISTORY, (6,), 8),
+}
+
+
+def actor_for(env, network="pd", **options):
+    torch.manual_seed(1)
+    groups = {"actor": ["policy"]}
+    options = {"hidden_dims": [8], "distribution_cfg": {"class_name": "GaussianDistribution"}, **options}
+    return PerceptionActor(
+        env.get_observations(), groups, "actor", 2, perception=NETWORKS[network], **options
+    )
+
+
+def advance(env, steps):
+    for _ in range(steps):
+        env.step(torch.randn(env.num_envs, 2))
+
+
+class Counter:
+    """Counts calls of a module."""
+
+    def __init__(self, module):
+        self.calls = 0
+        module.register_forward_hook(self.count)
+
+    def count(self, *_):
+        self.calls += 1
+
+
+@pytest.mark.parametrize("network", ["pd", "mlp"])
+@pytest.mark.parametrize("normalize", [False, True])
+def test_update_equals_rollout(network, normalize):
+    """Features of a mini-batch are those that the actor computes at each step by itself."""
+    torch.manual_seed(3)
+    env = ToyEnv(5, episode=11)
+    advance(env, 13)
+    actor = actor_for(env, network, obs_normalization=normalize)
+    storage = PerceptiveStorage(5, 12, env.get_observations(), ["policy"], 2, frames=True, steps_per_frame=5)
+    seen = rollout(env, storage, 12)
+    if normalize:
+        actor.update_normalization(storage.observations.flatten(0, 1))
+    with torch.no_grad():
+        by_step = torch.stack([actor(obs) for obs in seen])
+    for batch in storage.mini_batch_generator(2, 1):
+        got = actor(batch.observations)
+        for row, action in enumerate(batch.actions):
+            step, env_id = (storage.actions == action).all(-1).nonzero()[0].tolist()
+            assert torch.allclose(got[row], by_step[step, env_id], atol=1e-5)
+
+
+def test_features_once_per_tick_and_parameter_version():
+    env = ToyEnv(4)
+    actor = actor_for(env)
+    counter = Counter(actor.perception)
+    with torch.inference_mode():
+        for _ in range(5):
+            actor(env.get_observations())
+            advance(env, 1)
+        first = counter.calls
+        actor(env.get_observations())
+        assert counter.calls == 2 * first
+        actor(env.get_observations())
+        assert counter.calls == 2 * first
+    with torch.no_grad():
+        next(actor.perception.parameters()).add_(0.1)
+    with torch.inference_mode():
+        actor(env.get_observations())
+    assert counter.calls == 3 * first
+
+
+def test_cache_tells_environments_apart():
+    a, b = ToyEnv(4, seed=0), ToyEnv(4, seed=1)
+    advance(a, 10)
+    advance(b, 10)
+    actor = actor_for(a)
+    with torch.no_grad():
+        actor(a.get_observations())
+        cached = actor(b.get_observations())
+    assert torch.allclose(actor(b.get_observations()), cached)
+
+
+@pytest.mark.parametrize("network", ["pd", "mlp"])
+def test_reset_between_frames_gives_the_empty_embedding(network):
+    env = ToyEnv(4)
+    advance(env, 10)
+    actor = actor_for(env, network)
+    with torch.no_grad():
+        actor(env.get_observations())
+        env.frame_count[2] = 0
+        latent = actor.get_latent(env.get_observations())
+        empty = actor.perception(torch.zeros(1, HISTORY, 3, 3), torch.zeros(1, 1, dtype=torch.long))[0, 0]
+    assert torch.allclose(latent[2, 3:], empty) and not torch.allclose(latent[1, 3:], empty)
+
+
+def height_case(weight):
+    """An actor, a mini-batch and its gradients of a loss on the actions."""
+    torch.manual_seed(5)
+    env = ToyEnv(5, episode=11)
+    advance(env, 7)
+    actor = actor_for(env, height_loss_weight=weight)
+    storage = PerceptiveStorage(5, 9, env.get_observations(), ["policy", "height_target"], 2, frames=True)
+    rollout(env, storage, 9)
+    torch.manual_seed(6)
+    [batch] = storage.mini_batch_generator(1, 1)
+    return actor, batch.observations
+
+
+@pytest.mark.parametrize("weight", [0.5, 3.0])
+def test_height_loss_joins_the_backward_pass_at_unit_scale(weight):
+    actor, obs = height_case(weight)
+    (1e-3 * actor(obs).square().sum()).backward()  # the main loss is scaled, the height loss must not be
+    got = [p.grad.clone() for p in actor.parameters() if p.grad is not None]
+
+    plain, _ = height_case(0.0)
+    latent = plain.get_latent(obs)
+    prediction, valid = latent[:, 3:8], obs.step_count > 0
+    height = (prediction[valid] - obs["height_target"][valid]).square().mean()
+    (1e-3 * plain.mlp(latent).square().sum() + weight * height).backward()
+    expected = [p.grad for p in plain.parameters() if p.grad is not None]
+    assert 0 < valid.sum() < len(valid)
+    for a, b in zip(got, expected, strict=True):
+        assert torch.allclose(a, b, rtol=1e-4, atol=1e-7)
+    assert actor.pop_height_loss() == pytest.approx(height.item(), rel=1e-5)
+    assert actor.pop_height_loss() is None
+
+
+def test_height_loss_learns_the_heights():
+    actor, obs = height_case(1.0)
+    optimizer = torch.optim.Adam(actor.perception.parameters(), 0.02)
+    losses = []
+    for _ in range(80):
+        optimizer.zero_grad()
+        (0.0 * actor(obs).sum()).backward()
+        optimizer.step()
+        losses.append(actor.pop_height_loss())
+    assert losses[-1] < 0.2 * losses[0]
+
+
+def test_no_step_with_a_frame_gives_zero_height_loss():
+    actor, obs = height_case(1.0)
+    obs.step_count.zero_()
+    actor(obs).sum().backward()
+    assert actor.pop_height_loss() == 0.0
+    assert all(torch.isfinite(p.grad).all() for p in actor.parameters() if p.grad is not None)
+
+
+def test_height_supervision_needs_a_predictor_and_a_fitting_target():
+    env = ToyEnv(3)
+    with pytest.raises(ValueError, match="predicts no heights"):
+        actor_for(env, "mlp", height_loss_weight=1.0)
+    obs = env.get_observations()
+    obs["height_target"] = torch.zeros(3, 7)
+    with pytest.raises(ValueError, match="of 5 values, the environment gives 7"):
+        PerceptionActor(obs, {"actor": ["policy"]}, "actor", 2, NETWORKS["pd"], 1.0, hidden_dims=[8])

@@ -1,0 +1,121 @@
+"""PPO: returns by hand, its update with shared frames, and the stop at non-finite numbers."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from toy_env import ToyEnv, config
+
+from omniperception.learning import PerceptivePpo, TrainingDiverged
+
+
+def algorithm(env, num_steps=8, frames=True, **options):
+    cfg = config(frames, num_steps_per_env=num_steps, multi_gpu=None)
+    cfg["algorithm"] = {**cfg["algorithm"], **options}
+    torch.manual_seed(0)
+    return PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
+
+
+def collect(alg, env, steps):
+    obs = env.get_observations()
+    with torch.inference_mode():
+        for _ in range(steps):
+            obs, rewards, dones, extras = env.step(alg.act(obs))
+            alg.process_env_step(obs, rewards, dones, extras)
+        alg.compute_returns(obs)
+
+
+def test_returns_by_hand_with_termination_and_time_out():
+    """gamma = lambda = 0.5, V = 2 everywhere, reward 1; environment 0 runs on, 1 falls, 2 times out at step
+    1.
+
+    Step 2 bootstraps: delta = 1 + 0.5 * 2 - 2 = 0 for all, so its return is 2.
+    Step 1: running on, delta 0; falling, 1 - 2 = -1, return 1; time-out, the reward becomes 1 + 0.5 * 2 = 2
+    and nothing follows: delta 2 - 2 = 0, return 2. Step 0: delta 0 plus 0.25 times the advantage of step 1:
+    returns 2, 2 - 0.25 and 2.
+    """
+    env = ToyEnv(3, frames=False)
+    alg = algorithm(env, num_steps=3, frames=False, gamma=0.5, lam=0.5)
+    alg.critic.forward = lambda obs, **_: torch.full((3, 1), 2.0)
+    obs = env.get_observations()
+    for step in range(3):
+        alg.act(obs)
+        dones = torch.tensor([0, 1, 1]) if step == 1 else torch.zeros(3, dtype=torch.long)
+        time_outs = torch.tensor([0.0, 0.0, 1.0]) if step == 1 else torch.zeros(3)
+        alg.process_env_step(obs, torch.ones(3), dones, {"time_outs": time_outs})
+    alg.compute_returns(obs)
+    expected = torch.tensor([[2.0, 1.75, 2.0], [2.0, 1.0, 2.0], [2.0, 2.0, 2.0]])
+    assert torch.allclose(alg.storage.returns.squeeze(-1), expected)
+
+
+@pytest.mark.parametrize("num_envs", [2, 7])
+def test_update_with_frames(num_envs):
+    env = ToyEnv(num_envs)
+    alg = algorithm(env)
+    before = [p.clone() for p in alg.actor.perception.parameters()]
+    for _ in range(3):
+        collect(alg, env, 8)
+        losses = alg.update()
+    assert losses["height"] > 0 and all(torch.isfinite(torch.tensor(v)) for v in losses.values())
+    assert all((a != b).any() for a, b in zip(before, alg.actor.perception.parameters(), strict=True))
+
+
+def test_first_ratio_is_one():
+    """Before any step the update sees the log-probabilities of the rollout: windows and caching agree with
+    it."""
+    env = ToyEnv(6, episode=9)
+    alg = algorithm(env)
+    collect(alg, env, 8)
+    for batch in alg.storage.mini_batch_generator(2, 1):
+        alg.actor(batch.observations, stochastic_output=True)
+        log_prob = alg.actor.get_output_log_prob(batch.actions)
+        assert torch.allclose(log_prob, batch.old_actions_log_prob.squeeze(-1), atol=1e-4)
+
+
+def test_storage_holds_only_what_is_read():
+    env = ToyEnv(4)
+    assert set(algorithm(env).storage.observations.keys()) == {"policy", "height_target"}
+    assert set(algorithm(ToyEnv(4, frames=False), frames=False).storage.observations.keys()) == {"policy"}
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_non_finite_return_stops_before_it_reaches_the_weights(value):
+    env = ToyEnv(4)
+    alg = algorithm(env)
+    collect(alg, env, 8)
+    alg.storage.returns[3, 1] = value
+    with pytest.raises(TrainingDiverged, match="gradient of the critic.*returns") as error:
+        alg.update()
+    assert "\n" not in str(error.value)
+    for key, tensor in alg.critic.state_dict().items():
+        assert torch.isfinite(tensor).all(), key
+
+
+def test_non_finite_parameters_are_named():
+    env = ToyEnv(4)
+    alg = algorithm(env)
+    with torch.no_grad():
+        alg.actor.perception.distal.bias_hh_l0[0] = float("nan")
+    with pytest.raises(TrainingDiverged, match="perception.distal.bias_hh_l0"):
+        alg._check_parameters()
+
+
+def test_an_exploding_learning_rate_ends_in_a_clear_stop():
+    env = ToyEnv(4)
+    alg = algorithm(env, learning_rate=1e30, schedule="fixed", max_grad_norm=1e30)
+    with pytest.raises(TrainingDiverged):
+        for _ in range(5):
+            collect(alg, env, 8)
+            alg.update()
+
+
+def test_symmetry_and_frames_are_refused():
+    with pytest.raises(ValueError, match="one-dimensional observations only"):
+        algorithm(ToyEnv(4), symmetry_cfg={"use_mirror_loss": True})
+
+
+def test_groups_are_a_tensordict():
+    env = ToyEnv(4)
+    alg = algorithm(env)
+    collect(alg, env, 8)
+    [batch] = alg.storage.mini_batch_generator(1, 1)
+    assert isinstance(batch.observations.groups, TensorDict) and "policy" in batch.observations

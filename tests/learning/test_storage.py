@@ -1,0 +1,116 @@
+"""The storage keeps each LiDAR frame once and gives back every window and step exactly."""
+
+import pytest
+import torch
+from toy_env import HISTORY, PERIOD, ToyEnv, rollout
+
+from omniperception.learning import PerceptiveStorage, point_cloud_bytes
+from omniperception.learning.storage import max_windows
+
+
+def storage_for(env, num_steps, steps_per_frame=PERIOD):
+    return PerceptiveStorage(
+        env.num_envs,
+        num_steps,
+        env.get_observations(),
+        ["policy"],
+        2,
+        frames=env.has_frames,
+        steps_per_frame=steps_per_frame,
+    )
+
+
+@pytest.mark.parametrize(("num_envs", "num_batches"), [(1, 1), (5, 2), (7, 3), (6, 6)])
+def test_every_step_finds_its_own_window(num_envs, num_batches):
+    """Over several rollouts, in which the phase of the tick drifts and environments reset at any time."""
+    torch.manual_seed(0)
+    env = ToyEnv(num_envs, episode=11)
+    num_steps = 8
+    storage = storage_for(env, num_steps)
+    phases, emptied = set(), 0
+    for _ in range(6):
+        phases.add(env.step_count % PERIOD)
+        seen = rollout(env, storage, num_steps)
+        visited = []
+        for batch in storage.mini_batch_generator(num_batches, 1):
+            obs = batch.observations
+            assert obs.batch_size[0] == len(batch.actions)
+            num_in_batch = obs.batch_size[0] // num_steps
+            for row in range(obs.batch_size[0]):
+                step = row // num_in_batch
+                assert batch.values[row] == step
+                [env_id] = [
+                    e for e in range(num_envs) if torch.equal(storage.actions[step, e], batch.actions[row])
+                ]
+                visited.append((step, env_id))
+                truth = seen[step][env_id]
+                assert torch.equal(obs["policy"][row], truth["policy"])
+                count = int(truth["frame_count"])
+                assert obs.step_count[row] == count
+                emptied += count == 0
+                e, w = divmod(int(obs.step_window[row]), obs.window_count.shape[1])
+                assert torch.equal(obs.frames[e, w : w + HISTORY], truth["frames"])
+                assert count in (0, int(obs.window_count[e, w]))
+        assert sorted(visited) == [(s, e) for s in range(num_steps) for e in range(num_envs)]
+        storage.clear()
+    assert len(phases) == PERIOD and emptied > 0
+
+
+def test_mini_batches_are_spread_and_change_every_epoch():
+    env = ToyEnv(7)
+    storage = storage_for(env, 4)
+    rollout(env, storage, 4)
+    batches = [b.observations.batch_size[0] // 4 for b in storage.mini_batch_generator(3, 2)]
+    assert batches == [3, 2, 2, 3, 2, 2]
+    with pytest.raises(ValueError, match="num_mini_batches to at most 7"):
+        next(storage.mini_batch_generator(8, 1))
+
+
+def test_without_frames_the_mini_batches_are_shuffled_steps():
+    env = ToyEnv(6, frames=False)
+    storage = storage_for(env, 8)
+    rollout(env, storage, 8)
+    batches = list(storage.mini_batch_generator(4, 1))
+    assert [len(b.actions) for b in batches] == [12] * 4
+    assert len(batches[0].values.unique()) > 4  # steps are mixed
+    assert not hasattr(storage, "frames")
+
+
+def test_too_many_frames_and_missing_calls_are_reported():
+    env = ToyEnv(2, period=2)
+    with pytest.raises(ValueError, match="set it to the environment's value"):
+        rollout(env, storage_for(env, 8, steps_per_frame=5), 8)
+    storage = storage_for(env, 8)
+    storage.record_frames(env.get_observations())
+    with pytest.raises(RuntimeError, match="once before each"):
+        storage.record_frames(env.get_observations())
+    with pytest.raises(ValueError, match="no observations"):
+        PerceptiveStorage(2, 4, ToyEnv(2, frames=False).get_observations(), ["policy"], 2, frames=True)
+
+
+@pytest.mark.parametrize(
+    ("steps", "period", "expected"), [(24, 5, 6), (1, 5, 1), (5, 5, 2), (6, 5, 2), (7, 1, 7)]
+)
+def test_most_windows_by_enumeration(steps, period, expected):
+    ticks = [{(offset + s) // period for s in range(steps)} for offset in range(period)]
+    assert max(map(len, ticks)) == max_windows(steps, period) == expected
+
+
+def test_paper_sizes():
+    shared, windows = point_cloud_bytes(4096, 24, 384, 10, 5)
+    assert windows == 4096 * 24 * 10 * 384 * 3 * 4 == 4_529_848_320
+    assert shared == 4096 * 15 * 384 * 3 * 4 == 283_115_520
+
+
+def test_measured_bytes_are_as_predicted_and_a_tenth_of_storing_windows():
+    env = ToyEnv(8)
+    obs = env.get_observations()
+    obs["frames"] = torch.zeros(8, 10, 48, 3)
+    storage = PerceptiveStorage(8, 24, obs, ["policy"], 2, frames=True, steps_per_frame=5)
+    buffers = [v for v in vars(storage).values() if isinstance(v, torch.Tensor)] + list(
+        storage.observations.values()
+    )
+    clouds = sum(b.untyped_storage().nbytes() for b in buffers if b.shape[-2:] == (48, 3))
+    shared, windows = point_cloud_bytes(8, 24, 48, 10, 5)
+    assert clouds == shared
+    assert clouds <= windows / 10

@@ -1,0 +1,131 @@
+"""A tiny deterministic environment with LiDAR frames, resets and time-outs, and configurations to train on
+it."""
+
+import functools
+
+import numpy as np
+import torch
+from rsl_rl.env import VecEnv
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from omniperception.perception import PdRiskNet
+
+HISTORY, POINTS, PERIOD = 4, 3, 5
+
+
+class ToyEnv(VecEnv):
+    """A point on a line: the action moves it, the reward is minus the distance to the origin.
+
+    Frames are derived from the position; one frame buffer is reused in place, so whoever keeps it without
+    copying sees later frames.
+    """
+
+    def __init__(self, num_envs=6, frames=True, episode=17, period=PERIOD, seed=0):
+        self.num_envs, self.num_actions, self.device, self.cfg = num_envs, 2, "cpu", {}
+        self.max_episode_length = episode
+        self.has_frames, self.period = frames, period
+        self.rng = np.random.default_rng(seed)
+        self.step_count = 0
+        self.tick = 0
+        self.position = torch.tensor(self.rng.normal(size=(num_envs, 2)), dtype=torch.float32)
+        self.episode_length_buf = torch.arange(num_envs) * 3 % episode
+        self.frames = torch.zeros(num_envs, HISTORY, POINTS, 3)
+        self.frame_count = torch.zeros(num_envs, 1, dtype=torch.long)
+
+    def get_observations(self):
+        groups = {
+            "policy": torch.cat([self.position, self.episode_length_buf.unsqueeze(1) / 10.0], -1),
+            "height_target": (self.position[:, :1] * torch.linspace(0.1, 0.5, 5)).clamp(-1, 1),
+        }
+        if self.has_frames:
+            groups["frames"] = self.frames
+            groups["frame_count"] = self.frame_count.clone()
+            groups["frame_tick"] = torch.full((self.num_envs, 1), self.tick)
+        return TensorDict(groups, batch_size=[self.num_envs])
+
+    def step(self, actions):
+        self.position = (self.position + 0.1 * actions.clamp(-1, 1)).clamp(-3, 3)
+        self.step_count += 1
+        self.episode_length_buf = self.episode_length_buf + 1
+        if self.step_count % self.period == 0:
+            self._new_frame()
+        fell = self.position.norm(dim=-1) > 2.5
+        time_outs = (self.episode_length_buf >= self.max_episode_length) & ~fell
+        rewards = -self.position.norm(dim=-1)
+        self._reset((fell | time_outs).nonzero().flatten())
+        extras = {"time_outs": time_outs.float(), "log": {"Metrics/distance": -rewards.mean()}}
+        return self.get_observations(), rewards, (fell | time_outs).long(), extras
+
+    def _new_frame(self):
+        self.tick += 1
+        self.frames[:, :-1] = self.frames[:, 1:].clone()
+        noise = torch.randn(self.num_envs, POINTS, 1) * 0.01  # torch's global generator
+        self.frames[:, -1] = (
+            torch.cat([self.position, torch.ones(self.num_envs, 1)], -1).unsqueeze(1) * 0.1 + noise
+        )
+        self.frame_count = (self.frame_count + 1).clamp(max=HISTORY)
+
+    def _reset(self, ids):
+        self.position[ids] = torch.tensor(self.rng.normal(size=(len(ids), 2)), dtype=torch.float32)
+        self.episode_length_buf[ids] = 0
+        self.frame_count[ids] = 0
+
+    def state_dict(self):
+        names = ("step_count", "tick", "position", "episode_length_buf", "frames", "frame_count")
+        return {
+            "rng": self.rng.bit_generator.state,
+            "array": np.arange(3),
+            **{n: getattr(self, n) for n in names},
+        }
+
+    def load_state_dict(self, state):
+        assert torch.equal(state["array"], torch.arange(3))
+        self.rng.bit_generator.state = state["rng"]
+        for name in ("step_count", "tick", "position", "episode_length_buf", "frames", "frame_count"):
+            setattr(self, name, state[name])
+
+
+def config(frames=True, **overrides):
+    """Runner configuration; keyword arguments replace top-level entries."""
+    gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5}
+    mlp = {"hidden_dims": [16], "activation": "elu", "obs_normalization": True}
+    actor = {"class_name": "rsl_rl.models:MLPModel", "distribution_cfg": gaussian, **mlp}
+    if frames:
+        actor |= {
+            "class_name": "omniperception.learning.models:PerceptionActor",
+            "perception": functools.partial(PdRiskNet, 2, 1, HISTORY, proximal_dim=5, distal_dim=3),
+            "height_loss_weight": 1.0,
+        }
+    return {
+        "num_steps_per_env": 8,
+        "save_interval": 100,
+        "steps_per_frame": PERIOD,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": actor,
+        "critic": {"class_name": "MLPModel", **mlp},
+        "algorithm": {
+            "class_name": "omniperception.learning.ppo:PerceptivePpo",
+            "num_learning_epochs": 2,
+            "num_mini_batches": 2,
+        },
+        **overrides,
+    }
+
+
+def rollout(env, storage, num_steps):
+    """Fill the storage; returns copies of the observations of every step."""
+    seen = []
+    obs = env.get_observations()
+    for step in range(num_steps):
+        seen.append(obs.clone())
+        storage.record_frames(obs)
+        transition = RolloutStorage.Transition()
+        transition.observations = obs
+        transition.actions = torch.randn(env.num_envs, 2)
+        transition.values = torch.full((env.num_envs, 1), float(step))
+        transition.actions_log_prob = torch.zeros(env.num_envs)
+        transition.distribution_params = (torch.zeros(env.num_envs, 2), torch.ones(env.num_envs, 2))
+        obs, transition.rewards, transition.dones, _ = env.step(transition.actions)
+        storage.add_transition(transition)
+    return seen
