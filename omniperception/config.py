@@ -70,7 +70,7 @@ def assemble(config: DictConfig) -> RunConfig:
             seed=composed["seed"],
             sampler=perception.sampler if perception else None,
             frame_history=perception.history if perception else 0,
-            height_target=bool(perception and perception.height_weight > 0),
+            targets=tuple(perception.supervision) if perception else (),
             log_interval=ppo.num_steps_per_env,
             **parts,
         )

@@ -10,9 +10,13 @@ import torch
 from omniperception.lidar import RayScene
 from omniperception.world.rays import HitClass, RayShapes
 
-COLOURS = {HitClass.TERRAIN: (0.60, 0.61, 0.62), HitClass.OBSTACLE: (0.82, 0.71, 0.50), HitClass.ROBOT: (0.10, 0.11, 0.14)}
+COLOURS = {
+    HitClass.TERRAIN: (0.60, 0.61, 0.62),
+    HitClass.OBSTACLE: (0.82, 0.68, 0.45),
+    HitClass.ROBOT: (0.13, 0.14, 0.18),
+}
 """Linear RGB reflectance by what a ray has met; the terrain's is that of the lighter squares."""
-DARK_SQUARES = 0.72
+DARK_SQUARES = 0.76
 SQUARE_M = 0.5
 PROXIMAL, DISTAL = (0.95, 0.09, 0.03), (0.02, 0.22, 0.95)
 """Linear RGB of the LiDAR's points above and below the split elevation."""
@@ -78,7 +82,7 @@ class Renderer:
         width: int = 640,
         height: int = 360,
         samples: int = 1,
-        fov_deg: float = 42.0,
+        fov_deg: float = 46.0,
         device: str | torch.device = "cpu",
         num_threads: int | None = None,
     ) -> None:
@@ -152,7 +156,8 @@ class Renderer:
         stretched: torch.Tensor,
         arrows: tuple[Arrow, ...],
     ) -> torch.Tensor:
-        albedo = albedo * (DARK_SQUARES + (1 - DARK_SQUARES) * _checkers(xy_w / SQUARE_M, stretched / SQUARE_M))[:, None]
+        board = _checkers(xy_w / SQUARE_M, stretched / SQUARE_M)[:, None]
+        albedo = albedo * (DARK_SQUARES + (1 - DARK_SQUARES) * board)
         for arrow in arrows:
             cover = (0.5 - _arrow_distance(xy_w, arrow) / footprint).clamp(0.0, 1.0)[:, None]
             albedo = albedo + cover * (_vector(arrow.colour, albedo.device) - albedo)

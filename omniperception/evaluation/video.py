@@ -18,7 +18,7 @@ from omniperception.world import ray_shapes
 from omniperception.world.rays import HitClass
 
 FPS = 25
-BEHIND_M, ABOVE_M, AHEAD_M = 2.9, 1.9, 0.7
+BEHIND_M, ABOVE_M, AHEAD_M = 2.4, 1.45, 1.0
 """Where the camera is with respect to the robot, and how far ahead of the robot it looks."""
 FOLLOW_S, TURN_S = 0.25, 0.9
 """Time constants with which the camera follows the robot's position and heading."""
@@ -47,7 +47,7 @@ class FollowCamera:
         self._heading = self._keep_heading * self._heading + (1 - self._keep_heading) * heading
         ahead = self._heading / self._heading.norm().clamp(min=1e-6)
         eye = torch.cat((self._pos - BEHIND_M * ahead, pos_w.new_tensor([ABOVE_M])))
-        target = torch.cat((self._pos + AHEAD_M * ahead, pos_w.new_tensor([0.15])))
+        target = torch.cat((self._pos + AHEAD_M * ahead, pos_w.new_tensor([0.2])))
         return eye, target
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from torch import nn
 
 from omniperception.perception import Sampler
+from omniperception.task.env import HEIGHT_TARGET, SECTOR_TARGET
 
 
 @dataclass(frozen=True)
@@ -19,18 +20,27 @@ class PerceptionConfig:
         network: makes the network that embeds a history of frames.
         history: LiDAR frames that the network sees.
         height_weight: weight of the height supervision in the loss; 0 leaves it out.
+        sector_weight: weight of the supervision with obstacle nearness by sector; 0, as in the paper, leaves it out.
     """
 
     sampler: Callable[[], Sampler]
     network: Callable[[], nn.Module]
     history: int
     height_weight: float
+    sector_weight: float
 
     def __post_init__(self) -> None:
         if self.history < 1:
             raise ValueError(f"perception.history={self.history} must be at least 1")
-        if self.height_weight < 0:
-            raise ValueError(f"perception.height_weight={self.height_weight} must not be negative")
+        for name in ("height_weight", "sector_weight"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"perception.{name}={getattr(self, name)} must not be negative")
+
+    @property
+    def supervision(self) -> dict[str, float]:
+        """Weight of each supervised target, by observation group."""
+        weights = {HEIGHT_TARGET: self.height_weight, SECTOR_TARGET: self.sector_weight}
+        return {target: weight for target, weight in weights.items() if weight > 0}
 
 
 @dataclass(frozen=True)
@@ -120,7 +130,7 @@ def runner_config(
     if perception is not None:
         actor["class_name"] = "omniperception.learning.models:PerceptionActor"
         actor["perception"] = perception.network
-        actor["height_loss_weight"] = perception.height_weight
+        actor["supervision"] = perception.supervision
     return {
         "num_steps_per_env": ppo.num_steps_per_env,
         "save_interval": ppo.save_interval,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from rsl_rl.models import MLPModel
@@ -12,11 +12,6 @@ from torch import nn
 
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
-
-HEIGHT_TARGET = "height_target"
-"""Observation group (N, 187) that the proximal embedding is regressed on: base height minus terrain height,
-metres."""
-
 
 class _AddLoss(torch.autograd.Function):
     """Identity on the features whose backward pass also starts that of an auxiliary loss, at unit scale."""
@@ -40,9 +35,10 @@ class PerceptionActor(MLPModel):
     :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the
     network's embedding of an empty history.
 
-    With ``height_loss_weight`` the mean squared error between ``perception.height_prediction`` and the
-    observation group ``height_target``, over the steps that have a frame, joins whatever loss is
-    back-propagated through the actor (paper, Sec. 3.3.1: privileged height supervision).
+    With ``supervision`` the mean squared error between the part of the embedding that the network sets aside
+    for a target (``perception.supervised``) and the observation group of that name, over the steps that have a
+    frame, joins whatever loss is back-propagated through the actor (paper, Sec. 3.3.1: privileged height
+    supervision).
     """
 
     def __init__(
@@ -52,7 +48,7 @@ class PerceptionActor(MLPModel):
         obs_set: str,
         output_dim: int,
         perception: PerceptionNetwork | Callable[[], PerceptionNetwork],
-        height_loss_weight: float = 0.0,
+        supervision: Mapping[str, float] | None = None,
         **mlp_options,
     ) -> None:
         """Build the actor.
@@ -63,28 +59,30 @@ class PerceptionActor(MLPModel):
             obs_set: this model's set; only one-dimensional groups, LiDAR frames are read besides.
             output_dim: number of actions.
             perception: the network, or a function without arguments that builds it.
-            height_loss_weight: weight of the height regression; 0 leaves it out.
+            supervision: weight of the regression on each privileged observation group; 0 leaves it out.
             mlp_options: ``hidden_dims``, ``activation``, ``obs_normalization`` (of the one-dimensional
                 groups) and ``distribution_cfg`` of rsl_rl's ``MLPModel``.
         """
         network = perception if isinstance(perception, nn.Module) else perception()
-        if height_loss_weight < 0.0:
-            raise ValueError(f"height_loss_weight must not be negative, got {height_loss_weight}")
+        supervision = {target: weight for target, weight in (supervision or {}).items() if weight != 0.0}
+        for target, weight in supervision.items():
+            if weight < 0.0:
+                raise ValueError(f"supervision: the weight of {target} must not be negative, got {weight}")
         self._feature_dim = network.feature_dim  # read by _get_latent_dim while the base class builds the MLP
         super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
         self.perception: PerceptionNetwork = network
-        self.height_loss_weight = height_loss_weight
-        if height_loss_weight > 0.0:
-            self._check_height_target(obs)
+        self.supervision = supervision
+        for target in supervision:
+            self._check_target(target, obs)
         self._cache_key: tuple | None = None
         self._cached = torch.empty(0)
         self._cached_empty = torch.empty(0)
-        self._height_losses: list[torch.Tensor] = []
+        self._losses: dict[str, list[torch.Tensor]] = {target: [] for target in supervision}
 
     @property
     def extra_groups(self) -> list[str]:
         """Observation groups that the actor's losses read besides its inputs."""
-        return [HEIGHT_TARGET] if self.height_loss_weight > 0.0 else []
+        return list(self.supervision)
 
     def get_latent(
         self,
@@ -99,13 +97,12 @@ class PerceptionActor(MLPModel):
             features = self._rollout_features(obs)
         return torch.cat([super().get_latent(obs, masks, hidden_state), features], dim=-1)
 
-    def pop_height_loss(self) -> float | None:
-        """Mean squared height error since the last call, square metres; ``None`` if there was none."""
-        if not self._height_losses:
-            return None
-        mean = torch.stack(self._height_losses).mean().item()
-        self._height_losses.clear()
-        return mean
+    def pop_supervised_losses(self) -> dict[str, float]:
+        """Mean squared error of each supervised target since the last call, without those never computed."""
+        means = {target: torch.stack(losses).mean().item() for target, losses in self._losses.items() if losses}
+        for losses in self._losses.values():
+            losses.clear()
+        return means
 
     def _get_latent_dim(self) -> int:
         return self.obs_dim + self._feature_dim
@@ -149,30 +146,32 @@ class PerceptionActor(MLPModel):
         )
 
     def _update_features(self, obs: WindowedObservations) -> torch.Tensor:
-        """(B, D) embeddings of a mini-batch's steps; starts the height loss if there is one."""
+        """(B, D) embeddings of a mini-batch's steps; starts the supervised losses if there are any."""
         windows = self.perception(obs.frames, obs.window_count).flatten(0, 1)  # (E W, D)
         table = torch.cat([windows, self._empty_features(obs.frames)])
         has_frame = obs.step_count > 0
         features = table[torch.where(has_frame, obs.step_window, windows.shape[0])]
-        if self.height_loss_weight > 0.0 and torch.is_grad_enabled():
-            error = self.perception.height_prediction(features) - obs[HEIGHT_TARGET]
-            per_step = error.square().mean(dim=-1) * has_frame
-            loss = per_step.sum() / has_frame.sum().clamp(min=1)
-            self._height_losses.append(loss.detach())
-            features = _AddLoss.apply(features, self.height_loss_weight * loss)
-        return features
+        if not self.supervision or not torch.is_grad_enabled():
+            return features
+        total = torch.zeros((), device=features.device)
+        for target, weight in self.supervision.items():
+            error = features[:, self.perception.supervised[target]] - obs[target]
+            loss = (error.square().mean(dim=-1) * has_frame).sum() / has_frame.sum().clamp(min=1)
+            self._losses[target].append(loss.detach())
+            total = total + weight * loss
+        return _AddLoss.apply(features, total)
 
-    def _check_height_target(self, obs: TensorDict) -> None:
-        prediction = self.perception.height_prediction(torch.zeros(1, self._feature_dim))
-        if prediction is None:
+    def _check_target(self, target: str, obs: TensorDict) -> None:
+        if target not in self.perception.supervised:
             raise ValueError(
-                f"{type(self.perception).__name__} predicts no heights; set height_loss_weight=0 or use"
-                " PD-RiskNet"
+                f"{type(self.perception).__name__} sets nothing aside for {target}; set its weight to 0, e.g."
+                " perception.height_weight=0, or use perception=pd_risknet"
             )
-        size = obs[HEIGHT_TARGET].shape[-1] if HEIGHT_TARGET in obs else 0
-        if size != prediction.shape[-1]:
+        part = self.perception.supervised[target]
+        expected = part.stop - part.start
+        size = obs[target].shape[-1] if target in obs else 0
+        if size != expected or part.stop > self._feature_dim:
             raise ValueError(
-                f"height_loss_weight={self.height_loss_weight} needs an observation '{HEIGHT_TARGET}' of"
-                f" {prediction.shape[-1]} values, the environment gives {size}; set the weight to 0 or"
-                " match the height grid"
+                f"supervision needs an observation '{target}' of {expected} values within the embedding's"
+                f" {self._feature_dim}, the environment gives {size}; set its weight to 0 or match the sizes"
             )

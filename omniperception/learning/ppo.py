@@ -80,13 +80,11 @@ class PerceptivePpo(PPO):
         return super().act(obs)
 
     def update(self) -> dict[str, float]:
-        """One PPO update; mean losses, among them ``height`` with height supervision."""
+        """One PPO update; mean losses, among them those of the supervised targets."""
         losses = super().update()
         self.num_updates += 1
         if isinstance(self._raw_actor, PerceptionActor):
-            height = self._raw_actor.pop_height_loss()
-            if height is not None:
-                losses["height"] = height
+            losses |= self._raw_actor.pop_supervised_losses()
         self._check_parameters()
         return losses
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import nn
@@ -11,6 +11,8 @@ from omniperception.perception.windows import WindowedGru, WindowedLinear
 
 FEATURE_DIM = 251
 """Size of PD-RiskNet's embedding, 187 + 64 (paper, App. PD-RiskNet Architecture); the ablations match it."""
+NUM_SECTORS = 36
+"""Azimuth sectors of obstacle nearness that an embedding can be regressed on."""
 
 
 class PerceptionNetwork(nn.Module):
@@ -20,11 +22,13 @@ class PerceptionNetwork(nn.Module):
         num_points: P, points per frame.
         history: H, frames per window.
         feature_dim: D, size of the embedding.
+        supervised: the part of the embedding that can be regressed on each privileged target.
     """
 
     num_points: int
     history: int
     feature_dim: int
+    supervised: Mapping[str, slice] = {"sector_target": slice(0, NUM_SECTORS)}
 
     def __init__(self, num_points: int, history: int, feature_dim: int = FEATURE_DIM) -> None:
         super().__init__()
@@ -48,10 +52,6 @@ class PerceptionNetwork(nn.Module):
             (B, W, D) embeddings.
         """
         raise NotImplementedError
-
-    def height_prediction(self, features: torch.Tensor) -> torch.Tensor | None:
-        """The part of ``features`` (..., D) to be regressed on the height grid; ``None`` if there is none."""
-        return None
 
 
 class FpsGru(PerceptionNetwork):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import torch
 
-from omniperception.perception.networks import PerceptionNetwork
+from omniperception.perception.networks import NUM_SECTORS, PerceptionNetwork
 from omniperception.perception.windows import WindowedGru
 
 
@@ -14,6 +14,7 @@ class PdRiskNet(PerceptionNetwork):
 
     One frame's sampled, sorted and flattened points are one time step. The proximal state itself is regressed
     on the height grid (17 x 11 = 187 values in -1..1, as a GRU's state), so supervision needs no extra layer.
+    Beyond the paper, the first 36 distal values can be regressed on the nearness of obstacles by sector.
     """
 
     def __init__(
@@ -38,14 +39,13 @@ class PdRiskNet(PerceptionNetwork):
         self.proximal_dim = proximal_dim
         self.proximal = WindowedGru(3 * num_proximal, proximal_dim, history)
         self.distal = WindowedGru(3 * num_distal, distal_dim, history)
+        self.supervised = {
+            "height_target": slice(0, proximal_dim),
+            "sector_target": slice(proximal_dim, proximal_dim + NUM_SECTORS),
+        }
 
     def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """See :meth:`PerceptionNetwork.forward`."""
         near = self.proximal(frames[:, :, : self.num_proximal].flatten(2), count)
         far = self.distal(frames[:, :, self.num_proximal :].flatten(2), count)
         return torch.cat([near, far], dim=-1)
-
-    def height_prediction(self, features: torch.Tensor) -> torch.Tensor:
-        """Proximal embedding (..., proximal_dim): base height minus terrain height on the grid, metres, in
-        -1..1."""
-        return features[..., : self.proximal_dim]

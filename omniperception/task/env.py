@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -25,6 +25,12 @@ from omniperception.task.timing import StageTimer
 from omniperception.world import ObstacleField, ObstaclesConfig, RobotConfig, TerrainConfig, build_world
 from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 
+HEIGHT_TARGET, SECTOR_TARGET = "height_target", "sector_target"
+"""Observation groups that a network can be supervised with: the height grid, and 1 - d / NEARNESS_RANGE by sector."""
+
+NEARNESS_RANGE = 4.0
+"""Distance (m) from which on an obstacle counts as not near at all."""
+
 MAX_ACTION = 100.0
 """Actions beyond this magnitude are clipped; a policy that gets here has diverged."""
 
@@ -40,7 +46,7 @@ class EnvConfig:
         lidar: the sensor, or None.
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
-        height_target: whether the network is supervised with heights.
+        targets: privileged groups that the network is supervised with; of HEIGHT_TARGET and SECTOR_TARGET.
         log_interval: control steps between two reports of the metrics.
         initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
     """
@@ -59,7 +65,7 @@ class EnvConfig:
     lidar: SensorConfig | None = None
     sampler: Callable | None = None
     frame_history: int = 0
-    height_target: bool = False
+    targets: Sequence[str] = ()
     log_interval: int = 24
     initial_obstacle_level: float | None = None
 
@@ -81,8 +87,10 @@ class EnvConfig:
     def fields_read(self) -> frozenset[str]:
         """Optional fields that some reward or observation of this task reads."""
         fields = self.rewards.fields_read() | self.observations.fields_read()
-        if self.height_target:
+        if HEIGHT_TARGET in self.targets:
             fields |= {"heights"}
+        if SECTOR_TARGET in self.targets:
+            fields |= {"sectors"}
         if self.obstacles.num_obstacles:
             fields |= {"obstacle_contact"}
         return fields
@@ -349,8 +357,10 @@ class OmniEnv(VecEnv):
             groups["frames"] = self.sensing.frames
             groups["frame_count"] = self.sensing.frame_count.clone()
             groups["frame_tick"] = self.sensing.frame_tick.clone()
-        if self.config.height_target:
-            groups["height_target"] = self.heights
+        if HEIGHT_TARGET in self.config.targets:
+            groups[HEIGHT_TARGET] = self.heights
+        if SECTOR_TARGET in self.config.targets:
+            groups[SECTOR_TARGET] = (1.0 - self.sensing.sector_distance / NEARNESS_RANGE).clamp(min=0.0)
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:

@@ -40,7 +40,7 @@ def test_only_the_robot_touches_ground_and_obstacles(mixed):
     rng = np.random.default_rng(0)
     for _ in range(20):
         data.qpos[7:] = rng.uniform(-1.5, 1.5, 12)
-        data.mocap_pos[:] = rng.uniform(-0.3, 0.3, (mixed.model.nmocap, 3)) + [0, 0, 0.1]
+        data.mocap_pos[:] = rng.uniform([-0.3, -0.3, -0.2], [0.3, 0.3, 0.4], (mixed.model.nmocap, 3))
         mujoco.mj_forward(mixed.model, data)
         assert contact_pairs(mixed, data) == {"GR", "OR"}
 

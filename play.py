@@ -1,0 +1,126 @@
+"""Replays a run: counts what its policy does in whole episodes and films it.
+
+python play.py run=latest [viewer=video|none] [episodes=200] [video_s=20] [overrides]
+
+Overrides change the run's own configuration, e.g. obstacles=static num_envs=64 seed=3. Obstacles are all there from
+the first step. Writes replay.json and, with viewer=video, replay.mp4 and replay.png into the run directory.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+from omniperception import config
+from omniperception.assembly import build_runner
+from omniperception.evaluation.episodes import Episodes, run_episodes, table
+from omniperception.learning import CheckpointError, latest_checkpoint
+
+ARGUMENTS = {"run": "latest", "viewer": "video", "episodes": "200", "video_s": "20"}
+VIEWERS = ("video", "none")
+LIBRARIES = ("omniperception", "torch", "mujoco", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What to replay and how.
+
+    Attributes:
+        run_dir: the run.
+        viewer: 'video' or 'none'.
+        episodes: at least so many episodes.
+        video_s: length of the video (s).
+        overrides: changes to the run's configuration.
+    """
+
+    run_dir: Path
+    viewer: str
+    episodes: int
+    video_s: float
+    overrides: tuple[str, ...]
+
+    @classmethod
+    def parse(cls, arguments: Sequence[str]) -> Replay:
+        """From the command line."""
+        own, overrides = config.split_arguments(arguments, ARGUMENTS)
+        if own["viewer"] not in VIEWERS:
+            raise config.ConfigError(f"viewer={own['viewer']} is unknown; known: {', '.join(VIEWERS)}")
+        episodes = _number("episodes", own["episodes"], int)
+        video_s = _number("video_s", own["video_s"], float)
+        return cls(config.find_run(own["run"]), own["viewer"], episodes, video_s, tuple(overrides))
+
+    def configuration(self) -> config.RunConfig:
+        """The run's configuration as it is replayed."""
+        composed = config.load(self.run_dir, self.overrides)
+        if not any(override.startswith("num_envs=") for override in self.overrides):
+            composed.num_envs = min(composed.num_envs, self.episodes)
+        run = config.assemble(composed)
+        return replace(run, env=replace(run.env, initial_obstacle_level=1.0))
+
+
+def play(replay: Replay) -> None:
+    """Runs the episodes, prints the table and writes the figures."""
+    run = replay.configuration()
+    checkpoint = latest_checkpoint(replay.run_dir)
+    runner = build_runner(run, None)
+    runner.load(str(checkpoint), load_cfg={"actor": True})
+    policy = runner.get_inference_policy(str(runner.env.device))
+    if replay.viewer == "video":
+        episodes = _film(replay, runner.env, policy)
+    else:
+        episodes = run_episodes(runner.env, policy, replay.episodes)
+    summary = episodes.summary()
+    print(f"{checkpoint} in {run.env.num_envs} environments, seed {run.env.seed}")
+    print(table(summary))
+    report = {
+        "checkpoint": checkpoint.name,
+        "overrides": list(replay.overrides),
+        "seed": run.env.seed,
+        "num_envs": run.env.num_envs,
+        **summary,
+        "machine": {"cpu": platform.machine(), "system": platform.system(), "device": str(runner.env.device)},
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+    }
+    (replay.run_dir / "replay.json").write_text(json.dumps(report, indent=2) + "\n")
+    written = ["replay.json"] + (["replay.mp4", "replay.png"] if replay.viewer == "video" else [])
+    print(f"wrote {', '.join(str(replay.run_dir / name) for name in written)}")
+
+
+def _film(replay: Replay, env, policy) -> Episodes:
+    """Runs the episodes and films the first environment; the only user of the video modules."""
+    from omniperception.evaluation.video import Recorder
+
+    recorder = Recorder(env, replay.run_dir / "replay.mp4", replay.video_s)
+    try:
+        episodes = run_episodes(env, policy, replay.episodes, on_step=recorder)
+    finally:
+        recorder.close()
+    recorder.write_still(replay.run_dir / "replay.png")
+    return episodes
+
+
+def _number(key: str, text: str, kind: type) -> float:
+    try:
+        value = kind(text)
+    except ValueError:
+        value = 0
+    if not 0 < value < float("inf"):
+        raise config.ConfigError(f"{key}={text} must be a positive {'whole ' if kind is int else ''}number")
+    return value
+
+
+def main() -> None:
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        print(__doc__)
+        return
+    with config.one_line_errors(CheckpointError):
+        play(Replay.parse(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()
