@@ -2,8 +2,9 @@
 
 python play.py run=latest [viewer=video|none] [episodes=200] [video_s=20] [overrides]
 
-Overrides change the run's own configuration, e.g. obstacles=static num_envs=64 seed=3. Obstacles are all there from
-the first step. Writes replay.json and, with viewer=video, replay.mp4 and replay.png into the run directory.
+Overrides change the run's own configuration, e.g. obstacles=static num_envs=64 seed=3. Obstacles are all
+there from the first step. Writes replay.json and, with viewer=video, replay.mp4 and replay.png into the run
+directory.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.assembly import build_runner
-from omniperception.evaluation.episodes import Episodes, run_episodes, table
+from omniperception.evaluation.episodes import Episodes, Policy, run_episodes, table
 from omniperception.learning import CheckpointError, latest_checkpoint
+from omniperception.task.env import OmniEnv
 
 ARGUMENTS = {"run": "latest", "viewer": "video", "episodes": "200", "video_s": "20"}
 VIEWERS = ("video", "none")
@@ -91,7 +93,7 @@ def play(replay: Replay) -> None:
     print(f"wrote {', '.join(str(replay.run_dir / name) for name in written)}")
 
 
-def _film(replay: Replay, env, policy) -> Episodes:
+def _film(replay: Replay, env: OmniEnv, policy: Policy) -> Episodes:
     """Runs the episodes and films the first environment; the only user of the video modules."""
     from omniperception.evaluation.video import Recorder
 

@@ -32,7 +32,8 @@ class Episodes:
         yaw_rate_error: mean error of the yaw rate (rad/s).
         has_goal: whether the commands lead to a goal.
         per_env: episodes of each environment.
-        us_per_env_step: wall time by stage in microseconds per environment and control step; `policy` is the network.
+        us_per_env_step: wall time by stage in microseconds per environment and control step; `policy` is the
+            network.
     """
 
     length_s: torch.Tensor
@@ -60,7 +61,7 @@ class Episodes:
 
     @property
     def success(self) -> torch.Tensor:
-        """(num_episodes,) bool: the goal was reached or, without a goal, the time limit. Touches do not count."""
+        """(num_episodes,) bool: reached the goal or, without a goal, the time limit. Touches do not count."""
         return self.ended("goal" if self.has_goal else "time_out")
 
     def summary(self) -> dict:
@@ -94,8 +95,8 @@ def run_episodes(
 ) -> Episodes:
     """Runs the first ceil(num_episodes / num_envs) episodes of every environment.
 
-    Taking equally many episodes from each environment keeps short ones from being over-represented, as they would
-    be among the first to finish.
+    Taking equally many episodes from each environment keeps short ones from being over-represented, as they
+    would be among the first to finish.
 
     Args:
         env: freshly built: every environment at the start of an episode.
@@ -106,7 +107,7 @@ def run_episodes(
     if num_episodes < 1:
         raise ValueError(f"episodes={num_episodes} must be at least 1")
     if bool(env.episode_length_buf.any()):
-        raise ValueError("run_episodes needs a freshly built environment; this one is in the middle of episodes")
+        raise ValueError("run_episodes needs a freshly built environment; this one has already been stepped")
     tally = _Tally(env, math.ceil(num_episodes / env.num_envs))
     clock = _StageClock(env)
     with torch.no_grad():
@@ -130,7 +131,9 @@ def table(summary: dict) -> str:
         if summary[key] is not None:
             lines.append(f"  {label:<28}{summary[key]:8.3f} {unit}")
     times = sorted(summary["us_per_env_step"].items(), key=lambda item: -item[1])
-    lines.append("  time per environment step    " + ", ".join(f"{name} {spent:.1f}" for name, spent in times) + " us")
+    lines.append(
+        "  time per environment step    " + ", ".join(f"{name} {spent:.1f}" for name, spent in times) + " us"
+    )
     return "\n".join(lines)
 
 
@@ -165,12 +168,21 @@ class _Tally:
         self._knows_free = env.free is not None
         free = env.free if env.free is not None else torch.zeros_like(env.done)
         began = env.contacts & ~self._was_touching
-        step = (torch.ones_like(free), env.velocity_error, env.yaw_rate_error, free, env.velocity_error * free, began)
+        step = (
+            torch.ones_like(free),
+            env.velocity_error,
+            env.yaw_rate_error,
+            free,
+            env.velocity_error * free,
+            began,
+        )
         self._sums += torch.stack([value.double() for value in step], 1)
         filed = (env.done & (self._index < self._per_env)).nonzero().flatten()
         slot = self._index[filed]
         self._filed[filed, slot] = self._sums[filed]
-        self._outcome[filed, slot] = torch.stack([env.outcomes[name] for name in OUTCOMES], 1)[filed].int().argmax(1)
+        self._outcome[filed, slot] = (
+            torch.stack([env.outcomes[name] for name in OUTCOMES], 1)[filed].int().argmax(1)
+        )
         self._index += env.done
         self._sums *= ~env.done[:, None]
         self._was_touching = env.contacts & ~env.done

@@ -24,6 +24,8 @@ COMMAND, VELOCITY = (0.05, 0.55, 0.16), (0.98, 0.80, 0.05)
 """Linear RGB of the arrows of the commanded and of the actual velocity."""
 HORIZON, ZENITH = (0.78, 0.85, 0.92), (0.22, 0.42, 0.72)
 SUN, SKY_LIGHT, GROUND_LIGHT = (0.88, 0.83, 0.74), (0.34, 0.38, 0.44), (0.20, 0.19, 0.17)
+CAMERA_LIGHT = 0.36
+"""Light from the camera that gives form to what the sun does not reach; none on level ground."""
 TO_SUN = (-0.42, 0.46, 0.78)
 FOG_M = 28.0
 """Distance (m) at which the ground has faded to 1/e into the horizon."""
@@ -138,15 +140,17 @@ class Renderer:
         ground = (classes == HitClass.TERRAIN).nonzero().flatten()
         footprint = ranges[ground] / self._focal
         stretched = footprint / rays[ground, 2].abs().clamp(min=1e-3)
-        albedo[ground] = self._paint_ground(albedo[ground], points[ground, :2], footprint, stretched, view.arrows)
+        albedo[ground] = self._paint_ground(
+            albedo[ground], points[ground, :2], footprint, stretched, view.arrows
+        )
         facing = normals @ self._to_sun
         light = facing.clamp(min=0.0) * ~self._shadowed(points, normals, (classes >= 0) & (facing > 0))
         up = (0.5 + 0.5 * normals[:, 2:]).clamp(0.0, 1.0)
-        device = rays.device
-        ambient = _vector(GROUND_LIGHT, device) + up * (_vector(SKY_LIGHT, device) - _vector(GROUND_LIGHT, device))
-        colour = albedo * (light[:, None] * _vector(SUN, device) + ambient)
+        fill = CAMERA_LIGHT * (normals * rays).sum(1, keepdim=True).neg().clamp(min=0.0) * (1.0 - up)
+        sun, sky, earth, horizon = (_vector(c, rays.device) for c in (SUN, SKY_LIGHT, GROUND_LIGHT, HORIZON))
+        colour = albedo * (light[:, None] * sun + earth + up * (sky - earth) + fill)
         clear = torch.where(classes >= 0, torch.exp(-((ranges / FOG_M) ** 2)), 0.0)[:, None]
-        return ranges, classes, colour * clear + _vector(HORIZON, device) * (1 - clear)
+        return ranges, classes, colour * clear + horizon * (1 - clear)
 
     def _paint_ground(
         self,
@@ -178,7 +182,9 @@ class Renderer:
         shadowed[ids] = hits.shape_id.flatten() >= 0
         return shadowed
 
-    def _draw_points(self, colour: torch.Tensor, ranges: torch.Tensor, view: View, axes: torch.Tensor) -> None:
+    def _draw_points(
+        self, colour: torch.Tensor, ranges: torch.Tensor, view: View, axes: torch.Tensor
+    ) -> None:
         """Draws the LiDAR points that nothing hides, nearer ones over farther ones."""
         offset = view.points_w - view.eye_w
         distance = offset.norm(dim=1)

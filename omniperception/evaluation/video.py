@@ -59,7 +59,13 @@ class Recorder:
     """
 
     def __init__(
-        self, env: OmniEnv, path: Path, duration_s: float, width: int = 640, height: int = 360, env_id: int = 0
+        self,
+        env: OmniEnv,
+        path: Path,
+        duration_s: float,
+        width: int = 640,
+        height: int = 360,
+        env_id: int = 0,
     ) -> None:
         """
         Args:
@@ -78,14 +84,13 @@ class Recorder:
         self._steps = 0
         self._shapes = ray_shapes(env.world)
         self._base = self._shapes.bodies.index(env.world.base_body)
-        self._threads = env.config.sim.num_threads or None
-        self._renderer = Renderer(self._shapes, width, height, device=env.device, num_threads=self._threads)
+        self._renderer = self._build_renderer(1, samples=1)
         self._camera = FollowCamera(dt)
         self._split = _split_elevation(env)
         self._blind_until = 0
         self._best: tuple[float, View] | None = None
         self._writer = imageio_ffmpeg.write_frames(
-            str(path), (width, height), fps=1 / dt, codec="libx264", quality=7, macro_block_size=2
+            str(path), (width, height), fps=1 / dt, codec="libx264", quality=6, macro_block_size=2
         )
         self._writer.send(None)
 
@@ -111,11 +116,12 @@ class Recorder:
         """Writes the most telling moment so far as a PNG, `scale` times the video's size."""
         if self._best is None:
             return
-        width, height = self._size
-        renderer = Renderer(
-            self._shapes, scale * width, scale * height, samples=2, device=self._env.device, num_threads=self._threads
-        )
-        write_png(path, renderer.render(self._best[1]))
+        write_png(path, self._build_renderer(scale, samples=2).render(self._best[1]))
+
+    def _build_renderer(self, scale: int, samples: int) -> Renderer:
+        width, height = (scale * pixels for pixels in self._size)
+        threads = self._env.config.sim.num_threads or None
+        return Renderer(self._shapes, width, height, samples, device=self._env.device, num_threads=threads)
 
     def _view(self) -> View:
         env, state = self._env, self._env.kinematics
@@ -129,10 +135,12 @@ class Recorder:
             vector = rotate_yaw(yaw[None], velocity[self._id, None])[0]
             if float(vector.norm()) >= MIN_ARROW:
                 arrows.append(Arrow(base[:2].clone(), vector, width, colour))
-        return View(eye, target, pos[self._id].clone(), quat[self._id].clone(), points, proximal, tuple(arrows))
+        return View(
+            eye, target, pos[self._id].clone(), quat[self._id].clone(), points, proximal, tuple(arrows)
+        )
 
     def _points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Points (P, 3) (m, environment frame) of the newest frame, and which are proximal; none before a frame."""
+        """Points (P, 3) (m, environment frame) of the episode's newest frame, and which are proximal."""
         sensing, device = self._env.sensing, self._env.device
         if sensing is None or sensing.frame is None or sensing.tick < self._blind_until:
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
@@ -140,14 +148,17 @@ class Recorder:
         hit = frame.ranges[self._id].isfinite()
         points_s = frame.directions_s[self._id, hit] * frame.ranges[self._id, hit, None]
         points_b = _rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
-        at, turned = sensing.scene.body_pos[self._id, self._base], sensing.scene.body_quat[self._id, self._base]
+        at, turned = (
+            sensing.scene.body_pos[self._id, self._base],
+            sensing.scene.body_quat[self._id, self._base],
+        )
         return _rotate(turned, points_b) + at, frame.elevation[self._id, hit] > self._split
 
     def _interest(self) -> float:
-        """How much there is to see: the robot walks, and its LiDAR sees obstacles."""
+        """How much there is to see: the robot walks ahead, and its LiDAR sees obstacles."""
         env = self._env
-        speed = float(env.kinematics.base_lin_vel_yaw[self._id].norm())
-        value = min(speed, 0.8) + float(env.episode_length_buf[self._id] * env.control_dt > 2.0)
+        speed = float(env.kinematics.base_lin_vel_yaw[self._id, 0])
+        value = min(max(speed, 0.0), 0.8) + float(env.episode_length_buf[self._id] * env.control_dt > 2.0)
         if env.sensing is not None and env.sensing.frame is not None:
             seen = float((env.sensing.frame.class_id[self._id] == HitClass.OBSTACLE).float().mean())
             value += min(10.0 * seen, 1.0)
@@ -157,7 +168,9 @@ class Recorder:
 def write_png(path: Path, image: torch.Tensor) -> None:
     """Writes an image (height, width, 3) uint8 as a PNG."""
     height, width, _ = image.shape
-    lines = torch.cat((torch.zeros(height, 1, dtype=torch.uint8), image.flatten(1)), 1)  # 0: an unfiltered line
+    lines = torch.cat(
+        (torch.zeros(height, 1, dtype=torch.uint8), image.flatten(1)), 1
+    )  # 0: an unfiltered line
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     parts = (b"IHDR", header), (b"IDAT", zlib.compress(lines.numpy().tobytes(), 9)), (b"IEND", b"")
     chunks = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts)

@@ -93,8 +93,7 @@ class CompactLogger(Logger):
                 f"reward {statistics.mean(self.rewbuffer):.3f}, length {statistics.mean(self.lenbuffer):.0f}"
             )
         parts.append(f"value {losses['value']:.3g}")
-        if "height" in losses:
-            parts.append(f"height {losses['height']:.3g}")
+        parts += [f"{name} {value:.3g}" for name, value in losses.items() if name.endswith("_target")]
         parts += [f"{name} {value:.3g}" for name, value in metrics.items()]
         remaining = datetime.timedelta(seconds=round(statistics.mean(self._recent) * (total - done)))
         return " | ".join([*parts, f"ETA {remaining}"])

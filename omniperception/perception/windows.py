@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 
@@ -44,24 +45,67 @@ class WindowedGru(nn.GRU):
 
     def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """Frames (B, F, input_size) and count (B, W) -> last hidden states (B, W, hidden_size)."""
-        num_windows = window_count(frames, count, self.history)
+        window_count(frames, count, self.history)
         projected = functional.linear(frames, self.weight_ih_l0, self.bias_ih_l0)  # (B, F, 3 hidden)
         valid = valid_frames(count, self.history).unsqueeze(-1)  # (B, W, H, 1)
-        state = projected.new_zeros(frames.shape[0], num_windows, self.hidden_size)
-        for k in range(self.history):
-            recurrent = functional.linear(state, self.weight_hh_l0, self.bias_hh_l0)
-            next_state = _gru_cell(projected[:, k : k + num_windows], recurrent, state)
-            state = torch.where(valid[:, :, k], next_state, state)
+        return _UnrolledGru.apply(projected, valid, self.weight_hh_l0, self.bias_hh_l0)
+
+
+class _UnrolledGru(torch.autograd.Function):
+    """The recurrent steps over all windows, with the backward pass written out.
+
+    Autograd would make three times as many small operations and accumulate the weights' gradient step by step; here it
+    is one matrix product over all steps. Gate order is PyTorch's: reset, update, new.
+    """
+
+    @staticmethod
+    def forward(
+        ctx, projected: torch.Tensor, valid: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
+    ) -> torch.Tensor:
+        """(B, F, 3 h), (B, W, H, 1) bool, (3 h, h), (3 h,) -> last states (B, W, h)."""
+        batch, windows, history, _ = valid.shape
+        hidden = weight.shape[1]
+        keep = any(ctx.needs_input_grad)
+        state = projected.new_zeros(batch, windows, hidden)
+        saved = []
+        for k in range(history):
+            from_frame = projected[:, k : k + windows]
+            recurrent = functional.linear(state, weight, bias)
+            gates = (from_frame[..., : 2 * hidden] + recurrent[..., : 2 * hidden]).sigmoid_()
+            reset, update = gates.split(hidden, dim=-1)
+            recurrent_new = recurrent[..., 2 * hidden :]
+            new = torch.addcmul(from_frame[..., 2 * hidden :], reset, recurrent_new).tanh_()
+            if keep:
+                saved.append((state, gates, new, recurrent_new))
+            state = torch.where(valid[:, :, k], torch.lerp(new, state, update), state)
+        if keep:
+            ctx.save_for_backward(valid, weight, *(tensor for step in saved for tensor in step))
+            ctx.num_frames = projected.shape[1]
         return state
 
-
-def _gru_cell(projected: torch.Tensor, recurrent: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
-    """One GRU step from both projections (..., 3 hidden) in PyTorch's gate order: reset, update, new."""
-    hidden = state.shape[-1]
-    gates = torch.sigmoid(projected[..., : 2 * hidden] + recurrent[..., : 2 * hidden])
-    reset, update = gates.split(hidden, dim=-1)
-    candidate = torch.tanh(projected[..., 2 * hidden :] + reset * recurrent[..., 2 * hidden :])
-    return torch.lerp(candidate, state, update)
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        valid, weight, *saved = ctx.saved_tensors
+        batch, windows, history, _ = valid.shape
+        hidden = weight.shape[1]
+        d_projected = gradient.new_zeros(batch, ctx.num_frames, 3 * hidden)
+        d_recurrent = gradient.new_empty(history, batch, windows, 3 * hidden)
+        for k in reversed(range(history)):
+            state, gates, new, recurrent_new = saved[4 * k : 4 * k + 4]
+            reset, update = gates.split(hidden, dim=-1)
+            d_state = gradient * valid[:, :, k]
+            d_update = d_state * (state - new)
+            d_new = (d_state - d_state * update).mul_(1.0 - new * new)
+            d_gates = torch.cat((d_new * recurrent_new, d_update), -1).mul_(gates).mul_(1.0 - gates)
+            d_recurrent[k, ..., : 2 * hidden] = d_gates
+            torch.mul(d_new, reset, out=d_recurrent[k, ..., 2 * hidden :])
+            d_projected[:, k : k + windows, : 2 * hidden] += d_gates
+            d_projected[:, k : k + windows, 2 * hidden :] += d_new
+            gradient = gradient - d_state + d_state * update + d_recurrent[k] @ weight
+        states = torch.stack(saved[0::4]).flatten(0, 2)
+        flat = d_recurrent.flatten(0, 2)
+        return d_projected, None, flat.t() @ states, flat.sum(0)
 
 
 class WindowedLinear(nn.Module):

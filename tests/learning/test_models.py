@@ -110,7 +110,7 @@ def height_case(weight):
     torch.manual_seed(5)
     env = ToyEnv(5, episode=11)
     advance(env, 7)
-    actor = actor_for(env, height_loss_weight=weight)
+    actor = actor_for(env, supervision={"height_target": weight})
     storage = PerceptiveStorage(5, 9, env.get_observations(), ["policy", "height_target"], 2, frames=True)
     rollout(env, storage, 9)
     torch.manual_seed(6)
@@ -133,8 +133,8 @@ def test_height_loss_joins_the_backward_pass_at_unit_scale(weight):
     assert 0 < valid.sum() < len(valid)
     for a, b in zip(got, expected, strict=True):
         assert torch.allclose(a, b, rtol=1e-4, atol=1e-7)
-    assert actor.pop_height_loss() == pytest.approx(height.item(), rel=1e-5)
-    assert actor.pop_height_loss() is None
+    assert actor.pop_supervised_losses() == {"height_target": pytest.approx(height.item(), rel=1e-5)}
+    assert actor.pop_supervised_losses() == {}
 
 
 def test_height_loss_learns_the_heights():
@@ -145,7 +145,7 @@ def test_height_loss_learns_the_heights():
         optimizer.zero_grad()
         (0.0 * actor(obs).sum()).backward()
         optimizer.step()
-        losses.append(actor.pop_height_loss())
+        losses.append(actor.pop_supervised_losses()["height_target"])
     assert losses[-1] < 0.2 * losses[0]
 
 
@@ -153,15 +153,15 @@ def test_no_step_with_a_frame_gives_zero_height_loss():
     actor, obs = height_case(1.0)
     obs.step_count.zero_()
     actor(obs).sum().backward()
-    assert actor.pop_height_loss() == 0.0
+    assert actor.pop_supervised_losses() == {"height_target": 0.0}
     assert all(torch.isfinite(p.grad).all() for p in actor.parameters() if p.grad is not None)
 
 
 def test_height_supervision_needs_a_predictor_and_a_fitting_target():
     env = ToyEnv(3)
-    with pytest.raises(ValueError, match="predicts no heights"):
-        actor_for(env, "mlp", height_loss_weight=1.0)
+    with pytest.raises(ValueError, match="sets nothing aside for height_target"):
+        actor_for(env, "mlp", supervision={"height_target": 1.0})
     obs = env.get_observations()
     obs["height_target"] = torch.zeros(3, 7)
-    with pytest.raises(ValueError, match="of 5 values, the environment gives 7"):
-        PerceptionActor(obs, {"actor": ["policy"]}, "actor", 2, NETWORKS["pd"], 1.0, hidden_dims=[8])
+    with pytest.raises(ValueError, match="of 5 values within the embedding's 8, the environment gives 7"):
+        PerceptionActor(obs, {"actor": ["policy"]}, "actor", 2, NETWORKS["pd"], {"height_target": 1.0}, hidden_dims=[8])

@@ -55,7 +55,7 @@ def test_update_with_frames(num_envs):
     for _ in range(3):
         collect(alg, env, 8)
         losses = alg.update()
-    assert losses["height"] > 0 and all(torch.isfinite(torch.tensor(v)) for v in losses.values())
+    assert losses["height_target"] > 0 and all(torch.isfinite(torch.tensor(v)) for v in losses.values())
     assert all((a != b).any() for a, b in zip(before, alg.actor.perception.parameters(), strict=True))
 
 

@@ -169,7 +169,7 @@ class TestLearn:
         lines = capsys.readouterr().out.strip().splitlines()
         assert len(lines) == 3
         assert lines[2].startswith("3/3 | ")
-        for part in ("steps/s", "collect", "learn", "reward", "length", "height", "distance", "ETA"):
+        for part in ("steps/s", "collect", "learn", "reward", "length", "height_target", "distance", "ETA"):
             assert part in lines[2]
 
     def test_scalars_are_those_of_rsl_rl(self, tmp_path):
@@ -182,7 +182,7 @@ class TestLearn:
         assert {
             "Loss/value",
             "Loss/surrogate",
-            "Loss/height",
+            "Loss/height_target",
             "Loss/learning_rate",
             "Policy/mean_std",
             "Perf/total_fps",
@@ -190,7 +190,7 @@ class TestLearn:
             "Train/mean_episode_length",
             "Metrics/distance",
         } <= tags
-        assert [e.step for e in events.Scalars("Loss/height")] == [0, 1, 2]
+        assert [e.step for e in events.Scalars("Loss/height_target")] == [0, 1, 2]
         assert not (tmp_path / "git").exists()
 
     def test_without_a_run_directory_nothing_is_written(self, tmp_path, capsys, monkeypatch):

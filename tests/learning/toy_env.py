@@ -95,7 +95,7 @@ def config(frames=True, **overrides):
         actor |= {
             "class_name": "omniperception.learning.models:PerceptionActor",
             "perception": functools.partial(PdRiskNet, 2, 1, HISTORY, proximal_dim=5, distal_dim=3),
-            "height_loss_weight": 1.0,
+            "supervision": {"height_target": 1.0},
         }
     return {
         "num_steps_per_env": 8,

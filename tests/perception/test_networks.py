@@ -75,7 +75,7 @@ def test_pd_risknet_splits_the_points():
     near = gru_by_window(plain_gru(network.proximal), frames[:, :, :4], count)
     far = gru_by_window(plain_gru(network.distal), frames[:, :, 4:], count)
     assert torch.allclose(got, torch.cat([near, far], -1), atol=1e-5)
-    assert torch.equal(network.height_prediction(got), got[..., :5])
+    assert network.supervised["height_target"] == slice(0, 5)  # the proximal half
 
 
 def test_paper_dimensions():
@@ -84,7 +84,8 @@ def test_paper_dimensions():
     with torch.no_grad():
         features = network(torch.zeros(2, 10, 384, 3), torch.tensor([[0], [10]]))
     assert features.shape == (2, 1, 251)
-    assert network.height_prediction(features).shape == (2, 1, 187)
+    assert features[..., network.supervised["height_target"]].shape == (2, 1, 187)
+    assert network.supervised["sector_target"] == slice(187, 223)  # within the distal half
     assert (features[0] == 0).all()
 
 
@@ -107,7 +108,7 @@ def test_windowed_linear_equals_linear_on_each_window():
 def test_ablations_share_the_interface(network):
     frames = sequence()
     full = network(frames, counts())
-    assert full.shape == (B, W, 9) and network.height_prediction(full) is None
+    assert full.shape == (B, W, 9) and "height_target" not in network.supervised
     for w in range(W):  # a window by itself gives the same
         alone = network(frames[:, w : w + H], counts()[:, w : w + 1])
         assert torch.allclose(alone[:, 0], full[:, w], atol=1e-6)

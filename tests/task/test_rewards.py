@@ -86,10 +86,10 @@ class TestAvoidanceVelocity:
         expected = tensor([-half, -half], [half, -half], [half, half], [-half, half])
         torch.testing.assert_close(bearings, expected)
 
-    @pytest.mark.parametrize("wrong", [{"alpha": 0.0}, {"threshold": -1.0}, {"num_sectors": 0}, {"max_speed": 0.0}])
-    def test_wrong_settings_are_refused(self, wrong):
-        with pytest.raises(ValueError, match=rf"rewards\.avoidance\.{next(iter(wrong))}="):
-            AvoidanceConfig(**{"num_sectors": 36, "threshold": 1.0, "alpha": 1.0, **wrong})
+    @pytest.mark.parametrize("key", ["alpha", "threshold", "num_sectors", "max_speed"])
+    def test_wrong_settings_are_refused(self, key):
+        with pytest.raises(ValueError, match=rf"rewards\.avoidance\.{key}=0"):
+            AvoidanceConfig(**{"num_sectors": 36, "threshold": 1.0, "alpha": 1.0, key: 0})
 
 
 class TestTerms:

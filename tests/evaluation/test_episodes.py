@@ -1,0 +1,121 @@
+"""Which episodes are counted and what is recorded of them, on the real environment."""
+
+import pytest
+import torch
+
+from omniperception.evaluation import run_episodes
+from omniperception.evaluation.episodes import table
+from omniperception.task.metrics import OUTCOMES
+
+SHORT = "terminations.episode_length_s=0.4"  # 20 control steps
+BLIND = ("lidar=none", "obstacles=none", "rewards=walk", "observations=walk")
+
+
+def stand(observations):
+    return torch.zeros(len(observations), 12)
+
+
+def fling(observations):
+    """Even environments stand, odd ones throw themselves over."""
+    actions = torch.zeros(len(observations), 12)
+    actions[1::2, 1::3], actions[1::2, 2::3] = 8.0, -8.0
+    return actions
+
+
+def test_every_environment_gives_equally_many_episodes(make_env):
+    env = make_env(*BLIND, SHORT, "num_envs=4")
+    steps = []
+    episodes = run_episodes(env, stand, 6, on_step=lambda: steps.append(int(env.done.sum())))
+    assert len(episodes) == 8 and episodes.per_env == 2
+    assert len(steps) == 40 and sum(steps) == 8
+    assert episodes.ended("time_out").all() and episodes.success.all()
+    assert torch.allclose(episodes.length_s, torch.full((8,), 0.4, dtype=torch.float64))
+
+
+def test_short_episodes_are_not_over_represented(make_env):
+    env = make_env(
+        *BLIND, "terminations.episode_length_s=2.0", "terminations.min_base_height=0.25", "num_envs=4"
+    )
+    ends = torch.zeros(4, dtype=torch.int64)
+    episodes = run_episodes(env, fling, 8, on_step=lambda: ends.add_(env.done))
+    fell = episodes.ended("fall").reshape(4, 2)
+    assert fell[1::2].all() and not fell[::2].any()
+    assert ends[1] > 2 and len(episodes) == 8  # later falls of the same environment are not counted
+    assert episodes.summary()["rates"]["fall"]["count"] == 4
+
+
+def test_errors_are_means_over_the_steps_of_the_episode(make_env):
+    env = make_env(*BLIND, SHORT, "num_envs=4")
+    velocity, yaw_rate = [], []
+
+    def keep():
+        velocity.append(env.velocity_error.clone())
+        yaw_rate.append(env.yaw_rate_error.clone())
+
+    episodes = run_episodes(env, stand, 8, on_step=keep)
+    by_episode = torch.stack(velocity).reshape(2, 20, 4).mean(1).T.flatten().double()
+    assert torch.allclose(episodes.velocity_error, by_episode, atol=1e-6)
+    by_episode = torch.stack(yaw_rate).reshape(2, 20, 4).mean(1).T.flatten().double()
+    assert torch.allclose(episodes.yaw_rate_error, by_episode, atol=1e-6)
+    assert episodes.free_velocity_error is None and episodes.summary()["free_velocity_error_m_s"] is None
+
+
+def test_contacts_are_counted_when_they_begin(make_env):
+    env = make_env("obstacles=moving", SHORT, "num_envs=4")
+    # an obstacle on the robot of environment 2 from the first step; the last step of an episode counts, too
+    touched = torch.zeros(4, dtype=torch.bool)
+
+    def put_on_robot(observations):
+        step = int(env.episode_length_buf[2])
+        far, here = torch.tensor([50.0, 50.0]), env.kinematics.base_pos_w[2, :2]
+        env.obstacles.velocity_w[2] = 0.0
+        env.obstacles.pos_w[2, :, :2] = far.double()
+        env.obstacles.pos_w[2, 0, :2] = here.double() if step in (5, 6, 19) else far.double()
+        return torch.zeros(4, 12)
+
+    env.obstacles.advance = lambda dt, xy: None  # the test moves them
+    episodes = run_episodes(env, put_on_robot, 4, on_step=lambda: touched.logical_or_(env.contacts))
+    assert episodes.contacts[2] == 2 and episodes.collided[2] and touched[2]
+    assert episodes.ended("time_out")[2] and episodes.success[2]
+
+
+def test_time_with_nothing_near_excludes_the_moments_with_an_obstacle(make_env):
+    env = make_env("obstacles=moving", SHORT, "num_envs=4")
+    free = []
+    episodes = run_episodes(env, stand, 4, on_step=lambda: free.append(env.free.clone()))
+    assert torch.allclose(episodes.free_s, torch.stack(free).sum(0).double() * env.control_dt)
+
+
+def test_goals_are_successes_of_goal_commands(make_env):
+    goal = ("commands=corridor", "commands.spawn.x=[-0.5,-0.5]", "commands.goal_x=-0.6")
+    env = make_env("lidar=none", "obstacles=none", "rewards=walk", "observations=walk", *goal, "num_envs=2")
+    episodes = run_episodes(env, stand, 2)
+    assert episodes.has_goal and episodes.ended("goal").all() and episodes.success.all()
+    assert episodes.summary()["rates"]["goal"]["count"] == 2
+
+
+def test_the_same_seed_gives_the_same_episodes(make_env):
+    overrides = ("obstacles=moving", "randomization=lidar", SHORT, "num_envs=4", "seed=5")
+    first, second = (run_episodes(make_env(*overrides), fling, 8) for _ in range(2))
+    for name in ("length_s", "outcome", "contacts", "velocity_error", "free_s", "yaw_rate_error"):
+        assert torch.equal(getattr(first, name), getattr(second, name)), name
+
+
+def test_stage_times_survive_the_reports_of_the_log(make_env):
+    env = make_env(*BLIND, SHORT, "num_envs=4", "ppo.num_steps_per_env=7")
+    summary = run_episodes(env, stand, 4).summary()
+    times = summary["us_per_env_step"]
+    assert {"policy", "physics", "rewards", "observations"} <= set(times) and min(times.values()) > 0
+    assert "success" in table(summary) and "policy" in table(summary)
+
+
+def test_only_whole_episodes_are_counted(make_env):
+    env = make_env(*BLIND, SHORT, "num_envs=2")
+    env.step(torch.zeros(2, 12))
+    with pytest.raises(ValueError, match="freshly built"):
+        run_episodes(env, stand, 2)
+
+
+def test_outcomes_are_the_ones_of_the_environment(make_env):
+    episodes = run_episodes(make_env(*BLIND, SHORT, "num_envs=2"), stand, 2)
+    assert sum(int(episodes.ended(name).sum()) for name in OUTCOMES) == len(episodes)

@@ -1,0 +1,80 @@
+"""play.py from the command line."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import pytest
+import torch
+
+from omniperception import config
+from omniperception.assembly import build_runner
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = ("experiment=walk", "num_envs=4", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1")
+
+
+def play(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "play.py"), *arguments],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=300,
+    )
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    """A run of one iteration."""
+    path = tmp_path_factory.mktemp("run")
+    run = config.assemble(config.compose(SMALL))
+    config.save(run.composed, path)
+    build_runner(run, path).learn(1)
+    return path
+
+
+@pytest.mark.slow
+def test_a_run_is_replayed(run_dir):
+    overrides = ("num_envs=3", "terminations.episode_length_s=0.3")
+    done = play(f"run={run_dir}", "episodes=6", "video_s=0.2", *overrides)
+    assert done.returncode == 0, done.stderr
+    assert "success" in done.stdout and "us" in done.stdout
+    report = json.loads((run_dir / "replay.json").read_text())
+    assert report["episodes"] == 6 and report["checkpoint"] == "model_1.pt" and report["num_envs"] == 3
+    assert report["overrides"] == list(overrides)
+    assert report["rates"]["time_out"]["count"] + report["rates"]["fall"]["count"] == 6
+    assert imageio_ffmpeg.count_frames_and_secs(str(run_dir / "replay.mp4"))[0] == 5
+    assert (run_dir / "replay.png").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("run=nowhere",), "run=nowhere does not exist"),
+        (("viewer=hologram",), "viewer=hologram is unknown; known: video, none"),
+        (("episodes=many",), "episodes=many must be a positive whole number"),
+        (("speed=3",), "unknown override 'speed=3'"),
+    ],
+)
+def test_mistakes_are_one_line(run_dir, arguments, message):
+    own = () if arguments[0].startswith("run=") else (f"run={run_dir}",)
+    done = play(*own, *arguments)
+    assert done.returncode == 2 and message in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_replaying_does_not_change_the_policy(run_dir):
+    run = config.assemble(config.compose(SMALL))
+    runner = build_runner(run, None)
+    runner.load(str(run_dir / "checkpoints" / "model_1.pt"), load_cfg={"actor": True})
+    policy = runner.get_inference_policy("cpu")
+    before = {name: value.clone() for name, value in policy.state_dict().items()}
+    with torch.no_grad():
+        for _ in range(3):
+            runner.env.step(policy(runner.env.get_observations()))
+    assert all(torch.equal(before[name], value) for name, value in policy.state_dict().items())
+    assert any(name.endswith("_mean") for name in before)  # the observation normaliser is part of it

@@ -1,0 +1,312 @@
+"""The environment's step: determinism, isolation, anomalies, terminations, symmetry, saved states."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from omniperception.learning import load_checkpoint, save_checkpoint
+
+FULL = ("obstacles=moving", "randomization=paper", "perception=pd_risknet", "rewards=paper")
+
+
+def random_actions(env, steps, seed=0, scale=1.0):
+    generator = torch.Generator().manual_seed(seed)
+    return scale * torch.randn(steps, env.num_envs, env.num_actions, generator=generator)
+
+
+def rows(observations, env_ids):
+    return {name: observations[name][env_ids].clone() for name in observations.keys()}  # noqa: SIM118
+
+
+def assert_equal(a, b):
+    assert a.keys() == b.keys()
+    for name in a:
+        assert torch.equal(a[name], b[name]), name
+
+
+def trajectory(env, actions, env_ids=slice(None), before_step=None):
+    """Observations, rewards and ends of every step."""
+    record = []
+    for step, action in enumerate(actions):
+        if before_step is not None:
+            before_step(step)
+        observations, reward, done, extras = env.step(action)
+        record.append(
+            {
+                **rows(observations, env_ids),
+                "reward": reward[env_ids].clone(),
+                "done": done[env_ids].clone(),
+                "time_outs": extras["time_outs"][env_ids].clone(),
+            }
+        )
+    return record
+
+
+def test_two_environments_of_one_configuration_are_bit_identical(make_env):
+    short = "terminations.episode_length_s=0.5"
+    first, second = (make_env(*FULL, short) for _ in range(2))
+    actions = random_actions(first, 60)
+    one, other = trajectory(first, actions), trajectory(second, actions)
+    for a, b in zip(one, other, strict=True):
+        assert_equal(a, b)
+    assert sum(int(step["done"].sum()) for step in one) >= 8  # every robot has been reset twice
+    assert (one[-1]["frames"] != 0).any()
+
+
+def test_seeds_differ(make_env):
+    first, second = (make_env(*FULL, f"seed={seed}") for seed in (1, 2))
+    assert not torch.equal(first.get_observations()["command"], second.get_observations()["command"])
+    assert not torch.equal(first.sim.mocap_pos, second.sim.mocap_pos)
+
+
+def test_a_fall_in_one_environment_changes_nothing_in_the_others(make_env):
+    quiet, disturbed = make_env(*FULL), make_env(*FULL)
+    actions = random_actions(quiet, 30, scale=0.3)
+
+    def knock_over(step):
+        if step in (7, 18):
+            disturbed.sim.qpos[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+
+    others = torch.tensor([0, 2, 3])
+    expected = trajectory(quiet, actions, others)
+    got = trajectory(disturbed, actions, others, knock_over)
+    for a, b in zip(expected, got, strict=True):
+        assert_equal(a, b)
+    assert disturbed.episode_length_buf.tolist() == [30, 11, 30, 30]
+
+
+@pytest.mark.parametrize("field", ["qpos", "qvel"])
+@pytest.mark.parametrize("step", [7, 9])  # step index 9 ends with a LiDAR frame
+def test_a_diverged_environment_is_reset_counted_and_stays_alone(make_env, field, step):
+    healthy, broken = (make_env(*FULL, "ppo.num_steps_per_env=20") for _ in range(2))
+    actions = random_actions(healthy, 20, scale=0.3)
+    others = torch.tensor([0, 2, 3])
+
+    def poison(now):
+        if now == step:
+            getattr(broken.sim, field)[1, 2] = float("nan")
+
+    expected = trajectory(healthy, actions, others)
+    for now, action in enumerate(actions):
+        poison(now)
+        observations, reward, done, extras = broken.step(action)
+        assert_equal(expected[now], {**rows(observations, others), **ends(reward, done, extras, others)})
+        assert torch.isfinite(reward).all()
+        for name in observations.keys():  # noqa: SIM118
+            assert torch.isfinite(observations[name].float()).all(), (now, name)
+        assert done[1] == (now == step)
+        assert extras["time_outs"][1] == 0
+        if now == step:
+            assert reward[1] == 0 and broken.outcomes["diverged"].tolist() == [False, True, False, False]
+    assert extras["log"]["Anomalies/diverged"] == 1
+    assert all(math.isfinite(value) for value in extras["log"].values())
+
+
+def ends(reward, done, extras, env_ids):
+    return {
+        "reward": reward[env_ids].clone(),
+        "done": done[env_ids].clone(),
+        "time_outs": extras["time_outs"][env_ids].clone(),
+    }
+
+
+def test_a_saved_state_goes_on_bit_for_bit(make_env, tmp_path):
+    short = "terminations.episode_length_s=0.9"
+    whole, resumed = (make_env(*FULL, short, f"seed={seed}") for seed in (1, 1))
+    actions = random_actions(whole, 77)
+    trajectory(whole, actions[:37])
+    trajectory(resumed, actions[:11])  # whatever it did before is forgotten
+    save_checkpoint(tmp_path / "state.pt", whole.state_dict())
+    resumed.load_state_dict(load_checkpoint(tmp_path / "state.pt"))
+    everyone = torch.arange(4)
+    assert_equal(rows(whole.get_observations(), everyone), rows(resumed.get_observations(), everyone))
+    expected, got = trajectory(whole, actions[37:]), trajectory(resumed, actions[37:])
+    for a, b in zip(expected, got, strict=True):
+        assert_equal(a, b)
+    assert sum(int(step["done"].sum()) for step in expected) >= 4
+
+
+class TestTerminations:
+    def still(self, env):
+        return torch.zeros(env.num_envs, env.num_actions)
+
+    def outcome(self, env, name):
+        return env.outcomes[name].nonzero().flatten().tolist()
+
+    def test_tilt_and_height(self, make_env):
+        env = make_env(blind=True)
+        half = [math.radians(angle) / 2 for angle in (55, 70)]
+        env.sim.qpos[:, 2] = 2.0  # in the air, so that nothing rights them
+        env.sim.qpos[0, 3:7] = torch.tensor([math.cos(half[0]), math.sin(half[0]), 0.0, 0.0])
+        env.sim.qpos[1, 3:7] = torch.tensor([math.cos(half[1]), 0.0, math.sin(half[1]), 0.0])
+        env.sim.qpos[2, 2] = 0.1
+        _, _, done, extras = env.step(self.still(env))
+        assert done.tolist() == [0, 1, 1, 0]
+        assert self.outcome(env, "fall") == [1, 2]
+        assert extras["time_outs"].sum() == 0
+
+    def test_time_out_is_flagged_as_time_out_only(self, make_env):
+        env = make_env("terminations.episode_length_s=0.1", blind=True)
+        for step in range(5):
+            if step == 4:
+                env.sim.qpos[3, 2] = 0.05  # falls in the very step of the time limit
+            _, _, done, extras = env.step(self.still(env))
+            assert done.all() == (step == 4)
+        assert self.outcome(env, "time_out") == [0, 1, 2]
+        assert extras["time_outs"].tolist() == [1, 1, 1, 0]
+        assert self.outcome(env, "fall") == [3]
+        assert (env.episode_length_buf == 0).all()
+
+    @pytest.mark.parametrize("ends", [False, True])
+    def test_on_collision(self, make_env, ends):
+        preset = "collision" if ends else "default"
+        env = make_env(f"terminations={preset}", "obstacles=static", blind=True)
+        env.sim.mocap_pos[2, 0, :2] = env.sim.qpos[2, :2]
+        env.sim.mocap_pos[2, 0, 2] = 0.3
+        _, _, done, _ = env.step(self.still(env))
+        assert env.contacts.tolist() == [False, False, True, False]
+        assert done.tolist() == [0, 0, int(ends), 0]
+        assert self.outcome(env, "collision_end") == ([2] if ends else [])
+
+    def test_a_contact_in_any_physics_step_counts(self, make_env):
+        """An obstacle that goes through the trunk's corner within one control step is felt at its end."""
+        env = make_env("obstacles=moving", "obstacles.groups.walker.count=1", blind=True)
+        env.sim.qpos[:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        env.sim.mocap_pos[:, 0, :2] = torch.tensor([5.0, 5.0])
+        env.obstacles.velocity_w[:] = 0.0
+        env.sim.mocap_pos[1, 0] = torch.tensor([-1.0, 0.0, 0.8])
+        env.obstacles.velocity_w[1, 0, 0] = 200.0  # 1 m per physics step, 4 m per control step
+        env.step(self.still(env))
+        assert env.contacts.tolist() == [False, True, False, False]
+        assert env.sim.mocap_pos[1, 0, 0] > 1.0
+
+    def test_goal(self, make_env):
+        env = make_env("commands=corridor", "obstacles=corridor", blind=True)
+        env.sim.qpos[2, 0] = 11.6
+        _, _, done, extras = env.step(self.still(env))
+        assert done.tolist() == [0, 0, 1, 0] and self.outcome(env, "goal") == [2]
+        assert extras["time_outs"].sum() == 0
+
+    @pytest.mark.parametrize(
+        "wrong", ["episode_length_s=0", "max_tilt_deg=0", "max_tilt_deg=181", "min_base_height=-1"]
+    )
+    def test_wrong_settings_are_refused(self, make_config, wrong):
+        key, value = wrong.split("=")
+        with pytest.raises(ValueError, match=rf"terminations\.{key}={value}"):
+            make_config(f"terminations.{wrong}")
+
+
+class TestYawEquivariance:
+    """Robot, obstacles and command in the world turned together: nothing rewarded or seen changes."""
+
+    TURN = 1.1
+
+    def place(self, env, turn):
+        """One robot in the air, so that no friction cone knows the world's axes, among moving obstacles."""
+        rng = np.random.default_rng(0)
+        rotation = np.array([math.cos(turn / 2), 0, 0, math.sin(turn / 2)])
+        matrix = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        quat = np.array([1.0, 0.1, -0.15, 0.3])
+        turned = np.zeros(4)
+        mujoco.mju_mulQuat(turned, rotation, quat / np.linalg.norm(quat))
+        env.sim.qpos[0, :3] = torch.tensor([0.0, 0.0, 0.7])
+        env.sim.qpos[0, 3:7] = torch.from_numpy(turned)
+        env.sim.qpos[0, 7:] += torch.from_numpy(rng.uniform(-0.2, 0.2, 12))
+        env.sim.qvel[0] = torch.from_numpy(rng.uniform(-0.5, 0.5, 18))
+        env.sim.qvel[0, :2] = torch.from_numpy(matrix @ env.sim.qvel[0, :2].numpy())
+        for field in (env.sim.mocap_pos[0, :, :2], env.obstacles.velocity_w[0]):
+            field.copy_(torch.from_numpy(field.numpy() @ matrix.T))
+        half = env.sim.mocap_quat[0].numpy().copy()
+        for i, quat in enumerate(half):
+            mujoco.mju_mulQuat(env.sim.mocap_quat[0, i].numpy(), rotation, quat)
+        env.sim.mocap_pos[0, 0, :2] = torch.from_numpy(matrix @ np.array([0.7, 0.4]))
+
+    @pytest.mark.parametrize("preset", ["paper", "default"])
+    def test_step(self, make_env, preset):
+        envs = [make_env("obstacles=moving", f"rewards={preset}", num_envs=1) for _ in range(2)]
+        outcomes = []
+        for env, turn in zip(envs, (0.0, self.TURN), strict=True):
+            env.command.value[:] = torch.tensor([0.5, -0.2, 0.3])
+            self.place(env, turn)
+            for action in random_actions(env, 5, scale=0.5):
+                observations, reward, done, _ = env.step(action)
+            assert env.sensing.due(env.step_count) and not done.any()
+            outcomes.append({**rows(observations, [0]), "reward": reward})
+        straight, turned = outcomes
+        assert (envs[0].sensing.sector_distance < 1).any()
+        assert envs[0].avoidance_velocity.norm() > 0.1
+        for name in ("proprioception", "command", "privileged", "reward"):
+            torch.testing.assert_close(straight[name], turned[name], atol=2e-4, rtol=0, msg=name)
+        far = (straight["frames"][:, -1] - turned["frames"][:, -1]).norm(dim=-1) > 1e-3
+        assert far.float().mean() < 0.05  # a ray at an edge may meet the other side of it
+
+
+class TestWithoutLidar:
+    def test_blind_runs_build_nothing_of_it(self, make_env):
+        env = make_env("obstacles=moving", blind=True)
+        assert env.sensing is None
+        for action in random_actions(env, 24, scale=0.1):
+            observations, _, _, extras = env.step(action)
+        assert not {"frames", "frame_count", "height_target"} & set(observations.keys())
+        stages = {key for key in extras["log"] if key.startswith("Time/")}
+        assert not any("rays" in stage or "sampling" in stage or "sectors" in stage for stage in stages)
+        assert "Time/physics_us_per_env_step" in stages
+
+    def test_a_reward_alone_keeps_the_lidar_without_frames(self, make_env):
+        env = make_env("perception=none")
+        assert env.sensing is not None and env.sensing.frames is None
+        assert "frames" not in env.get_observations().keys()  # noqa: SIM118
+
+    def test_free_ground_has_no_obstacle_stage(self, make_env):
+        env = make_env("obstacles=none", blind=True)
+        env.step(torch.zeros(4, 12))
+        assert env.obstacles is None and "obstacles" not in env.timer.seconds
+        assert env.world.model.nsensor == 0 and env.world.model.nmocap == 0
+
+
+def test_observations_have_history_and_forget_at_a_reset(make_env):
+    env = make_env("obstacles=none", blind=True)
+    proprioception = env.get_observations()["proprioception"]
+    assert proprioception.shape == (4, 330)
+    assert (proprioception.unflatten(1, (10, 33)) == proprioception[:, None, :33]).all()
+    actions = random_actions(env, 3)
+    env.step(actions[0])
+    before = env.step(actions[1])[0]["proprioception"].unflatten(1, (10, 33)).clone()
+    env.sim.qpos[2, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    after = env.step(actions[2])[0]["proprioception"].unflatten(1, (10, 33))
+    others = [0, 1, 3]
+    assert torch.equal(after[others, :-1], before[others, 1:])
+    assert (after[2] == after[2, :1]).all()
+    assert after[2, 0, :12].abs().max() < 1e-6 and after[2, 0, -3:].tolist() == [0, 0, -1]
+
+
+def test_previous_action_is_the_applied_one_and_zero_after_a_reset(make_env):
+    env = make_env("obstacles=none", blind=True)
+    action = random_actions(env, 1)[0]
+    env.sim.qpos[1, 2] = 0.05
+    observations = env.step(action)[0]
+    assert torch.equal(observations["action"][[0, 2, 3]], action[[0, 2, 3]])
+    assert (observations["action"][1] == 0).all()
+
+
+def test_nearest_obstacles_by_hand(make_env):
+    """Per obstacle x/4, y/4, relative velocity, radius, 1 - edge distance / 4, nearest edge first."""
+    env = make_env("obstacles=moving", "obstacles.groups.walker.count=2", num_envs=1)
+    env.sim.qpos[0, 3:7] = torch.tensor([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])  # faces +y
+    env.sim.mocap_pos[0, :, :2] = torch.tensor([[0.0, 3.0], [2.0, 0.0]])
+    env.obstacles.velocity_w[0] = torch.tensor([[0.0, -1.0], [0.0, 0.0]])
+    observations = env.step(torch.zeros(1, 12))[0]
+    group = env._groups["privileged"]
+    seen = observations["privileged"][0, group.slices["obstacles"]].unflatten(0, (2, 6))
+    radius = env.obstacles.radius.float()
+    velocity = env.kinematics.base_lin_vel_yaw[0]
+    near, ahead = seen
+    assert near[:2].tolist() == pytest.approx([0.0, -0.5], abs=2e-3)  # to its right
+    assert near[2:4].tolist() == pytest.approx((-velocity).tolist(), abs=1e-6)
+    assert near[4].item() == pytest.approx(radius[1].item())
+    assert near[5].item() == pytest.approx(1 - (2 - radius[1].item()) / 4, abs=2e-3)
+    assert ahead[0].item() == pytest.approx((3 - 0.02) / 4, abs=2e-3)  # has come 2 cm in 0.02 s
+    assert ahead[2].item() == pytest.approx(-1 - velocity[0].item(), abs=1e-5)

@@ -1,0 +1,113 @@
+"""The task's LiDAR: its ticks, its history of frames, and what a reset forgets."""
+
+import math
+
+import pytest
+import torch
+
+
+def still(env):
+    return torch.zeros(env.num_envs, env.num_actions)
+
+
+def test_frames_come_at_tick_times_only(make_env):
+    env = make_env("obstacles=static")
+    observations = env.get_observations()
+    assert env.sensing.period_steps == 5
+    for step in range(1, 16):
+        before = observations["frames"].clone()
+        observations = env.step(still(env))[0]
+        changed = not torch.equal(before, observations["frames"])
+        assert changed == (step % 5 == 0), step
+        assert (observations["frame_tick"] == 1 + step // 5).all()
+        assert (observations["frame_count"] == 1 + step // 5).all()
+        if changed:
+            assert torch.equal(observations["frames"][:, :-1], before[:, 1:])
+
+
+def test_frame_count_stops_at_the_history(make_env):
+    env = make_env("obstacles=static", "perception.history=3", "lidar.sensor.period_s=0.02")
+    counts = [int(env.step(still(env))[0]["frame_count"][0]) for _ in range(5)]
+    assert counts == [2, 3, 3, 3, 3]
+    assert env.sensing.frames.shape[:2] == (4, 3)
+
+
+def test_a_reset_clears_that_environments_frames_only(make_env):
+    env = make_env("obstacles=static", "rewards=paper")
+    for _ in range(6):
+        env.step(still(env))
+    before = env.sensing.frames.clone()
+    sectors = env.sensing.sector_distance.clone()
+    env.sim.qpos[1, 2] = 0.05
+    observations, _, done, _ = env.step(still(env))
+    assert done.tolist() == [0, 1, 0, 0]
+    assert observations["frame_count"].flatten().tolist() == [2, 0, 2, 2]
+    assert (observations["frames"][1] == 0).all()
+    others = [0, 2, 3]
+    assert torch.equal(observations["frames"][others], before[others])
+    assert torch.equal(env.sensing.sector_distance[others], sectors[others])
+    assert (env.sensing.sector_distance[1] == 6.0).all()
+    assert env.sensing.mean_distal_range(6.0)[1] == 6.0  # the last episode's distances are forgotten, too
+    for _ in range(3):
+        observations = env.step(still(env))[0]
+    assert observations["frame_count"].flatten().tolist() == [3, 1, 3, 3]
+    assert (observations["frames"][1, :-1] == 0).all() and (observations["frames"][1, -1] != 0).any()
+    assert env.sensing.mean_distal_range(6.0)[1] < 6.0
+
+
+def test_points_lie_within_the_range_in_units_of_it(make_env):
+    env = make_env("obstacles=static")
+    distance = env.sensing.frames[:, -1].norm(dim=-1)
+    assert distance.max() <= 1.0 + 1e-6
+    assert distance[distance > 0].min() >= 0.1 / 6.0 - 1e-6
+
+
+def test_sector_distance_of_a_pillar_by_hand(make_env):
+    """A pillar of known radius 2 m to the left: 36 sectors from -180 deg, so sectors 26 and 27 see it."""
+    env = make_env("obstacles=static", "lidar.sensor.num_rays=20000", num_envs=1)
+    env.sim.qpos[0, 3:7] = torch.tensor([math.cos(0.4), 0.0, 0.0, math.sin(0.4)])  # yaw 0.8
+    left = 0.8 + math.pi / 2
+    env.sim.mocap_pos[0, :, 2] = -100.0
+    env.sim.mocap_pos[0, 0] = torch.tensor([2 * math.cos(left), 2 * math.sin(left), 0.5])
+    for _ in range(5):
+        env.step(still(env))
+    sectors = env.sensing.sector_distance[0]
+    radius = env.obstacles.radius[0].item()
+    base_shift = env.kinematics.base_pos_w[0, :2].norm().item()
+    for sector in (26, 27):
+        assert sectors[sector].item() == pytest.approx(2 - radius, abs=0.02 + base_shift)
+    assert (sectors[[*range(20), *range(34, 36)]] == 6.0).all()
+
+
+def test_ground_and_own_legs_never_count_as_obstacles(make_env):
+    env = make_env("obstacles=none", "perception=none")
+    for _ in range(10):
+        env.step(still(env))
+    assert (env.sensing.sector_distance == 6.0).all()
+    assert torch.isfinite(env.sensing.frame.true_ranges).float().mean() > 0.3  # though rays do hit the ground
+
+
+def test_distal_range_is_the_mean_of_capped_distances(make_env):
+    env = make_env("obstacles=static", "rewards=paper")
+    frame = env.sensing.frame
+    for i in range(env.num_envs):
+        distances = [
+            min(range_, 2.5)
+            for range_, theta in zip(frame.true_ranges[i].tolist(), frame.elevation[i].tolist(), strict=True)
+            if theta < math.radians(20)
+        ]
+        mean = sum(distances) / len(distances)
+        assert env.sensing.mean_distal_range(2.5)[i].item() == pytest.approx(mean, rel=1e-4)
+
+
+def test_noise_reaches_the_points_and_not_the_reward(make_env):
+    clean, noisy = make_env("obstacles=static"), make_env("obstacles=static", "randomization=lidar")
+    torch.testing.assert_close(clean.sensing.sector_distance, noisy.sensing.sector_distance)
+    assert torch.equal(clean.sensing.frame.true_ranges, noisy.sensing.frame.true_ranges)
+    assert not torch.equal(clean.sensing.frames, noisy.sensing.frames)
+
+
+@pytest.mark.parametrize("period", ["0.03", "0.005"])
+def test_a_period_between_control_steps_is_refused(make_env, period):
+    with pytest.raises(ValueError, match=rf"lidar\.sensor\.period_s={period} must be a multiple"):
+        make_env(f"lidar.sensor.period_s={period}")

@@ -1,0 +1,206 @@
+"""Every preset composes and builds; the paper's numbers; wrong configurations are told in one line."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from omniperception import config
+from omniperception.assembly import build_runner
+from omniperception.config import ConfigError
+from omniperception.task.env import OmniEnv
+
+ROOT = Path(__file__).resolve().parents[1]
+PRESETS = sorted(
+    str(path.relative_to(config.CONFIG_DIR).with_suffix(""))
+    for path in config.CONFIG_DIR.glob("**/*.yaml")
+    if path.parent != config.CONFIG_DIR
+)
+BLIND = ["perception=none", "rewards=walk", "observations=walk"]
+COMPANIONS = {
+    "commands/corridor": ["obstacles=corridor"],
+    "obstacles/corridor": ["commands=corridor"],
+    "lidar/none": BLIND,
+}
+"""What a preset needs beside it."""
+LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
+
+
+def test_no_preset_is_missed():
+    assert len(PRESETS) == 33
+    groups = {preset.split("/")[0] for preset in PRESETS}
+    assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()}
+    assert set(COMPANIONS) <= set(PRESETS)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_composes_builds_and_steps(preset):
+    group, name = preset.split("/")
+    run = config.assemble(config.compose([*COMPANIONS.get(preset, []), f"{group}={name}", "num_envs=2"]))
+    if preset.startswith(LEARNING):
+        runner = build_runner(run, None)
+        env = runner.env
+        with torch.inference_mode():
+            actions = runner.get_inference_policy("cpu")(env.get_observations())
+        assert actions.shape == (2, 12)
+    else:
+        env = OmniEnv(run.env)
+        actions = torch.zeros(2, 12)
+    for _ in range(5):
+        observations, reward, _, _ = env.step(actions.clone())
+    assert torch.isfinite(reward).all()
+    assert all(torch.isfinite(observations[key].float()).all() for key in observations.keys())  # noqa: SIM118
+
+
+class TestPaper:
+    @pytest.fixture(scope="class")
+    def run(self):
+        return config.assemble(config.compose(["experiment=paper"]))
+
+    def test_hyperparameters(self, run):
+        """Table 'PPO Hyperparameters' and the hidden layers of section 'Actor Network Architecture'."""
+        ppo = run.ppo
+        assert (ppo.clip_param, ppo.lam, ppo.gamma) == (0.2, 0.95, 0.99)
+        assert (ppo.learning_rate, ppo.schedule, ppo.desired_kl) == (1e-3, "adaptive", 0.01)
+        assert (ppo.value_loss_coef, ppo.use_clipped_value_loss) == (1.0, True)
+        assert (ppo.entropy_coef, ppo.max_grad_norm) == (0.01, 1.0)
+        assert run.env.num_envs == 4096
+        assert (ppo.num_steps_per_env, ppo.num_learning_epochs, ppo.num_mini_batches) == (24, 5, 4)
+        assert (list(ppo.hidden_dims), ppo.activation) == ([1024, 512, 256, 128], "elu")
+
+    def test_perception(self, run):
+        network = run.perception.network()
+        assert run.perception.history == run.env.frame_history == 10
+        assert run.perception.height_weight > 0 and run.env.height_target
+        widths = [m.hidden_size for m in network.modules() if isinstance(m, torch.nn.GRU)]
+        assert sorted(widths) == [64, 187]
+
+    def test_recipe(self, run):
+        assert len(run.env.rewards.terms) == 11 and run.env.rewards.avoidance.num_sectors == 36
+        assert run.env.rewards.avoidance.threshold == 1.0
+        assert run.env.randomization.gravity_offset == (-1.0, 1.0)
+        assert run.env.randomization.noise and run.env.observations.actor == ("proprioception", "command")
+
+
+class TestRates:
+    def test_defaults(self, make_config):
+        env = make_config().env
+        assert env.sim.timestep == 0.005 and env.sim.control_dt == pytest.approx(0.02)
+        assert env.lidar.sensor.period_s == 0.1
+        assert env.lidar.sensor.mount_pos == (0.28945, 0.0, -0.046825)
+
+
+WRONG = [
+    (["foo=1"], "foo"),
+    (["obstacles=dragons"], "dragons"),
+    (["num_envs=0"], "num_envs=0 must be at least 1"),
+    (["perception=pd_risknet", "lidar=none"], "perception=none"),
+    (["lidar=none", "perception=none"], "rewards=walk observations=walk"),
+    (["lidar.sensor.period_s=-0.1"], "period_s=-0.1"),
+    (["lidar.sensor.max_range=-1"], "max_range=-1"),
+    (["lidar.sensor.num_rays=0"], "num_rays=0"),
+    (["commands.lin_vel_x=[1.0,-1.0]"], "lin_vel_x"),
+    (["terrain.restitution=1.5"], "terrain.restitution=1.5"),
+    (["ppo.num_mini_batches=0"], "ppo.num_mini_batches=0"),
+    (["sim.decimation=0"], "sim.decimation=0"),
+    (["robot.kp=-1"], "robot.kp=-1"),
+    (["observations.actor=[smell]"], "smell"),
+    (["seed=abc"], "seed"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "named"), WRONG)
+def test_wrong_configurations_name_the_key_in_one_line(overrides, named):
+    with pytest.raises(ConfigError) as error:
+        config.check(overrides)
+    assert named in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (["foo=1"], "foo"),
+        (["lidar=none"], "perception=none"),
+        (["lidar.sensor.period_s=0.03"], "lidar.sensor.period_s=0.03"),
+        (["lidar.exclude_geoms=[nose]"], "lidar.exclude_geoms"),
+        (["run=no/such/run"], "run=latest"),
+    ],
+)
+def test_the_program_tells_what_is_wrong_in_one_line(tmp_path, overrides, named):
+    command = [sys.executable, str(ROOT / "train.py"), *overrides, "hydra.run.dir=run"]
+    if overrides[0].startswith("run="):
+        command.pop()
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
+    assert result.returncode == 2, result.stderr
+    assert len(lines) == 1 and named in lines[0] and "Traceback" not in result.stderr
+
+
+def test_every_job_of_a_sweep_is_checked_before_the_first_starts():
+    config.check(["-m", "num_envs=2,4", "obstacles=static,moving"])
+    with pytest.raises(ConfigError, match="num_envs=0"):
+        config.check(["--multirun", "num_envs=2,0"])
+
+
+class TestRunDirectories:
+    @pytest.fixture
+    def run_dir(self, tmp_path):
+        run = config.assemble(config.compose(["experiment=walk", "num_envs=7", "rewards.terms.tilt.weight=-3"]))
+        config.save(run.composed, tmp_path)
+        return tmp_path
+
+    def test_a_saved_configuration_is_the_run(self, run_dir):
+        run = config.assemble(config.load(run_dir))
+        assert run.env.num_envs == 7 and run.env.lidar is None and run.perception is None
+        assert run.env.rewards.terms["tilt"].weight == -3
+
+    def test_interpolations_are_saved_as_values(self, run_dir):
+        run = config.assemble(config.compose(["lidar.sensor.max_range=9.0"]))
+        config.save(run.composed, run_dir)
+        assert "${" not in (run_dir / config.CONFIG_FILE).read_text()
+        assert config.load(run_dir).perception.sampler.max_range == 9.0
+
+    def test_overrides_of_values_and_of_groups(self, run_dir):
+        loaded = config.load(run_dir, ["num_envs=3", "obstacles=static", "ppo.max_iterations=5"])
+        run = config.assemble(loaded)
+        assert run.env.num_envs == 3 and run.ppo.max_iterations == 5
+        assert run.env.obstacles.num_obstacles == 8
+        assert run.env.rewards.terms["tilt"].weight == -3  # what is not overridden stays the run's
+
+    def test_wrong_overrides_are_named(self, run_dir):
+        for override, named in (
+            ("ppo.foo=1", "max_iterations"),
+            ("foo=1", "num_envs"),
+            ("experiment=paper", "keeps its experiment"),
+            ("num_envs", "key=value"),
+        ):
+            with pytest.raises(ConfigError, match=named):
+                config.load(run_dir, [override])
+
+    def test_missing_runs(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(ConfigError, match=r"train\.py first"):
+            config.find_run("latest")
+        with pytest.raises(ConfigError, match="run=latest"):
+            config.find_run("nowhere")
+        with pytest.raises(ConfigError, match="not a run directory"):
+            config.load(tmp_path)
+
+    def test_latest_is_the_newest(self, tmp_path, monkeypatch):
+        import os
+
+        monkeypatch.chdir(tmp_path)
+        for age, name in ((50, "b"), (10, "a"), (90, "c")):
+            config.save({"num_envs": 1}, tmp_path / "outputs" / name)
+            path = tmp_path / "outputs" / name / config.CONFIG_FILE
+            os.utime(path, (path.stat().st_atime, path.stat().st_mtime - age))
+        assert config.find_run("latest") == Path("outputs/a")
+
+
+def test_entry_points_take_their_own_arguments_out():
+    own, overrides = config.split_arguments(["run=x", "num_envs=2", "-m"], {"run": "", "steps": "5"})
+    assert own == {"run": "x", "steps": "5"} and overrides == ["num_envs=2", "-m"]
+    with pytest.raises(ConfigError, match="'video' is not of the form key=value"):
+        config.split_arguments(["video"], {"run": ""})

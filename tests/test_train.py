@@ -1,0 +1,67 @@
+"""train.py: the configuration is saved first, and a resumed run is the uninterrupted one."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from omniperception import config
+from omniperception.learning import load_checkpoint
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALL = ("num_envs=16", "ppo.num_steps_per_env=12", "ppo.hidden_dims=[32,16]", "seed=3")
+
+
+def train(folder, *arguments):
+    command = [sys.executable, str(ROOT / "train.py"), *arguments]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def checkpoint(folder, run, iteration):
+    return load_checkpoint(folder / run / "checkpoints" / f"model_{iteration}.pt")
+
+
+def test_the_configuration_is_saved_before_anything_uses_it(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    monkeypatch.chdir(tmp_path)
+    import train as program
+
+    seen = []
+    monkeypatch.setattr(
+        program,
+        "learn",
+        lambda run, run_dir, resume: seen.append((run, config.load(run_dir), resume)),
+    )
+    monkeypatch.setattr(sys, "argv", ["train.py", "experiment=walk", "num_envs=5", "hydra.run.dir=here"])
+    program.main()
+    [(run, saved, resume)] = seen
+    assert not resume and saved.num_envs == 5 and (tmp_path / "here" / "config.yaml").is_file()
+    assert config.assemble(saved).composed == run.composed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        ["experiment=walk"],
+        ["experiment=quickstart", "randomization=paper", "perception.sampler.num_proximal=16"],
+    ],
+    ids=["walk", "quickstart"],
+)
+def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, recipe):
+    train(tmp_path, *recipe, *SMALL, "ppo.max_iterations=4", "hydra.run.dir=whole")
+    train(tmp_path, *recipe, *SMALL, "ppo.max_iterations=2", "hydra.run.dir=parts")
+    halfway = checkpoint(tmp_path, "parts", 2)
+    output = train(tmp_path, "run=parts", "ppo.max_iterations=4")
+    assert "after 2 iterations" in output
+    whole, parts = checkpoint(tmp_path, "whole", 4), checkpoint(tmp_path, "parts", 4)
+    assert whole["iteration"] == parts["iteration"] == 4
+    for part in ("actor_state_dict", "critic_state_dict"):
+        assert whole[part].keys() == parts[part].keys()
+        for name, value in whole[part].items():
+            assert torch.equal(value, parts[part][name]), name
+    assert any(not torch.equal(v, halfway["actor_state_dict"][k]) for k, v in whole["actor_state_dict"].items())
