@@ -25,7 +25,7 @@ from omniperception.task.env import OmniEnv
 
 ARGUMENTS = {"run": "latest", "viewer": "video", "episodes": "200", "video_s": "20"}
 VIEWERS = ("video", "none")
-LIBRARIES = ("omniperception", "torch", "mujoco", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
+LIBRARIES = ("omniperception", "torch", "mujoco-core", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
 
 
 @dataclass(frozen=True)

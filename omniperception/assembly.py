@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from omniperception.config import RunConfig
+from omniperception.config import ConfigError, RunConfig
 from omniperception.learning import Runner
 from omniperception.learning.config import runner_config
 from omniperception.task.env import OmniEnv
@@ -17,12 +17,17 @@ from omniperception.task.env import OmniEnv
 def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
     """The environment and everything that learns in it, seeded.
 
+    A setting that only the compiled world can judge, such as a geom's name, is a ConfigError here.
+
     Args:
         run: the assembled configuration.
         log_dir: where TensorBoard files and checkpoints go; None writes nothing.
     """
     seed_everything(run.env.seed)
-    env = OmniEnv(run.env)
+    try:
+        env = OmniEnv(run.env)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
     return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
 
 

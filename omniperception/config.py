@@ -62,6 +62,7 @@ def assemble(config: DictConfig) -> RunConfig:
     """Instantiates and validates every part of a composed configuration."""
     try:
         _check_groups(config)
+        _check_whole_numbers(config)
         composed = OmegaConf.to_container(config, resolve=True)
         parts = {key: _instantiate(key, value) for key, value in composed.items() if isinstance(value, dict)}
         perception, ppo = parts.pop("perception"), parts.pop("ppo")
@@ -162,6 +163,12 @@ def one_line_errors(*also: type[Exception]) -> Iterator[None]:
 def _check_groups(config: DictConfig) -> None:
     if config.perception and not config.lidar:
         raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
+
+
+def _check_whole_numbers(config: DictConfig) -> None:
+    for key in ("num_envs", "seed"):
+        if not isinstance(config[key], int):
+            raise ConfigError(f"{key}={config[key]} must be a whole number")
 
 
 def _instantiate(key: str, value: dict) -> object | None:

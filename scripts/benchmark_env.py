@@ -57,7 +57,10 @@ def environment_steps(env: OmniEnv) -> Callable[[], float]:
 
 def report(name: str, num_envs: int, seconds: list[float], bare: list[float], steps: int) -> None:
     ratios = [steps / BLOCK * b / s for s, b in zip(seconds, bare, strict=True)]
-    bare_rate, rate = num_envs * BLOCK / statistics.median(bare), num_envs * steps / statistics.median(seconds)
+    bare_rate, rate = (
+        num_envs * BLOCK / statistics.median(bare),
+        num_envs * steps / statistics.median(seconds),
+    )
     print(f"bare Batch.step     {bare_rate:10,.0f} env steps/s")
     print(f"{name:<19} {rate:10,.0f} env steps/s")
     print(

@@ -55,9 +55,9 @@ def test_every_preset_composes_builds_and_steps(preset):
 
 
 class TestPaper:
-    @pytest.fixture(scope="class")
-    def run(self):
-        return config.assemble(config.compose(["experiment=paper"]))
+    @pytest.fixture
+    def run(self, make_config):
+        return make_config("experiment=paper")
 
     def test_hyperparameters(self, run):
         """Table 'PPO Hyperparameters' and the hidden layers of section 'Actor Network Architecture'."""
@@ -73,9 +73,9 @@ class TestPaper:
     def test_perception(self, run):
         network = run.perception.network()
         assert run.perception.history == run.env.frame_history == 10
-        assert run.perception.height_weight > 0 and run.env.height_target
-        widths = [m.hidden_size for m in network.modules() if isinstance(m, torch.nn.GRU)]
-        assert sorted(widths) == [64, 187]
+        assert run.env.targets == ("height_target",)
+        widths = {name: part.hidden_size for name, part in network.named_children()}
+        assert widths == {"proximal": 187, "distal": 64}
 
     def test_recipe(self, run):
         assert len(run.env.rewards.terms) == 11 and run.env.rewards.avoidance.num_sectors == 36
@@ -107,7 +107,8 @@ WRONG = [
     (["sim.decimation=0"], "sim.decimation=0"),
     (["robot.kp=-1"], "robot.kp=-1"),
     (["observations.actor=[smell]"], "smell"),
-    (["seed=abc"], "seed"),
+    (["seed=abc"], "seed=abc must be a whole number"),
+    (["num_envs=2.5"], "num_envs=2.5 must be a whole number"),
 ]
 
 
@@ -124,7 +125,7 @@ def test_wrong_configurations_name_the_key_in_one_line(overrides, named):
         (["foo=1"], "foo"),
         (["lidar=none"], "perception=none"),
         (["lidar.sensor.period_s=0.03"], "lidar.sensor.period_s=0.03"),
-        (["lidar.exclude_geoms=[nose]"], "lidar.exclude_geoms"),
+        (["terrain.friction=-1"], "terrain.friction=-1"),
         (["run=no/such/run"], "run=latest"),
     ],
 )
@@ -138,6 +139,22 @@ def test_the_program_tells_what_is_wrong_in_one_line(tmp_path, overrides, named)
     assert len(lines) == 1 and named in lines[0] and "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("lidar.sensor.period_s=0.03", "lidar.sensor.period_s=0.03 must be a multiple"),
+        ("lidar.exclude_geoms=[nose]", "lidar.exclude_geoms"),
+        ("robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),
+        ("perception.sampler.num_proximal=0", "num_proximal=0"),
+    ],
+)
+def test_what_only_the_compiled_world_can_judge_is_a_config_error_too(override, named):
+    run = config.assemble(config.compose([override, "num_envs=1"]))
+    with pytest.raises(ConfigError) as error:
+        build_runner(run, None)
+    assert named in str(error.value)
+
+
 def test_every_job_of_a_sweep_is_checked_before_the_first_starts():
     config.check(["-m", "num_envs=2,4", "obstacles=static,moving"])
     with pytest.raises(ConfigError, match="num_envs=0"):
@@ -147,7 +164,8 @@ def test_every_job_of_a_sweep_is_checked_before_the_first_starts():
 class TestRunDirectories:
     @pytest.fixture
     def run_dir(self, tmp_path):
-        run = config.assemble(config.compose(["experiment=walk", "num_envs=7", "rewards.terms.tilt.weight=-3"]))
+        overrides = ["experiment=walk", "num_envs=7", "rewards.terms.tilt.weight=-3"]
+        run = config.assemble(config.compose(overrides))
         config.save(run.composed, tmp_path)
         return tmp_path
 

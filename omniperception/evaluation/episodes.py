@@ -131,9 +131,7 @@ def table(summary: dict) -> str:
         if summary[key] is not None:
             lines.append(f"  {label:<28}{summary[key]:8.3f} {unit}")
     times = sorted(summary["us_per_env_step"].items(), key=lambda item: -item[1])
-    lines.append(
-        "  time per environment step    " + ", ".join(f"{name} {spent:.1f}" for name, spent in times) + " us"
-    )
+    lines.append("  time per environment step    " + ", ".join(f"{name} {spent:.1f}" for name, spent in times) + " us")
     return "\n".join(lines)
 
 
@@ -180,9 +178,7 @@ class _Tally:
         filed = (env.done & (self._index < self._per_env)).nonzero().flatten()
         slot = self._index[filed]
         self._filed[filed, slot] = self._sums[filed]
-        self._outcome[filed, slot] = (
-            torch.stack([env.outcomes[name] for name in OUTCOMES], 1)[filed].int().argmax(1)
-        )
+        self._outcome[filed, slot] = torch.stack([env.outcomes[name] for name in OUTCOMES], 1)[filed].int().argmax(1)
         self._index += env.done
         self._sums *= ~env.done[:, None]
         self._was_touching = env.contacts & ~env.done

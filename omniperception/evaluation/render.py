@@ -140,9 +140,7 @@ class Renderer:
         ground = (classes == HitClass.TERRAIN).nonzero().flatten()
         footprint = ranges[ground] / self._focal
         stretched = footprint / rays[ground, 2].abs().clamp(min=1e-3)
-        albedo[ground] = self._paint_ground(
-            albedo[ground], points[ground, :2], footprint, stretched, view.arrows
-        )
+        albedo[ground] = self._paint_ground(albedo[ground], points[ground, :2], footprint, stretched, view.arrows)
         facing = normals @ self._to_sun
         light = facing.clamp(min=0.0) * ~self._shadowed(points, normals, (classes >= 0) & (facing > 0))
         up = (0.5 + 0.5 * normals[:, 2:]).clamp(0.0, 1.0)
@@ -182,9 +180,7 @@ class Renderer:
         shadowed[ids] = hits.shape_id.flatten() >= 0
         return shadowed
 
-    def _draw_points(
-        self, colour: torch.Tensor, ranges: torch.Tensor, view: View, axes: torch.Tensor
-    ) -> None:
+    def _draw_points(self, colour: torch.Tensor, ranges: torch.Tensor, view: View, axes: torch.Tensor) -> None:
         """Draws the LiDAR points that nothing hides, nearer ones over farther ones."""
         offset = view.points_w - view.eye_w
         distance = offset.norm(dim=1)

@@ -135,9 +135,7 @@ class Recorder:
             vector = rotate_yaw(yaw[None], velocity[self._id, None])[0]
             if float(vector.norm()) >= MIN_ARROW:
                 arrows.append(Arrow(base[:2].clone(), vector, width, colour))
-        return View(
-            eye, target, pos[self._id].clone(), quat[self._id].clone(), points, proximal, tuple(arrows)
-        )
+        return View(eye, target, pos[self._id].clone(), quat[self._id].clone(), points, proximal, tuple(arrows))
 
     def _points(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Points (P, 3) (m, environment frame) of the episode's newest frame, and which are proximal."""
@@ -168,9 +166,7 @@ class Recorder:
 def write_png(path: Path, image: torch.Tensor) -> None:
     """Writes an image (height, width, 3) uint8 as a PNG."""
     height, width, _ = image.shape
-    lines = torch.cat(
-        (torch.zeros(height, 1, dtype=torch.uint8), image.flatten(1)), 1
-    )  # 0: an unfiltered line
+    lines = torch.cat((torch.zeros(height, 1, dtype=torch.uint8), image.flatten(1)), 1)  # 0: an unfiltered line
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     parts = (b"IHDR", header), (b"IDAT", zlib.compress(lines.numpy().tobytes(), 9)), (b"IEND", b"")
     chunks = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts)

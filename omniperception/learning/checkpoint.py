@@ -30,9 +30,7 @@ def checkpoint_path(run_dir: str | os.PathLike, iteration: int) -> Path:
 def list_checkpoints(run_dir: str | os.PathLike) -> list[Path]:
     """Complete checkpoints of a run, oldest first; half-written temporary files are not among them."""
     folder = Path(run_dir) / "checkpoints"
-    found = [
-        (int(match[1]), path) for path in folder.glob("model_*.pt") if (match := _NAME.fullmatch(path.name))
-    ]
+    found = [(int(match[1]), path) for path in folder.glob("model_*.pt") if (match := _NAME.fullmatch(path.name))]
     return [path for _, path in sorted(found)]
 
 
@@ -87,9 +85,7 @@ def load_checkpoint(path: str | os.PathLike, map_location: str | torch.device | 
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path} is no checkpoint of this program: it has no format '{FORMAT}'")
     if content["version"] != VERSION:
-        raise CheckpointError(
-            f"{path} has checkpoint version {content['version']}, this program reads {VERSION}"
-        )
+        raise CheckpointError(f"{path} has checkpoint version {content['version']}, this program reads {VERSION}")
     return content
 
 
@@ -117,8 +113,7 @@ def portable(value, where: str = "state"):
     if value is None or isinstance(value, bool | int | float | str | bytes):
         return value
     raise CheckpointError(
-        f"cannot save {where}: a {type(value).__name__}; use tensors, arrays, numbers, strings,"
-        " lists or dicts"
+        f"cannot save {where}: a {type(value).__name__}; use tensors, arrays, numbers, strings, lists or dicts"
     )
 
 

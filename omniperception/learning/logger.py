@@ -34,9 +34,7 @@ class CompactLogger(Logger):
         purge = first_iteration if first_iteration > 0 else None
         self.writer = SummaryWriter(log_dir=self.log_dir, flush_secs=10, purge_step=purge)  # type: ignore
 
-    def log(
-        self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **values
-    ) -> None:
+    def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **values) -> None:
         """Write the scalars and print the line; ``values`` are rsl_rl's other arguments."""
         if self.writer is None:
             return
@@ -44,9 +42,7 @@ class CompactLogger(Logger):
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, **values)
         self._recent.append(collect_time + learn_time)
-        print(
-            self._line(it + 1, total_it, collect_time, learn_time, values["loss_dict"], metrics), flush=True
-        )
+        print(self._line(it + 1, total_it, collect_time, learn_time, values["loss_dict"], metrics), flush=True)
 
     def stop_logging_writer(self) -> None:
         """Close the TensorBoard file."""
@@ -89,9 +85,7 @@ class CompactLogger(Logger):
             f"collect {collect:.2f} s, learn {learn:.2f} s",
         ]
         if self.rewbuffer:
-            parts.append(
-                f"reward {statistics.mean(self.rewbuffer):.3f}, length {statistics.mean(self.lenbuffer):.0f}"
-            )
+            parts.append(f"reward {statistics.mean(self.rewbuffer):.3f}, length {statistics.mean(self.lenbuffer):.0f}")
         parts.append(f"value {losses['value']:.3g}")
         parts += [f"{name} {value:.3g}" for name, value in losses.items() if name.endswith("_target")]
         parts += [f"{name} {value:.3g}" for name, value in metrics.items()]
@@ -101,7 +95,5 @@ class CompactLogger(Logger):
 
 def _mean(infos: list[Mapping], name: str) -> float:
     """Mean of one entry over all log dictionaries that have it."""
-    values = [
-        torch.as_tensor(info[name], dtype=torch.float32).flatten().cpu() for info in infos if name in info
-    ]
+    values = [torch.as_tensor(info[name], dtype=torch.float32).flatten().cpu() for info in infos if name in info]
     return torch.cat(values).mean().item()

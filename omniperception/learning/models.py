@@ -13,6 +13,7 @@ from torch import nn
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
 
+
 class _AddLoss(torch.autograd.Function):
     """Identity on the features whose backward pass also starts that of an auxiliary loss, at unit scale."""
 
@@ -110,9 +111,7 @@ class PerceptionActor(MLPModel):
     def _empty_features(self, frames: torch.Tensor) -> torch.Tensor:
         """(1, D) embedding of a history without a valid frame."""
         shape = (1, self.perception.history, *frames.shape[2:])
-        return self.perception(
-            frames.new_zeros(shape), torch.zeros(1, 1, dtype=torch.long, device=frames.device)
-        )[0]
+        return self.perception(frames.new_zeros(shape), torch.zeros(1, 1, dtype=torch.long, device=frames.device))[0]
 
     def _rollout_features(self, obs: TensorDict) -> torch.Tensor:
         """(N, D) embeddings of the current histories, from the cache if nothing they depend on has

@@ -111,9 +111,7 @@ class PerceptivePpo(PPO):
         stored: dict[str, torch.Tensor] = {f"observation '{k}'": v for k, v in storage.observations.items()}
         if storage.has_frames:
             stored["observation 'frames'"] = storage.frames
-        stored |= {
-            name: getattr(storage, name) for name in ("rewards", "actions", "values", "returns", "advantages")
-        }
+        stored |= {name: getattr(storage, name) for name in ("rewards", "actions", "values", "returns", "advantages")}
         for name, tensor in stored.items():
             finite = torch.isfinite(tensor)
             if not finite.all():

@@ -122,9 +122,7 @@ class Runner(OnPolicyRunner):
             self.logger.stop_logging_writer()
         if self._interrupted:
             self._interrupted = False
-            raise KeyboardInterrupt(
-                f"interrupted after {self.current_learning_iteration} iterations, checkpoint saved"
-            )
+            raise KeyboardInterrupt(f"interrupted after {self.current_learning_iteration} iterations, checkpoint saved")
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Write everything that a resumed run needs to ``path``, atomically."""
@@ -212,9 +210,7 @@ class Runner(OnPolicyRunner):
             self._check_step(obs, rewards)
         obs, rewards, dones = obs.to(self.device), rewards.to(self.device), dones.to(self.device)
         self.alg.process_env_step(obs, rewards, dones, extras)
-        self.logger.process_env_step(
-            rewards, dones, extras, self.alg.intrinsic_rewards if self.alg.rnd else None
-        )
+        self.logger.process_env_step(rewards, dones, extras, self.alg.intrinsic_rewards if self.alg.rnd else None)
         return obs
 
     def _check_step(self, obs: TensorDict, rewards: torch.Tensor) -> None:
@@ -222,11 +218,7 @@ class Runner(OnPolicyRunner):
         for name, tensor in (("rewards", rewards), *((g, obs[g]) for g in self.alg.storage.stored_groups)):
             finite = torch.isfinite(tensor)
             if not finite.all():
-                env = (
-                    int((~finite).flatten(1).any(1).nonzero()[0])
-                    if tensor.dim() > 1
-                    else int((~finite).nonzero()[0])
-                )
+                env = int((~finite).flatten(1).any(1).nonzero()[0]) if tensor.dim() > 1 else int((~finite).nonzero()[0])
                 raise TrainingDiverged(
                     f"iteration {self.current_learning_iteration}: the environment returned"
                     f" non-finite {name}, first in environment {env}"
@@ -261,9 +253,7 @@ class Runner(OnPolicyRunner):
         def note(signum, frame) -> None:
             self._interrupted = True
             signal.signal(signal.SIGINT, previous)
-            print(
-                "interrupted: finishing this iteration, then saving (Ctrl-C again stops at once)", flush=True
-            )
+            print("interrupted: finishing this iteration, then saving (Ctrl-C again stops at once)", flush=True)
 
         previous = signal.signal(signal.SIGINT, note)
         try:

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 import warp as wp
+import itertools
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no line per compiled kernel
 
@@ -33,7 +34,7 @@ def split(num_envs: int, work_per_env: int, num_threads: int) -> list[tuple[int,
     worth = max(1, num_envs * work_per_env // MIN_CHUNK_WORK)
     num_chunks = min(num_envs, worth, 1 if num_threads == 1 else num_threads * CHUNKS_PER_THREAD)
     edges = [num_envs * k // num_chunks for k in range(num_chunks + 1)]
-    return [(low, high - low) for low, high in zip(edges, edges[1:], strict=False)]
+    return [(low, high - low) for low, high in itertools.pairwise(edges)]
 
 
 class SplitLaunch:
@@ -57,9 +58,7 @@ class SplitLaunch:
         threads = 1 if self.cuda_device else num_threads
         chunks = split(num_envs, work_per_env, threads) if num_envs else []
         self.commands = [
-            wp.launch(
-                kernel, dim=(count, *inner), inputs=[first, *args], device=wp_device(device), record_cmd=True
-            )
+            wp.launch(kernel, dim=(count, *inner), inputs=[first, *args], device=wp_device(device), record_cmd=True)
             for first, count in chunks
         ]
         self.pool = thread_pool(threads - 1) if len(chunks) > 1 else None
@@ -92,7 +91,5 @@ class SplitLaunch:
 def wp_device(device: torch.device) -> wp.Device:
     """The Warp device of a torch device."""
     if device.type == "cuda":
-        return wp.get_device(
-            f"cuda:{device.index if device.index is not None else torch.cuda.current_device()}"
-        )
+        return wp.get_device(f"cuda:{device.index if device.index is not None else torch.cuda.current_device()}")
     return wp.get_device(device.type)

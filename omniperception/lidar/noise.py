@@ -47,9 +47,7 @@ def noise_parameters(noise: Sequence[Noise]) -> tuple[float, float, float, float
     """(distance ratio, mask ratio, mask low, mask high) of at most one noise of each kind; 0 for none."""
     for kind in (MaskNoise, DistanceNoise):
         if sum(isinstance(item, kind) for item in noise) > 1:
-            raise ValueError(
-                f"lidar.noise holds more than one {kind.__name__}; give at most one of each kind"
-            )
+            raise ValueError(f"lidar.noise holds more than one {kind.__name__}; give at most one of each kind")
     unknown = [item for item in noise if not isinstance(item, (MaskNoise, DistanceNoise))]
     if unknown:
         raise ValueError(f"lidar.noise={unknown} must be MaskNoise or DistanceNoise")

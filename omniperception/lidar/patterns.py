@@ -32,27 +32,18 @@ class ScanPattern:
 
     def __post_init__(self) -> None:
         rows = self.elevation.shape
-        if (
-            len(rows) != 1
-            or rows[0] < 1
-            or self.azimuth.shape != rows
-            or self.directions_s.shape != (*rows, 3)
-        ):
+        if len(rows) != 1 or rows[0] < 1 or self.azimuth.shape != rows or self.directions_s.shape != (*rows, 3):
             raise ValueError(
                 f"pattern needs directions_s (M, 3), elevation (M,) and azimuth (M,), M >= 1; got "
                 f"{tuple(self.directions_s.shape)}, {tuple(rows)} and {tuple(self.azimuth.shape)}"
             )
         if not (self.points_per_second > 0.0 and math.isfinite(self.points_per_second)):
-            raise ValueError(
-                f"pattern.points_per_second={self.points_per_second} must be positive and finite"
-            )
+            raise ValueError(f"pattern.points_per_second={self.points_per_second} must be positive and finite")
         if not torch.isfinite(self.directions_s).all():
             raise ValueError("pattern.directions_s must be finite")
         norms = torch.linalg.vector_norm(self.directions_s, dim=1)
         if (norms - 1.0).abs().max() > 1e-4:
-            raise ValueError(
-                f"pattern.directions_s must be unit vectors; norms span {norms.min()}..{norms.max()}"
-            )
+            raise ValueError(f"pattern.directions_s must be unit vectors; norms span {norms.min()}..{norms.max()}")
 
     @classmethod
     def from_angles(
@@ -241,9 +232,7 @@ def _series(wave: np.ufunc, amplitudes_deg: tuple[float, ...], angle: np.ndarray
     return np.radians(sum(a * wave(k * angle) for k, a in enumerate(amplitudes_deg) if a))
 
 
-def _sidebands(
-    wave: np.ufunc, amplitudes_deg: dict[int, float], carrier: np.ndarray, angle: np.ndarray
-) -> np.ndarray:
+def _sidebands(wave: np.ufunc, amplitudes_deg: dict[int, float], carrier: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.radians(sum(a * wave(carrier + k * angle) for k, a in amplitudes_deg.items()))
 
 

@@ -159,9 +159,7 @@ class RayScene:
         self.radius = upload([shape.bounding_radius for shape in self.shapes], wp.float32)
         self.shape_class = upload([shape.class_id for shape in self.shapes], wp.int32)
 
-    def launch(
-        self, kernel: wp.Kernel, inner: Sequence[int], args: Sequence, work_per_env: int = 1
-    ) -> SplitLaunch:
+    def launch(self, kernel: wp.Kernel, inner: Sequence[int], args: Sequence, work_per_env: int = 1) -> SplitLaunch:
         """A replayable launch of ``kernel`` over ``(num_envs, *inner)`` on this scene's device."""
         return SplitLaunch(kernel, self.num_envs, inner, args, self.device, self.num_threads, work_per_env)
 
@@ -192,11 +190,7 @@ class RayScene:
         Returns:
             Freshly allocated hits.
         """
-        if (
-            origins_w.shape != directions_w.shape
-            or origins_w.ndim != 3
-            or origins_w.shape[::2] != (self.num_envs, 3)
-        ):
+        if origins_w.shape != directions_w.shape or origins_w.ndim != 3 or origins_w.shape[::2] != (self.num_envs, 3):
             raise ValueError(
                 f"origins_w {tuple(origins_w.shape)} and directions_w {tuple(directions_w.shape)} "
                 f"must both be (num_envs={self.num_envs}, R, 3)"

@@ -55,9 +55,7 @@ class LidarConfig:
         if not self.min_range >= 0.0:
             raise ValueError(f"lidar.min_range={self.min_range} must be >= 0")
         if not (self.max_range > self.min_range and math.isfinite(self.max_range)):
-            raise ValueError(
-                f"lidar.max_range={self.max_range} must be > lidar.min_range={self.min_range} and finite"
-            )
+            raise ValueError(f"lidar.max_range={self.max_range} must be > lidar.min_range={self.min_range} and finite")
         object.__setattr__(self, "mount_pos", finite_tuple("lidar.mount_pos", self.mount_pos, 3))
         if self.mount_rpy is not None and self.mount_quat is not None:
             raise ValueError("lidar.mount_rpy and lidar.mount_quat are both given; set one of them to null")
@@ -186,9 +184,7 @@ class Lidar:
 
     def _record_cast(self, stride: int):
         pattern, scene, frame, placed = self.pattern, self.scene, self.frame, self._placed
-        self._scan = torch.cat(
-            [pattern.directions_s, pattern.elevation[:, None], pattern.azimuth[:, None]], dim=1
-        )
+        self._scan = torch.cat([pattern.directions_s, pattern.elevation[:, None], pattern.azimuth[:, None]], dim=1)
         self._scan = self._scan.to(device=scene.device, dtype=torch.float32).contiguous()
         args = [
             wp.from_torch(self._scan, dtype=ScanRow),
@@ -225,6 +221,4 @@ class Lidar:
             wp.from_torch(self.frame.true_ranges),
             wp.from_torch(self.frame.ranges),
         ]
-        return self.scene.launch(
-            add_noise, (self.config.num_rays,), args, work_per_env=4 * self.config.num_rays
-        )
+        return self.scene.launch(add_noise, (self.config.num_rays,), args, work_per_env=4 * self.config.num_rays)

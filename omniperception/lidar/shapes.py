@@ -53,16 +53,12 @@ class Shape:
         object.__setattr__(self, "kind", kind)
         names = SIZE_NAMES[kind]
         for field, length in (("size", len(names)), ("pos", 3), ("quat", 4)):
-            object.__setattr__(
-                self, field, finite_tuple(f"shape.{field}", getattr(self, field), length, names)
-            )
+            object.__setattr__(self, field, finite_tuple(f"shape.{field}", getattr(self, field), length, names))
         if any(value <= 0.0 for value in self.size):
             raise ValueError(f"shape.size={self.size} of a {kind.name.lower()} must be positive: {names}")
         norm = math.sqrt(sum(value * value for value in self.quat))
         if abs(norm - 1.0) > 1e-3:
-            raise ValueError(
-                f"shape.quat={self.quat} must be a unit quaternion (w, x, y, z); its norm is {norm:.6g}"
-            )
+            raise ValueError(f"shape.quat={self.quat} must be a unit quaternion (w, x, y, z); its norm is {norm:.6g}")
         if self.body < -1:
             raise ValueError(f"shape.body={self.body} must be a body index >= 0, or -1 for a fixed shape")
         if self.class_id < 0:
@@ -82,9 +78,7 @@ class Shape:
         return max(self.size)
 
 
-def finite_tuple(
-    key: str, value: Sequence[float], length: int, names: Sequence[str] = ()
-) -> tuple[float, ...]:
+def finite_tuple(key: str, value: Sequence[float], length: int, names: Sequence[str] = ()) -> tuple[float, ...]:
     """``value`` as a tuple of ``length`` finite floats, or a ValueError that names ``key``."""
     result = tuple(float(item) for item in value)
     if len(result) != length:

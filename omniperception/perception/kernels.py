@@ -333,12 +333,8 @@ def write_distal(
         first = b * n // bins
         last = (b + 1) * n // bins
         if pick_middle != 0:
-            points_out[env, first_slot + b] = middle_hit(
-                env, half, first, last, scale, ranges, directions, scratch
-            )
+            points_out[env, first_slot + b] = middle_hit(env, half, first, last, scale, ranges, directions, scratch)
         else:
-            points_out[env, first_slot + b] = mean_hit(
-                env, half, first, last, scale, ranges, directions, scratch
-            )
+            points_out[env, first_slot + b] = mean_hit(env, half, first, last, scale, ranges, directions, scratch)
     for b in range(bins, num_bins):
         points_out[env, first_slot + b] = wp.vec3(0.0, 0.0, 0.0)

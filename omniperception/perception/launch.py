@@ -14,6 +14,7 @@ from functools import cache
 
 import torch
 import warp as wp
+import itertools
 
 MIN_ENVS_PER_THREAD = 4
 """Fewer environments than this are not worth another thread."""
@@ -99,9 +100,7 @@ def launch_over_envs(
         launch_chunk(0, num_envs)
         return
     _load_on_cpu(kernel.module)  # compiling is not for several threads at once
-    pending = [
-        _pool(threads - 1).submit(launch_chunk, *span) for span in zip(bounds[1:-1], bounds[2:], strict=True)
-    ]
+    pending = [_pool(threads - 1).submit(launch_chunk, *span) for span in itertools.pairwise(bounds)]
     try:
         launch_chunk(0, bounds[1])
     finally:

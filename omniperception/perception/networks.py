@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from omniperception.perception.windows import WindowedGru, WindowedLinear
+import itertools
 
 FEATURE_DIM = 251
 """Size of PD-RiskNet's embedding, 187 + 64 (paper, App. PD-RiskNet Architecture); the ablations match it."""
@@ -81,7 +82,7 @@ class FpsMlp(PerceptionNetwork):
         sizes = [*hidden, feature_dim]
         self.first = WindowedLinear(3 * num_points, sizes[0], history)
         rest: list[nn.Module] = []
-        for fan_in, fan_out in zip(sizes, sizes[1:], strict=False):
+        for fan_in, fan_out in itertools.pairwise(sizes):
             rest += [nn.ELU(), nn.Linear(fan_in, fan_out)]
         self.rest = nn.Sequential(*rest)
 

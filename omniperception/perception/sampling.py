@@ -69,8 +69,7 @@ class Sampler(ABC):
         for name, tensor in {"ranges": ranges, **given}.items():
             if tensor.dtype != torch.float32 or tensor.device != ranges.device:
                 raise ValueError(
-                    f"sampler: {name} must be float32 on {ranges.device}, got {tensor.dtype} on"
-                    f" {tensor.device}"
+                    f"sampler: {name} must be float32 on {ranges.device}, got {tensor.dtype} on {tensor.device}"
                 )
         self._sample(ranges, directions_s, elevation, azimuth, out)
 
@@ -142,9 +141,7 @@ class PdSampler(Sampler):
             num_threads: CPU threads; all cores by default.
         """
         if num_proximal < 0 or num_distal < 0:
-            raise ValueError(
-                f"num_proximal and num_distal must not be negative, got {num_proximal} and {num_distal}"
-            )
+            raise ValueError(f"num_proximal and num_distal must not be negative, got {num_proximal} and {num_distal}")
         super().__init__(num_proximal + num_distal, max_range, num_threads)
         if not 180.0 / kernels.MAX_RING < ring_deg <= 180.0:
             raise ValueError(f"ring_deg must lie in (0.006, 180], got {ring_deg}")
@@ -229,9 +226,7 @@ class PdSampler(Sampler):
             "ray": (n, r),
             "distance": (n, r),
         }
-        self._tensors = {
-            name: torch.empty(size, dtype=torch.int32, device=device) for name, size in sizes.items()
-        }
+        self._tensors = {name: torch.empty(size, dtype=torch.int32, device=device) for name, size in sizes.items()}
         self._tensors |= {name: torch.empty(n, r, device=device) for name in "xyz"}
         scratch = kernels.Scratch()
         for name, tensor in self._tensors.items():

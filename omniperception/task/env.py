@@ -76,7 +76,9 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.lidar is None:
             if self.sampler is not None:
-                raise ValueError("lidar=none gives the perception network nothing to see; use lidar=mid360 or perception=none")
+                raise ValueError(
+                    "lidar=none gives the perception network nothing to see; use lidar=mid360 or perception=none"
+                )
             unmet = sorted(self.fields_read() & {"sectors", "rays"})
             if unmet:
                 raise ValueError(

@@ -132,7 +132,10 @@ class Randomizer:
 
     def _scale_motors(self, env_ids: torch.Tensor) -> None:
         scale = self._draw(env_ids, "motor_strength", (self._model.nu, 1))
-        gain, bias = torch.as_tensor(self._model.actuator_gainprm), torch.as_tensor(self._model.actuator_biasprm)
+        gain, bias = (
+            torch.as_tensor(self._model.actuator_gainprm),
+            torch.as_tensor(self._model.actuator_biasprm),
+        )
         self._sim.model_field("actuator_gainprm")[env_ids] = gain * scale
         self._sim.model_field("actuator_biasprm")[env_ids] = bias * scale
 

@@ -165,7 +165,10 @@ def closing_speed(env: OmniEnv, horizon: float, margin: float) -> torch.Tensor:
     velocities; the term is the largest (1 - clearance / margin) (1 - time / horizon) with clearance (m) to the
     obstacle's edge below `margin` (m). It sees the approach, where the sector distances see only the distance.
     """
-    rel_pos, rel_vel = env.obstacle_rel_pos_yaw, env.obstacle_vel_yaw - env.kinematics.base_lin_vel_yaw[:, None]
+    rel_pos, rel_vel = (
+        env.obstacle_rel_pos_yaw,
+        env.obstacle_vel_yaw - env.kinematics.base_lin_vel_yaw[:, None],
+    )
     speed_squared = rel_vel.square().sum(-1)
     time = (-(rel_pos * rel_vel).sum(-1) / speed_squared.clamp(min=1e-6)).clamp(0.0, horizon)
     closest = (rel_pos + rel_vel * time[..., None]).norm(dim=-1) - env.obstacle_radius

@@ -7,7 +7,15 @@ from dataclasses import dataclass
 
 import torch
 
-from omniperception.lidar import Lidar, LidarConfig, LidarFrame, Noise, RayScene, ScanPattern, sector_distances
+from omniperception.lidar import (
+    Lidar,
+    LidarConfig,
+    LidarFrame,
+    Noise,
+    RayScene,
+    ScanPattern,
+    sector_distances,
+)
 from omniperception.sim import Simulator
 from omniperception.world import ray_shapes
 from omniperception.world.rays import HitClass

@@ -33,9 +33,7 @@ def test_every_environment_gives_equally_many_episodes(make_env):
 
 
 def test_short_episodes_are_not_over_represented(make_env):
-    env = make_env(
-        *BLIND, "terminations.episode_length_s=2.0", "terminations.min_base_height=0.25", "num_envs=4"
-    )
+    env = make_env(*BLIND, "terminations.episode_length_s=2.0", "terminations.min_base_height=0.25", "num_envs=4")
     ends = torch.zeros(4, dtype=torch.int64)
     episodes = run_episodes(env, fling, 8, on_step=lambda: ends.add_(env.done))
     fell = episodes.ended("fall").reshape(4, 2)

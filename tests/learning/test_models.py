@@ -19,9 +19,7 @@ def actor_for(env, network="pd", **options):
     torch.manual_seed(1)
     groups = {"actor": ["policy"]}
     options = {"hidden_dims": [8], "distribution_cfg": {"class_name": "GaussianDistribution"}, **options}
-    return PerceptionActor(
-        env.get_observations(), groups, "actor", 2, perception=NETWORKS[network], **options
-    )
+    return PerceptionActor(env.get_observations(), groups, "actor", 2, perception=NETWORKS[network], **options)
 
 
 def advance(env, steps):

@@ -35,9 +35,7 @@ def differences(a, b, where=""):
     if isinstance(a, dict):
         return [d for k in a if k != "total_time" for d in differences(a[k], b[k], f"{where}.{k}")]
     if isinstance(a, list | tuple):
-        return [
-            d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{where}[{i}]")
-        ]
+        return [d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{where}[{i}]")]
     same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
     return [] if same else [where]
 

@@ -39,9 +39,7 @@ def test_every_step_finds_its_own_window(num_envs, num_batches):
             for row in range(obs.batch_size[0]):
                 step = row // num_in_batch
                 assert batch.values[row] == step
-                [env_id] = [
-                    e for e in range(num_envs) if torch.equal(storage.actions[step, e], batch.actions[row])
-                ]
+                [env_id] = [e for e in range(num_envs) if torch.equal(storage.actions[step, e], batch.actions[row])]
                 visited.append((step, env_id))
                 truth = seen[step][env_id]
                 assert torch.equal(obs["policy"][row], truth["policy"])
@@ -88,9 +86,7 @@ def test_too_many_frames_and_missing_calls_are_reported():
         PerceptiveStorage(2, 4, ToyEnv(2, frames=False).get_observations(), ["policy"], 2, frames=True)
 
 
-@pytest.mark.parametrize(
-    ("steps", "period", "expected"), [(24, 5, 6), (1, 5, 1), (5, 5, 2), (6, 5, 2), (7, 1, 7)]
-)
+@pytest.mark.parametrize(("steps", "period", "expected"), [(24, 5, 6), (1, 5, 1), (5, 5, 2), (6, 5, 2), (7, 1, 7)])
 def test_most_windows_by_enumeration(steps, period, expected):
     ticks = [{(offset + s) // period for s in range(steps)} for offset in range(period)]
     assert max(map(len, ticks)) == max_windows(steps, period) == expected
@@ -107,9 +103,7 @@ def test_measured_bytes_are_as_predicted_and_a_tenth_of_storing_windows():
     obs = env.get_observations()
     obs["frames"] = torch.zeros(8, 10, 48, 3)
     storage = PerceptiveStorage(8, 24, obs, ["policy"], 2, frames=True, steps_per_frame=5)
-    buffers = [v for v in vars(storage).values() if isinstance(v, torch.Tensor)] + list(
-        storage.observations.values()
-    )
+    buffers = [v for v in vars(storage).values() if isinstance(v, torch.Tensor)] + list(storage.observations.values())
     clouds = sum(b.untyped_storage().nbytes() for b in buffers if b.shape[-2:] == (48, 3))
     shared, windows = point_cloud_bytes(8, 24, 48, 10, 5)
     assert clouds == shared

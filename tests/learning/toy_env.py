@@ -61,9 +61,7 @@ class ToyEnv(VecEnv):
         self.tick += 1
         self.frames[:, :-1] = self.frames[:, 1:].clone()
         noise = torch.randn(self.num_envs, POINTS, 1) * 0.01  # torch's global generator
-        self.frames[:, -1] = (
-            torch.cat([self.position, torch.ones(self.num_envs, 1)], -1).unsqueeze(1) * 0.1 + noise
-        )
+        self.frames[:, -1] = torch.cat([self.position, torch.ones(self.num_envs, 1)], -1).unsqueeze(1) * 0.1 + noise
         self.frame_count = (self.frame_count + 1).clamp(max=HISTORY)
 
     def _reset(self, ids):

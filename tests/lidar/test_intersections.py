@@ -10,9 +10,7 @@ import torch
 from omniperception.lidar import RayScene, Shape, ShapeKind
 
 RELATIVE, ABSOLUTE = 1e-5, 1e-5
-GRAZING = (
-    1e-3  # hit or miss may differ where mj_ray changes its mind when the ray moves sideways by this, metres
-)
+GRAZING = 1e-3  # hit or miss may differ where mj_ray changes its mind when the ray moves sideways by this, metres
 SHALLOW = 0.05  # the tolerance grows as SHALLOW / |cos of incidence| below this: float32 cannot do better
 
 SIZES = {

@@ -35,7 +35,7 @@ def test_mask_replaces_its_share_of_the_hits(pattern):
     masked = frame.ranges[frame.ranges != frame.true_ranges]
     share = masked.numel() / frame.ranges.numel()
     assert share == pytest.approx(0.1, abs=4.0 * math.sqrt(0.1 * 0.9 / 20_000))
-    assert 0.0 <= masked.min() and masked.max() <= 0.3
+    assert masked.min() >= 0.0 and masked.max() <= 0.3
     assert masked.mean() == pytest.approx(0.15, abs=4.0 * 0.3 / math.sqrt(12 * 2000))
     assert (masked < 0.1).any()  # below the minimum range: the mask may
 

@@ -28,12 +28,10 @@ def seconds(*values):
 def test_mid360_model_has_the_devices_field_of_view(model):
     elevation = np.degrees(model.elevation.numpy())
     assert model.num_rows == 800_000 and model.points_per_second == RATE
-    assert elevation.min() == pytest.approx(-7.21, abs=0.3) and elevation.max() == pytest.approx(
-        52.16, abs=0.3
-    )
+    assert elevation.min() == pytest.approx(-7.21, abs=0.3) and elevation.max() == pytest.approx(52.16, abs=0.3)
     filled, _ = np.histogram(model.azimuth.numpy(), bins=360, range=(0.0, 2.0 * math.pi))
     assert filled.min() > 0.9 * filled.mean()
-    assert 0.0 <= model.azimuth.min() and model.azimuth.max() <= np.float32(2.0 * math.pi)
+    assert model.azimuth.min() >= 0.0 and model.azimuth.max() <= np.float32(2.0 * math.pi)
 
 
 def test_directions_agree_with_the_angles(model):

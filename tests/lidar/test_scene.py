@@ -44,9 +44,7 @@ def test_a_miss_after_a_hit_is_infinite():
 @pytest.mark.parametrize("num_envs", [1, 3, 7])
 @pytest.mark.parametrize("num_rays", [0, 1, 3001])
 @pytest.mark.parametrize("num_bodies", [0, 2])
-@pytest.mark.parametrize(
-    "shapes", [[], [Shape(ShapeKind.SPHERE, (0.5,), pos=(2.0, 0.0, 0.0))]], ids=["empty", "one"]
-)
+@pytest.mark.parametrize("shapes", [[], [Shape(ShapeKind.SPHERE, (0.5,), pos=(2.0, 0.0, 0.0))]], ids=["empty", "one"])
 def test_odd_counts(num_envs, num_rays, num_bodies, shapes):
     scene = RayScene(shapes, num_envs, num_bodies, num_threads=2)
     assert scene.body_pos.shape == (num_envs, num_bodies, 3) and scene.body_quat.shape == (

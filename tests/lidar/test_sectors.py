@@ -17,9 +17,7 @@ def sectors(points_s, classes, base_quat=UPRIGHT, mount_pos=(0.0, 0.0, 0.0), mou
     class_id = torch.tensor(classes, dtype=torch.int32).reshape(1, -1)
     quat = torch.tensor([base_quat], dtype=torch.float32)
     options = {"obstacle_class": OBSTACLE, "max_distance": 5.0} | options
-    return sector_distances(
-        ranges, points / ranges[..., None], class_id, quat, mount_pos, mount_quat, **options
-    )[0]
+    return sector_distances(ranges, points / ranges[..., None], class_id, quat, mount_pos, mount_quat, **options)[0]
 
 
 def ring(radius=lambda j: 1.0 + j / 36.0):
@@ -41,9 +39,7 @@ def test_one_hit_fills_one_sector_with_its_horizontal_distance():
 
 def test_the_nearest_hit_of_a_sector_counts_and_other_classes_do_not():
     points = [(2.0, 0.1, 0.0), (1.5, 0.1, 0.0), (0.5, 0.1, 0.0), (1.8, 0.1, 0.0)]
-    assert sectors(points, [OBSTACLE, OBSTACLE, 0, OBSTACLE])[18] == pytest.approx(
-        math.hypot(1.5, 0.1), rel=1e-5
-    )
+    assert sectors(points, [OBSTACLE, OBSTACLE, 0, OBSTACLE])[18] == pytest.approx(math.hypot(1.5, 0.1), rel=1e-5)
 
 
 def test_all_sectors():
@@ -77,9 +73,7 @@ def test_turning_the_sensor_on_its_mount_shifts_the_sectors():
 
 def test_pitch_is_levelled_and_the_mount_offset_counts():
     pitch = math.radians(60.0)  # nose down: the sensor, 1 m ahead in the base, is 0.5 m ahead on the level
-    distances = sectors(
-        [(2.0, 0.01, 0.0)], [OBSTACLE], quat_from_rpy(0.0, pitch, 0.7), mount_pos=(1.0, 0.0, 0.0)
-    )
+    distances = sectors([(2.0, 0.01, 0.0)], [OBSTACLE], quat_from_rpy(0.0, pitch, 0.7), mount_pos=(1.0, 0.0, 0.0))
     assert distances[18] == pytest.approx(math.hypot(0.5 + 2.0 * math.cos(pitch), 0.01), rel=1e-5)
 
 

@@ -36,9 +36,7 @@ def crowd(num_envs, seed=0, num_threads=2):
         K.CAPSULE: (0.1, 0.5),
         K.ELLIPSOID: (0.2, 0.4, 0.6),
     }
-    shapes = [Shape(K.PLANE)] + [
-        Shape(k, sizes[k], body=1 + i, class_id=1 + i % 3) for i, k in enumerate(closed)
-    ]
+    shapes = [Shape(K.PLANE)] + [Shape(k, sizes[k], body=1 + i, class_id=1 + i % 3) for i, k in enumerate(closed)]
     scene = RayScene(shapes, num_envs, 1 + len(closed), num_threads=num_threads)
     generator = torch.Generator().manual_seed(seed)
     scene.body_pos[:] = 6.0 * torch.rand(scene.body_pos.shape, generator=generator) - 3.0
@@ -119,13 +117,9 @@ def test_mounting_follows_the_body():
     scene.body_pos[0, 0, 2] = 2.0
     config = LidarConfig(1, 1 / 30, 0.1, 50.0, (0.0, 0.0, 0.5), (0.0, math.radians(30.0), 0.0))
     lidar = Lidar(config, grid(1, 1, 10.0), scene, 0)
-    assert float(lidar.cast(clock(1, 0.0)).ranges) == pytest.approx(
-        2.5 / math.sin(math.radians(30.0)), rel=1e-5
-    )
+    assert float(lidar.cast(clock(1, 0.0)).ranges) == pytest.approx(2.5 / math.sin(math.radians(30.0)), rel=1e-5)
     scene.body_quat[0, 0] = torch.tensor(quat_from_rpy(0.0, math.radians(60.0), 1.0))  # nose down by 60 more
-    assert float(lidar.cast(clock(1, 0.0)).ranges) == pytest.approx(
-        2.0 + 0.5 * math.cos(math.radians(60.0)), rel=1e-5
-    )
+    assert float(lidar.cast(clock(1, 0.0)).ranges) == pytest.approx(2.0 + 0.5 * math.cos(math.radians(60.0)), rel=1e-5)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
@@ -145,8 +139,7 @@ def test_odd_counts_give_the_same_on_one_thread_and_two(pattern, num_envs, num_r
 
 def test_threads_agree_on_a_crowd(pattern):
     frames = [
-        Lidar(LidarConfig(3000), pattern, crowd(7, num_threads=n), 0, (1,)).cast(clock(7, 0.3))
-        for n in (1, 2, 5)
+        Lidar(LidarConfig(3000), pattern, crowd(7, num_threads=n), 0, (1,)).cast(clock(7, 0.3)) for n in (1, 2, 5)
     ]
     assert torch.equal(frames[0].ranges, frames[1].ranges) and torch.equal(frames[0].ranges, frames[2].ranges)
 
@@ -162,9 +155,7 @@ def test_a_frame_allocates_nothing_new(pattern):
 def test_mount_published_for_the_go2_looks_forward_and_down():
     quat = torch.tensor(quat_from_rpy(0.0, -2.8782, 3.14), dtype=torch.float64)
     up = rotate(quat, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    assert up[2] == pytest.approx(math.cos(2.8782), abs=1e-3) and up[0] == pytest.approx(
-        math.sin(2.8782), abs=1e-3
-    )
+    assert up[2] == pytest.approx(math.cos(2.8782), abs=1e-3) and up[0] == pytest.approx(math.sin(2.8782), abs=1e-3)
 
 
 @pytest.mark.parametrize(

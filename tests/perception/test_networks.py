@@ -32,9 +32,7 @@ def gru_by_window(gru, frames, count):
 
 
 def plain_gru(windowed):
-    plain = nn.GRU(windowed.input_size, windowed.hidden_size, batch_first=True).to(
-        windowed.weight_ih_l0.dtype
-    )
+    plain = nn.GRU(windowed.input_size, windowed.hidden_size, batch_first=True).to(windowed.weight_ih_l0.dtype)
     plain.load_state_dict(windowed.state_dict())
     return plain
 

@@ -8,6 +8,7 @@ import torch
 from clouds import MAX_RANGE, random_rays, rays_from_points, sample
 
 from omniperception.perception import FpsSampler, PdSampler, RawSampler
+import itertools
 
 
 def brute_force_fps(points, k):
@@ -126,7 +127,7 @@ class TestDistal:
             ids = [i for i in self.distal(rays, env) if torch.isfinite(rays[0][env, i])]
             cloud = (rays[0][env, ids, None] * rays[1][env, ids] / MAX_RANGE).numpy()
             edges = [b * len(ids) // 16 for b in range(17)]
-            bins = [cloud[a:b] for a, b in zip(edges, edges[1:], strict=False)]
+            bins = [cloud[a:b] for a, b in itertools.pairwise(edges)]
             expected = [b.mean(0) if reduce == "average" else b[len(b) // 2] for b in bins]
             np.testing.assert_allclose(got[env, 8:], expected, atol=1e-5)
 
@@ -146,18 +147,14 @@ class TestDistal:
     def test_bins_of_rays_without_any_hit_are_free_space(self):
         ranges, *rest = random_rays(2, 250, seed=9)
         for reduce in ("average", "pick"):
-            sampler = PdSampler(
-                8, 16, max_range=MAX_RANGE, split_deg=self.SPLIT, distal_bins="rays", reduce=reduce
-            )
+            sampler = PdSampler(8, 16, max_range=MAX_RANGE, split_deg=self.SPLIT, distal_bins="rays", reduce=reduce)
             got = sample(sampler, (torch.full_like(ranges, math.inf), *rest))
             assert (got[:, :8] == 0).all()
             assert torch.allclose(got[:, 8:].norm(dim=-1), torch.ones(2, 16), atol=1e-5)
 
     def test_partition_by_elevation(self):
         rays = random_rays(3, 300, seed=10)
-        got = sample(
-            PdSampler(32, 32, max_range=MAX_RANGE, split_deg=self.SPLIT, reduce="pick"), rays
-        ).double()
+        got = sample(PdSampler(32, 32, max_range=MAX_RANGE, split_deg=self.SPLIT, reduce="pick"), rays).double()
         theta = torch.rad2deg(torch.asin(got[..., 2] / got.norm(dim=-1)))
         assert (theta[:, :32] > self.SPLIT).all() and (theta[:, 32:] <= self.SPLIT).all()
 
@@ -166,9 +163,7 @@ class TestInterface:
     def test_raw_points_in_ray_order(self):
         rays = random_rays(3, 50)
         got = sample(RawSampler(50, max_range=MAX_RANGE), rays)
-        expected = torch.where(
-            torch.isfinite(rays[0])[..., None], rays[0][..., None] * rays[1] / MAX_RANGE, 0.0
-        )
+        expected = torch.where(torch.isfinite(rays[0])[..., None], rays[0][..., None] * rays[1] / MAX_RANGE, 0.0)
         assert torch.allclose(got, expected, atol=1e-6)
 
     @pytest.mark.parametrize("num_envs", [1, 2, 7, 33])
@@ -198,9 +193,7 @@ class TestInterface:
         ranges, directions, theta, phi = random_rays(4, 60, seed=11)
         shared = directions[:1].expand(4, -1, -1), theta[:1].expand(4, -1), phi[:1].expand(4, -1)
         sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
-        assert torch.equal(
-            sample(sampler, (ranges, *shared)), sample(sampler, (ranges, *(t.clone() for t in shared)))
-        )
+        assert torch.equal(sample(sampler, (ranges, *shared)), sample(sampler, (ranges, *(t.clone() for t in shared))))
 
     def test_azimuth_branch_does_not_matter(self):
         ranges, directions, theta, phi = random_rays(2, 60, seed=12)

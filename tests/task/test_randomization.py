@@ -212,9 +212,7 @@ class TestLatency:
             observations = env.step(torch.ones(3, 12))[0]
         newest = observations["proprioception"].unflatten(1, (10, 33))[:, -1, :12]
         torch.testing.assert_close(newest, env.sensed.joint_pos - env.default_joint_pos)
-        torch.testing.assert_close(
-            observations["privileged"][:, :12], env.kinematics.joint_pos - env.default_joint_pos
-        )
+        torch.testing.assert_close(observations["privileged"][:, :12], env.kinematics.joint_pos - env.default_joint_pos)
 
     def test_a_reset_has_no_past(self, one_row):
         env = one_row("latency_s", 0.045, 0.045, num_envs=3)

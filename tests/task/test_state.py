@@ -79,9 +79,7 @@ def test_turning_about_the_vertical_changes_only_world_quantities():
     for i in range(len(qpos)):
         turned_qpos[i, :3], turned_qvel[i, :3] = rotated(qpos[i, :3], turn), rotated(qvel[i, :3], turn)
         mujoco.mju_mulQuat(turned_qpos[i, 3:7], turn, qpos[i, 3:7])
-    a, b = (
-        Kinematics.of(torch.tensor(p), torch.tensor(v)) for p, v in ((qpos, qvel), (turned_qpos, turned_qvel))
-    )
+    a, b = (Kinematics.of(torch.tensor(p), torch.tensor(v)) for p, v in ((qpos, qvel), (turned_qpos, turned_qvel)))
     for field in ("base_lin_vel_b", "base_lin_vel_yaw", "base_ang_vel_b", "projected_gravity_b"):
         torch.testing.assert_close(getattr(a, field), getattr(b, field), atol=1e-5, rtol=0)
     difference = torch.remainder(b.yaw - a.yaw - 1.2 + torch.pi, 2 * torch.pi) - torch.pi
