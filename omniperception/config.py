@@ -104,7 +104,7 @@ def save(composed: dict, run_dir: Path) -> None:
 
 
 def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
-    """The configuration of a run; group overrides (obstacles=static) replace whole groups, dotted ones single values."""
+    """The configuration of a run; obstacles=static replaces a whole group, dotted overrides single values."""
     path = run_dir / CONFIG_FILE
     if not path.is_file():
         raise ConfigError(f"{run_dir} is not a run directory: it has no {CONFIG_FILE}; run=latest finds the newest run")

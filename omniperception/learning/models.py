@@ -92,10 +92,8 @@ class PerceptionActor(MLPModel):
         hidden_state: HiddenState = None,
     ) -> torch.Tensor:
         """Normalised one-dimensional groups and the embedding, concatenated."""
-        if isinstance(obs, WindowedObservations):
-            features = self._update_features(obs)
-        else:
-            features = self._rollout_features(obs)
+        in_update = isinstance(obs, WindowedObservations)
+        features = self._update_features(obs) if in_update else self._rollout_features(obs)
         return torch.cat([super().get_latent(obs, masks, hidden_state), features], dim=-1)
 
     def pop_supervised_losses(self) -> dict[str, float]:

@@ -279,7 +279,7 @@ def place_shapes(
         q_carrier = to_quat(body_quat[env, view_body])
         p_view = body_pos[env, view_body] + wp.quat_rotate(q_carrier, view_pos)
         q_view = q_carrier * q_view
-    count = 0
+    count = wp.int32(0)
     for i in range(num_viewed):
         shape = viewed[i]
         body = shape_body[shape]
@@ -365,7 +365,7 @@ def cast_scan(
     entry = scan[row]
     d = wp.vec3(entry[0], entry[1], entry[2])
     best = max_range
-    hit = -1
+    hit = wp.int32(-1)
     for s in range(num_slots[env]):
         if slot_near[env, s] >= best:
             break
@@ -380,8 +380,8 @@ def cast_scan(
                 hit = shape
     if hit < 0 or best < min_range:
         best = INF
-        hit = -1
-    label = -1
+        hit = wp.int32(-1)
+    label = wp.int32(-1)
     if hit >= 0:
         label = shape_class[hit]
     ranges_out[env, ray] = best
@@ -420,8 +420,8 @@ def cast_rays(
     origin = origins[env, ray]
     d = wp.normalize(directions[env, ray])
     best = max_range
-    hit = -1
-    hit_slot = 0
+    hit = wp.int32(-1)
+    hit_slot = wp.int32(0)
     for s in range(num_slots[env]):
         shape = slot_shape[env, s]
         bound = slot_bound[env, s]

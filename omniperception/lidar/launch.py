@@ -1,5 +1,6 @@
 """Recorded kernel launches: one on a GPU, split over environments and threads on a CPU."""
 
+import itertools
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -8,7 +9,6 @@ from typing import Any
 
 import torch
 import warp as wp
-import itertools
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no line per compiled kernel
 
@@ -53,12 +53,20 @@ class SplitLaunch:
         device: torch.device,
         num_threads: int,
         work_per_env: int = 1,
+        block_dim: int = 256,
     ) -> None:
         self.cuda_device = device if device.type == "cuda" else None
         threads = 1 if self.cuda_device else num_threads
         chunks = split(num_envs, work_per_env, threads) if num_envs else []
         self.commands = [
-            wp.launch(kernel, dim=(count, *inner), inputs=[first, *args], device=wp_device(device), record_cmd=True)
+            wp.launch(
+                kernel,
+                dim=(count, *inner),
+                inputs=[first, *args],
+                device=wp_device(device),
+                record_cmd=True,
+                block_dim=block_dim,
+            )
             for first, count in chunks
         ]
         self.pool = thread_pool(threads - 1) if len(chunks) > 1 else None

@@ -1,33 +1,19 @@
-"""Launching Warp kernels over environments: one launch on CUDA, one per worker thread on the CPU.
-
-Warp runs a CPU launch on the calling thread but releases the interpreter lock meanwhile, so splitting the
-environment dimension over a few persistent threads uses all cores. Every kernel launched here takes
-``env_offset`` first.
-"""
+"""Launching Warp kernels on tensors that come with each call, over environments and CPU threads."""
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 
 import torch
 import warp as wp
-import itertools
 
-MIN_ENVS_PER_THREAD = 4
-"""Fewer environments than this are not worth another thread."""
+from omniperception.lidar.launch import SplitLaunch, default_num_threads
+
+_WORK_PER_ENV = 1024
+"""Sampling one environment's cloud is worth a thread from a handful of environments on."""
 
 _VIEW_CACHE_SIZE = 64
 _views: OrderedDict[tuple, wp.array] = OrderedDict()
-
-
-def default_num_threads() -> int:
-    """Number of CPU cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def view(tensor: torch.Tensor, dtype: type) -> wp.array:
@@ -83,36 +69,6 @@ def launch_over_envs(
         block_dim: CUDA threads per block.
         num_threads: CPU threads; all the process may use by default.
     """
-    if num_envs == 0:
-        return
     shape = (inner,) if inner else ()
-    if device.type == "cuda":
-        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, dim=(num_envs, *shape), inputs=[0, *inputs], stream=stream, block_dim=block_dim)
-        return
-    threads = min(num_threads or default_num_threads(), max(1, num_envs // MIN_ENVS_PER_THREAD))
-    bounds = [num_envs * i // threads for i in range(threads + 1)]
-
-    def launch_chunk(first: int, last: int) -> None:
-        wp.launch(kernel, dim=(last - first, *shape), inputs=[first, *inputs], device="cpu")
-
-    if threads == 1:
-        launch_chunk(0, num_envs)
-        return
-    _load_on_cpu(kernel.module)  # compiling is not for several threads at once
-    pending = [_pool(threads - 1).submit(launch_chunk, *span) for span in itertools.pairwise(bounds)]
-    try:
-        launch_chunk(0, bounds[1])
-    finally:
-        for future in pending:
-            future.result()
-
-
-@cache
-def _pool(num_workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(num_workers, thread_name_prefix="warp-cpu")
-
-
-@cache
-def _load_on_cpu(module: wp.Module) -> None:
-    wp.load_module(module, device="cpu")
+    threads = num_threads or default_num_threads()
+    SplitLaunch(kernel, num_envs, shape, inputs, device, threads, _WORK_PER_ENV, block_dim)()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import nn
 
 from omniperception.perception.windows import WindowedGru, WindowedLinear
-import itertools
 
 FEATURE_DIM = 251
 """Size of PD-RiskNet's embedding, 187 + 64 (paper, App. PD-RiskNet Architecture); the ablations match it."""

@@ -61,7 +61,7 @@ class Simulator(Protocol):
     num_envs: int
     device: torch.device
     qpos: torch.Tensor
-    """(num_envs, 7 + num_joints) float64: base position (m, environment frame), quaternion (w, x, y, z), joints (rad)."""
+    """(num_envs, 7 + num_joints) float64: base position (m, environment frame), quaternion (wxyz), joints (rad)."""
     qvel: torch.Tensor
     """(num_envs, 6 + num_joints) float64: base linear velocity (m/s, world), angular velocity (rad/s, base), joints."""
     mocap_pos: torch.Tensor

@@ -1,5 +1,6 @@
 """Samplers against brute force in NumPy, and on degenerate clouds."""
 
+import itertools
 import math
 
 import numpy as np
@@ -8,7 +9,6 @@ import torch
 from clouds import MAX_RANGE, random_rays, rays_from_points, sample
 
 from omniperception.perception import FpsSampler, PdSampler, RawSampler
-import itertools
 
 
 def brute_force_fps(points, k):
