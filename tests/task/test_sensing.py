@@ -107,6 +107,15 @@ def test_noise_reaches_the_points_and_not_the_reward(make_env):
     assert not torch.equal(clean.sensing.frames, noisy.sensing.frames)
 
 
+def test_sector_target_is_the_nearness_of_obstacles(make_env):
+    """1 - d / 4 m, and 0 from 4 m on."""
+    env = make_env("obstacles=static", "perception.sector_weight=1.0")
+    env.sensing.sector_distance[0, :5] = torch.tensor([0.0, 1.0, 3.0, 4.0, 6.0])
+    target = env.step(still(env))[0]["sector_target"]
+    assert target[0, :5].tolist() == pytest.approx([1.0, 0.75, 0.25, 0.0, 0.0])
+    assert "sector_target" not in make_env("obstacles=static").get_observations().keys()  # noqa: SIM118
+
+
 @pytest.mark.parametrize("period", ["0.03", "0.005"])
 def test_a_period_between_control_steps_is_refused(make_env, period):
     with pytest.raises(ValueError, match=rf"lidar\.sensor\.period_s={period} must be a multiple"):
