@@ -71,8 +71,20 @@ class Simulator(Protocol):
     failed: torch.Tensor
     """(num_envs,) bool: simulations whose state became non-finite or raised an error since the last reset."""
 
-    def step(self, joint_target: torch.Tensor) -> None:
-        """One physics step with (num_envs, num_joints) joint position targets (rad)."""
+    qpos_steps: torch.Tensor
+    """(num_envs, num_steps, nq) float64: qpos after each physics step of the last call, if they are recorded."""
+    qvel_steps: torch.Tensor
+    """(num_envs, num_steps, nv) float64."""
+
+    def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
+        """Physics steps with (num_envs, num_joints) joint position targets (rad).
+
+        Args:
+            joint_target: held through all steps.
+            num_steps: physics steps.
+            mocap_path: (num_envs, num_steps, num_placed_obstacles, 3) float64, m: where the kinematic bodies are during
+                each step; None leaves them where they are.
+        """
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         """Puts some environments into a state, (n, nq) and (n, nv)."""
@@ -81,7 +93,13 @@ class Simulator(Protocol):
         """(num_envs, num_joints) actuator torque (N m) of the last physics step."""
 
     def contact_sensor(self, kind: str) -> torch.Tensor:
-        """(num_envs, width) readings of one kind of contact sensor in the last physics step."""
+        """(num_envs, width) float32 readings of one kind of contact sensor in the last physics step.
+
+        Forces (N, environment frame) are those that the geom exerts on what it touches: a foot that stands pushes down.
+        """
+
+    def touched(self, kind: str) -> torch.Tensor:
+        """(num_envs,) bool: whether a sensor of that kind found a contact in any step of the last call."""
 
     def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions (num_envs, n, 3) (m) and quaternions (num_envs, n, 4) of bodies at the current state, float32."""

@@ -17,6 +17,7 @@ _INTEGRATORS = {
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
 }
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+_MOCAP_POS = int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 _STAGE_POS = mujoco.mjtStage.mjSTAGE_POS.value
 _MAX_SPEED = 1e3
 """A generalised velocity (m/s or rad/s) beyond this is a diverged simulation."""
@@ -27,9 +28,11 @@ class MujocoSimulator:
 
     State tensors are views of the engine's own memory. Contact sensors and torques describe the state before the last
     physics step, as `mj_step` leaves them; body poses are recomputed for the current state.
+
+    The steps of one call are one native call: threads that sleep between calls cost more than the obstacles' motion.
     """
 
-    def __init__(self, world: World, config: SimConfig, num_envs: int) -> None:
+    def __init__(self, world: World, config: SimConfig, num_envs: int, record_states: bool = False) -> None:
         self.world, self.config, self.num_envs = world, config, num_envs
         self.device = torch.device("cpu")
         apply_options(world.model, config)
@@ -40,20 +43,43 @@ class MujocoSimulator:
         self.mocap_quat = torch.from_numpy(self.batch.bind("mocap_quat"))
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
-        self._sensordata = self.batch.bind("sensordata") if world.sensors else None
-        self._contacts = {kind: np.zeros((num_envs, _width(world, kind))) for kind in world.sensors}
+        self._record = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
+        self._records: dict[str, np.ndarray] = self._allocate_records(1)
         self._fields: dict[str, torch.Tensor] = {}
         self._torque: np.ndarray | None = None
         self._poses: tuple[np.ndarray, np.ndarray] | None = None
 
-    def step(self, joint_target: torch.Tensor) -> None:
+    @property
+    def qpos_steps(self) -> torch.Tensor:
+        return torch.from_numpy(self._records["qpos"])
+
+    @property
+    def qvel_steps(self) -> torch.Tensor:
+        return torch.from_numpy(self._records["qvel"])
+
+    def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
         self._ctrl.copy_(joint_target)
         try:
-            self.batch.step()
+            if mocap_path is None and not self._record:
+                self.batch.step(nstep=num_steps)
+            else:
+                self._roll_out(num_steps, mocap_path)
         except SimulationError as error:
             self.failed[torch.from_numpy(np.asarray(error.ids))] = True
-        for kind, values in self._contacts.items():
-            values[:] = self._sensordata[:, self.world.sensor_slice(kind)]
+
+    def _roll_out(self, num_steps: int, mocap_path: torch.Tensor | None) -> None:
+        """Steps with the kinematic bodies on their way, recording what somebody reads after every step."""
+        if self._records and next(iter(self._records.values())).shape[1] != num_steps:
+            self._records = self._allocate_records(num_steps)
+        control = None if mocap_path is None else mocap_path.flatten(2).numpy()
+        self.batch.rollout(
+            num_steps, control=control, control_spec=_MOCAP_POS, record=self._record or ("time",), out=self._records
+        )
+
+    def _allocate_records(self, num_steps: int) -> dict[str, np.ndarray]:
+        model = self.world.model
+        widths = {"sensordata": model.nsensordata, "qpos": model.nq, "qvel": model.nv}
+        return {name: np.zeros((self.num_envs, num_steps, widths[name])) for name in self._record}
 
     def detect_failures(self) -> None:
         """Marks simulations whose state is no longer finite or faster than anything physical."""
@@ -68,7 +94,7 @@ class MujocoSimulator:
         self.qpos[env_ids] = qpos.double()
         self.qvel[env_ids] = qvel.double()
         self.failed[env_ids] = False
-        for values in self._contacts.values():
+        for values in self._records.values():
             values[env_ids.numpy()] = 0.0
 
     def joint_torque(self) -> torch.Tensor:
@@ -77,7 +103,12 @@ class MujocoSimulator:
         return torch.from_numpy(self._torque.astype(np.float32))
 
     def contact_sensor(self, kind: str) -> torch.Tensor:
-        return torch.from_numpy(self._contacts[kind].astype(np.float32))
+        values = self._records["sensordata"][:, -1, self.world.sensor_slice(kind)]
+        return torch.from_numpy(values.astype(np.float32))
+
+    def touched(self, kind: str) -> torch.Tensor:
+        found = self._records["sensordata"][:, :, self.world.sensor_slice(kind)] > 0
+        return torch.from_numpy(found.any(axis=(1, 2)))
 
     def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         if self._poses is None:
@@ -119,8 +150,3 @@ def apply_options(model: mujoco.MjModel, config: SimConfig) -> None:
     model.opt.cone = _CONES[config.cone]
     model.opt.iterations = config.iterations
     model.opt.ls_iterations = config.ls_iterations
-
-
-def _width(world: World, kind: str) -> int:
-    columns = world.sensor_slice(kind)
-    return columns.stop - columns.start

@@ -123,7 +123,8 @@ class OmniEnv(VecEnv):
         self._reads = fields
         sensors = {FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT} & fields
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
-        self.sim = MujocoSimulator(self.world, config.sim, config.num_envs)
+        late = config.randomization.latency_s is not None
+        self.sim = MujocoSimulator(self.world, config.sim, config.num_envs, record_states=late)
         self.device = self.sim.device
         self.random = EnvRandom(config.seed, config.num_envs, self.device)
         self.command = config.commands.build(config.num_envs, self.device, self.random)
@@ -189,7 +190,7 @@ class OmniEnv(VecEnv):
             "step_count": self.step_count,
             "episode_length": self.episode_length_buf,
             "actions": list(self.actions),
-            "delayed": [list(entry) for entry in self._delayed or []],
+            "past": list(self._past or ()),
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -202,8 +203,8 @@ class OmniEnv(VecEnv):
         self.step_count = state["step_count"]
         self.episode_length_buf.copy_(state["episode_length"])
         self.actions = tuple(state["actions"])
-        if self._delayed is not None:
-            self._delayed = [tuple(entry) for entry in state["delayed"]]
+        if self._past is not None:
+            self._past = tuple(state["past"])
         for name, buffer in state["histories"].items():
             self._groups[name].buffer = buffer
         self._read_state()
@@ -215,23 +216,30 @@ class OmniEnv(VecEnv):
         target = self.default_joint_pos + self.robot.action_scale * actions
         if self.randomizer.joint_offset is not None:
             target = target + self.randomizer.joint_offset
-        self.touching.zero_()
+        path = None
+        if self.obstacles is not None:
+            with self.timer.stage("obstacles"):
+                path = self._obstacle_path()
+        with self.timer.stage("physics"):
+            self.sim.step(target, self.config.sim.decimation, path)
+            self.sim.detect_failures()
+        if OBSTACLE_CONTACT in self.world.sensors:
+            self.touching = self.sim.touched(OBSTACLE_CONTACT)
+        if self._past is not None:
+            for past, recorded in zip(self._past, (self.sim.qpos_steps, self.sim.qvel_steps), strict=True):
+                past.copy_(torch.cat((past[:, recorded.shape[1] :], recorded), 1)[:, -past.shape[1] :])
+
+    def _obstacle_path(self) -> torch.Tensor:
+        """Moves the obstacles through the control step; where they are during each of its physics steps."""
+        path = []
         for _ in range(self.config.sim.decimation):
-            if self.obstacles is not None:
-                with self.timer.stage("obstacles"):
-                    self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
-            with self.timer.stage("physics"):
-                self.sim.step(target)
-            if OBSTACLE_CONTACT in self.world.sensors:
-                self.touching |= (self.sim.contact_sensor(OBSTACLE_CONTACT) > 0).any(1)
-            if self._delayed is not None:
-                self._delayed.append((self.sim.qpos.float(), self.sim.qvel.float()))
-                del self._delayed[0]
-        self.sim.detect_failures()
+            self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
+            path.append(self.obstacles.pos_w.clone())
+        return torch.stack(path, 1)
 
     def _read_state(self) -> None:
         self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)
-        self.sensed = self.kinematics if self._delayed is None else self._late_kinematics()
+        self.sensed = self.kinematics if self._past is None else self._late_kinematics()
         if "joint_torque" in self._reads:
             self.joint_torque = self.sim.joint_torque()
         if "foot_force" in self._reads:
@@ -245,10 +253,9 @@ class OmniEnv(VecEnv):
 
     def _late_kinematics(self) -> Kinematics:
         """The state `delay` physics steps ago, by environment."""
-        qpos = torch.stack([entry[0] for entry in self._delayed])
-        qvel = torch.stack([entry[1] for entry in self._delayed])
-        index = len(self._delayed) - 1 - self.randomizer.delay
-        return Kinematics.of(qpos[index, self._all_envs], qvel[index, self._all_envs])
+        qpos, qvel = self._past
+        index = qpos.shape[1] - 1 - self.randomizer.delay
+        return Kinematics.of(qpos[self._all_envs, index], qvel[self._all_envs, index])
 
     def _locate_obstacles(self) -> None:
         if self.obstacles is None:
@@ -340,9 +347,9 @@ class OmniEnv(VecEnv):
             self.obstacles.reset(env_ids, pose[:, :2])
         self.sim.reset(env_ids, qpos, qvel)
         self.randomizer.reset(env_ids)
-        if self._delayed is not None:
-            for past_qpos, past_qvel in self._delayed:
-                past_qpos[env_ids], past_qvel[env_ids] = qpos, qvel
+        if self._past is not None:
+            for past, now in zip(self._past, (qpos, qvel), strict=True):
+                past[env_ids] = now.double()[:, None]
         self.command.reset(env_ids, Kinematics.of(self.sim.qpos, self.sim.qvel))
         self.episode_length_buf[env_ids] = 0
         self.actions = tuple(a.index_fill(0, env_ids, 0.0) for a in self.actions)
@@ -421,7 +428,7 @@ class OmniEnv(VecEnv):
         self.last_joint_vel = zero
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
-        self._delayed: list[tuple[torch.Tensor, torch.Tensor]] | None = None
+        self._past: tuple[torch.Tensor, torch.Tensor] | None = None
         if self.randomizer.delay is not None:
-            entry = self.sim.qpos.float(), self.sim.qvel.float()
-            self._delayed = [tuple(x.clone() for x in entry) for _ in range(self.randomizer.max_delay + 1)]
+            entry = self.sim.qpos, self.sim.qvel
+            self._past = tuple(x[:, None].repeat(1, self.randomizer.max_delay + 1, 1) for x in entry)

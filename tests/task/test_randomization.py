@@ -193,9 +193,12 @@ class TestLatency:
         history = [env.sim.qpos.float()]
         physics_step = env.sim.step
 
-        def recorded(target):
-            physics_step(target)
-            history.append(env.sim.qpos.float())
+        def recorded(target, num_steps, mocap_path):
+            for _ in range(num_steps):
+                physics_step(target)
+                history.append(env.sim.qpos.float())
+            env.sim._records["qpos"] = torch.stack(history[-num_steps:], 1).double().numpy()
+            env.sim._records["qvel"] = env.sim.qvel[:, None].repeat(1, num_steps, 1).numpy()
 
         env.sim.step = recorded
         generator = torch.Generator().manual_seed(0)
