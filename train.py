@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -29,7 +30,7 @@ def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
 @hydra.main(config_path="conf", config_name="config", version_base="1.3")
 def train(composed: DictConfig) -> None:
     with config.one_line_errors(CheckpointError, TrainingDiverged):
-        run_dir = Path(HydraConfig.get().runtime.output_dir).relative_to(Path.cwd())
+        run_dir = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
         run = config.assemble(composed)
         config.save(run.composed, run_dir)
         learn(run, run_dir, resume=False)
@@ -42,6 +43,9 @@ def resume(name: str, overrides: list[str]) -> None:
 
 def main() -> None:
     arguments = sys.argv[1:]
+    if any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments):
+        train()  # Hydra's own flags: --help, --cfg job, --info
+        return
     with config.one_line_errors(CheckpointError, TrainingDiverged):
         own, overrides = config.split_arguments(arguments, {"run": ""})
         if own["run"]:

@@ -26,9 +26,9 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
     seed_everything(run.env.seed)
     try:
         env = OmniEnv(run.env)
+        return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
 
 
 def learning_settings(run: RunConfig, env: OmniEnv) -> dict:

@@ -16,7 +16,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from omniperception.learning.config import PerceptionConfig, PPOConfig
@@ -53,16 +53,18 @@ def compose(overrides: Sequence[str]) -> DictConfig:
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
-            return hydra_compose("config", overrides=list(overrides))
+            config = hydra_compose("config", overrides=list(overrides))
+            presets = hydra_compose("config", overrides=[o for o in overrides if _is_group(o)])
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_one_line(error)) from None
+    _check_kinds(config, presets)
+    return config
 
 
 def assemble(config: DictConfig) -> RunConfig:
     """Instantiates and validates every part of a composed configuration."""
     try:
         _check_groups(config)
-        _check_whole_numbers(config)
         composed = OmegaConf.to_container(config, resolve=True)
         parts = {key: _instantiate(key, value) for key, value in composed.items() if isinstance(value, dict)}
         perception, ppo = parts.pop("perception"), parts.pop("ppo")
@@ -109,7 +111,7 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
     if not path.is_file():
         raise ConfigError(f"{run_dir} is not a run directory: it has no {CONFIG_FILE}; run=latest finds the newest run")
     config = OmegaConf.load(path)
-    groups = [o for o in overrides if (CONFIG_DIR / o.split("=", 1)[0]).is_dir()]
+    groups = [o for o in overrides if _is_group(o)]
     if groups:
         fresh = compose(groups)
         for override in groups:
@@ -165,10 +167,28 @@ def _check_groups(config: DictConfig) -> None:
         raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
 
 
-def _check_whole_numbers(config: DictConfig) -> None:
-    for key in ("num_envs", "seed"):
-        if not isinstance(config[key], int):
-            raise ConfigError(f"{key}={config[key]} must be a whole number")
+def _is_group(override: str) -> bool:
+    """Whether an override chooses a preset, such as obstacles=static."""
+    return (CONFIG_DIR / override.split("=", 1)[0]).is_dir()
+
+
+def _check_kinds(config: object, presets: object, key: str = "") -> None:
+    """Every value must be of the kind that its preset has: a number for a number, a list for a list."""
+    if isinstance(config, DictConfig) and isinstance(presets, DictConfig):
+        for name in presets:
+            if name in config and not OmegaConf.is_interpolation(presets, name):
+                _check_kinds(config[name], presets[name], f"{key}.{name}" if key else str(name))
+        return
+    given, expected = _kind(config), _kind(presets)
+    if None in (given, expected) or given == expected or (given, expected) == ("a whole number", "a number"):
+        return
+    raise ConfigError(f"{key}={config} must be {expected}")
+
+
+def _kind(value: object) -> str | None:
+    kinds = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+    kinds |= {ListConfig: "a list", DictConfig: "a group of settings"}
+    return kinds.get(type(value))
 
 
 def _instantiate(key: str, value: dict) -> object | None:
@@ -189,7 +209,9 @@ def _set(config: DictConfig, override: str) -> None:
         parent = OmegaConf.select(config, key.rpartition(".")[0]) if "." in key else config
         known = ", ".join(map(str, parent)) if isinstance(parent, DictConfig) else "nothing"
         raise ConfigError(f"unknown override '{override}'; known there: {known}")
+    before = OmegaConf.select(config, key)
     OmegaConf.update(config, key, yaml.safe_load(value))
+    _check_kinds(OmegaConf.select(config, key), before, key)
 
 
 _MISSING = object()

@@ -109,6 +109,12 @@ WRONG = [
     (["observations.actor=[smell]"], "smell"),
     (["seed=abc"], "seed=abc must be a whole number"),
     (["num_envs=2.5"], "num_envs=2.5 must be a whole number"),
+    (["ppo.learning_rate=fast"], "ppo.learning_rate=fast must be a number"),
+    (["commands.lin_vel_x=1.0"], "commands.lin_vel_x=1.0 must be a list"),
+    (["terminations.on_collision=3"], "terminations.on_collision=3 must be true or false"),
+    (["rewards.terms.yaw_rate.weight=heavy"], "rewards.terms.yaw_rate.weight=heavy must be a number"),
+    (["sim.timestep=nan"], "sim.timestep=nan must be positive"),
+    (["+rewards.terms.yaw_rate.func.sigma=1.0"], "yaw_rate"),
 ]
 
 
@@ -142,6 +148,8 @@ def test_the_program_tells_what_is_wrong_in_one_line(tmp_path, overrides, named)
 @pytest.mark.parametrize(
     ("override", "named"),
     [
+        ("perception.sampler.num_proximal=0", "perception.sampler.num_proximal=0 must be at least 1"),
+        ("ppo.activation=foo", "foo"),
         ("lidar.sensor.period_s=0.03", "lidar.sensor.period_s=0.03 must be a multiple"),
         ("lidar.exclude_geoms=[nose]", "lidar.exclude_geoms"),
         ("robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),

@@ -30,6 +30,7 @@ class Scratch:
     keys: wp.array3d(dtype=wp.int32)  # (2, N, R) sort keys, read from one half and written to the other
     items: wp.array3d(dtype=wp.int32)  # (2, N, R) what is sorted by them
     histogram: wp.array2d(dtype=wp.int32)  # (N, RADIX_SIZE)
+    cell_hits: wp.array2d(dtype=wp.int32)  # (N, distal slots) hits of each cell
 
 
 _FARTHEST_POINTS = r"""
@@ -255,20 +256,12 @@ def mean_hit(
     directions: wp.array2d(dtype=wp.vec3),
     scratch: Scratch,
 ) -> wp.vec3:
-    """Mean of the hits among sorted rays first..last-1; their mean direction at maximum range if there is
-    none."""
+    """Mean of the sorted hits first..last-1."""
     total = wp.vec3(0.0, 0.0, 0.0)
-    direction = wp.vec3(0.0, 0.0, 0.0)
-    hits = wp.float32(0.0)
     for i in range(first, last):
         ray = scratch.items[half, env, i]
-        direction += directions[env, ray]
-        if is_hit(ranges[env, ray]):
-            total += (ranges[env, ray] * scale) * directions[env, ray]
-            hits += 1.0
-    if hits > 0.0:
-        return total / hits
-    return wp.normalize(direction)
+        total += (ranges[env, ray] * scale) * directions[env, ray]
+    return total / float(last - first)
 
 
 @wp.func
@@ -282,23 +275,9 @@ def middle_hit(
     directions: wp.array2d(dtype=wp.vec3),
     scratch: Scratch,
 ) -> wp.vec3:
-    """The middle one of the hits among sorted rays first..last-1; the middle ray at maximum range if there is
-    none."""
-    hits = wp.int32(0)
-    for i in range(first, last):
-        if is_hit(ranges[env, scratch.items[half, env, i]]):
-            hits += 1
-    if hits == 0:
-        return directions[env, scratch.items[half, env, first + (last - first) // 2]]
-    seen = wp.int32(0)
-    point = wp.vec3(0.0, 0.0, 0.0)
-    for i in range(first, last):
-        ray = scratch.items[half, env, i]
-        if is_hit(ranges[env, ray]):
-            if seen == hits // 2:
-                point = (ranges[env, ray] * scale) * directions[env, ray]
-            seen += 1
-    return point
+    """The middle one of the sorted hits first..last-1."""
+    ray = scratch.items[half, env, first + (last - first) // 2]
+    return (ranges[env, ray] * scale) * directions[env, ray]
 
 
 @wp.kernel
@@ -313,17 +292,15 @@ def write_distal(
     scale: float,
     first_slot: int,
     num_bins: int,
-    bin_rays: int,
     pick_middle: int,
     scratch: Scratch,
     points_out: wp.array2d(dtype=wp.vec3),
 ):
-    """One point per bin of consecutive distal points (or rays, with bin_rays) in (theta ring, phi) order,
-    then zeros."""
+    """One point per bin of consecutive distal points in (theta ring, phi) order, then zeros."""
     env = env_offset + wp.tid()
     n = wp.int32(0)
     for ray in range(ranges.shape[1]):
-        if elevation[env, ray] <= split and (bin_rays != 0 or is_hit(ranges[env, ray])):
+        if elevation[env, ray] <= split and is_hit(ranges[env, ray]):
             scratch.keys[0, env, n] = sort_key(elevation[env, ray], azimuth[env, ray], ring)
             scratch.items[0, env, n] = ray
             n += 1
@@ -338,3 +315,51 @@ def write_distal(
             points_out[env, first_slot + b] = mean_hit(env, half, first, last, scale, ranges, directions, scratch)
     for b in range(bins, num_bins):
         points_out[env, first_slot + b] = wp.vec3(0.0, 0.0, 0.0)
+
+
+@wp.kernel
+def average_cells(
+    env_offset: int,
+    ranges: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.vec3),
+    elevation: wp.array2d(dtype=wp.float32),
+    azimuth: wp.array2d(dtype=wp.float32),
+    lowest: float,
+    split: float,
+    num_rings: int,
+    num_columns: int,
+    blind: float,
+    scale: float,
+    first_slot: int,
+    scratch: Scratch,
+    points_out: wp.array2d(dtype=wp.vec3),
+):
+    """The mean of the distal hits in each cell of a (theta, phi) grid; an empty cell's centre at maximum range."""
+    env = env_offset + wp.tid()
+    ring_height = (split - lowest) / float(num_rings)
+    column_width = 2.0 * wp.PI / float(num_columns)
+    for cell in range(num_rings * num_columns):
+        scratch.cell_hits[env, cell] = 0
+        points_out[env, first_slot + cell] = wp.vec3(0.0, 0.0, 0.0)
+    for ray in range(ranges.shape[1]):
+        theta = elevation[env, ray]
+        if theta <= split and is_hit(ranges[env, ray]) and ranges[env, ray] >= blind:
+            phi = azimuth[env, ray]
+            phi -= 2.0 * wp.PI * wp.floor(phi / (2.0 * wp.PI))
+            ring = wp.clamp(int(wp.floor((theta - lowest) / ring_height)), 0, num_rings - 1)
+            column = wp.min(int(phi / column_width), num_columns - 1)
+            cell = ring * num_columns + column
+            scratch.cell_hits[env, cell] = scratch.cell_hits[env, cell] + 1
+            point = (ranges[env, ray] * scale) * directions[env, ray]
+            points_out[env, first_slot + cell] = points_out[env, first_slot + cell] + point
+    for cell in range(num_rings * num_columns):
+        hits = scratch.cell_hits[env, cell]
+        if hits > 0:
+            points_out[env, first_slot + cell] = points_out[env, first_slot + cell] / float(hits)
+        else:
+            theta = lowest + (float(cell // num_columns) + 0.5) * ring_height
+            phi = (float(cell % num_columns) + 0.5) * column_width
+            horizontal = wp.cos(theta)
+            points_out[env, first_slot + cell] = wp.vec3(
+                horizontal * wp.cos(phi), horizontal * wp.sin(phi), wp.sin(theta)
+            )

@@ -4,6 +4,7 @@ architecture)."""
 from __future__ import annotations
 
 import torch
+from torch import nn
 
 from omniperception.perception.networks import NUM_SECTORS, PerceptionNetwork
 from omniperception.perception.windows import WindowedGru
@@ -24,6 +25,7 @@ class PdRiskNet(PerceptionNetwork):
         history: int = 10,
         proximal_dim: int = 187,
         distal_dim: int = 64,
+        distal_encoder: int = 0,
     ) -> None:
         """Configure both paths.
 
@@ -33,12 +35,20 @@ class PdRiskNet(PerceptionNetwork):
             history: H, frames per window.
             proximal_dim: size of the proximal embedding and of the height grid.
             distal_dim: size of the distal embedding.
+            distal_encoder: width of an ELU layer that each distal frame passes before its GRU; 0, as in the paper,
+                has none.
         """
+        for name, value in (("num_proximal", num_proximal), ("num_distal", num_distal)):
+            if value < 1:
+                raise ValueError(f"perception.sampler.{name}={value} must be at least 1 for PD-RiskNet")
         super().__init__(num_proximal + num_distal, history, proximal_dim + distal_dim)
         self.num_proximal = num_proximal
         self.proximal_dim = proximal_dim
         self.proximal = WindowedGru(3 * num_proximal, proximal_dim, history)
-        self.distal = WindowedGru(3 * num_distal, distal_dim, history)
+        self.encoder = nn.Identity()
+        if distal_encoder:
+            self.encoder = nn.Sequential(nn.Linear(3 * num_distal, distal_encoder), nn.ELU())
+        self.distal = WindowedGru(distal_encoder or 3 * num_distal, distal_dim, history)
         self.supervised = {
             "height_target": slice(0, proximal_dim),
             "sector_target": slice(proximal_dim, proximal_dim + NUM_SECTORS),
@@ -47,5 +57,5 @@ class PdRiskNet(PerceptionNetwork):
     def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """See :meth:`PerceptionNetwork.forward`."""
         near = self.proximal(frames[:, :, : self.num_proximal].flatten(2), count)
-        far = self.distal(frames[:, :, self.num_proximal :].flatten(2), count)
+        far = self.distal(self.encoder(frames[:, :, self.num_proximal :].flatten(2)), count)
         return torch.cat([near, far], dim=-1)

@@ -109,11 +109,11 @@ class PdSampler(Sampler):
     are zero.
 
     ``distal_bins="points"`` bins the hits, as the paper does: where a bin looks depends on how many hits
-    there are before it in the order. ``distal_bins="rays"`` bins the distal rays instead, hit or not: a bin
-    then always covers the same rays of a repeating scan, and about the same solid angle of another, so a
-    network input keeps its direction. Such a bin is the mean of its hits; one without a hit holds its rays'
-    mean direction at maximum range, because there "nothing seen" means free space up to the maximum range,
-    whereas a zero would say "touching".
+    there are before it in the order. ``distal_bins="cells"`` averages over the cells of a fixed grid instead,
+    ``distal_rings`` rings of theta between ``lowest_deg`` and ``split_deg`` times num_distal / distal_rings columns
+    of phi from 0, so that a network input keeps its direction. Hits nearer than ``blind`` are the robot's own or
+    noise and are left out there; a cell without a hit holds its centre at maximum range, because there "nothing seen"
+    means free space, whereas a zero would say "touching".
     """
 
     def __init__(
@@ -126,6 +126,9 @@ class PdSampler(Sampler):
         ring_deg: float = 2.0,
         reduce: str = "average",
         distal_bins: str = "points",
+        distal_rings: int = 4,
+        lowest_deg: float = -7.5,
+        blind: float = 0.0,
         num_threads: int | None = None,
     ) -> None:
         """Configure the two halves.
@@ -137,7 +140,10 @@ class PdSampler(Sampler):
             split_deg: elevation in the sensor frame that separates the halves, degrees.
             ring_deg: height of a theta ring for sorting, degrees.
             reduce: "average" takes a bin's mean, "pick" its middle point.
-            distal_bins: "points" or "rays".
+            distal_bins: "points" or "cells".
+            distal_rings: rings of the grid of cells; it must divide num_distal.
+            lowest_deg: lowest elevation of the grid of cells, degrees.
+            blind: nearest range that cells take in, metres.
             num_threads: CPU threads; all cores by default.
         """
         if num_proximal < 0 or num_distal < 0:
@@ -147,8 +153,17 @@ class PdSampler(Sampler):
             raise ValueError(f"ring_deg must lie in (0.006, 180], got {ring_deg}")
         if reduce not in ("average", "pick"):
             raise ValueError(f"reduce must be 'average' or 'pick', got '{reduce}'")
-        if distal_bins not in ("points", "rays"):
-            raise ValueError(f"distal_bins must be 'points' or 'rays', got '{distal_bins}'")
+        if distal_bins not in ("points", "cells"):
+            raise ValueError(f"distal_bins must be 'points' or 'cells', got '{distal_bins}'")
+        if distal_bins == "cells":
+            if reduce != "average":
+                raise ValueError(f"distal_bins='cells' averages; set reduce='average' instead of '{reduce}'")
+            if distal_rings < 1 or num_distal % distal_rings:
+                raise ValueError(f"distal_rings={distal_rings} must be at least 1 and divide num_distal={num_distal}")
+            if not lowest_deg < split_deg:
+                raise ValueError(f"lowest_deg={lowest_deg} must be below split_deg={split_deg}")
+        if not 0.0 <= blind < max_range:
+            raise ValueError(f"blind={blind} must lie in [0, max_range={max_range})")
         if math.isnan(split_deg):
             raise ValueError("split_deg must be a number of degrees, got nan")
         self.num_proximal = num_proximal
@@ -156,7 +171,10 @@ class PdSampler(Sampler):
         self.split = math.radians(split_deg)
         self.ring = math.radians(ring_deg)
         self.pick_middle = int(reduce == "pick")
-        self.bin_rays = int(distal_bins == "rays")
+        self.cells = distal_bins == "cells"
+        self.num_rings = distal_rings
+        self.lowest = math.radians(lowest_deg)
+        self.blind = blind
         self._scratch: kernels.Scratch | None = None
         self._scratch_key: tuple | None = None
         self._tensors: dict[str, torch.Tensor] = {}
@@ -194,7 +212,25 @@ class PdSampler(Sampler):
                 points,
                 block_dim=32,
             )
-        if self.num_distal:
+        if self.num_distal and self.cells:
+            launch(
+                kernels.average_cells,
+                ranges_v,
+                directions_v,
+                theta,
+                phi,
+                self.lowest,
+                self.split,
+                self.num_rings,
+                self.num_distal // self.num_rings,
+                self.blind,
+                scale,
+                self.num_proximal,
+                scratch,
+                points,
+                block_dim=32,
+            )
+        elif self.num_distal:
             launch(
                 kernels.write_distal,
                 ranges_v,
@@ -206,7 +242,6 @@ class PdSampler(Sampler):
                 scale,
                 self.num_proximal,
                 self.num_distal,
-                self.bin_rays,
                 self.pick_middle,
                 scratch,
                 points,
@@ -223,6 +258,7 @@ class PdSampler(Sampler):
             "keys": (2, n, r),
             "items": (2, n, r),
             "histogram": (n, kernels.RADIX_SIZE),
+            "cell_hits": (n, max(self.num_distal, 1)),
             "ray": (n, r),
             "distance": (n, r),
         }

@@ -36,7 +36,7 @@ class SimConfig:
     num_threads: int = 0
 
     def __post_init__(self) -> None:
-        if self.timestep <= 0:
+        if not 0 < self.timestep < float("inf"):
             raise ValueError(f"sim.timestep={self.timestep} must be positive")
         for name in ("decimation", "iterations", "ls_iterations"):
             if getattr(self, name) < 1:

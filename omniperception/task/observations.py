@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from omniperception.task.state import fields_read, reads
+from omniperception.task.state import check_term, fields_read, reads
 
 if TYPE_CHECKING:
     from omniperception.task.env import OmniEnv
@@ -28,6 +28,8 @@ class ObservationGroup:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", {name: term for name, term in self.terms.items() if term is not None})
+        for name, term in self.terms.items():
+            check_term(f"terms.{name}", term)
         if self.history < 1:
             raise ValueError(f"observations: history={self.history} must be at least 1")
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from omniperception.task.state import fields_read, reads
+from omniperception.task.state import check_term, fields_read, reads
 
 if TYPE_CHECKING:
     from omniperception.task.env import OmniEnv
@@ -40,6 +40,8 @@ class RewardsConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", {k: t for k, t in self.terms.items() if t is not None and t.weight != 0})
+        for name, term in self.terms.items():
+            check_term(f"terms.{name}.func", term.func)
 
     def fields_read(self) -> frozenset[str]:
         return frozenset().union(*(fields_read(term.func) for term in self.terms.values()))

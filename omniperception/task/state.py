@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +30,14 @@ def fields_read(term: Callable) -> frozenset[str]:
     while isinstance(term, partial):
         term = term.func
     return getattr(term, "reads", frozenset())
+
+
+def check_term(name: str, term: Callable) -> None:
+    """Refuses a term that cannot be called with the environment alone, such as one with a misspelt parameter."""
+    try:
+        inspect.signature(term).bind(None)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 @dataclass
