@@ -72,6 +72,8 @@ class PerceptionActor(MLPModel):
         self._feature_dim = network.feature_dim  # read by _get_latent_dim while the base class builds the MLP
         super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
         self.perception: PerceptionNetwork = network
+        with torch.no_grad():  # an untrained embedding is noise to the gait; it enters as its weights learn
+            self.mlp[0].weight[:, self.obs_dim :] = 0.0
         self.supervision = supervision
         for target in supervision:
             self._check_target(target, obs)
@@ -144,6 +146,8 @@ class PerceptionActor(MLPModel):
 
     def _update_features(self, obs: WindowedObservations) -> torch.Tensor:
         """(B, D) embeddings of a mini-batch's steps; starts the supervised losses if there are any."""
+        if not obs.has_frames:  # the sensor sleeps: there is nothing to embed and nothing to learn from
+            return self._empty_features(obs.frames).expand(obs.batch_size[0], -1)
         windows = self.perception(obs.frames, obs.window_count).flatten(0, 1)  # (E W, D)
         table = torch.cat([windows, self._empty_features(obs.frames)])
         has_frame = obs.step_count > 0

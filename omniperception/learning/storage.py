@@ -34,6 +34,11 @@ class WindowedObservations:
     step_count: torch.Tensor
 
     @property
+    def has_frames(self) -> bool:
+        """Whether any step has seen a frame since its environment's reset."""
+        return bool(self.window_count.any())
+
+    @property
     def batch_size(self) -> torch.Size:
         """Number of control steps, as a one-element size."""
         return self.groups.batch_size

@@ -86,16 +86,19 @@ class CurriculumConfig:
     """Raises the share and the speed of obstacles as walking improves.
 
     Attributes:
-        max_velocity_error: the level rises while the error (m/s) of the linear velocity away from obstacles is below.
+        start_velocity_error: the first obstacles come once the error (m/s) of the linear velocity is below.
+        max_velocity_error: from then on the level rises while that error, away from obstacles, is below.
         rise: how much the level (0 to 1) rises per second of simulated time of each environment.
     """
 
+    start_velocity_error: float = 0.25
     max_velocity_error: float = 0.25
     rise: float = 0.02
 
     def __post_init__(self) -> None:
-        if self.max_velocity_error <= 0 or self.rise <= 0:
-            raise ValueError("obstacles.curriculum: max_velocity_error and rise must be positive")
+        for key in ("start_velocity_error", "max_velocity_error", "rise"):
+            if getattr(self, key) <= 0:
+                raise ValueError(f"obstacles.curriculum.{key}={getattr(self, key)} must be positive")
 
 
 @dataclass(frozen=True)
@@ -239,7 +242,10 @@ class ObstacleField:
     def raise_level(self, velocity_error: float, seconds: float) -> None:
         """Raises the curriculum's level while the robot walks well (`velocity_error` in m/s)."""
         curriculum = self.config.curriculum
-        if curriculum is not None and velocity_error < curriculum.max_velocity_error:
+        if curriculum is None:
+            return
+        bound = curriculum.max_velocity_error if self.level > 0 else curriculum.start_velocity_error
+        if velocity_error < bound:
             self.level = min(1.0, self.level + curriculum.rise * seconds)
 
     def state_dict(self) -> dict:
