@@ -45,9 +45,7 @@ class PdRiskNet(PerceptionNetwork):
         self.num_proximal = num_proximal
         self.proximal_dim = proximal_dim
         self.proximal = WindowedGru(3 * num_proximal, proximal_dim, history)
-        self.encoder = nn.Identity()
-        if distal_encoder:
-            self.encoder = nn.Sequential(nn.Linear(3 * num_distal, distal_encoder), nn.ELU())
+        self.encoder = nn.Sequential(nn.Linear(3 * num_distal, distal_encoder), nn.ELU()) if distal_encoder else None
         self.distal = WindowedGru(distal_encoder or 3 * num_distal, distal_dim, history)
         self.supervised = {
             "height_target": slice(0, proximal_dim),
@@ -57,5 +55,6 @@ class PdRiskNet(PerceptionNetwork):
     def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """See :meth:`PerceptionNetwork.forward`."""
         near = self.proximal(frames[:, :, : self.num_proximal].flatten(2), count)
-        far = self.distal(self.encoder(frames[:, :, self.num_proximal :].flatten(2)), count)
+        far = frames[:, :, self.num_proximal :].flatten(2)
+        far = self.distal(far if self.encoder is None else self.encoder(far), count)
         return torch.cat([near, far], dim=-1)

@@ -125,3 +125,11 @@ def test_wrong_counts_are_refused():
         FpsGru(6, H, 9)(sequence(), torch.full((B, W + 1), H))
     with pytest.raises(ValueError, match="at least 1"):
         FpsGru(0, H)
+
+
+def test_the_distal_encoder_is_a_layer_before_the_gru():
+    network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3, distal_encoder=7)
+    frames, count = sequence(), counts()
+    encoded = torch.nn.functional.elu(network.encoder[0](frames[:, :, 4:].flatten(2)))
+    far = gru_by_window(plain_gru(network.distal), encoded.unsqueeze(-1), count)
+    assert torch.allclose(network(frames, count)[..., 5:], far, atol=1e-5)

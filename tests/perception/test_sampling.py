@@ -237,7 +237,7 @@ class TestInterface:
         [
             {"ring_deg": 0.0},
             {"reduce": "median"},
-            {"distal_bins": "cells"},
+            {"distal_bins": "rays"},
             {"num_proximal": -1},
             {"num_proximal": 0, "num_distal": 0},
             {"max_range": 0.0},

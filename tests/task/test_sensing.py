@@ -120,3 +120,16 @@ def test_sector_target_is_the_nearness_of_obstacles(make_env):
 def test_a_period_between_control_steps_is_refused(make_env, period):
     with pytest.raises(ValueError, match=rf"lidar\.sensor\.period_s={period} must be a multiple"):
         make_env(f"lidar.sensor.period_s={period}")
+
+
+def test_the_lidar_sleeps_until_the_curriculum_lets_obstacles_in(make_env):
+    env = make_env("experiment=quickstart", "perception.sampler.num_proximal=8")
+    actions = torch.zeros(env.num_envs, env.num_actions)
+    for _ in range(6):
+        env.step(actions)
+    assert env.obstacles.level == 0.0 and env.sensing.tick == 0 and not env.sensing.frame_count.any()
+    assert "rays" not in env.timer.seconds
+    env.obstacles.level = 0.5
+    for _ in range(5):
+        observations = env.step(actions)[0]
+    assert env.sensing.tick == 1 and (observations["frame_count"] == 1).all()

@@ -112,11 +112,15 @@ def test_standing_obstacles_stay_where_they_are():
 
 class TestCurriculum:
     def test_level_rises_only_below_the_error(self):
-        field = field_of(2, curriculum=CurriculumConfig(max_velocity_error=0.3, rise=0.1))
+        field = field_of(2, curriculum=CurriculumConfig(0.2, max_velocity_error=0.3, rise=0.1))
         assert field.level == 0.0
+        field.raise_level(0.29, 1.0)  # good enough to go on, not to start
+        assert field.level == 0.0
+        field.raise_level(0.19, 1.0)
+        assert field.level == pytest.approx(0.1)
         field.raise_level(0.3, 1.0)
-        assert field.level == 0.0
-        field.raise_level(0.29, 2.0)
+        assert field.level == pytest.approx(0.1)
+        field.raise_level(0.29, 1.0)
         assert field.level == pytest.approx(0.2)
         for _ in range(20):
             field.raise_level(0.1, 1.0)
