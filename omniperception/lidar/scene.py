@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from .kernels import cast_rays, place_shapes
+from .kernels.geometry import Geometry
+from .kernels.place import place_shapes
+from .kernels.rays import rays_kernel
 from .launch import SplitLaunch, default_num_threads, wp_device
 from .shapes import Shape
 
@@ -63,12 +65,12 @@ class PlacedShapes:
         args = [
             scene.wp_body_pos,
             scene.wp_body_quat,
-            scene.kind,
+            scene.geometry.kind,
             scene.body,
             scene.pos,
             scene.quat,
-            scene.size,
-            scene.radius,
+            scene.geometry.size,
+            scene.geometry.radius,
             wp.array(viewed or [0], dtype=wp.int32, device=device),
             len(viewed),
             view.body,
@@ -151,13 +153,19 @@ class RayScene:
         def upload(values: list, dtype: type) -> wp.array:
             return wp.array(values or [dtype()], dtype=dtype, device=self.wp_device)
 
-        self.kind = upload([int(shape.kind) for shape in self.shapes], wp.int32)
+        self.geometry = Geometry()
+        self.geometry.kind = upload([int(shape.kind) for shape in self.shapes], wp.int32)
         self.body = upload([shape.body for shape in self.shapes], wp.int32)
         self.pos = upload([wp.vec3(*shape.pos) for shape in self.shapes], wp.vec3)
         self.quat = upload([wp.vec4(*shape.quat) for shape in self.shapes], wp.vec4)
-        self.size = upload([wp.vec3(*(shape.size + (0.0,) * 3)[:3]) for shape in self.shapes], wp.vec3)
-        self.radius = upload([shape.bounding_radius for shape in self.shapes], wp.float32)
-        self.shape_class = upload([shape.class_id for shape in self.shapes], wp.int32)
+        self.geometry.size = upload([wp.vec3(*(shape.size + (0.0,) * 3)[:3]) for shape in self.shapes], wp.vec3)
+        self.geometry.radius = upload([shape.bounding_radius for shape in self.shapes], wp.float32)
+        self.geometry.class_id = upload([shape.class_id for shape in self.shapes], wp.int32)
+
+    @property
+    def kinds(self) -> frozenset[int]:
+        """The kinds of shapes that this scene has."""
+        return frozenset(int(shape.kind) for shape in self.shapes)
 
     def launch(self, kernel: wp.Kernel, inner: Sequence[int], args: Sequence, work_per_env: int = 1) -> SplitLaunch:
         """A replayable launch of ``kernel`` over ``(num_envs, *inner)`` on this scene's device."""
@@ -209,9 +217,7 @@ class RayScene:
                 wp.from_torch(self._contiguous(directions_w), dtype=wp.vec3),
                 float(max_range),
                 int(normals),
-                self.kind,
-                self.size,
-                self.radius,
+                self.geometry,
                 placed.bound,
                 placed.shape,
                 placed.axes,
@@ -220,7 +226,7 @@ class RayScene:
                 wp.from_torch(shape_id),
                 wp.from_torch(normals_w, dtype=wp.vec3),
             ]
-            self.launch(cast_rays, (num_rays,), args, work_per_env=num_rays * max(len(self.shapes), 1))()
+            self.launch(rays_kernel(self.kinds), (num_rays,), args, work_per_env=num_rays * max(len(self.shapes), 1))()
         return RayHits(ranges, shape_id, normals_w if normals else None)
 
     def _contiguous(self, tensor: torch.Tensor) -> torch.Tensor:

@@ -3,7 +3,7 @@
 import torch
 import warp as wp
 
-from .kernels import sector_minima
+from .kernels.sectors import sector_minima
 from .launch import SplitLaunch, default_num_threads
 
 

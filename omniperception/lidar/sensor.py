@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from .kernels import ScanRow, add_noise, cast_scan
+from .kernels.noise import add_noise
+from .kernels.scan import ScanRow, scan_kernel
 from .noise import Noise, noise_parameters
 from .patterns import ScanPattern
 from .scene import PlacedShapes, RayScene, View
@@ -192,9 +193,7 @@ class Lidar:
             stride,
             self.config.min_range,
             self.config.max_range,
-            scene.kind,
-            scene.size,
-            scene.shape_class,
+            scene.geometry,
             placed.bound,
             placed.near,
             placed.shape,
@@ -209,7 +208,9 @@ class Lidar:
             wp.from_torch(frame.row),
         ]
         num_rays = self.config.num_rays
-        return scene.launch(cast_scan, (num_rays,), args, work_per_env=num_rays * (len(scene.shapes) + 4))
+        return scene.launch(
+            scan_kernel(scene.kinds), (num_rays,), args, work_per_env=num_rays * (len(scene.shapes) + 4)
+        )
 
     def _record_noise(self, noise: Sequence[Noise], seed: int):
         args = [

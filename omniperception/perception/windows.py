@@ -6,6 +6,9 @@ how many of a window's newest frames are valid.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
@@ -46,7 +49,7 @@ class WindowedGru(nn.GRU):
     def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """Frames (B, F, input_size) and count (B, W) -> last hidden states (B, W, hidden_size)."""
         window_count(frames, count, self.history)
-        projected = functional.linear(frames, self.weight_ih_l0, self.bias_ih_l0)  # (B, F, 3 hidden)
+        projected = functional.linear(frames, self.weight_ih_l0, self.bias_ih_l0).float()  # (B, F, 3 hidden)
         valid = valid_frames(count, self.history).unsqueeze(-1)  # (B, W, H, 1)
         return _UnrolledGru.apply(projected, valid, self.weight_hh_l0, self.bias_hh_l0)
 
@@ -55,7 +58,8 @@ class _UnrolledGru(torch.autograd.Function):
     """The recurrent steps over all windows, with the backward pass written out.
 
     Autograd would make three times as many small operations and accumulate the weights' gradient step by step; here it
-    is one matrix product over all steps. Gate order is PyTorch's: reset, update, new.
+    is one matrix product over all steps. Gate order is PyTorch's: reset, update, new. Under autocast the matrix
+    products of both passes are of its type and everything else stays float32.
     """
 
     @staticmethod
@@ -70,7 +74,7 @@ class _UnrolledGru(torch.autograd.Function):
         saved = []
         for k in range(history):
             from_frame = projected[:, k : k + windows]
-            recurrent = functional.linear(state, weight, bias)
+            recurrent = functional.linear(state, weight, bias).float()
             gates = (from_frame[..., : 2 * hidden] + recurrent[..., : 2 * hidden]).sigmoid_()
             reset, update = gates.split(hidden, dim=-1)
             recurrent_new = recurrent[..., 2 * hidden :]
@@ -81,6 +85,7 @@ class _UnrolledGru(torch.autograd.Function):
         if keep:
             ctx.save_for_backward(valid, weight, *(tensor for step in saved for tensor in step))
             ctx.num_frames = projected.shape[1]
+            ctx.autocast = _autocast_like_now(projected.device.type)
         return state
 
     @staticmethod
@@ -102,10 +107,20 @@ class _UnrolledGru(torch.autograd.Function):
             torch.mul(d_new, reset, out=d_recurrent[k, ..., 2 * hidden :])
             d_projected[:, k : k + windows, : 2 * hidden] += d_gates
             d_projected[:, k : k + windows, 2 * hidden :] += d_new
-            gradient = gradient - d_state + d_state * update + d_recurrent[k] @ weight
+            with ctx.autocast():
+                d_previous = (d_recurrent[k] @ weight).float()
+            gradient = gradient - d_state + d_state * update + d_previous
         states = torch.stack(saved[0::4]).flatten(0, 2)
         flat = d_recurrent.flatten(0, 2)
-        return d_projected, None, flat.t() @ states, flat.sum(0)
+        with ctx.autocast():
+            d_weight = (flat.t() @ states).float()
+        return d_projected, None, d_weight, flat.sum(0)
+
+
+def _autocast_like_now(device_type: str) -> Callable[[], torch.autocast]:
+    """Makes contexts with the present state of autocast, for a backward pass, which runs outside of it."""
+    enabled, dtype = torch.is_autocast_enabled(device_type), torch.get_autocast_dtype(device_type)
+    return partial(torch.autocast, device_type, dtype=dtype, enabled=enabled)
 
 
 class WindowedLinear(nn.Module):
