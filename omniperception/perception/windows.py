@@ -49,9 +49,9 @@ class WindowedGru(nn.GRU):
     def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """Frames (B, F, input_size) and count (B, W) -> last hidden states (B, W, hidden_size)."""
         window_count(frames, count, self.history)
-        projected = functional.linear(frames, self.weight_ih_l0, self.bias_ih_l0).float()  # (B, F, 3 hidden)
+        projected = functional.linear(frames, self.weight_ih_l0, self.bias_ih_l0)  # (B, F, 3 hidden)
         valid = valid_frames(count, self.history).unsqueeze(-1)  # (B, W, H, 1)
-        return _UnrolledGru.apply(projected, valid, self.weight_hh_l0, self.bias_hh_l0)
+        return _UnrolledGru.apply(projected.to(self.weight_hh_l0.dtype), valid, self.weight_hh_l0, self.bias_hh_l0)
 
 
 class _UnrolledGru(torch.autograd.Function):
@@ -74,7 +74,7 @@ class _UnrolledGru(torch.autograd.Function):
         saved = []
         for k in range(history):
             from_frame = projected[:, k : k + windows]
-            recurrent = functional.linear(state, weight, bias).float()
+            recurrent = functional.linear(state, weight, bias).to(state.dtype)
             gates = (from_frame[..., : 2 * hidden] + recurrent[..., : 2 * hidden]).sigmoid_()
             reset, update = gates.split(hidden, dim=-1)
             recurrent_new = recurrent[..., 2 * hidden :]
@@ -108,12 +108,12 @@ class _UnrolledGru(torch.autograd.Function):
             d_projected[:, k : k + windows, : 2 * hidden] += d_gates
             d_projected[:, k : k + windows, 2 * hidden :] += d_new
             with ctx.autocast():
-                d_previous = (d_recurrent[k] @ weight).float()
+                d_previous = (d_recurrent[k] @ weight).to(gradient.dtype)
             gradient = gradient - d_state + d_state * update + d_previous
         states = torch.stack(saved[0::4]).flatten(0, 2)
         flat = d_recurrent.flatten(0, 2)
         with ctx.autocast():
-            d_weight = (flat.t() @ states).float()
+            d_weight = (flat.t() @ states).to(weight.dtype)
         return d_projected, None, d_weight, flat.sum(0)
 
 
