@@ -10,22 +10,20 @@ directory.
 from __future__ import annotations
 
 import json
-import platform
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import config
-from omniperception.assembly import build_runner
-from omniperception.evaluation.episodes import Episodes, Policy, run_episodes, table
-from omniperception.learning import CheckpointError, latest_checkpoint
+from omniperception.assembly import load_policy
+from omniperception.evaluation.episodes import Episodes, Policy, run_episodes
+from omniperception.evaluation.report import provenance, table, times_line
+from omniperception.learning import CheckpointError
 from omniperception.task.env import OmniEnv
 
 ARGUMENTS = {"run": "latest", "viewer": "video", "episodes": "200", "video_s": "20"}
 VIEWERS = ("video", "none")
-LIBRARIES = ("omniperception", "torch", "mujoco-core", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
 
 
 @dataclass(frozen=True)
@@ -52,8 +50,8 @@ class Replay:
         own, overrides = config.split_arguments(arguments, ARGUMENTS)
         if own["viewer"] not in VIEWERS:
             raise config.ConfigError(f"viewer={own['viewer']} is unknown; known: {', '.join(VIEWERS)}")
-        episodes = _number("episodes", own["episodes"], int)
-        video_s = _number("video_s", own["video_s"], float)
+        episodes = config.positive("episodes", own["episodes"], int)
+        video_s = config.positive("video_s", own["video_s"], float)
         return cls(config.find_run(own["run"]), own["viewer"], episodes, video_s, tuple(overrides))
 
     def configuration(self) -> config.RunConfig:
@@ -61,32 +59,28 @@ class Replay:
         composed = config.load(self.run_dir, self.overrides)
         if not any(override.startswith("num_envs=") for override in self.overrides):
             composed.num_envs = min(composed.num_envs, self.episodes)
-        run = config.assemble(composed)
-        return replace(run, env=replace(run.env, initial_obstacle_level=1.0))
+        return config.assemble(composed)
 
 
 def play(replay: Replay) -> None:
     """Runs the episodes, prints the table and writes the figures."""
     run = replay.configuration()
-    checkpoint = latest_checkpoint(replay.run_dir)
-    runner = build_runner(run, None)
-    runner.load(str(checkpoint), load_cfg={"actor": True})
-    policy = runner.get_inference_policy(str(runner.env.device))
+    trained = load_policy(run, replay.run_dir)
     if replay.viewer == "video":
-        episodes = _film(replay, runner.env, policy)
+        episodes = _film(replay, trained.env, trained.policy)
     else:
-        episodes = run_episodes(runner.env, policy, replay.episodes)
+        episodes = run_episodes(trained.env, trained.policy, replay.episodes)
     summary = episodes.summary()
-    print(f"{checkpoint} in {run.env.num_envs} environments, seed {run.env.seed}")
-    print(table(summary))
+    print(f"{trained.checkpoint} in {run.env.num_envs} environments, seed {run.env.seed}")
+    print(table({"run": summary}))
+    print(times_line(summary))
     report = {
-        "checkpoint": checkpoint.name,
+        "checkpoint": trained.checkpoint.name,
         "overrides": list(replay.overrides),
         "seed": run.env.seed,
         "num_envs": run.env.num_envs,
         **summary,
-        "machine": {"cpu": platform.machine(), "system": platform.system(), "device": str(runner.env.device)},
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        **provenance(trained.env.device),
     }
     (replay.run_dir / "replay.json").write_text(json.dumps(report, indent=2) + "\n")
     written = ["replay.json"] + (["replay.mp4", "replay.png"] if replay.viewer == "video" else [])
@@ -104,16 +98,6 @@ def _film(replay: Replay, env: OmniEnv, policy: Policy) -> Episodes:
         recorder.close()
     recorder.write_still(replay.run_dir / "replay.png")
     return episodes
-
-
-def _number(key: str, text: str, kind: type) -> float:
-    try:
-        value = kind(text)
-    except ValueError:
-        value = 0
-    if not 0 < value < float("inf"):
-        raise config.ConfigError(f"{key}={text} must be a positive {'whole ' if kind is int else ''}number")
-    return value
 
 
 def main() -> None:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import random
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from omniperception.config import ConfigError, RunConfig
-from omniperception.learning import Runner
+from omniperception.learning import Runner, latest_checkpoint
 from omniperception.learning.config import runner_config
 from omniperception.task.env import OmniEnv
+
+if TYPE_CHECKING:
+    from omniperception.evaluation.episodes import Policy
 
 
 def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
@@ -29,6 +34,33 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
         return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
     except ValueError as error:
         raise ConfigError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A run's newest policy and the environment to try it in.
+
+    Attributes:
+        env: at the start of its first episodes, with all obstacles.
+        policy: from observations to actions, without exploration noise.
+        checkpoint: where the weights came from.
+    """
+
+    env: OmniEnv
+    policy: Policy
+    checkpoint: Path
+
+
+def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
+    """The policy of the newest checkpoint in `run_dir`, in the environment of `run`.
+
+    Raises:
+        CheckpointError: there is none, or it does not fit.
+    """
+    checkpoint = latest_checkpoint(run_dir)
+    runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0)), None)
+    runner.load(str(checkpoint), load_cfg={"actor": True})
+    return TrainedPolicy(runner.env, runner.get_inference_policy(str(runner.env.device)), checkpoint)
 
 
 def learning_settings(run: RunConfig, env: OmniEnv) -> dict:

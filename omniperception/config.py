@@ -25,6 +25,10 @@ from omniperception.task.env import EnvConfig
 CONFIG_DIR = Path(__file__).resolve().parents[1] / "conf"
 CONFIG_FILE = "config.yaml"
 OUTPUTS = Path("outputs")
+FIXED_BY_SCENARIO = ("seed", "terrain", "obstacles", "commands", "terminations", "randomization")
+"""What a scenario replaces in a run's configuration; the run keeps everything else."""
+DEFINED_BY_SCENARIO = ("obstacles", "commands")
+"""Groups that a scenario writes out in full, so that another preset would be mixed with it."""
 
 
 class ConfigError(ValueError):
@@ -50,6 +54,7 @@ class RunConfig:
 
 def compose(overrides: Sequence[str]) -> DictConfig:
     """Composes `conf/config.yaml` with overrides as on the command line."""
+    _check_scenario(overrides)
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
@@ -106,7 +111,11 @@ def save(composed: dict, run_dir: Path) -> None:
 
 
 def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
-    """The configuration of a run; obstacles=static replaces a whole group, dotted overrides single values."""
+    """The configuration of a run, changed by overrides.
+
+    obstacles=static replaces a whole group, dotted overrides single values, and scenario=corridor replaces what
+    FIXED_BY_SCENARIO names.
+    """
     path = run_dir / CONFIG_FILE
     if not path.is_file():
         raise ConfigError(f"{run_dir} is not a run directory: it has no {CONFIG_FILE}; run=latest finds the newest run")
@@ -118,11 +127,17 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
             group = override.split("=", 1)[0]
             if group == "experiment":
                 raise ConfigError(f"{override}: a run keeps its experiment; override the groups that should differ")
-            config[group] = fresh[group]
+            for key in FIXED_BY_SCENARIO if group == "scenario" else (group,):
+                config[key] = fresh[key]
     for override in overrides:
         if override not in groups:
             _set(config, override)
     return config
+
+
+def scenarios() -> tuple[str, ...]:
+    """Names of the scenarios in conf/scenario."""
+    return tuple(sorted(path.stem for path in (CONFIG_DIR / "scenario").glob("*.yaml")))
 
 
 def find_run(name: str) -> Path:
@@ -152,6 +167,17 @@ def split_arguments(arguments: Sequence[str], known: dict[str, str]) -> tuple[di
     return own, overrides
 
 
+def positive(key: str, text: str, kind: type) -> float:
+    """The positive number, int or float, that an entry point's own argument stands for."""
+    try:
+        value = kind(text)
+    except ValueError:
+        value = 0
+    if not 0 < value < float("inf"):
+        raise ConfigError(f"{key}={text} must be a positive {'whole ' if kind is int else ''}number")
+    return value
+
+
 @contextlib.contextmanager
 def one_line_errors(*also: type[Exception]) -> Iterator[None]:
     """Turns a wrong configuration, or one of `also`, into one line on standard error and exit code 2."""
@@ -160,6 +186,21 @@ def one_line_errors(*also: type[Exception]) -> Iterator[None]:
     except (ConfigError, *also) as error:
         print(f"error: {_one_line(error)}", file=sys.stderr, flush=True)
         sys.exit(2)
+
+
+def _check_scenario(overrides: Sequence[str]) -> None:
+    chosen = dict(override.split("=", 1) for override in overrides if "=" in override)
+    if chosen.get("scenario", "null") == "null":
+        return
+    for group in DEFINED_BY_SCENARIO:
+        if group in chosen:
+            raise ConfigError(
+                f"scenario={chosen['scenario']} defines the {group}; leave {group}={chosen[group]} out, or override"
+                f" single values such as {group}.{_EXAMPLES[group]}"
+            )
+
+
+_EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
 
 
 def _check_groups(config: DictConfig) -> None:

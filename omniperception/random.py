@@ -10,6 +10,7 @@ import torch
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64
 _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
+_DRAWS_PER_EPISODE = 1 << 20
 
 
 class EnvRandom:
@@ -22,6 +23,13 @@ class EnvRandom:
     def __init__(self, seed: int, num_envs: int, device: torch.device | str = "cpu") -> None:
         self._key = _mix(torch.arange(num_envs, device=device) + (seed + 1) * 1_000_003)
         self.counter = torch.zeros(num_envs, dtype=torch.int64, device=device)
+
+    def start_episode(self, env_ids: torch.Tensor) -> None:
+        """Goes on to the stretch of the stream that the next episode draws from.
+
+        What an environment draws in its k-th episode then depends on k, not on how much it drew before.
+        """
+        self.counter[env_ids] = (self.counter[env_ids] // _DRAWS_PER_EPISODE + 1) * _DRAWS_PER_EPISODE
 
     def uniform(self, env_ids: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
         """Draws from [0, 1) for some environments.

@@ -1,4 +1,4 @@
-"""Evaluation of trained policies: counted episodes with confidence intervals, and videos."""
+"""Evaluation of trained policies: counted episodes with confidence intervals, baselines, pictures and videos."""
 
 from omniperception.evaluation.episodes import Episodes, run_episodes
 from omniperception.evaluation.statistics import wilson

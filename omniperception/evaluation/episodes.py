@@ -1,4 +1,4 @@
-"""Runs a policy for a number of whole episodes and counts what happened in them."""
+"""Runs a policy for a number of whole episodes and measures what happens in them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,18 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict
 
-from omniperception.evaluation.statistics import wilson
+from omniperception.evaluation.clearance import Clearance
+from omniperception.evaluation.statistics import quantiles, rate
+from omniperception.evaluation.tracks import TrackRecorder, Tracks
 from omniperception.task.env import OmniEnv
 from omniperception.task.metrics import OUTCOMES
 
 Policy = Callable[[TensorDict], torch.Tensor]
 """From observations to actions (num_envs, num_actions), without exploration noise."""
+
+CLEARANCE_CAP = 1.0
+"""Clearances (m) beyond this are reported as this."""
+_GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
@@ -25,27 +31,41 @@ class Episodes:
         length_s: duration (s).
         outcome: int64 index into `omniperception.task.metrics.OUTCOMES`: how it ended.
         contacts: int64 number of times that the robot began to touch obstacles.
-        velocity_error: mean error of the horizontal velocity (m/s).
+        first_contact_s: time (s) of the first touch, infinite without one.
+        clearance: smallest distance (m) in space between any link and any obstacle, at the end of every control step;
+            0 in an episode with a touch, CLEARANCE_CAP where nothing came nearer; None without obstacles.
+        energy: sum over joints and control steps of |torque * joint velocity| * dt (J), the torque of the last physics
+            step of each control step.
+        path: length (m) of the base's horizontal way.
+        velocity_error: mean error of the horizontal velocity (m/s) against the task's command.
         free_velocity_error: the same over the moments with no obstacle near, NaN in an episode without such a
             moment; None where the run does not measure distances to obstacles.
         free_s: time with no obstacle near (s); None as above.
         yaw_rate_error: mean error of the yaw rate (rad/s).
         has_goal: whether the commands lead to a goal.
+        weight: of the robot (N).
         per_env: episodes of each environment.
         us_per_env_step: wall time by stage in microseconds per environment and control step; `policy` is the
-            network.
+            network, `measuring` what is measured here.
+        tracks: ways of the robots, where asked for.
     """
 
     length_s: torch.Tensor
     outcome: torch.Tensor
     contacts: torch.Tensor
+    first_contact_s: torch.Tensor
+    clearance: torch.Tensor | None
+    energy: torch.Tensor
+    path: torch.Tensor
     velocity_error: torch.Tensor
     free_velocity_error: torch.Tensor | None
     free_s: torch.Tensor | None
     yaw_rate_error: torch.Tensor
     has_goal: bool
+    weight: float
     per_env: int
     us_per_env_step: dict[str, float]
+    tracks: Tracks | None = None
 
     def __len__(self) -> int:
         return len(self.length_s)
@@ -64,34 +84,69 @@ class Episodes:
         """(num_episodes,) bool: reached the goal or, without a goal, the time limit. Touches do not count."""
         return self.ended("goal" if self.has_goal else "time_out")
 
+    @property
+    def verdict(self) -> list[str]:
+        """One of VERDICTS for each episode."""
+        words = []
+        for succeeded, touched, outcome in zip(self.success, self.collided, self.outcome, strict=True):
+            if succeeded:
+                words.append("success, touched" if touched else "success")
+            else:
+                words.append(OUTCOMES[outcome].replace("_", " "))
+        return words
+
     def summary(self) -> dict:
-        """Rates with 95 % Wilson intervals, mean errors and times, as plain numbers."""
+        """Rates with 95 % Wilson intervals, means and quantiles, as plain numbers.
+
+        `rates` lets a trial go on after a touch, as the paper does; `rates_to_first_contact` ends it there, so that
+        its rates add up to one.
+        """
+        untouched, reached = ~self.collided, self.success
+        falls, time_outs = self.ended("fall"), self.ended("time_out")
         rates = {
-            "success": self.success,
-            "success_untouched": self.success & ~self.collided,
+            "success": reached,
+            "success_untouched": reached & untouched,
             "collision": self.collided,
-            "fall": self.ended("fall"),
-            "time_out": self.ended("time_out"),
+            "fall": falls,
+            "time_out": time_outs,
             "diverged": self.ended("diverged"),
         }
+        to_first_contact = {"success": reached, "fall": falls, "diverged": self.ended("diverged")}
         if self.has_goal:
-            rates["goal"] = self.ended("goal")
+            to_first_contact["time_out"] = time_outs
+        to_first_contact = {name: happened & untouched for name, happened in to_first_contact.items()}
         return {
             "episodes": len(self),
             "episodes_per_env": self.per_env,
             "success_means": "goal reached" if self.has_goal else "time limit reached",
-            "rates": {name: _rate(happened) for name, happened in rates.items()},
+            "rates": {name: rate(happened) for name, happened in rates.items()},
+            "rates_to_first_contact": {
+                name: rate(happened) for name, happened in {**to_first_contact, "collision": self.collided}.items()
+            },
+            "time_to_goal_s": quantiles(self.length_s[reached]) if self.has_goal else None,
+            "clearance_m": quantiles(self.clearance),
             "mean_length_s": float(self.length_s.mean()),
             "contacts_per_minute": 60.0 * float(self.contacts.sum() / self.length_s.sum()),
             "velocity_error_m_s": _weighted(self.velocity_error, self.length_s),
             "free_velocity_error_m_s": _weighted(self.free_velocity_error, self.free_s),
             "yaw_rate_error_rad_s": _weighted(self.yaw_rate_error, self.length_s),
+            "energy_j": quantiles(self.energy),
+            "power_w": float(self.energy.sum() / self.length_s.sum()),
+            "cost_of_transport": float(self.energy.sum() / (self.weight * self.path.sum())),
             "us_per_env_step": dict(self.us_per_env_step),
         }
 
 
+VERDICTS = ("success", "success, touched", "time out", "fall", "collision end", "diverged")
+"""What became of an episode, in words."""
+
+
 def run_episodes(
-    env: OmniEnv, policy: Policy, num_episodes: int, on_step: Callable[[], None] | None = None
+    env: OmniEnv,
+    policy: Policy,
+    num_episodes: int,
+    on_step: Callable[[], None] | None = None,
+    keep_tracks: bool = False,
 ) -> Episodes:
     """Runs the first ceil(num_episodes / num_envs) episodes of every environment.
 
@@ -103,45 +158,31 @@ def run_episodes(
         policy: from observations to actions.
         num_episodes: at least so many episodes are run.
         on_step: called after every control step, in which environments that ended have already been reset.
+        keep_tracks: whether to keep the robots' ways.
     """
     if num_episodes < 1:
         raise ValueError(f"episodes={num_episodes} must be at least 1")
     if bool(env.episode_length_buf.any()):
         raise ValueError("run_episodes needs a freshly built environment; this one has already been stepped")
-    tally = _Tally(env, math.ceil(num_episodes / env.num_envs))
-    clock = _StageClock(env)
-    with torch.no_grad():
-        observations = env.get_observations()
-        while not tally.complete:
-            with env.timer.stage("policy"):
-                actions = policy(observations)
-            observations, _, _, extras = env.step(actions)
-            tally.record()
-            clock.record(extras)
-            if on_step is not None:
-                on_step()
-    return tally.episodes(clock.us_per_env_step())
-
-
-def table(summary: dict) -> str:
-    """A summary as a table for the console."""
-    lines = [f"{summary['episodes']} episodes, success: {summary['success_means']}"]
-    lines += [_rate_line(name, rate) for name, rate in summary["rates"].items()]
-    for key, label, unit in _FIGURES:
-        if summary[key] is not None:
-            lines.append(f"  {label:<28}{summary[key]:8.3f} {unit}")
-    times = sorted(summary["us_per_env_step"].items(), key=lambda item: -item[1])
-    lines.append("  time per environment step    " + ", ".join(f"{name} {spent:.1f}" for name, spent in times) + " us")
-    return "\n".join(lines)
-
-
-_FIGURES = (
-    ("velocity_error_m_s", "velocity error", "m/s"),
-    ("free_velocity_error_m_s", "velocity error, nothing near", "m/s"),
-    ("yaw_rate_error_rad_s", "yaw rate error", "rad/s"),
-    ("contacts_per_minute", "contacts", "per minute"),
-    ("mean_length_s", "episode length", "s"),
-)
+    per_env = math.ceil(num_episodes / env.num_envs)
+    tally, clock = _Tally(env, per_env), _StageClock(env)
+    tracks = TrackRecorder(env, per_env) if keep_tracks else None
+    probes = [tally.record] + ([tracks.record] if tracks is not None else [])
+    env.probes.extend(probes)
+    try:
+        with torch.no_grad():
+            observations = env.get_observations()
+            while not tally.complete:
+                with env.timer.stage("policy"):
+                    actions = policy(observations)
+                observations, _, _, extras = env.step(actions)
+                clock.record(extras)
+                if on_step is not None:
+                    on_step()
+    finally:
+        for probe in probes:
+            env.probes.remove(probe)
+    return tally.episodes(clock.us_per_env_step(), tracks.tracks() if tracks is not None else None)
 
 
 class _Tally:
@@ -149,11 +190,17 @@ class _Tally:
 
     def __init__(self, env: OmniEnv, per_env: int) -> None:
         self._env, self._per_env = env, per_env
-        self._index = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
-        self._sums = torch.zeros(env.num_envs, 6, dtype=torch.float64, device=env.device)
-        self._filed = torch.zeros(env.num_envs, per_env, 6, dtype=torch.float64, device=env.device)
-        self._outcome = torch.zeros(env.num_envs, per_env, dtype=torch.int64, device=env.device)
-        self._was_touching = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+        shape, kind = (env.num_envs,), {"dtype": torch.float64, "device": env.device}
+        self._index = torch.zeros(shape, dtype=torch.int64, device=env.device)
+        self._sums = torch.zeros(*shape, len(_SUMS), **kind)
+        self._filed = torch.zeros(*shape, per_env, len(_SUMS), **kind)
+        self._outcome = torch.zeros(*shape, per_env, dtype=torch.int64, device=env.device)
+        self._first_contact = torch.full(shape, math.inf, **kind)
+        self._filed_contact = torch.zeros(*shape, per_env, **kind)
+        self._clearance = Clearance(env) if env.config.obstacles.num_obstacles else None
+        self._least = torch.full(shape, CLEARANCE_CAP, device=env.device)
+        self._filed_least = torch.zeros(*shape, per_env, device=env.device)
+        self._was_touching = torch.zeros(shape, dtype=torch.bool, device=env.device)
         self._knows_free = True
 
     @property
@@ -161,43 +208,87 @@ class _Tally:
         return bool((self._index >= self._per_env).all())
 
     def record(self) -> None:
-        """Takes in the control step that has just been done."""
-        env = self._env
+        """Takes in the control step that has just been done, before finished environments are reset."""
+        with self._env.timer.stage("measuring"):
+            self._add_step()
+            self._file_ended()
+
+    def _add_step(self) -> None:
+        env, dt = self._env, self._env.control_dt
         self._knows_free = env.free is not None
         free = env.free if env.free is not None else torch.zeros_like(env.done)
         began = env.contacts & ~self._was_touching
-        step = (
-            torch.ones_like(free),
-            env.velocity_error,
-            env.yaw_rate_error,
-            free,
-            env.velocity_error * free,
-            began,
-        )
-        self._sums += torch.stack([value.double() for value in step], 1)
+        motion = env.kinematics
+        step = {
+            "steps": torch.ones_like(free),
+            "velocity_error": env.velocity_error,
+            "yaw_rate_error": env.yaw_rate_error,
+            "free": free,
+            "free_velocity_error": env.velocity_error * free,
+            "contacts": began,
+            "energy": (env.sim.joint_torque() * motion.joint_vel).abs().sum(1) * dt,
+            "path": motion.base_lin_vel_yaw.norm(dim=1) * dt,
+        }
+        healthy = ~env.sim.failed
+        self._sums += torch.stack([torch.where(healthy, step[name].double(), 0.0) for name in _SUMS], 1)
+        time = self._sums[:, 0] * dt
+        self._first_contact = torch.where(began, torch.minimum(self._first_contact, time), self._first_contact)
+        if self._clearance is not None:
+            known = env.contacts | (self._index >= self._per_env)
+            self._least = self._clearance.measure(self._least.masked_fill(known, 0.0))
+        self._was_touching = env.contacts & ~env.done
+
+    def _file_ended(self) -> None:
+        env = self._env
         filed = (env.done & (self._index < self._per_env)).nonzero().flatten()
         slot = self._index[filed]
         self._filed[filed, slot] = self._sums[filed]
+        self._filed_contact[filed, slot] = self._first_contact[filed]
+        self._filed_least[filed, slot] = self._least[filed]
         self._outcome[filed, slot] = torch.stack([env.outcomes[name] for name in OUTCOMES], 1)[filed].int().argmax(1)
         self._index += env.done
         self._sums *= ~env.done[:, None]
-        self._was_touching = env.contacts & ~env.done
+        self._first_contact[env.done] = math.inf
+        self._least[env.done] = CLEARANCE_CAP
 
-    def episodes(self, us_per_env_step: dict[str, float]) -> Episodes:
-        steps, velocity, yaw_rate, free, free_velocity, began = self._filed.flatten(0, 1).cpu().unbind(1)
-        dt = self._env.control_dt
+    def episodes(self, us_per_env_step: dict[str, float], tracks: Tracks | None) -> Episodes:
+        env, dt = self._env, self._env.control_dt
+        sums = dict(zip(_SUMS, self._filed.flatten(0, 1).cpu().unbind(1), strict=True))
+        steps, free, contacts = sums["steps"], sums["free"], sums["contacts"].long()
+        clearance = None
+        if self._clearance is not None:
+            clearance = self._filed_least.flatten().cpu().double()
         return Episodes(
             length_s=steps * dt,
             outcome=self._outcome.flatten().cpu(),
-            contacts=began.long(),
-            velocity_error=velocity / steps,
-            free_velocity_error=free_velocity / free if self._knows_free else None,
+            contacts=contacts,
+            first_contact_s=self._filed_contact.flatten().cpu(),
+            clearance=clearance,
+            energy=sums["energy"],
+            path=sums["path"],
+            velocity_error=sums["velocity_error"] / steps,
+            free_velocity_error=sums["free_velocity_error"] / free if self._knows_free else None,
             free_s=free * dt if self._knows_free else None,
-            yaw_rate_error=yaw_rate / steps,
-            has_goal=self._env.command.reached(self._env.kinematics) is not None,
+            yaw_rate_error=sums["yaw_rate_error"] / steps,
+            has_goal=env.command.goal_w is not None,
+            weight=float(env.world.model.body_subtreemass[env.world.base_body]) * _GRAVITY,
             per_env=self._per_env,
             us_per_env_step=us_per_env_step,
+            tracks=tracks,
         )
+
+
+_SUMS = (
+    "steps",
+    "velocity_error",
+    "yaw_rate_error",
+    "free",
+    "free_velocity_error",
+    "contacts",
+    "energy",
+    "path",
+)
+"""What is added up over the control steps of an episode."""
 
 
 class _StageClock:
@@ -224,17 +315,6 @@ class _StageClock:
 
 
 _TIME, _UNIT = "Time/", "_us_per_env_step"
-
-
-def _rate(happened: torch.Tensor) -> dict:
-    count = int(happened.sum())
-    low, high = wilson(count, len(happened))
-    return {"count": count, "rate": count / len(happened), "low": low, "high": high}
-
-
-def _rate_line(name: str, rate: dict) -> str:
-    interval = f"[{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
-    return f"  {name.replace('_', ' '):<28}{100 * rate['rate']:7.1f} %  {interval:<14} {rate['count']}"
 
 
 def _weighted(mean: torch.Tensor | None, weight: torch.Tensor | None) -> float | None:

@@ -143,6 +143,8 @@ class Recorder:
         if sensing is None or sensing.frame is None or sensing.tick < self._blind_until:
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         frame, config = sensing.frame, sensing.config.sensor
+        if frame.ranges is None:  # no network looks at points
+            return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         hit = frame.ranges[self._id].isfinite()
         points_s = frame.directions_s[self._id, hit] * frame.ranges[self._id, hit, None]
         points_b = _rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
@@ -157,8 +159,9 @@ class Recorder:
         env = self._env
         speed = float(env.kinematics.base_lin_vel_yaw[self._id, 0])
         value = min(max(speed, 0.0), 0.8) + float(env.episode_length_buf[self._id] * env.control_dt > 2.0)
-        if env.sensing is not None and env.sensing.frame is not None:
-            seen = float((env.sensing.frame.class_id[self._id] == HitClass.OBSTACLE).float().mean())
+        frame = env.sensing.frame if env.sensing is not None else None
+        if frame is not None and frame.class_id is not None:
+            seen = float((frame.class_id[self._id] == HitClass.OBSTACLE).float().mean())
             value += min(10.0 * seen, 1.0)
         return value
 

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from omniperception.perception import Sampler
-from omniperception.task.env import HEIGHT_TARGET, SECTOR_TARGET
+from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, SECTOR_TARGET
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,11 @@ class PerceptionConfig:
         history: LiDAR frames that the network sees.
         height_weight: weight of the height supervision in the loss; 0 leaves it out.
         sector_weight: weight of the supervision with obstacle nearness by sector; 0, as in the paper, leaves it out.
+        avoidance_weight: weight of the supervision of an avoidance velocity that is added to the command which the
+            actor follows; 0, as in the paper, leaves it out.
+        supervised_epochs: passes over each rollout in which the network is trained by supervision alone, while PPO
+            takes the embedding as it is; 0, as in the paper: PPO's loss and the supervision together, end to end.
+        learning_rate: of those passes.
     """
 
     sampler: Callable[[], Sampler]
@@ -29,18 +34,32 @@ class PerceptionConfig:
     history: int
     height_weight: float
     sector_weight: float
+    avoidance_weight: float = 0.0
+    supervised_epochs: int = 0
+    learning_rate: float = 1.0e-3
 
     def __post_init__(self) -> None:
         if self.history < 1:
             raise ValueError(f"perception.history={self.history} must be at least 1")
-        for name in ("height_weight", "sector_weight"):
+        for name in ("height_weight", "sector_weight", "avoidance_weight", "supervised_epochs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"perception.{name}={getattr(self, name)} must not be negative")
+        if self.learning_rate <= 0:
+            raise ValueError(f"perception.learning_rate={self.learning_rate} must be positive")
+        if self.supervised_epochs and not self.supervision:
+            raise ValueError(
+                f"perception.supervised_epochs={self.supervised_epochs} needs something to learn from; set"
+                " perception.avoidance_weight, sector_weight or height_weight, or supervised_epochs=0"
+            )
 
     @property
     def supervision(self) -> dict[str, float]:
         """Weight of each supervised target, by observation group."""
-        weights = {HEIGHT_TARGET: self.height_weight, SECTOR_TARGET: self.sector_weight}
+        weights = {
+            HEIGHT_TARGET: self.height_weight,
+            SECTOR_TARGET: self.sector_weight,
+            AVOIDANCE_TARGET: self.avoidance_weight,
+        }
         return {target: weight for target, weight in weights.items() if weight > 0}
 
 
@@ -136,16 +155,20 @@ def runner_config(
         "class_name": "rsl_rl.models:MLPModel",
         "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": ppo.init_std},
     }
+    supervision = None
     if perception is not None:
         actor["class_name"] = "omniperception.learning.models:PerceptionActor"
         actor["perception"] = perception.network
         actor["supervision"] = perception.supervision
+        actor["end_to_end"] = perception.supervised_epochs == 0
+        supervision = {"epochs": perception.supervised_epochs, "learning_rate": perception.learning_rate}
     return {
         "num_steps_per_env": ppo.num_steps_per_env,
         "save_interval": ppo.save_interval,
         "keep_checkpoints": ppo.keep_checkpoints,
         "max_minutes": ppo.max_minutes,
         "steps_per_frame": steps_per_frame,
+        "supervision": supervision,
         "obs_groups": {"actor": list(actor_groups), "critic": list(critic_groups)},
         "actor": actor,
         "critic": {**network, "class_name": "rsl_rl.models:MLPModel"},

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import HiddenState
 from tensordict import TensorDict
 from torch import nn
+from torch.nn import functional
 
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
@@ -28,6 +29,13 @@ class _AddLoss(torch.autograd.Function):
         return gradient, torch.ones_like(loss)
 
 
+AVOIDANCE = "avoidance_target"
+"""The supervised target that is not a part of the embedding but read out of it and added to the command."""
+
+AVOIDANCE_HIDDEN = 64
+"""Width of the read-out's hidden layer."""
+
+
 class PerceptionActor(MLPModel):
     """An MLP on one-dimensional observation groups and the embedding of the LiDAR history.
 
@@ -36,10 +44,14 @@ class PerceptionActor(MLPModel):
     :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the
     network's embedding of an empty history.
 
-    With ``supervision`` the mean squared error between the part of the embedding that the network sets aside
-    for a target (``perception.supervised``) and the observation group of that name, over the steps that have a
-    frame, joins whatever loss is back-propagated through the actor (paper, Sec. 3.3.1: privileged height
+    With ``supervision`` and ``end_to_end`` the mean squared error between the part of the embedding that the network
+    sets aside for a target (``perception.supervised``) and the observation group of that name, over the steps that
+    have a frame, joins whatever loss is back-propagated through the actor (paper, Sec. 3.3.1: privileged height
     supervision).
+
+    With supervision of ``avoidance_target`` an avoidance velocity is read out of the embedding and added to the
+    commanded one before the MLP sees it, because that sum is what the reward wants tracked (paper, r_vel_avoid): a
+    gait that follows commands then avoids as soon as the read-out is right. Without a frame it is 0.
     """
 
     def __init__(
@@ -50,6 +62,8 @@ class PerceptionActor(MLPModel):
         output_dim: int,
         perception: PerceptionNetwork | Callable[[], PerceptionNetwork],
         supervision: Mapping[str, float] | None = None,
+        command_group: str = "command",
+        end_to_end: bool = True,
         **mlp_options,
     ) -> None:
         """Build the actor.
@@ -61,6 +75,9 @@ class PerceptionActor(MLPModel):
             output_dim: number of actions.
             perception: the network, or a function without arguments that builds it.
             supervision: weight of the regression on each privileged observation group; 0 leaves it out.
+            command_group: the group that begins with the commanded velocity (v_x, v_y).
+            end_to_end: whether the loss of an update reaches the perception network; otherwise it is trained by a
+                :class:`~omniperception.learning.supervision.PerceptionTrainer` alone.
             mlp_options: ``hidden_dims``, ``activation``, ``obs_normalization`` (of the one-dimensional
                 groups) and ``distribution_cfg`` of rsl_rl's ``MLPModel``.
         """
@@ -69,12 +86,15 @@ class PerceptionActor(MLPModel):
         for target, weight in supervision.items():
             if weight < 0.0:
                 raise ValueError(f"supervision: the weight of {target} must not be negative, got {weight}")
+        self.command_group, self.end_to_end, self.avoidance = command_group, end_to_end, None
         self._feature_dim = network.feature_dim  # read by _get_latent_dim while the base class builds the MLP
         super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
         self.perception: PerceptionNetwork = network
         with torch.no_grad():  # an untrained embedding is noise to the gait; it enters as its weights learn
             self.mlp[0].weight[:, self.obs_dim :] = 0.0
         self.supervision = supervision
+        if AVOIDANCE in supervision:
+            self.avoidance = self._build_avoidance(obs)
         for target in supervision:
             self._check_target(target, obs)
         self._cache_key: tuple | None = None
@@ -94,9 +114,48 @@ class PerceptionActor(MLPModel):
         hidden_state: HiddenState = None,
     ) -> torch.Tensor:
         """Normalised one-dimensional groups and the embedding, concatenated."""
-        in_update = isinstance(obs, WindowedObservations)
-        features = self._update_features(obs) if in_update else self._rollout_features(obs)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and self.end_to_end):
+            if isinstance(obs, WindowedObservations):
+                features, has_frame = self.embed(obs), obs.step_count > 0
+                if self.supervision and obs.has_frames and torch.is_grad_enabled():
+                    features = _AddLoss.apply(features, self.supervised_loss(features, obs))
+                obs = obs.groups
+            else:
+                features, has_frame = self._rollout_features(obs), obs["frame_count"].squeeze(-1) > 0
+            if self.avoidance is not None:
+                obs = self._avoiding(obs, self._read_avoidance(features, has_frame))
         return torch.cat([super().get_latent(obs, masks, hidden_state), features], dim=-1)
+
+    def perception_parameters(self) -> Iterator[nn.Parameter]:
+        """Parameters of the network and of what is read out of its embedding."""
+        yield from self.perception.parameters()
+        if self.avoidance is not None:
+            yield from self.avoidance.parameters()
+
+    def embed(self, obs: WindowedObservations) -> torch.Tensor:
+        """(B, D) embeddings of the steps of an update; each window is embedded once."""
+        if not obs.has_frames:  # the sensor sleeps: there is nothing to embed
+            return self._empty_features(obs.frames).expand(obs.batch_size[0], -1)
+        windows = obs.window_features
+        if windows is None:
+            windows = self.perception(obs.frames, obs.window_count)
+        table = torch.cat([windows.flatten(0, 1), self._empty_features(obs.frames)])
+        return table[torch.where(obs.step_count > 0, obs.step_window, table.shape[0] - 1)]
+
+    def supervised_loss(self, features: torch.Tensor, obs: WindowedObservations) -> torch.Tensor:
+        """Weighted sum of the mean squared errors of all targets, over the steps that have a frame."""
+        has_frame = obs.step_count > 0
+        total = torch.zeros((), device=features.device)
+        for target, weight in self.supervision.items():
+            if target == AVOIDANCE:
+                predicted = self._read_avoidance(features, has_frame)
+            else:
+                predicted = features[:, self.perception.supervised[target]]
+            error = (predicted - obs[target]).square().mean(dim=-1)
+            loss = (error * has_frame).sum() / has_frame.sum().clamp(min=1)
+            self._losses[target].append(loss.detach())
+            total = total + weight * loss
+        return total
 
     def pop_supervised_losses(self) -> dict[str, float]:
         """Mean squared error of each supervised target since the last call, without those never computed."""
@@ -144,25 +203,32 @@ class PerceptionActor(MLPModel):
             versions,
         )
 
-    def _update_features(self, obs: WindowedObservations) -> torch.Tensor:
-        """(B, D) embeddings of a mini-batch's steps; starts the supervised losses if there are any."""
-        if not obs.has_frames:  # the sensor sleeps: there is nothing to embed and nothing to learn from
-            return self._empty_features(obs.frames).expand(obs.batch_size[0], -1)
-        windows = self.perception(obs.frames, obs.window_count).flatten(0, 1)  # (E W, D)
-        table = torch.cat([windows, self._empty_features(obs.frames)])
-        has_frame = obs.step_count > 0
-        features = table[torch.where(has_frame, obs.step_window, windows.shape[0])]
-        if not self.supervision or not torch.is_grad_enabled():
-            return features
-        total = torch.zeros((), device=features.device)
-        for target, weight in self.supervision.items():
-            error = features[:, self.perception.supervised[target]] - obs[target]
-            loss = (error.square().mean(dim=-1) * has_frame).sum() / has_frame.sum().clamp(min=1)
-            self._losses[target].append(loss.detach())
-            total = total + weight * loss
-        return _AddLoss.apply(features, total)
+    def _build_avoidance(self, obs: TensorDict) -> nn.Module:
+        if self.command_group not in self.obs_groups or obs[self.command_group].shape[-1] < 2:
+            raise ValueError(
+                f"perception.avoidance_weight needs the actor to observe '{self.command_group}', it observes"
+                f" {self.obs_groups}; add it to observations.actor or set perception.avoidance_weight=0"
+            )
+        last = nn.Linear(AVOIDANCE_HIDDEN, 2)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        return nn.Sequential(nn.Linear(self._feature_dim, AVOIDANCE_HIDDEN), nn.ELU(), last)
+
+    def _read_avoidance(self, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor:
+        """(B, 2) avoidance velocity (m/s, yaw-aligned frame) in the embedding, 0 without a frame."""
+        return self.avoidance(features).float() * has_frame[:, None]
+
+    def _avoiding(self, groups: TensorDict, avoidance: torch.Tensor) -> TensorDict:
+        """The observations with the avoidance velocity added to the commanded one."""
+        groups = groups.clone(recurse=False)
+        groups[self.command_group] = groups[self.command_group] + functional.pad(
+            avoidance, (0, groups[self.command_group].shape[-1] - 2)
+        )
+        return groups
 
     def _check_target(self, target: str, obs: TensorDict) -> None:
+        if target == AVOIDANCE:
+            return
         if target not in self.perception.supervised:
             raise ValueError(
                 f"{type(self.perception).__name__} sets nothing aside for {target}; set its weight to 0, e.g."

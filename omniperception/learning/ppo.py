@@ -14,6 +14,7 @@ from tensordict import TensorDict
 
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.storage import PerceptiveStorage
+from omniperception.learning.supervision import PerceptionTrainer
 
 
 class TrainingDiverged(RuntimeError):
@@ -33,6 +34,7 @@ class PerceptivePpo(PPO):
         """Arguments of rsl_rl's PPO."""
         super().__init__(*args, **kwargs)
         self.num_updates = 0
+        self.perception_trainer: PerceptionTrainer | None = None
         self.optimizer.register_step_pre_hook(lambda *_: self._check_gradients())
 
     @staticmethod
@@ -71,6 +73,8 @@ class PerceptivePpo(PPO):
             steps_per_frame=cfg.get("steps_per_frame", 1),
         )
         alg = alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])
+        if perceptive and not actor.end_to_end:
+            alg.perception_trainer = PerceptionTrainer(actor, max_grad_norm=alg.max_grad_norm, **cfg["supervision"])
         alg.compile(cfg.get("torch_compile_mode"))
         return alg
 
@@ -80,13 +84,42 @@ class PerceptivePpo(PPO):
         return super().act(obs)
 
     def update(self) -> dict[str, float]:
-        """One PPO update; mean losses, among them those of the supervised targets."""
+        """One PPO update; mean losses, among them those of the supervised targets.
+
+        A perception network that is not trained end to end has embedded the rollout before it learns from it, so that
+        PPO sees what the policy acted on.
+        """
+        if self.perception_trainer is not None:
+            acted_on = self._embed_rollout()
+            self.perception_trainer.train(self.storage, self.num_mini_batches, self.use_mixed_precision)
+            self.storage.window_features = acted_on
         losses = super().update()
         self.num_updates += 1
         if isinstance(self._raw_actor, PerceptionActor):
             losses |= self._raw_actor.pop_supervised_losses()
         self._check_parameters()
         return losses
+
+    def _embed_rollout(self) -> torch.Tensor | None:
+        """(N, W, D) embeddings of the rollout's windows; None without a frame."""
+        everyone = self.storage.observations_of(torch.arange(self.storage.num_envs, device=self.device))
+        if not everyone.has_frames:
+            return None
+        with torch.no_grad():
+            return self._raw_actor.perception(everyone.frames, everyone.window_count)
+
+    def save(self) -> dict:
+        """States of the networks and of the optimisers."""
+        state = super().save()
+        if self.perception_trainer is not None:
+            state["perception_optimizer_state_dict"] = self.perception_trainer.optimizer.state_dict()
+        return state
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Load the parts that ``load_cfg`` names, all by default; whether the iteration is one of them."""
+        if self.perception_trainer is not None and (load_cfg is None or load_cfg.get("optimizer")):
+            self.perception_trainer.optimizer.load_state_dict(loaded_dict["perception_optimizer_state_dict"])
+        return super().load(loaded_dict, load_cfg, strict)
 
     def _check_gradients(self) -> None:
         for name, model in (("actor", self._raw_actor), ("critic", self._raw_critic)):

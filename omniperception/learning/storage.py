@@ -25,6 +25,7 @@ class WindowedObservations:
             it.
         step_window: (B,) index e * W + w of each step's window.
         step_count: (B,) valid frames at each step; 0 after a reset until the next frame.
+        window_features: (E, W, D) embeddings of the windows, where they are fixed during the update, else None.
     """
 
     groups: TensorDict
@@ -32,6 +33,7 @@ class WindowedObservations:
     window_count: torch.Tensor
     step_window: torch.Tensor
     step_count: torch.Tensor
+    window_features: torch.Tensor | None = None
 
     @property
     def has_frames(self) -> bool:
@@ -118,6 +120,7 @@ class PerceptiveStorage(RolloutStorage):
         capacity = self.history - 1 + max_windows(num_steps, steps_per_frame)
         self.frames = torch.zeros(num_envs, capacity, *obs["frames"].shape[2:], device=device)
         self.frame_count = torch.zeros(num_steps, num_envs, dtype=torch.int16, device=device)
+        self.window_features: torch.Tensor | None = None
         self._step_windows: list[int] = []
         self._ticks: list[int] = []
 
@@ -165,6 +168,7 @@ class PerceptiveStorage(RolloutStorage):
         """Start the next rollout."""
         super().clear()
         if self.has_frames:
+            self.window_features = None
             self._step_windows.clear()
             self._ticks.clear()
 
@@ -185,9 +189,12 @@ class PerceptiveStorage(RolloutStorage):
                 f" environments; set num_mini_batches to at most {self.num_envs}"
             )
         for _ in range(num_epochs):
-            order = torch.randperm(self.num_envs, device=self.device)
-            for env_ids in order.tensor_split(num_mini_batches):
+            for env_ids in self.shuffled_envs(num_mini_batches):
                 yield self._batch(env_ids)
+
+    def shuffled_envs(self, num_parts: int) -> tuple[torch.Tensor, ...]:
+        """All environments in a new order, in parts whose sizes differ by one at most."""
+        return torch.randperm(self.num_envs, device=self.device).tensor_split(num_parts)
 
     def _batch(self, env_ids: torch.Tensor) -> RolloutStorage.Batch:
         """All steps of some environments, flattened in (step, environment) order."""
@@ -196,7 +203,7 @@ class PerceptiveStorage(RolloutStorage):
             return buffer[:, env_ids].flatten(0, 1)
 
         return RolloutStorage.Batch(
-            observations=self._observations(env_ids),  # type: ignore[arg-type]
+            observations=self.observations_of(env_ids),  # type: ignore[arg-type]
             actions=take(self.actions),
             values=take(self.values),
             advantages=take(self.advantages),
@@ -205,7 +212,8 @@ class PerceptiveStorage(RolloutStorage):
             old_distribution_params=tuple(take(p) for p in self.distribution_params),
         )
 
-    def _observations(self, env_ids: torch.Tensor) -> WindowedObservations:
+    def observations_of(self, env_ids: torch.Tensor) -> WindowedObservations:
+        """What some environments saw at all steps, flattened in (step, environment) order."""
         num_windows = self.num_windows
         window = torch.tensor(self._step_windows, device=self.device)  # (T,)
         step_count = self.frame_count[:, env_ids]  # (T, E)
@@ -219,4 +227,5 @@ class PerceptiveStorage(RolloutStorage):
             window_count=count.t().contiguous().long(),
             step_window=(first + window.unsqueeze(1)).flatten(),
             step_count=step_count.flatten().long(),
+            window_features=None if self.window_features is None else self.window_features[env_ids],
         )

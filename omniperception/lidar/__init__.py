@@ -1,27 +1,97 @@
-"""A stand-alone LiDAR toolkit: scan patterns, analytic scenes and noise, for thousands of environments."""
+"""A stand-alone LiDAR toolkit: scan patterns, scenes, sensors and noise, for thousands of environments."""
 
-from .noise import DistanceNoise, MaskNoise, Noise
-from .patterns import ScanPattern, grid, mid360, select_rows
+from .devices import DEVICES, DeviceSpec
+from .heightfield import HeightField
+from .meshes import TriangleMesh
+from .motion import PoseTrack
+from .mujoco import GeomShapes, MujocoScene, geom_shapes
+from .noise import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
+from .patterns import (
+    LIVOX,
+    ScanPattern,
+    Selection,
+    airy,
+    avia,
+    custom,
+    grid,
+    hap,
+    hdl32e,
+    hdl64e,
+    height_scanner,
+    horizon,
+    make_selection,
+    mid40,
+    mid70,
+    mid360,
+    os0,
+    os1,
+    os2,
+    ouster,
+    select_rows,
+    spinning,
+    tele15,
+    vlp16,
+    vlp32c,
+    xt16,
+    xt32,
+)
 from .scene import RayHits, RayScene
-from .sectors import sector_distances
-from .sensor import Lidar, LidarConfig, LidarFrame, quat_from_rpy
+from .sectors import SectorDistances, sector_distances
+from .sensor import OUTPUTS, Lidar, LidarConfig, LidarFrame, quat_from_rpy
 from .shapes import Shape, ShapeKind
 
 __all__ = [
+    "DEVICES",
+    "LIVOX",
+    "OUTPUTS",
+    "AngularJitter",
+    "DeviceSpec",
     "DistanceNoise",
+    "Dropout",
+    "GaussianNoise",
+    "GeomShapes",
+    "HeightField",
     "Lidar",
     "LidarConfig",
     "LidarFrame",
     "MaskNoise",
+    "MixedPixels",
+    "MujocoScene",
     "Noise",
+    "PoseTrack",
     "RayHits",
     "RayScene",
     "ScanPattern",
+    "SectorDistances",
+    "Selection",
     "Shape",
     "ShapeKind",
+    "TriangleMesh",
+    "airy",
+    "avia",
+    "custom",
+    "geom_shapes",
     "grid",
+    "hap",
+    "hdl32e",
+    "hdl64e",
+    "height_scanner",
+    "horizon",
+    "make_selection",
+    "mid40",
+    "mid70",
     "mid360",
+    "os0",
+    "os1",
+    "os2",
+    "ouster",
     "quat_from_rpy",
     "sector_distances",
     "select_rows",
+    "spinning",
+    "tele15",
+    "vlp16",
+    "vlp32c",
+    "xt16",
+    "xt32",
 ]

@@ -1,16 +1,24 @@
-"""Range noise of the LiDAR, as in the paper's sensor simulation."""
+"""Noise of the LiDAR: figures of each model. A model that is not given is not in the compiled kernel.
 
+They act in this order, whatever the order in which they are given: angular jitter turns the ray before it is cast;
+mixed pixels, Gaussian and distance noise change the distance of a hit, which then ends at the maximum range and is no
+point below the minimum range; the mask replaces it; dropout loses it. No model turns a miss into a hit.
+"""
+
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+from .kernels.noise import MAX_SIGMAS, NoiseFigures
 
 
 @dataclass(frozen=True)
 class MaskNoise:
-    """A random share of the hits gets a meaningless short distance.
+    """A random share of the hits gets a meaningless short distance, as in the paper.
 
     Attributes:
         ratio: Probability that a hit is replaced.
-        low: Lower end of the uniform distance, metres.
+        low: Lower end of the uniform distance, metres; below the sensor's minimum range is allowed.
         high: Upper end, metres.
     """
 
@@ -19,15 +27,14 @@ class MaskNoise:
     high: float = 0.3
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.ratio <= 1.0:
-            raise ValueError(f"lidar.noise.mask.ratio={self.ratio} must be in 0..1")
-        if not 0.0 <= self.low <= self.high < float("inf"):
+        _require_share("mask.ratio", self.ratio)
+        if not 0.0 <= self.low <= self.high < math.inf:
             raise ValueError(f"lidar.noise.mask.low={self.low} and high={self.high} must be 0 <= low <= high")
 
 
 @dataclass(frozen=True)
 class DistanceNoise:
-    """Every hit's distance is multiplied by 1 + ratio * U(-1, 1).
+    """Every hit's distance is multiplied by 1 + ratio * U(-1, 1), as in the paper.
 
     Attributes:
         ratio: Largest relative error.
@@ -36,25 +43,156 @@ class DistanceNoise:
     ratio: float = 0.1
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.ratio <= 1.0:
-            raise ValueError(f"lidar.noise.distance.ratio={self.ratio} must be in 0..1")
+        _require_share("distance.ratio", self.ratio)
 
 
-Noise = MaskNoise | DistanceNoise
+@dataclass(frozen=True)
+class GaussianNoise:
+    """A normal variable of standard deviation sigma + sigma_per_metre * distance is added to every hit's distance.
+
+    Attributes:
+        sigma: Metres.
+        sigma_per_metre: Metres per metre.
+    """
+
+    sigma: float = 0.02
+    sigma_per_metre: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_amount("gaussian.sigma", self.sigma)
+        _require_amount("gaussian.sigma_per_metre", self.sigma_per_metre)
 
 
-def noise_parameters(noise: Sequence[Noise]) -> tuple[float, float, float, float]:
-    """(distance ratio, mask ratio, mask low, mask high) of at most one noise of each kind; 0 for none."""
-    for kind in (MaskNoise, DistanceNoise):
-        if sum(isinstance(item, kind) for item in noise) > 1:
-            raise ValueError(f"lidar.noise holds more than one {kind.__name__}; give at most one of each kind")
-    unknown = [item for item in noise if not isinstance(item, (MaskNoise, DistanceNoise))]
-    if unknown:
-        raise ValueError(f"lidar.noise={unknown} must be MaskNoise or DistanceNoise")
-    distance_ratio, mask = 0.0, (0.0, 0.0, 0.0)
-    for item in noise:
-        if isinstance(item, MaskNoise):
-            mask = (item.ratio, item.low, item.high)
+@dataclass(frozen=True)
+class AngularJitter:
+    """Each ray is cast beside its nominal direction, and its distance is reported along the nominal one.
+
+    The true ranges are those along the directions really cast: jitter is part of where the beam goes. The angle from
+    the nominal direction is Rayleigh distributed (its tangent is), cut off at 5 ``sigma_deg``.
+
+    Attributes:
+        sigma_deg: Standard deviation along each of two axes across the ray, degrees.
+    """
+
+    sigma_deg: float = 0.05
+
+    def __post_init__(self) -> None:
+        _require_amount("jitter.sigma_deg", self.sigma_deg)
+        if self.sigma_deg > 10.0:
+            raise ValueError(f"lidar.noise.jitter.sigma_deg={self.sigma_deg} must be at most 10 degrees")
+
+
+@dataclass(frozen=True)
+class Dropout:
+    """A hit is lost with probability ratio + ratio_per_metre * distance.
+
+    Attributes:
+        ratio: Probability at the sensor.
+        ratio_per_metre: Increase per metre.
+    """
+
+    ratio: float = 0.0
+    ratio_per_metre: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_share("dropout.ratio", self.ratio)
+        _require_amount("dropout.ratio_per_metre", self.ratio_per_metre)
+
+
+@dataclass(frozen=True)
+class MixedPixels:
+    """A beam that meets two surfaces at a depth edge measures a distance between them.
+
+    A second ray is cast on the beam's rim, on a side that turns by the golden angle from row to row of the scan table:
+    which rays are mixed is a function of the scene alone. Where both rays hit and their distances differ by more than
+    ``min_gap`` and at most ``max_gap``, the distance is foreground * near + (1 - foreground) * far. Where the second
+    ray meets nothing, so does that part of the beam, and the first ray's distance stands.
+
+    Attributes:
+        divergence_deg: Full opening angle of the beam, degrees.
+        min_gap: Smaller differences are one surface seen at a slant, metres.
+        max_gap: Larger differences are two echoes that the device tells apart, metres.
+        foreground: Weight of the nearer surface, 0 to 1.
+    """
+
+    divergence_deg: float = 0.2
+    min_gap: float = 0.1
+    max_gap: float = 1.0e9
+    foreground: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.divergence_deg <= 10.0:
+            raise ValueError(f"lidar.noise.mixed.divergence_deg={self.divergence_deg} must be in 0..10 degrees")
+        if not 0.0 <= self.min_gap <= self.max_gap < math.inf:
+            raise ValueError(
+                f"lidar.noise.mixed.min_gap={self.min_gap} and max_gap={self.max_gap} must be 0 <= min_gap <= max_gap"
+            )
+        _require_share("mixed.foreground", self.foreground)
+
+
+Noise = MaskNoise | DistanceNoise | GaussianNoise | AngularJitter | Dropout | MixedPixels
+
+NAMES = {
+    MaskNoise: "mask",
+    DistanceNoise: "distance",
+    GaussianNoise: "gaussian",
+    AngularJitter: "jitter",
+    Dropout: "dropout",
+    MixedPixels: "mixed",
+}
+
+
+def noise_by_name(noise: Sequence[Noise]) -> dict[str, Noise]:
+    """The models by the names under which the kernels know them; at most one of each kind."""
+    named: dict[str, Noise] = {}
+    for model in noise:
+        if type(model) not in NAMES:
+            known = ", ".join(kind.__name__ for kind in NAMES)
+            raise ValueError(f"lidar.noise={model!r} must be one of {known}")
+        name = NAMES[type(model)]
+        if name in named:
+            raise ValueError(f"lidar.noise holds more than one {type(model).__name__}; give at most one of each kind")
+        named[name] = model
+    return named
+
+
+def noise_figures(named: dict[str, Noise], seed: int, min_range: float, max_range: float) -> NoiseFigures:
+    """The models' figures as the kernels read them, angles as their tangents."""
+    figures = NoiseFigures()
+    figures.seed, figures.min_range, figures.max_range = seed & 0x7FFFFFFF, min_range, max_range
+    for name, model in named.items():
+        if name == "jitter":
+            figures.jitter_sigma = math.tan(math.radians(model.sigma_deg))
+        elif name == "mixed":
+            figures.mixed_radius = math.tan(math.radians(model.divergence_deg) / 2.0)
+            figures.mixed_min_gap, figures.mixed_max_gap = model.min_gap, model.max_gap
+            figures.mixed_weight = model.foreground
+        elif name == "gaussian":
+            figures.gaussian_sigma, figures.gaussian_sigma_per_metre = model.sigma, model.sigma_per_metre
+        elif name == "distance":
+            figures.distance_ratio = model.ratio
+        elif name == "dropout":
+            figures.dropout_ratio, figures.dropout_ratio_per_metre = model.ratio, model.ratio_per_metre
         else:
-            distance_ratio = item.ratio
-    return (distance_ratio, *mask)
+            figures.mask_ratio, figures.mask_low, figures.mask_high = model.ratio, model.low, model.high
+    return figures
+
+
+def spread(named: dict[str, Noise]) -> float:
+    """Largest angle between a nominal direction and one that is cast for it, rad."""
+    angle = 0.0
+    if "jitter" in named:
+        angle += math.atan(MAX_SIGMAS * math.tan(math.radians(named["jitter"].sigma_deg)))
+    if "mixed" in named:
+        angle += math.radians(named["mixed"].divergence_deg) / 2.0
+    return angle
+
+
+def _require_share(name: str, value: float) -> None:
+    if not 0.0 <= value <= 1.0:
+        raise ValueError(f"lidar.noise.{name}={value} must be in 0..1")
+
+
+def _require_amount(name: str, value: float) -> None:
+    if not 0.0 <= value < math.inf:
+        raise ValueError(f"lidar.noise.{name}={value} must be >= 0 and finite")

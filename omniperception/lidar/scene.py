@@ -1,18 +1,21 @@
-"""A scene of analytic shapes for many environments at once, and general rays through it."""
+"""A scene of shapes for many environments at once, and general rays through it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import warp as wp
 
-from .kernels.geometry import Geometry
-from .kernels.place import place_shapes
+from .assets import lay_out
+from .deformable import Deformable
+from .kernels.place import GROUP_SIZE, bound_groups, place_kernel
 from .kernels.rays import rays_kernel
 from .launch import SplitLaunch, default_num_threads, wp_device
 from .shapes import Shape
 
 IDENTITY_QUAT = (1.0, 0.0, 0.0, 0.0)
+POSE_TYPES = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 
 @dataclass(frozen=True)
@@ -43,10 +46,18 @@ class View:
 
 
 class PlacedShapes:
-    """A scene's shapes in a viewer's frame, nearest first, refreshed by calling it.
+    """A scene's shapes in a viewer's frame, nearest first, refreshed by ``refresh``.
 
-    ``bound`` (num_envs, S) holds centre and rejection threshold, ``near`` the distance to the shape, ``axes``
-    its axes in rows, ``shape`` its index, ``count`` (num_envs,) how many of the S slots are in use.
+    Without a view the frame is the environment's, nothing is left out, and neighbours stand together.
+
+    Attributes:
+        bound: Centre and rejection threshold of each slot, (num_envs, S) vec4.
+        near: A lower bound of the distance to the shape, metres, ascending, (num_envs, S); none without a view.
+        shape: Index of the shape, (num_envs, S) int32.
+        axes: Its axes in rows, (num_envs, S) mat33.
+        pose: Its pose in float64, (num_envs, S) transformd.
+        count: How many of the S slots are in use, (num_envs,) int32.
+        group: Centre and radius of a sphere around each GROUP_SIZE slots, (num_envs, G) vec4d; None with a view.
     """
 
     def __init__(self, scene: "RayScene", exclude_shapes: Sequence[int], view: View | None) -> None:
@@ -58,50 +69,109 @@ class PlacedShapes:
         self.near = wp.zeros(slots, dtype=wp.float32, device=device)
         self.shape = wp.zeros(slots, dtype=wp.int32, device=device)
         self.axes = wp.zeros(slots, dtype=wp.mat33, device=device)
+        self.pose = wp.zeros(slots, dtype=wp.transformd, device=device)
         self.count = wp.zeros(scene.num_envs, dtype=wp.int32, device=device)
-        cull = view is not None
-        view = view or View()
+        self.group: wp.array | None = None
+        if view is None:
+            groups = (scene.num_envs, -(-slots[1] // GROUP_SIZE))
+            self.group = wp.zeros(groups, dtype=wp.vec4d, device=device)
+        self._order = wp.zeros(slots, dtype=wp.int32, device=device)
+        self._spare = wp.zeros(slots, dtype=wp.float32, device=device)
+        self._scene, self._view, self._num_viewed = scene, view, len(viewed)
+        self._viewed = wp.array(viewed or [0], dtype=wp.int32, device=device)
+        self._launches: list[SplitLaunch] = []
+        self._visible: torch.Tensor | None = None
+
+    def refresh(self) -> None:
+        """Places the shapes where their bodies are now."""
+        if not self._launches or self._visible is not self._scene.visible_if_used:
+            self._visible = self._scene.visible_if_used
+            self._launches = [self._record_place()]
+            if self.group is not None:
+                self._launches.append(self._record_groups())
+        for launch in self._launches:
+            launch()
+
+    def _record_groups(self) -> SplitLaunch:
+        args = [self._scene.geometry.radius, self.shape, self.pose, self.count, self.group]
+        return self._scene.launch(bound_groups, (), args, work_per_env=4 * self._num_viewed)
+
+    def _record_place(self) -> SplitLaunch:
+        scene, view = self._scene, self._view or View()
         low, high = view.elevation or (-4.0, 4.0)
+        if self._visible is None:
+            visible = wp.empty((0, 0), dtype=wp.bool, device=scene.wp_device)
+        else:
+            visible = wp.from_torch(self._visible)
         args = [
             scene.wp_body_pos,
             scene.wp_body_quat,
             scene.geometry.kind,
             scene.body,
-            scene.pos,
-            scene.quat,
+            scene.pose,
             scene.geometry.size,
             scene.geometry.radius,
-            wp.array(viewed or [0], dtype=wp.int32, device=device),
-            len(viewed),
+            visible,
+            self._viewed,
+            self._num_viewed,
             view.body,
-            wp.vec3(*view.pos),
-            wp.vec4(*view.quat),
-            int(cull),
+            wp_pose(view.pos, view.quat),
+            int(self._view is not None),
             view.max_range,
             low,
             high,
+            self._order,
+            self._spare,
             self.bound,
             self.near,
             self.shape,
             self.axes,
+            self.pose,
             self.count,
         ]
-        self.refresh = scene.launch(place_shapes, (), args, work_per_env=20 * len(viewed))
+        kernel = place_kernel(POSE_TYPES[scene.body_pos.dtype])
+        return scene.launch(kernel, (), args, work_per_env=30 * self._num_viewed)
 
 
 class RayScene:
-    """Shapes shared by ``num_envs`` environments, carried by bodies whose poses are each environment's own.
+    """Shapes in ``num_envs`` environments, carried by bodies whose poses are each environment's own.
 
-    Every environment has its own origin, and a ray meets only the shapes of its own environment. Write
-    ``body_pos`` and ``body_quat`` in place before a cast; a body moved far below is as good as absent.
+    Every environment has its own origin, and a ray meets only the shapes of its own environment. Write ``body_pos`` and
+    ``body_quat`` in place before a cast, and ``visible`` to hide shapes or to have them in some environments only.
 
     Attributes:
         shapes: The shapes; a shape id is an index into this tuple.
         device: Where the tensors live.
         num_threads: CPU threads per cast; unused on a GPU.
 
-    Conventions are those of ``mj_ray``: a plane is infinite and hit from the side of its normal only; a ray
-    that starts inside a closed shape hits its exit surface.
+    What rays meet is what they meet in ``mj_ray``:
+        - A plane is hit from the side of its normal only, and ends where its half extents do. Other surfaces are hit
+          from both sides: a ray that starts inside a closed shape hits its exit surface.
+        - Where two surfaces coincide, either is reported. A ray that starts on a surface, which is within 1e-7 of the
+          shape's size, hits it at 0 or passes on to the next one, as rounding decides.
+        - A ray along a face of a box or a triangle may hit it or miss it; its range is that of a point on it.
+        - Meshes and height fields have no gaps at edges and corners. A triangle without area is never hit.
+
+    Accuracy: what float32 leaves uncertain is computed again in float64, so that ranges are right to 1e-5 of their
+    value plus 1e-5 m for shapes of 1 mm to 1 km. Poses are composed in float64 and made relative to the viewer before
+    they are rounded: with ``pose_dtype=torch.float64`` that holds at any distance from the origin, with float32 the
+    caller's own rounding (6e-5 m at 1 km) comes on top.
+
+    What cannot be placed is not there: a ray passes through a shape whose body has a position or a quaternion that is
+    not finite or a quaternion of norm 0 (below 1e-6), and a sensor on such a body misses everything; ``broken_poses``
+    finds them. A quaternion of any other norm is normalised. A triangle of a deformable with a vertex that is not
+    finite is not there. A ray whose origin or direction is not finite, or whose direction has length 0, misses.
+
+    Args:
+        shapes: What there is to meet; may be empty.
+        num_envs: Number of environments.
+        num_bodies: Bodies of an environment.
+        device: Of the tensors.
+        num_threads: CPU threads per cast, None for all cores.
+        pose_dtype: Of ``body_pos`` and ``body_quat``, torch.float32 or torch.float64.
+
+    Raises:
+        ValueError: An argument is out of its bounds; the message names it.
     """
 
     def __init__(
@@ -111,6 +181,7 @@ class RayScene:
         num_bodies: int,
         device: str | torch.device = "cpu",
         num_threads: int | None = None,
+        pose_dtype: torch.dtype = torch.float32,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} must be at least 1")
@@ -118,6 +189,8 @@ class RayScene:
             raise ValueError(f"num_bodies={num_bodies} must not be negative")
         if num_threads is not None and num_threads < 1:
             raise ValueError(f"num_threads={num_threads} must be at least 1, or None for all cores")
+        if pose_dtype not in POSE_TYPES:
+            raise ValueError(f"pose_dtype={pose_dtype} must be torch.float32 or torch.float64")
         for k, shape in enumerate(shapes):
             if shape.body >= num_bodies:
                 raise ValueError(f"shapes[{k}].body={shape.body} must be < num_bodies={num_bodies}")
@@ -127,8 +200,16 @@ class RayScene:
         self.device = torch.empty(0, device=device).device
         self.wp_device = wp_device(self.device)
         self.num_threads = num_threads or default_num_threads()
-        self._place_bodies()
-        self._upload_shapes()
+        self._place_bodies(pose_dtype)
+        self.body = wp.array([shape.body for shape in shapes] or [0], dtype=wp.int32, device=self.wp_device)
+        poses = [wp_pose(shape.pos, shape.quat) for shape in shapes]
+        self.pose = wp.array(poses or [wp.transformd()], dtype=wp.transformd, device=self.wp_device)
+        self.geometry, parts = lay_out(self.shapes, num_envs, self.wp_device)
+        self._deformables = {
+            k: Deformable(self.shapes[k].asset, part, self.geometry, num_envs, self.device, self.num_threads)
+            for k, part in parts.items()
+        }
+        self._visible: torch.Tensor | None = None
         self._placed: dict[frozenset[int], PlacedShapes] = {}
 
     @property
@@ -141,28 +222,71 @@ class RayScene:
         """Body orientations in the environment's frame, (w, x, y, z), (num_envs, num_bodies, 4); in place."""
         return self._body_quat
 
-    def _place_bodies(self) -> None:
-        rows = max(self.num_bodies, 1)  # Warp needs an address even where there is no body
-        pos = torch.zeros(self.num_envs, rows, 3, device=self.device)
-        quat = torch.tensor(IDENTITY_QUAT, device=self.device).repeat(self.num_envs, rows, 1)
-        self._body_pos, self._body_quat = pos[:, : self.num_bodies], quat[:, : self.num_bodies]
-        self.wp_body_pos = wp.from_torch(pos, dtype=wp.vec3)
-        self.wp_body_quat = wp.from_torch(quat, dtype=wp.vec4)
+    @property
+    def visible(self) -> torch.Tensor:
+        """Which shapes there are in which environment, (num_envs, num_shapes) bool, all at first; write in place.
 
-    def _upload_shapes(self) -> None:
-        def upload(values: list, dtype: type) -> wp.array:
-            return wp.array(values or [dtype()], dtype=dtype, device=self.wp_device)
-
-        self.geometry = Geometry()
-        self.geometry.kind = upload([int(shape.kind) for shape in self.shapes], wp.int32)
-        self.body = upload([shape.body for shape in self.shapes], wp.int32)
-        self.pos = upload([wp.vec3(*shape.pos) for shape in self.shapes], wp.vec3)
-        self.quat = upload([wp.vec4(*shape.quat) for shape in self.shapes], wp.vec4)
-        self.geometry.size = upload([wp.vec3(*(shape.size + (0.0,) * 3)[:3]) for shape in self.shapes], wp.vec3)
-        self.geometry.radius = upload([shape.bounding_radius for shape in self.shapes], wp.float32)
-        self.geometry.class_id = upload([shape.class_id for shape in self.shapes], wp.int32)
+        Allocated, and looked at, from the first use on.
+        """
+        if self._visible is None:
+            self._visible = torch.ones(self.num_envs, len(self.shapes), dtype=torch.bool, device=self.device)
+        return self._visible
 
     @property
+    def visible_if_used(self) -> torch.Tensor | None:
+        """``visible``, or None as long as nobody has asked for it."""
+        return self._visible
+
+    def shapes_of(self, body: int) -> tuple[int, ...]:
+        """Indices of the shapes that a body carries; -1 for those fixed in the environment."""
+        return tuple(k for k, shape in enumerate(self.shapes) if shape.body == body)
+
+    def broken_poses(self) -> torch.Tensor:
+        """Which bodies have a pose that is not finite or a quaternion of norm 0, (num_envs, num_bodies) bool."""
+        norm = torch.linalg.vector_norm(self.body_quat.double(), dim=-1)
+        finite = self.body_pos.isfinite().all(-1) & norm.isfinite()
+        return ~finite | (norm <= 1e-6)
+
+    def vertices(self, shape_id: int) -> torch.Tensor:
+        """Vertices of a deformable shape in its frame, metres, (num_envs, V, 3) float32.
+
+        Write in place, then call ``refit``.
+        """
+        return self._deformable(shape_id).vertices
+
+    def update_vertices(self, shape_id: int, vertices: torch.Tensor) -> None:
+        """Moves the vertices of a deformable shape and refits its trees, once per frame.
+
+        Args:
+            shape_id: The shape.
+            vertices: In the frame of the shape, metres, (num_envs, V, 3), or (V, 3) for all environments.
+        """
+        own = self._deformable(shape_id).vertices
+        if vertices.shape not in (own.shape, own.shape[1:]):
+            raise ValueError(f"vertices {tuple(vertices.shape)} must be {tuple(own.shape)} or {tuple(own.shape[1:])}")
+        own.copy_(vertices)
+        self._deformables[shape_id].refit()
+
+    def refit(self) -> None:
+        """Brings the trees of all deformable shapes up to date with their vertices."""
+        for deformable in self._deformables.values():
+            deformable.refit()
+
+    def _deformable(self, shape_id: int) -> Deformable:
+        if shape_id not in self._deformables:
+            raise ValueError(f"shape_id={shape_id} must be a deformable shape, one of {sorted(self._deformables)}")
+        return self._deformables[shape_id]
+
+    def _place_bodies(self, dtype: torch.dtype) -> None:
+        rows = max(self.num_bodies, 1)  # Warp needs an address even where there is no body
+        pos = torch.zeros(self.num_envs, rows, 3, device=self.device, dtype=dtype)
+        quat = torch.tensor(IDENTITY_QUAT, device=self.device, dtype=dtype).repeat(self.num_envs, rows, 1)
+        self._body_pos, self._body_quat = pos[:, : self.num_bodies], quat[:, : self.num_bodies]
+        real = POSE_TYPES[dtype]
+        self.wp_body_pos = wp.from_torch(pos, dtype=wp.types.vector(3, real))
+        self.wp_body_quat = wp.from_torch(quat, dtype=wp.types.vector(4, real))
+
+    @cached_property
     def kinds(self) -> frozenset[int]:
         """The kinds of shapes that this scene has."""
         return frozenset(int(shape.kind) for shape in self.shapes)
@@ -189,8 +313,8 @@ class RayScene:
         """Casts general rays, for cameras and checks.
 
         Args:
-            origins_w: Start of each ray in its environment's frame, metres, (num_envs, R, 3).
-            directions_w: Direction of each ray, any length, (num_envs, R, 3).
+            origins_w: Start of each ray in its environment's frame, metres, (num_envs, R, 3), float32 or float64.
+            directions_w: Direction of each ray, any length > 0, (num_envs, R, 3), float32 or float64.
             max_range: Rays end here, metres.
             exclude_shapes: Indices of shapes that these rays pass through.
             normals: Whether to compute the normals as well.
@@ -210,30 +334,38 @@ class RayScene:
         shape_id = torch.empty(self.num_envs, num_rays, device=self.device, dtype=torch.int32)
         normals_w = torch.empty(self.num_envs, num_rays if normals else 1, 3, device=self.device)
         if num_rays:
+            dtype = torch.promote_types(torch.promote_types(origins_w.dtype, directions_w.dtype), torch.float32)
+            origins_w, directions_w = (x.to(self.device, dtype).contiguous() for x in (origins_w, directions_w))
             placed = self._placed_without(exclude_shapes)
             placed.refresh()
+            vec3 = wp.types.vector(3, POSE_TYPES[dtype])
             args = [
-                wp.from_torch(self._contiguous(origins_w), dtype=wp.vec3),
-                wp.from_torch(self._contiguous(directions_w), dtype=wp.vec3),
+                wp.from_torch(origins_w, dtype=vec3),
+                wp.from_torch(directions_w, dtype=vec3),
                 float(max_range),
                 int(normals),
                 self.geometry,
-                placed.bound,
+                placed.group,
                 placed.shape,
                 placed.axes,
+                placed.pose,
                 placed.count,
                 wp.from_torch(ranges),
                 wp.from_torch(shape_id),
                 wp.from_torch(normals_w, dtype=wp.vec3),
             ]
-            self.launch(rays_kernel(self.kinds), (num_rays,), args, work_per_env=num_rays * max(len(self.shapes), 1))()
+            kernel = rays_kernel(self.kinds, POSE_TYPES[dtype])
+            self.launch(kernel, (num_rays,), args, work_per_env=num_rays * max(len(self.shapes), 1))()
         return RayHits(ranges, shape_id, normals_w if normals else None)
-
-    def _contiguous(self, tensor: torch.Tensor) -> torch.Tensor:
-        return tensor.to(device=self.device, dtype=torch.float32).contiguous()
 
     def _placed_without(self, exclude_shapes: Sequence[int]) -> PlacedShapes:
         key = self.check_shape_ids(exclude_shapes)
         if key not in self._placed:
             self._placed[key] = PlacedShapes(self, exclude_shapes, view=None)
         return self._placed[key]
+
+
+def wp_pose(pos: Sequence[float], quat: Sequence[float]) -> wp.transformd:
+    """A position and an orientation (w, x, y, z) of any norm as Warp's transform in float64."""
+    w, x, y, z = quat
+    return wp.transformd(wp.vec3d(*pos), wp.normalize(wp.quatd(x, y, z, w)))

@@ -1,18 +1,27 @@
 """The LiDAR: a scan pattern on a moving mount, cast through a scene at its own rate."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import get_args
 
 import torch
 import warp as wp
 
-from .kernels.noise import add_noise
-from .kernels.scan import ScanRow, scan_kernel
-from .noise import Noise, noise_parameters
-from .patterns import ScanPattern
-from .scene import PlacedShapes, RayScene, View
+from .kernels.motion import Track
+from .kernels.scan import Labels, Rays, ScanOutputs, ScanVariant, scan_kernel
+from .kernels.search import FEW_SLOTS, WORD, Slots, pack_slots
+from .launch import SplitLaunch
+from .motion import PoseTrack, SweptShapes, viewpoint_of
+from .noise import Noise, noise_by_name, noise_figures, spread
+from .patterns import ROW_SLACK, ScanPattern, make_selection
+from .patterns.selection import Strategy
+from .rows import ScanRows
+from .scene import POSE_TYPES, PlacedShapes, RayScene, View
 from .shapes import finite_tuple
+
+RAYS_PER_TASK = 256
+"""Rays of one environment that a CPU thread casts in one go."""
 
 
 def quat_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
@@ -38,6 +47,12 @@ class LidarConfig:
         mount_pos: Sensor position in the mount body's frame, metres.
         mount_rpy: Sensor orientation in the mount body's frame, roll-pitch-yaw about fixed axes, rad.
         mount_quat: The same as (w, x, y, z), in place of ``mount_rpy``.
+        selection: Which points of a frame are kept: "every_kth", "stratified" or "random", see ``make_selection``.
+        reference_range: Distance at which a white wall seen perpendicularly has intensity 1, metres.
+        motion_segments: Pieces into which a frame is cut for motion distortion: each point is cast from the sensor's
+            and the bodies' poses at its own time, interpolated between the ends of its piece. 0: every point is cast
+            from the poses at the frame's end.
+        motion_jump: A body that moves farther than this within a piece was placed anew and does not sweep, metres.
     """
 
     num_rays: int = 1000
@@ -47,6 +62,10 @@ class LidarConfig:
     mount_pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     mount_rpy: tuple[float, float, float] | None = None
     mount_quat: tuple[float, float, float, float] | None = None
+    selection: Strategy = "every_kth"
+    reference_range: float = 10.0
+    motion_segments: int = 0
+    motion_jump: float = math.inf
 
     def __post_init__(self) -> None:
         if self.num_rays < 1 or self.num_rays != int(self.num_rays):
@@ -57,6 +76,15 @@ class LidarConfig:
             raise ValueError(f"lidar.min_range={self.min_range} must be >= 0")
         if not (self.max_range > self.min_range and math.isfinite(self.max_range)):
             raise ValueError(f"lidar.max_range={self.max_range} must be > lidar.min_range={self.min_range} and finite")
+        if not (self.reference_range > 0.0 and math.isfinite(self.reference_range)):
+            raise ValueError(f"lidar.reference_range={self.reference_range} must be positive and finite")
+        if self.selection not in get_args(Strategy):
+            known = ", ".join(get_args(Strategy))
+            raise ValueError(f"lidar.selection={self.selection!r} must be one of {known}")
+        if self.motion_segments < 0 or self.motion_segments != int(self.motion_segments):
+            raise ValueError(f"lidar.motion_segments={self.motion_segments} must be a whole number >= 0")
+        if not self.motion_jump > 0.0:
+            raise ValueError(f"lidar.motion_jump={self.motion_jump} must be a positive distance in metres")
         object.__setattr__(self, "mount_pos", finite_tuple("lidar.mount_pos", self.mount_pos, 3))
         if self.mount_rpy is not None and self.mount_quat is not None:
             raise ValueError("lidar.mount_rpy and lidar.mount_quat are both given; set one of them to null")
@@ -78,25 +106,56 @@ class LidarConfig:
 class LidarFrame:
     """One scan of every environment. The tensors are the sensor's own and are overwritten by the next cast.
 
+    A field that was not asked for is None: it is neither computed nor stored. Noise disturbs ``ranges``, and with it
+    ``valid`` and the points; everything else describes the surface that the ray really met.
+
     Attributes:
         ranges: Measured distance along each ray with noise, metres, ``inf`` for a miss, (num_envs, N).
         true_ranges: The same without noise; the very tensor ``ranges`` when no noise is configured.
-        shape_id: Index of the shape that was hit, -1 for a miss, (num_envs, N) int32.
+        valid: Whether the ray measured a distance, (num_envs, N) bool.
+        points_s: Measured points in the sensor's frame, metres, NaN for a miss, (num_envs, N, 3).
+        points_b: The same in the frame of the body that carries the sensor, (num_envs, N, 3). With motion
+            distortion, each point is in the sensor's and the body's frame at its own time, as a device reports it.
+        points_w: The same in the environment's frame, from the sensor's pose at each point's time, (num_envs, N, 3).
+        normals_w: Outward unit normal of the surface in the environment's frame, zero for a miss, (num_envs, N, 3).
+        incidence: Angle between the ray and the surface's normal, rad in [0, pi/2], NaN for a miss, (num_envs, N).
+        intensity: reflectivity * cos(incidence) * (reference_range / true range)^2, Lambert's law for a beam that the
+            surface catches whole; 1 is a white wall seen perpendicularly at ``config.reference_range``, 0 a miss,
+            (num_envs, N).
+        body_id: Body that carries the shape that was hit, -1 for a fixed shape, -2 for a miss, (num_envs, N) int32.
+        shape_id: Index of that shape, -1 for a miss, (num_envs, N) int32.
         class_id: Class of that shape, -1 for a miss, (num_envs, N) int32.
+        time_s: When each ray was emitted after the frame's start at ``time_s - period_s``, s, (num_envs, N).
         directions_s: Unit direction of each ray in the sensor frame, (num_envs, N, 3).
         elevation: Angle theta of each ray in the sensor frame, rad, (num_envs, N).
         azimuth: Angle phi of each ray in the sensor frame, rad in [0, 2 pi), (num_envs, N).
-        row: Row of the scan table, (num_envs, N) int32.
+        row: Row of the scan pattern, (num_envs, N) int32.
     """
 
-    ranges: torch.Tensor
-    true_ranges: torch.Tensor
-    shape_id: torch.Tensor
-    class_id: torch.Tensor
-    directions_s: torch.Tensor
-    elevation: torch.Tensor
-    azimuth: torch.Tensor
-    row: torch.Tensor
+    ranges: torch.Tensor | None = None
+    true_ranges: torch.Tensor | None = None
+    valid: torch.Tensor | None = None
+    points_s: torch.Tensor | None = None
+    points_b: torch.Tensor | None = None
+    points_w: torch.Tensor | None = None
+    normals_w: torch.Tensor | None = None
+    incidence: torch.Tensor | None = None
+    intensity: torch.Tensor | None = None
+    body_id: torch.Tensor | None = None
+    shape_id: torch.Tensor | None = None
+    class_id: torch.Tensor | None = None
+    time_s: torch.Tensor | None = None
+    directions_s: torch.Tensor | None = None
+    elevation: torch.Tensor | None = None
+    azimuth: torch.Tensor | None = None
+    row: torch.Tensor | None = None
+
+
+OUTPUTS = tuple(field.name for field in fields(LidarFrame))
+"""Everything that a LiDAR can report, by the names of ``LidarFrame``'s fields."""
+
+_VECTORS = ("points_s", "points_b", "points_w", "normals_w", "directions_s")
+_INTEGERS = ("body_id", "shape_id", "class_id", "row")
 
 
 class Lidar:
@@ -104,13 +163,18 @@ class Lidar:
 
     A surface nearer than ``min_range`` blocks the ray and returns nothing. A ray that starts inside a closed
     shape hits its exit surface, as in ``mj_ray``; give the shapes of the sensor's own housing in
-    ``exclude_shapes``.
+    ``exclude_shapes``. A robot with several sensors has one ``Lidar`` for each on the same scene: they share the
+    bodies' poses and nothing else, so each has its own mount, rate and outputs.
 
     Attributes:
         config, pattern, scene: As given.
+        outputs: Names of the fields of ``frame`` that are computed.
         frame: The frame that ``cast`` fills and returns.
         phase_rows: Rows by which each environment's device is ahead, (num_envs,) int64, from the seed.
-        frame_count: Frames cast so far, (1,) int32; the noise is a function of it.
+        track: The poses that motion distortion needs; None without it. ``cast`` takes the scene's poses as those at
+            the frame's end; with more than one segment, call ``track.advance()`` at the ends of the others.
+        frame_count: Frames cast by each environment since its last ``reset``, (num_envs,) int32; the noise and a
+            random selection are functions of it, of the seed and of the environment.
     """
 
     def __init__(
@@ -122,25 +186,46 @@ class Lidar:
         exclude_shapes: Sequence[int] = (),
         noise: Sequence[Noise] = (),
         seed: int = 0,
+        outputs: Sequence[str] = ("ranges",),
+        reflectivity: Mapping[int, float] | None = None,
     ) -> None:
+        """Sets up the sensor; casting allocates nothing more.
+
+        Args:
+            config: Mount, rate and limits.
+            pattern: Where the device looks, as a function of time.
+            scene: What there is to see.
+            mount_body: Body of the scene that carries the sensor; -1 for a sensor fixed in each environment.
+            exclude_shapes: Indices of shapes that the rays pass through.
+            noise: At most one model of each kind.
+            seed: Of the device's phases and of the noise.
+            outputs: What to compute, names from ``OUTPUTS``.
+            reflectivity: Of each class of shapes, 0 to 1 for matt surfaces; 1 for classes not named. Read by
+                the output ``intensity`` only.
+        """
         if not -1 <= mount_body < scene.num_bodies:
             raise ValueError(
                 f"lidar.mount_body={mount_body} must be in 0..{scene.num_bodies - 1}, or -1 (fixed sensor)"
             )
-        stride = pattern.stride(config.period_s, config.num_rays)
         self.config, self.pattern, self.scene = config, pattern, scene
-        self.phase_rows = self._draw_phase(seed)
+        self.outputs = _known_outputs(outputs)
+        self._selection = make_selection(pattern, config.period_s, config.num_rays, config.selection, seed)
+        generator = torch.Generator().manual_seed(seed)
+        self.phase_rows = self._selection.draw_phases(scene.num_envs, generator).to(scene.device)
         self._first_row = torch.zeros(scene.num_envs, dtype=torch.int64, device=scene.device)
         self._scratch = torch.zeros(scene.num_envs, dtype=torch.float64, device=scene.device)
-        self.frame_count = torch.zeros(1, dtype=torch.int32, device=scene.device)
-        self.frame = self._allocate_frame(has_noise=bool(noise))
-        view = View(mount_body, config.mount_pos, config.quat, config.max_range, self._elevation_span())
-        self._placed = PlacedShapes(scene, exclude_shapes, view)
-        self._cast = self._record_cast(stride)
-        self._add_noise = self._record_noise(noise, seed) if noise else None
+        self.frame_count = torch.zeros(scene.num_envs, dtype=torch.int32, device=scene.device)
+        self._noise = noise_by_name(noise)
+        self.frame = self._allocate_frame()
+        self.track: PoseTrack | None = None
+        self._rays = self._lay_out_rays()
+        self._view, self._placed = self._place(mount_body, exclude_shapes)
+        num_viewed = len(scene.shapes) - len(set(exclude_shapes))
+        self._slots, self._pack = self._slots_of(num_viewed)
+        self._cast = self._record_cast(seed, reflectivity or {}, num_viewed)
 
     def cast(self, time_s: torch.Tensor) -> LidarFrame:
-        """Casts the frame that ends at ``time_s`` from the bodies' current poses.
+        """Casts the frame that ends at ``time_s`` from the bodies' current poses or, with a ``track``, along it.
 
         Args:
             time_s: Each environment's time, s, (num_envs,) float64.
@@ -152,74 +237,174 @@ class Lidar:
             raise ValueError(
                 f"time_s must be float64 ({self.scene.num_envs},), got {time_s.dtype} {tuple(time_s.shape)}"
             )
-        self.pattern.first_rows(time_s, self.config.period_s, self.phase_rows, self._first_row, self._scratch)
+        self._seek(time_s)
+        if self.track is not None:
+            self.track.advance()
         self._placed.refresh()
+        if self._pack is not None:
+            self._pack()
         self._cast()
-        if self._add_noise is not None:
-            self._add_noise()
-            self.frame_count.add_(1)
+        self.frame_count.add_(1)
         return self.frame
 
-    def _draw_phase(self, seed: int) -> torch.Tensor:
-        generator = torch.Generator().manual_seed(seed)
-        phase = torch.randint(self.pattern.num_rows, (self.scene.num_envs,), generator=generator)
-        return phase.to(self.scene.device)
+    def reset(self, env_ids: torch.Tensor | None = None) -> None:
+        """Starts the random numbers of some environments, or of all, anew: they repeat from the first frame's."""
+        if env_ids is None:
+            self.frame_count.zero_()
+        else:
+            self.frame_count[env_ids] = 0
 
-    def _elevation_span(self) -> tuple[float, float]:
-        elevation = torch.asin(self.pattern.directions_s[:, 2].double().clamp(-1.0, 1.0))
-        return float(elevation.min()), float(elevation.max())
+    def _seek(self, time_s: torch.Tensor) -> None:
+        """Finds the rows of the frame that ends at ``time_s``."""
+        self.pattern.first_rows(time_s, self.config.period_s, self.phase_rows, self._first_row, self._scratch)
+        self._rows.seek(self._first_row)
+        if self._variant is not None:
+            self._selection.variants(self._first_row, self.frame_count, self._salts, self._variant)
+        if self._lag is not None:
+            rate = self.pattern.points_per_second
+            start = torch.sub(time_s, self.config.period_s, out=self._scratch).mul_(rate)
+            lag = torch.sub(start, ROW_SLACK, out=self._lag_scratch).ceil_().sub_(start).clamp_(min=0.0)
+            self._lag.copy_(lag.div_(rate))
 
-    def _allocate_frame(self, has_noise: bool) -> LidarFrame:
+    def _allocate_frame(self) -> LidarFrame:
         shape, device = (self.scene.num_envs, self.config.num_rays), self.scene.device
-        true_ranges = torch.full(shape, math.inf, device=device)
-        return LidarFrame(
-            ranges=true_ranges.clone() if has_noise else true_ranges,
-            true_ranges=true_ranges,
-            shape_id=torch.full(shape, -1, dtype=torch.int32, device=device),
-            class_id=torch.full(shape, -1, dtype=torch.int32, device=device),
-            directions_s=torch.zeros(*shape, 3, device=device),
-            elevation=torch.zeros(shape, device=device),
-            azimuth=torch.zeros(shape, device=device),
-            row=torch.zeros(shape, dtype=torch.int32, device=device),
-        )
 
-    def _record_cast(self, stride: int):
-        pattern, scene, frame, placed = self.pattern, self.scene, self.frame, self._placed
-        self._scan = torch.cat([pattern.directions_s, pattern.elevation[:, None], pattern.azimuth[:, None]], dim=1)
-        self._scan = self._scan.to(device=scene.device, dtype=torch.float32).contiguous()
+        def tensor(name: str) -> torch.Tensor:
+            if name == "valid":
+                return torch.zeros(shape, dtype=torch.bool, device=device)
+            if name in _INTEGERS:
+                return torch.zeros(shape, dtype=torch.int32, device=device)
+            return torch.zeros(*shape, 3, device=device) if name in _VECTORS else torch.zeros(shape, device=device)
+
+        tensors = {name: tensor(name) for name in self.outputs}
+        if not self._noise and {"ranges", "true_ranges"} <= self.outputs:
+            tensors["true_ranges"] = tensors["ranges"]
+        return LidarFrame(**tensors)
+
+    def _place(self, mount_body: int, exclude_shapes: Sequence[int]) -> tuple[View, PlacedShapes | SweptShapes]:
+        """Where the sensor looks from, and what places the shapes that it may see."""
+        config, reach = self.config, self._reach()
+        elevation = None
+        if reach == 0.0:
+            angles = torch.asin(self.pattern.directions_s[:, 2].double().clamp(-1.0, 1.0))
+            margin = spread(self._noise)
+            elevation = (float(angles.min()) - margin, float(angles.max()) + margin)
+        view = View(mount_body, config.mount_pos, config.quat, config.max_range + reach, elevation)
+        if not config.motion_segments:
+            return view, PlacedShapes(self.scene, exclude_shapes, view)
+        self.track = PoseTrack(self.scene, config.motion_segments, config.motion_jump)
+        return view, SweptShapes(self.scene, exclude_shapes, view, self.track)
+
+    def _reach(self) -> float:
+        """How far from the sensor's origin its rays start, metres."""
+        origins = self.pattern.origins_s
+        return 0.0 if origins is None else float(torch.linalg.vector_norm(origins.double(), dim=1).max())
+
+    def _slots_of(self, num_viewed: int) -> tuple[Slots, SplitLaunch | None]:
+        """The placed shapes as the kernels read them, and what packs them into words where there are many."""
+        placed, slots = self._placed, Slots()
+        slots.bound, slots.near, slots.shape = placed.bound, placed.near, placed.shape
+        slots.count, slots.reach = placed.count, self._reach()
+        if placed.axes is not None:
+            slots.axes, slots.pose = placed.axes, placed.pose
+        if num_viewed <= FEW_SLOTS or self.pattern.origins_s is not None:
+            return slots, None
+        num_words = -(-num_viewed // WORD)
+        slots.words = wp.zeros((self.scene.num_envs, num_words, 4 * WORD), wp.float32, device=self.scene.wp_device)
+        return slots, self.scene.launch(pack_slots, (), [slots], work_per_env=2 * num_viewed)
+
+    def _record_cast(self, seed: int, reflectivity: Mapping[int, float], num_viewed: int) -> SplitLaunch:
+        config, scene, rays = self.config, self.scene, self._rays
+        written = self.outputs - ({"true_ranges"} if self.frame.true_ranges is self.frame.ranges else set())
         args = [
-            wp.from_torch(self._scan, dtype=ScanRow),
-            wp.from_torch(self._first_row),
-            stride,
-            self.config.min_range,
-            self.config.max_range,
+            rays,
+            viewpoint_of(self._view),
+            scene.wp_body_pos,
+            scene.wp_body_quat,
             scene.geometry,
-            placed.bound,
-            placed.near,
-            placed.shape,
-            placed.axes,
-            placed.count,
-            wp.from_torch(frame.true_ranges),
-            wp.from_torch(frame.shape_id),
-            wp.from_torch(frame.class_id),
-            wp.from_torch(frame.directions_s, dtype=wp.vec3),
-            wp.from_torch(frame.elevation),
-            wp.from_torch(frame.azimuth),
-            wp.from_torch(frame.row),
+            self._slots,
+            self.track.arrays if self.track is not None else Track(),
+            self._labels(reflectivity),
+            noise_figures(self._noise, seed, config.min_range, config.max_range),
+            self._output_arrays(written),
         ]
-        num_rays = self.config.num_rays
-        return scene.launch(
-            scan_kernel(scene.kinds), (num_rays,), args, work_per_env=num_rays * (len(scene.shapes) + 4)
+        variant = ScanVariant(
+            kinds=scene.kinds,
+            outputs=frozenset(written),
+            noise=frozenset(self._noise),
+            packed=self._pack is not None,
+            moving=self.track is not None,
+            displaced=self.pattern.origins_s is not None,
+            selected=self._variant is not None,
+            shots=self._lag is not None and self.pattern.rows_per_shot > 1,
+            pose_type=POSE_TYPES[scene.body_pos.dtype],
         )
+        work = rays.block * (min(num_viewed, 64) + 4)
+        num_tasks = scene.num_envs * rays.num_blocks
+        return SplitLaunch(scan_kernel(variant), num_tasks, (), args, scene.device, scene.num_threads, work)
 
-    def _record_noise(self, noise: Sequence[Noise], seed: int):
-        args = [
-            seed & 0x7FFFFFFF,
-            wp.from_torch(self.frame_count),
-            *noise_parameters(noise),
-            self.config.min_range,
-            self.config.max_range,
-            wp.from_torch(self.frame.true_ranges),
-            wp.from_torch(self.frame.ranges),
-        ]
-        return self.scene.launch(add_noise, (self.config.num_rays,), args, work_per_env=4 * self.config.num_rays)
+    def _lay_out_rays(self) -> Rays:
+        """Brings the pattern onto the device."""
+        pattern, config, scene = self.pattern, self.config, self.scene
+        every_kth = self._selection.strategy == "every_kth"
+        angles = bool(self.outputs & {"elevation", "azimuth"})
+        rays = Rays()
+        rays.stride = pattern.stride(config.period_s, config.num_rays) if every_kth else 1
+        self._rows = ScanRows(pattern, rays.stride, scene.num_envs, angles, scene.device)
+        rays.directions = wp.from_torch(self._rows.directions, dtype=wp.vec3)
+        if self._rows.origins is not None:
+            rays.origins = wp.from_torch(self._rows.origins, dtype=wp.vec3)
+        if angles:
+            rays.angles = wp.from_torch(self._rows.angles, dtype=wp.vec2)
+        rays.cycle, rays.num_rows = self._rows.cycle, pattern.num_rows
+        rays.start, rays.first_row = wp.from_torch(self._rows.start), wp.from_torch(self._first_row)
+        self._variant: torch.Tensor | None = None
+        if not every_kth:
+            self._offsets = self._selection.offsets.to(scene.device).contiguous()
+            self._salts = self._selection.salts(scene.num_envs).to(scene.device)
+            self._variant = torch.zeros_like(self._first_row)
+            rays.offsets, rays.variant = wp.from_torch(self._offsets), wp.from_torch(self._variant)
+        self._lag: torch.Tensor | None = None
+        if "time_s" in self.outputs or config.motion_segments:
+            self._lag = torch.zeros(scene.num_envs, device=scene.device)
+            self._lag_scratch = torch.zeros_like(self._scratch)
+            rays.lag = wp.from_torch(self._lag)
+        rays.seconds_per_row, rays.rows_per_shot = 1.0 / pattern.points_per_second, pattern.rows_per_shot
+        rays.period, rays.count = config.period_s, config.num_rays
+        rays.block = 1 if scene.device.type == "cuda" else min(RAYS_PER_TASK, config.num_rays)
+        rays.num_blocks = -(-rays.count // rays.block)
+        rays.min_range, rays.max_range = config.min_range, config.max_range
+        return rays
+
+    def _labels(self, reflectivity: Mapping[int, float]) -> Labels:
+        labels, scene = Labels(), self.scene
+        labels.body, labels.frame = scene.body, wp.from_torch(self.frame_count)
+        if "intensity" in self.outputs:
+            table = _reflectivity_table(reflectivity, [shape.class_id for shape in scene.shapes])
+            scaled = [value * self.config.reference_range**2 for value in table]
+            labels.reflectivity = wp.array(scaled, dtype=wp.float32, device=scene.wp_device)
+        return labels
+
+    def _output_arrays(self, written: set[str] | frozenset[str]) -> ScanOutputs:
+        arrays = ScanOutputs()
+        for name in written:
+            tensor = getattr(self.frame, name)
+            setattr(arrays, name, wp.from_torch(tensor, dtype=wp.vec3) if name in _VECTORS else wp.from_torch(tensor))
+        return arrays
+
+
+def _known_outputs(outputs: Sequence[str]) -> frozenset[str]:
+    unknown = sorted(set(outputs) - set(OUTPUTS))
+    if unknown or not outputs:
+        raise ValueError(f"lidar.outputs={unknown or list(outputs)} must be names out of {', '.join(OUTPUTS)}")
+    return frozenset(outputs)
+
+
+def _reflectivity_table(reflectivity: Mapping[int, float], class_ids: Sequence[int]) -> list[float]:
+    """Reflectivity by class id, 1 where none is given."""
+    for class_id, value in reflectivity.items():
+        if class_id < 0 or not (value >= 0.0 and math.isfinite(value)):
+            raise ValueError(
+                f"lidar.reflectivity={{{class_id}: {value}}} must map class ids >= 0 to finite numbers >= 0"
+            )
+    return [float(reflectivity.get(k, 1.0)) for k in range(max((*class_ids, 0)) + 1)]

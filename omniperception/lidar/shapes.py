@@ -1,9 +1,12 @@
-"""Analytic shapes that rays can meet, described with MuJoCo's size conventions."""
+"""Shapes that rays can meet, described with MuJoCo's size conventions."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+
+from .heightfield import HeightField
+from .meshes import TriangleMesh
 
 
 class ShapeKind(IntEnum):
@@ -15,30 +18,44 @@ class ShapeKind(IntEnum):
     CYLINDER = 3
     CAPSULE = 4
     ELLIPSOID = 5
+    MESH = 6
+    HEIGHTFIELD = 7
+    DEFORMABLE = 8
 
 
 SIZE_NAMES = {
-    ShapeKind.PLANE: (),
+    ShapeKind.PLANE: ("half_x", "half_y"),
     ShapeKind.BOX: ("half_x", "half_y", "half_z"),
     ShapeKind.SPHERE: ("radius",),
     ShapeKind.CYLINDER: ("radius", "half_length"),
     ShapeKind.CAPSULE: ("radius", "half_length"),
     ShapeKind.ELLIPSOID: ("half_x", "half_y", "half_z"),
+    ShapeKind.MESH: (),
+    ShapeKind.HEIGHTFIELD: (),
+    ShapeKind.DEFORMABLE: (),
+}
+ASSET_TYPES = {
+    ShapeKind.MESH: TriangleMesh,
+    ShapeKind.HEIGHTFIELD: HeightField,
+    ShapeKind.DEFORMABLE: TriangleMesh,
 }
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One rigid analytic shape, carried by a moving body or fixed in its environment.
+    """One shape, carried by a moving body or fixed in its environment.
 
     Attributes:
         kind: What the shape is.
         size: Metres. Sphere ``(radius,)``; cylinder and capsule ``(radius, half_length)`` along the local z
-            axis; box and ellipsoid half extents; plane ``()``: infinite, normal along the local +z axis.
+            axis; box and ellipsoid half extents; plane ``()`` or ``(half_x, half_y)``, of which 0 is infinite, with its
+            normal along the local +z axis; the others ``()``.
         body: Index of the moving body that carries the shape; -1 is fixed in the environment's frame.
         pos: Position in that body's frame, metres.
         quat: Orientation in that body's frame, (w, x, y, z), unit length.
         class_id: What a hit on this shape is reported as, >= 0.
+        asset: The ``TriangleMesh`` of a mesh (rigid) or a deformable (at rest), the ``HeightField`` of a height field.
+            Shapes may share one; it is uploaded once, or once for each deformable.
     """
 
     kind: ShapeKind
@@ -47,35 +64,57 @@ class Shape:
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     class_id: int = 0
+    asset: TriangleMesh | HeightField | None = None
 
     def __post_init__(self) -> None:
         kind = _as_kind(self.kind)
         object.__setattr__(self, "kind", kind)
         names = SIZE_NAMES[kind]
+        if kind == ShapeKind.PLANE and len(self.size) == 0:
+            object.__setattr__(self, "size", (0.0, 0.0))
         for field, length in (("size", len(names)), ("pos", 3), ("quat", 4)):
             object.__setattr__(self, field, finite_tuple(f"shape.{field}", getattr(self, field), length, names))
-        if any(value <= 0.0 for value in self.size):
+        if kind == ShapeKind.PLANE:
+            if any(value < 0.0 for value in self.size):
+                raise ValueError(f"shape.size={self.size} of a plane must be >= 0, of which 0 is infinite: {names}")
+        elif any(value <= 0.0 for value in self.size):
             raise ValueError(f"shape.size={self.size} of a {kind.name.lower()} must be positive: {names}")
-        norm = math.sqrt(sum(value * value for value in self.quat))
+        norm = math.hypot(*self.quat)
         if abs(norm - 1.0) > 1e-3:
             raise ValueError(f"shape.quat={self.quat} must be a unit quaternion (w, x, y, z); its norm is {norm:.6g}")
         if self.body < -1:
             raise ValueError(f"shape.body={self.body} must be a body index >= 0, or -1 for a fixed shape")
         if self.class_id < 0:
             raise ValueError(f"shape.class_id={self.class_id} must be >= 0; -1 is reserved for misses")
+        self._check_asset()
+
+    def _check_asset(self) -> None:
+        wanted = ASSET_TYPES.get(self.kind)
+        given = type(self.asset).__name__
+        if wanted is None and self.asset is not None:
+            raise ValueError(f"shape.asset={given} of a {self.kind.name.lower()} must be None: its size says it all")
+        if wanted is not None and not isinstance(self.asset, wanted):
+            raise ValueError(f"shape.asset={given} of a {self.kind.name.lower()} must be a {wanted.__name__}")
+
+    @property
+    def extents(self) -> tuple[float, float, float]:
+        """What the kernels call the size: for a mesh or a height field, half of a box around ``pos`` that holds it."""
+        if self.kind in (ShapeKind.MESH, ShapeKind.HEIGHTFIELD):
+            return self.asset.half_extents
+        return (*self.size, 0.0, 0.0, 0.0)[:3]
 
     @property
     def bounding_radius(self) -> float:
-        """Radius of the sphere around ``pos`` that holds the whole shape, metres; infinite for a plane."""
-        if self.kind == ShapeKind.PLANE:
+        """Radius of the sphere around ``pos`` that holds the shape, metres; infinite for a plane or a deformable."""
+        if self.kind in (ShapeKind.PLANE, ShapeKind.DEFORMABLE):
             return math.inf
-        if self.kind == ShapeKind.BOX:
-            return math.hypot(*self.size)
-        if self.kind == ShapeKind.CYLINDER:
+        if self.kind in (ShapeKind.BOX, ShapeKind.CYLINDER):
             return math.hypot(*self.size)
         if self.kind == ShapeKind.CAPSULE:
             return sum(self.size)
-        return max(self.size)
+        if self.kind in (ShapeKind.SPHERE, ShapeKind.ELLIPSOID):
+            return max(self.size)
+        return self.asset.radius
 
 
 def finite_tuple(key: str, value: Sequence[float], length: int, names: Sequence[str] = ()) -> tuple[float, ...]:

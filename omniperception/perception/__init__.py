@@ -2,9 +2,10 @@
 
 from omniperception.perception.networks import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
 from omniperception.perception.pd_risknet import PdRiskNet
-from omniperception.perception.sampling import FpsSampler, PdSampler, RawSampler, Sampler
+from omniperception.perception.sampling import Attitude, FpsSampler, PdSampler, ProximitySampler, RawSampler, Sampler
 
 __all__ = [
+    "Attitude",
     "DirectMlp",
     "FpsGru",
     "FpsMlp",
@@ -12,6 +13,7 @@ __all__ = [
     "PdRiskNet",
     "PdSampler",
     "PerceptionNetwork",
+    "ProximitySampler",
     "RawSampler",
     "Sampler",
 ]

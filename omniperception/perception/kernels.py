@@ -30,7 +30,6 @@ class Scratch:
     keys: wp.array3d(dtype=wp.int32)  # (2, N, R) sort keys, read from one half and written to the other
     items: wp.array3d(dtype=wp.int32)  # (2, N, R) what is sorted by them
     histogram: wp.array2d(dtype=wp.int32)  # (N, RADIX_SIZE)
-    cell_hits: wp.array2d(dtype=wp.int32)  # (N, distal slots) hits of each cell
 
 
 _FARTHEST_POINTS = r"""
@@ -112,6 +111,11 @@ def farthest_points(
     lane: int,
     num_lanes: int,
 ): ...
+
+
+@wp.func
+def to_quat(wxyz: wp.vec4):
+    return wp.normalize(wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
 
 
 @wp.func
@@ -317,49 +321,48 @@ def write_distal(
         points_out[env, first_slot + b] = wp.vec3(0.0, 0.0, 0.0)
 
 
-@wp.kernel
-def average_cells(
+@wp.kernel(module="unique", enable_backward=False)
+def proximity_grid(
     env_offset: int,
     ranges: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.vec3),
     elevation: wp.array2d(dtype=wp.float32),
-    azimuth: wp.array2d(dtype=wp.float32),
-    lowest: float,
     split: float,
-    num_rings: int,
-    num_columns: int,
     blind: float,
-    scale: float,
+    base_quat: wp.array(dtype=wp.vec4),  # (w, x, y, z)
+    mount_pos: wp.vec3,
+    mount_quat: wp.vec4,
+    body: wp.vec2,
+    band_edges: wp.array(dtype=wp.float32),
+    num_sectors: int,
+    decay: float,
     first_slot: int,
-    scratch: Scratch,
     points_out: wp.array2d(dtype=wp.vec3),
 ):
-    """The mean of the distal hits in each cell of a (theta, phi) grid; an empty cell's centre at maximum range."""
+    """The nearest distal hit of each azimuth sector and height band around the base, as bearing and proximity."""
     env = env_offset + wp.tid()
-    ring_height = (split - lowest) / float(num_rings)
-    column_width = 2.0 * wp.PI / float(num_columns)
-    for cell in range(num_rings * num_columns):
-        scratch.cell_hits[env, cell] = 0
+    num_bands = band_edges.shape[0] - 1
+    for cell in range(num_bands * num_sectors):
         points_out[env, first_slot + cell] = wp.vec3(0.0, 0.0, 0.0)
+    q_base = to_quat(base_quat[env])
+    forward = wp.quat_rotate(q_base, wp.vec3(1.0, 0.0, 0.0))
+    level = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -wp.atan2(forward[1], forward[0])) * q_base
+    offset = wp.quat_rotate(level, mount_pos)
+    turn = wp.quat_to_matrix(level * to_quat(mount_quat))
     for ray in range(ranges.shape[1]):
-        theta = elevation[env, ray]
-        if theta <= split and is_hit(ranges[env, ray]) and ranges[env, ray] >= blind:
-            phi = azimuth[env, ray]
-            phi -= 2.0 * wp.PI * wp.floor(phi / (2.0 * wp.PI))
-            ring = wp.clamp(int(wp.floor((theta - lowest) / ring_height)), 0, num_rings - 1)
-            column = wp.min(int(phi / column_width), num_columns - 1)
-            cell = ring * num_columns + column
-            scratch.cell_hits[env, cell] = scratch.cell_hits[env, cell] + 1
-            point = (ranges[env, ray] * scale) * directions[env, ray]
-            points_out[env, first_slot + cell] = points_out[env, first_slot + cell] + point
-    for cell in range(num_rings * num_columns):
-        hits = scratch.cell_hits[env, cell]
-        if hits > 0:
-            points_out[env, first_slot + cell] = points_out[env, first_slot + cell] / float(hits)
-        else:
-            theta = lowest + (float(cell // num_columns) + 0.5) * ring_height
-            phi = (float(cell % num_columns) + 0.5) * column_width
-            horizontal = wp.cos(theta)
-            points_out[env, first_slot + cell] = wp.vec3(
-                horizontal * wp.cos(phi), horizontal * wp.sin(phi), wp.sin(theta)
-            )
+        distance = ranges[env, ray]
+        if elevation[env, ray] <= split and is_hit(distance) and distance >= blind:
+            p = offset + distance * (turn * directions[env, ray])
+            on_body = wp.abs(p[0]) < body[0] and wp.abs(p[1]) < body[1]
+            if not on_body and p[2] >= band_edges[0] and p[2] < band_edges[num_bands]:
+                band = wp.int32(0)
+                while p[2] >= band_edges[band + 1]:
+                    band += 1
+                turned = (wp.atan2(p[1], p[0]) + _PI) / (2.0 * _PI)
+                sector = wp.clamp(int(turned * float(num_sectors)), 0, num_sectors - 1)
+                horizontal = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+                proximity = wp.exp(-horizontal / decay)
+                slot = first_slot + band * num_sectors + sector
+                if proximity > points_out[env, slot][2]:
+                    bearing = proximity / wp.max(horizontal, 1.0e-6)
+                    points_out[env, slot] = wp.vec3(bearing * p[0], bearing * p[1], proximity)

@@ -3,8 +3,12 @@ distal."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -14,7 +18,23 @@ from omniperception.perception.launch import launch_over_envs, view
 _FPS_LANES = 128
 """CUDA threads that share one environment's farthest point sampling."""
 
+vec4 = kernels.wp.vec4
 vec3, float32, int32 = kernels.wp.vec3, kernels.wp.float32, kernels.wp.int32
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """How the sensors of N robots stand.
+
+    Attributes:
+        base_quat: (N, 4) float32, (w, x, y, z), orientation of the bases in the world.
+        mount_pos: sensor position in the base frame, metres.
+        mount_quat: sensor orientation in the base frame, (w, x, y, z).
+    """
+
+    base_quat: torch.Tensor
+    mount_pos: tuple[float, float, float]
+    mount_quat: tuple[float, float, float, float]
 
 
 class Sampler(ABC):
@@ -23,10 +43,12 @@ class Sampler(ABC):
     Attributes:
         num_points: P, points written per environment.
         max_range: metres; points are divided by it.
+        needs_attitude: whether it looks at the cloud from the levelled base.
     """
 
     num_points: int
     max_range: float
+    needs_attitude: ClassVar[bool] = False
 
     def __init__(self, num_points: int, max_range: float, num_threads: int | None = None) -> None:
         if num_points < 1:
@@ -44,6 +66,7 @@ class Sampler(ABC):
         elevation: torch.Tensor,
         azimuth: torch.Tensor,
         out: torch.Tensor,
+        attitude: Attitude | None = None,
     ) -> None:
         """Sample one frame; every element of ``out`` is written.
 
@@ -54,6 +77,7 @@ class Sampler(ABC):
             azimuth: (N, R) float32, phi in the sensor frame, radians, any branch.
             out: (N, P, 3) float32, points in the sensor frame divided by ``max_range``; may be a strided
                 slice.
+            attitude: how the sensor stands, for a sampler with ``needs_attitude``.
         """
         n, r = ranges.shape
         expected = {
@@ -71,10 +95,12 @@ class Sampler(ABC):
                 raise ValueError(
                     f"sampler: {name} must be float32 on {ranges.device}, got {tensor.dtype} on {tensor.device}"
                 )
-        self._sample(ranges, directions_s, elevation, azimuth, out)
+        if self.needs_attitude and attitude is None:
+            raise ValueError(f"{type(self).__name__} needs the attitude of the base")
+        self._sample(ranges, directions_s, elevation, azimuth, out, attitude)
 
     @abstractmethod
-    def _sample(self, ranges, directions_s, elevation, azimuth, out) -> None:
+    def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         """Write ``out`` from checked tensors."""
 
 
@@ -85,7 +111,7 @@ class RawSampler(Sampler):
         """Args: num_rays: R of every frame; max_range: metres."""
         super().__init__(num_rays, max_range, num_threads)
 
-    def _sample(self, ranges, directions_s, elevation, azimuth, out) -> None:
+    def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         inputs = [view(ranges, float32), view(directions_s, vec3), 1.0 / self.max_range, view(out, vec3)]
         launch_over_envs(
             kernels.raw_points,
@@ -108,12 +134,7 @@ class PdSampler(Sampler):
     steps of 2 pi / 65536. With fewer points than slots each point has its own slot and the remaining slots
     are zero.
 
-    ``distal_bins="points"`` bins the hits, as the paper does: where a bin looks depends on how many hits
-    there are before it in the order. ``distal_bins="cells"`` averages over the cells of a fixed grid instead,
-    ``distal_rings`` rings of theta between ``lowest_deg`` and ``split_deg`` times num_distal / distal_rings columns
-    of phi from 0, so that a network input keeps its direction. Hits nearer than ``blind`` are the robot's own or
-    noise and are left out there; a cell without a hit holds its centre at maximum range, because there "nothing seen"
-    means free space, whereas a zero would say "touching".
+    Where a distal bin looks thus depends on how many hits there are before it in the order.
     """
 
     def __init__(
@@ -125,10 +146,6 @@ class PdSampler(Sampler):
         split_deg: float,
         ring_deg: float = 2.0,
         reduce: str = "average",
-        distal_bins: str = "points",
-        distal_rings: int = 4,
-        lowest_deg: float = -7.5,
-        blind: float = 0.0,
         num_threads: int | None = None,
     ) -> None:
         """Configure the two halves.
@@ -140,10 +157,6 @@ class PdSampler(Sampler):
             split_deg: elevation in the sensor frame that separates the halves, degrees.
             ring_deg: height of a theta ring for sorting, degrees.
             reduce: "average" takes a bin's mean, "pick" its middle point.
-            distal_bins: "points" or "cells".
-            distal_rings: rings of the grid of cells; it must divide num_distal.
-            lowest_deg: lowest elevation of the grid of cells, degrees.
-            blind: nearest range that cells take in, metres.
             num_threads: CPU threads; all cores by default.
         """
         if num_proximal < 0 or num_distal < 0:
@@ -153,17 +166,6 @@ class PdSampler(Sampler):
             raise ValueError(f"ring_deg must lie in (0.006, 180], got {ring_deg}")
         if reduce not in ("average", "pick"):
             raise ValueError(f"reduce must be 'average' or 'pick', got '{reduce}'")
-        if distal_bins not in ("points", "cells"):
-            raise ValueError(f"distal_bins must be 'points' or 'cells', got '{distal_bins}'")
-        if distal_bins == "cells":
-            if reduce != "average":
-                raise ValueError(f"distal_bins='cells' averages; set reduce='average' instead of '{reduce}'")
-            if distal_rings < 1 or num_distal % distal_rings:
-                raise ValueError(f"distal_rings={distal_rings} must be at least 1 and divide num_distal={num_distal}")
-            if not lowest_deg < split_deg:
-                raise ValueError(f"lowest_deg={lowest_deg} must be below split_deg={split_deg}")
-        if not 0.0 <= blind < max_range:
-            raise ValueError(f"blind={blind} must lie in [0, max_range={max_range})")
         if math.isnan(split_deg):
             raise ValueError("split_deg must be a number of degrees, got nan")
         self.num_proximal = num_proximal
@@ -171,15 +173,11 @@ class PdSampler(Sampler):
         self.split = math.radians(split_deg)
         self.ring = math.radians(ring_deg)
         self.pick_middle = int(reduce == "pick")
-        self.cells = distal_bins == "cells"
-        self.num_rings = distal_rings
-        self.lowest = math.radians(lowest_deg)
-        self.blind = blind
         self._scratch: kernels.Scratch | None = None
         self._scratch_key: tuple | None = None
         self._tensors: dict[str, torch.Tensor] = {}
 
-    def _sample(self, ranges, directions_s, elevation, azimuth, out) -> None:
+    def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         n, r = ranges.shape
         scratch = self._scratch_for(n, r, ranges.device)
         ranges_v, directions_v = view(ranges, float32), view(directions_s, vec3)
@@ -212,25 +210,7 @@ class PdSampler(Sampler):
                 points,
                 block_dim=32,
             )
-        if self.num_distal and self.cells:
-            launch(
-                kernels.average_cells,
-                ranges_v,
-                directions_v,
-                theta,
-                phi,
-                self.lowest,
-                self.split,
-                self.num_rings,
-                self.num_distal // self.num_rings,
-                self.blind,
-                scale,
-                self.num_proximal,
-                scratch,
-                points,
-                block_dim=32,
-            )
-        elif self.num_distal:
+        if self.num_distal:
             launch(
                 kernels.write_distal,
                 ranges_v,
@@ -258,7 +238,6 @@ class PdSampler(Sampler):
             "keys": (2, n, r),
             "items": (2, n, r),
             "histogram": (n, kernels.RADIX_SIZE),
-            "cell_hits": (n, max(self.num_distal, 1)),
             "ray": (n, r),
             "distance": (n, r),
         }
@@ -269,6 +248,86 @@ class PdSampler(Sampler):
             setattr(scratch, name, view(tensor, float32 if name in "xyz" else int32))
         self._scratch, self._scratch_key = scratch, (n, r, device)
         return scratch
+
+
+class ProximitySampler(PdSampler):
+    """Proximal points as in :class:`PdSampler`; the distal half as proximities around the levelled base.
+
+    Distal hits are sorted by where they are: azimuth sector around the base and band of height, in the base's frame
+    without roll and pitch, which the IMU gives. Each cell holds the bearing of its horizontally nearest hit times
+    exp(-d / decay), and that proximity itself: (x, y, proximity), with free space 0. A network input thus always
+    looks the same way, does not move as the trunk rolls and pitches, and is large where an obstacle is near; the
+    avoidance velocity (paper, Sec. 'Risk-Aware Locomotion Policy') is nearly linear in it. Sector 0 starts at -pi.
+    Hits on the robot's own body, and nearer than ``blind``, are left out.
+    """
+
+    needs_attitude = True
+
+    def __init__(
+        self,
+        num_proximal: int,
+        num_sectors: int = 36,
+        *,
+        max_range: float,
+        split_deg: float,
+        band_edges: Sequence[float],
+        decay: float,
+        blind: float,
+        body: Sequence[float],
+        ring_deg: float = 2.0,
+        num_threads: int | None = None,
+    ) -> None:
+        """Configure both halves.
+
+        Args:
+            num_proximal: slots of the proximal half, written first.
+            num_sectors: azimuth sectors.
+            max_range: metres; proximal points are divided by it.
+            split_deg: elevation in the sensor frame that separates the halves, degrees.
+            band_edges: increasing heights that separate the bands, metres above the base's origin.
+            decay: distance over which the proximity falls by e, metres.
+            blind: nearest range that counts, metres.
+            body: half length and half width of the robot's own body around the base's origin, metres.
+            ring_deg: height of a theta ring for sorting the proximal half, degrees.
+            num_threads: CPU threads; all cores by default.
+        """
+        edges = [float(edge) for edge in band_edges]
+        if len(edges) < 2 or any(low >= high for low, high in itertools.pairwise(edges)):
+            raise ValueError(f"band_edges={edges} must be at least two increasing heights")
+        if num_sectors < 1 or not decay > 0.0:
+            raise ValueError(f"num_sectors={num_sectors} must be at least 1 and decay={decay} positive")
+        if not 0.0 <= blind < max_range:
+            raise ValueError(f"blind={blind} must lie in [0, max_range={max_range})")
+        if len(body) != 2 or min(body) < 0.0:
+            raise ValueError(f"body={list(body)} must be [half length, half width] in metres")
+        options = {"split_deg": split_deg, "ring_deg": ring_deg, "num_threads": num_threads}
+        super().__init__(num_proximal, 0, max_range=max_range, **options)
+        self.num_sectors = num_sectors
+        self.num_points = num_proximal + num_sectors * (len(edges) - 1)
+        self.edges, self.decay, self.blind, self.body = torch.tensor(edges), decay, blind, tuple(body)
+
+    def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
+        super()._sample(ranges, directions_s, elevation, azimuth, out, attitude)
+        self.edges = self.edges.to(ranges.device)
+        inputs = [
+            view(ranges, float32),
+            view(directions_s, vec3),
+            view(elevation, float32),
+            self.split,
+            self.blind,
+            view(attitude.base_quat, vec4),
+            vec3(*attitude.mount_pos),
+            vec4(*attitude.mount_quat),
+            kernels.wp.vec2(*self.body),
+            view(self.edges, float32),
+            self.num_sectors,
+            self.decay,
+            self.num_proximal,
+            view(out, vec3),
+        ]
+        launch_over_envs(
+            kernels.proximity_grid, ranges.shape[0], inputs, ranges.device, num_threads=self.num_threads, block_dim=32
+        )
 
 
 class FpsSampler(PdSampler):

@@ -104,6 +104,9 @@ class Simulator(Protocol):
     def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions (num_envs, n, 3) (m) and quaternions (num_envs, n, 4) of bodies at the current state, float32."""
 
+    def geom_poses(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions (num_envs, n, 3) (m) and rotation matrices (num_envs, n, 3, 3) of geoms, likewise."""
+
     def model_field(self, name: str) -> torch.Tensor:
         """(num_envs, ...) per-environment values of a model field, made per-environment on the first call."""
 

@@ -48,6 +48,7 @@ class MujocoSimulator:
         self._fields: dict[str, torch.Tensor] = {}
         self._torque: np.ndarray | None = None
         self._poses: tuple[np.ndarray, np.ndarray] | None = None
+        self._geom_poses: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def qpos_steps(self) -> torch.Tensor:
@@ -117,6 +118,14 @@ class MujocoSimulator:
         index = np.asarray(bodies)
         pos, quat = (field[:, index].astype(np.float32) for field in self._poses)
         return torch.from_numpy(pos), torch.from_numpy(quat)
+
+    def geom_poses(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        if self._geom_poses is None:
+            self._geom_poses = self.batch.bind("geom_xpos"), self.batch.bind("geom_xmat")
+        self.batch.forward(stage=_STAGE_POS)
+        index = np.asarray(geoms)
+        pos, mat = (field[:, index].astype(np.float32) for field in self._geom_poses)
+        return torch.from_numpy(pos), torch.from_numpy(mat.reshape(*pos.shape, 3))
 
     def model_field(self, name: str) -> torch.Tensor:
         if name not in self._fields:

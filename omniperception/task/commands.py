@@ -73,37 +73,50 @@ class VelocityCommandConfig:
 
 @dataclass(frozen=True)
 class GoalCommandConfig:
-    """Walk to a line ahead: the command points along the way to the goal, and turns the robot to face it.
+    """Walk to a goal: the command points along the way there, and turns the robot to face it.
 
     Attributes:
-        goal_x: the goal is reached beyond this x (m, environment frame).
-        goal_y: y (m) that the command aims at.
+        goal_x: range (m, environment frame) from which the goal's x is drawn at every reset.
+        goal_y: range (m) of its y.
+        radius: the goal is reached within this distance (m, horizontal, of the base's origin); None: beyond the line
+            x = goal_x, wherever. The command then aims one metre beyond it, so that it never turns around.
         speed: commanded speed (m/s).
         yaw_gain: yaw rate per heading error (1/s).
         max_ang_vel_z: bound of the commanded yaw rate (rad/s).
         spawn: where the robot starts.
     """
 
-    goal_x: float
-    goal_y: float
+    goal_x: Sequence[float]
+    goal_y: Sequence[float]
+    radius: float | None
     speed: float
     yaw_gain: float
     max_ang_vel_z: float
     spawn: SpawnConfig
 
     def __post_init__(self) -> None:
+        for key in ("goal_x", "goal_y"):
+            object.__setattr__(self, key, _check_range(key, getattr(self, key)))
         for key in ("speed", "yaw_gain", "max_ang_vel_z"):
             if getattr(self, key) <= 0:
                 raise ValueError(f"commands.{key}={getattr(self, key)} must be positive")
+        if self.radius is not None and self.radius <= 0:
+            raise ValueError(f"commands.radius={self.radius} must be positive, or null for a line to cross")
 
     def build(self, num_envs: int, device: torch.device, random: EnvRandom) -> GoalCommand:
-        return GoalCommand(self, num_envs, device)
+        return GoalCommand(self, num_envs, device, random)
 
 
 class Command(Protocol):
-    """A source of commands; `value` is (num_envs, 3): v_x, v_y (m/s) and yaw rate (rad/s) in the base frame."""
+    """A source of commands.
+
+    Attributes:
+        value: (num_envs, 3): v_x, v_y (m/s) and yaw rate (rad/s) in the base frame.
+        goal_w: (num_envs, 2) the goal (m, environment frame), or None for commands without one.
+    """
 
     value: torch.Tensor
+    goal_w: torch.Tensor | None
 
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None: ...
 
@@ -123,6 +136,7 @@ class VelocityCommand:
     def __init__(self, config: VelocityCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
         self.config = config
         self.value = torch.zeros(num_envs, 3, device=device)
+        self.goal_w = None
         self.time_left = torch.zeros(num_envs, device=device)
         self._random = random
         ranges = (config.lin_vel_x, config.lin_vel_y, config.ang_vel_z)
@@ -158,28 +172,38 @@ class VelocityCommand:
 class GoalCommand:
     """Points to the goal from wherever the robot is."""
 
-    def __init__(self, config: GoalCommandConfig, num_envs: int, device: torch.device) -> None:
+    def __init__(self, config: GoalCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
         self.config = config
         self.value = torch.zeros(num_envs, 3, device=device)
+        self.goal_w = torch.zeros(num_envs, 2, device=device)
+        self._random = random
+        ranges = (config.goal_x, config.goal_y)
+        self._low = torch.tensor([r[0] for r in ranges], device=device)
+        self._high = torch.tensor([r[1] for r in ranges], device=device)
 
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
+        self.goal_w[env_ids] = self._low + self._random.uniform(env_ids, (2,)) * (self._high - self._low)
         self.advance(0.0, kinematics)
 
     def advance(self, dt: float, kinematics: Kinematics) -> None:
         config = self.config
-        ahead = config.goal_x + 1.0 - kinematics.base_pos_w[:, 0]  # one metre beyond, so that it never turns around
-        aside = config.goal_y - kinematics.base_pos_w[:, 1]
-        bearing = torch.atan2(aside, ahead.clamp(min=0.5))
+        ahead, aside = (self.goal_w - kinematics.base_pos_w[:, :2]).unbind(1)
+        if config.radius is None:
+            ahead = (ahead + 1.0).clamp(min=0.5)
+        bearing = torch.atan2(aside, ahead)
         to_goal = torch.stack((bearing.cos(), bearing.sin()), -1)
         self.value[:, :2] = rotate_yaw(-kinematics.yaw, to_goal) * config.speed
         error = torch.remainder(bearing - kinematics.yaw + math.pi, 2 * math.pi) - math.pi
         self.value[:, 2] = (config.yaw_gain * error).clamp(-config.max_ang_vel_z, config.max_ang_vel_z)
 
     def reached(self, kinematics: Kinematics) -> torch.Tensor:
-        return kinematics.base_pos_w[:, 0] >= self.config.goal_x
+        if self.config.radius is None:
+            return kinematics.base_pos_w[:, 0] >= self.goal_w[:, 0]
+        return (self.goal_w - kinematics.base_pos_w[:, :2]).norm(dim=1) <= self.config.radius
 
     def state_dict(self) -> dict:
-        return {"value": self.value}
+        return {"value": self.value, "goal_w": self.goal_w}
 
     def load_state_dict(self, state: dict) -> None:
         self.value.copy_(state["value"])
+        self.goal_w.copy_(state["goal_w"])

@@ -25,8 +25,9 @@ from omniperception.task.timing import StageTimer
 from omniperception.world import ObstacleField, ObstaclesConfig, RobotConfig, TerrainConfig, build_world
 from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 
-HEIGHT_TARGET, SECTOR_TARGET = "height_target", "sector_target"
-"""Observation groups that a network can be supervised with: the height grid, and 1 - d / NEARNESS_RANGE by sector."""
+HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target", "avoidance_target"
+"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector, and the
+avoidance velocity."""
 
 NEARNESS_RANGE = 4.0
 """Distance (m) from which on an obstacle counts as not near at all."""
@@ -46,7 +47,7 @@ class EnvConfig:
         lidar: the sensor, or None.
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
-        targets: privileged groups that the network is supervised with; of HEIGHT_TARGET and SECTOR_TARGET.
+        targets: privileged groups that the network is supervised with; those named *_TARGET here.
         log_interval: control steps between two reports of the metrics.
         initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
     """
@@ -74,6 +75,8 @@ class EnvConfig:
             raise ValueError(f"num_envs={self.num_envs} must be at least 1")
         if self.log_interval < 1:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
+        if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
+            raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
         if self.lidar is None:
             if self.sampler is not None:
                 raise ValueError(
@@ -91,7 +94,7 @@ class EnvConfig:
         fields = self.rewards.fields_read() | self.observations.fields_read()
         if HEIGHT_TARGET in self.targets:
             fields |= {"heights"}
-        if SECTOR_TARGET in self.targets:
+        if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
             fields |= {"sectors"}
         if self.obstacles.num_obstacles:
             fields |= {"obstacle_contact"}
@@ -110,6 +113,10 @@ class OmniEnv(VecEnv):
     LiDAR's rate a frame is cast, given noise and sampled -> rewards and terminations -> finished environments are
     reset -> observations. Contact forces and torques describe the state before the last physics step (5 ms old);
     contacts with obstacles are those of all physics steps of the control step.
+
+    Attributes:
+        avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from the sector distances of the newest frame
+            when a term reads them, else 0.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -137,6 +144,7 @@ class OmniEnv(VecEnv):
         self.sensing = self._build_sensing(fields) if config.uses_lidar else None
         self._allocate()
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
+        self.probes: list[Callable[[], None]] = []  # called in each step before finished environments are reset
         self.step_count = 0
         self._all_envs = torch.arange(self.num_envs, device=self.device)
         self._reset(self._all_envs)
@@ -167,6 +175,8 @@ class OmniEnv(VecEnv):
             outcomes, done = self._terminate()
             rewards = self._reward()
             self._record(done, outcomes)
+        for probe in self.probes:
+            probe()
         with self.timer.stage("resets"):
             self.command.advance(self.control_dt, self.kinematics)
             self._fresh = done
@@ -208,6 +218,8 @@ class OmniEnv(VecEnv):
         for name, buffer in state["histories"].items():
             self._groups[name].buffer = buffer
         self._read_state()
+        if self.sensing is not None:
+            self._read_avoidance()
         self.observations = self._collect(dict(state["observations"]))
 
     # ---- the parts of a step -----------------------------------------------------------------------------------------
@@ -232,6 +244,9 @@ class OmniEnv(VecEnv):
     def _obstacle_path(self) -> torch.Tensor:
         """Moves the obstacles through the control step; where they are during each of its physics steps."""
         path = []
+        if self.obstacles.any_approaches:
+            commanded = rotate_yaw(self.kinematics.yaw, self.command.value[:, :2])
+            self.obstacles.start_anew(self.sim.qpos[:, :2], commanded)
         for _ in range(self.config.sim.decimation):
             self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
             path.append(self.obstacles.pos_w.clone())
@@ -278,14 +293,14 @@ class OmniEnv(VecEnv):
         with self.timer.stage("rays"):
             self.sensing.cast(self.step_count * self.control_dt)
         with self.timer.stage("sampling"):
-            self.sensing.sample()
+            self.sensing.sample(self.sensed.base_quat_w)
         with self.timer.stage("sectors"):
             self.sensing.measure_sectors()
+            self._read_avoidance()
 
-    @property
-    def avoidance_velocity(self) -> torch.Tensor:
-        """(num_envs, 2) m/s in the yaw-aligned frame, from the sector distances of the newest frame."""
-        return avoidance_velocity(self.sensing.sector_distance, self.config.rewards.avoidance)
+    def _read_avoidance(self) -> None:
+        if "sectors" in self._reads:
+            self.avoidance_velocity = avoidance_velocity(self.sensing.sector_distance, self.config.rewards.avoidance)
 
     def _terminate(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Why environments end, each environment for one reason, and whether they do."""
@@ -336,6 +351,7 @@ class OmniEnv(VecEnv):
 
     def _reset(self, env_ids: torch.Tensor) -> None:
         """Starts a new episode in some environments; the others are not touched."""
+        self.random.start_episode(env_ids)
         spawn = self.config.commands.spawn
         low = torch.tensor([spawn.x[0], spawn.y[0], torch.pi / 180 * spawn.yaw_deg[0]], device=self.device)
         high = torch.tensor([spawn.x[1], spawn.y[1], torch.pi / 180 * spawn.yaw_deg[1]], device=self.device)
@@ -344,19 +360,22 @@ class OmniEnv(VecEnv):
         joints = self.default_joint_pos.expand(len(env_ids), -1)
         qpos = torch.cat((pose[:, :2], height, yaw_quat(pose[:, 2]), joints), 1)
         qvel = torch.zeros(len(env_ids), self.sim.qvel.shape[1], device=self.device)
-        if self.obstacles is not None:
-            self.obstacles.reset(env_ids, pose[:, :2])
         self.sim.reset(env_ids, qpos, qvel)
         self.randomizer.reset(env_ids)
         if self._past is not None:
             for past, now in zip(self._past, (qpos, qvel), strict=True):
                 past[env_ids] = now.double()[:, None]
         self.command.reset(env_ids, Kinematics.of(self.sim.qpos, self.sim.qvel))
+        if self.obstacles is not None:
+            commanded = rotate_yaw(pose[:, 2], self.command.value[env_ids, :2])
+            goal = None if self.command.goal_w is None else self.command.goal_w[env_ids]
+            self.obstacles.reset(env_ids, pose[:, :2], commanded, goal)
         self.episode_length_buf[env_ids] = 0
         self.actions = tuple(a.index_fill(0, env_ids, 0.0) for a in self.actions)
         self.touching[env_ids] = False
         if self.sensing is not None:
             self.sensing.reset(env_ids)
+            self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
 
     def _observe(self) -> TensorDict:
         return self._collect({name: buffer.update(self, self._fresh) for name, buffer in self._groups.items()})
@@ -371,6 +390,8 @@ class OmniEnv(VecEnv):
             groups[HEIGHT_TARGET] = self.heights
         if SECTOR_TARGET in self.config.targets:
             groups[SECTOR_TARGET] = (1.0 - self.sensing.sector_distance / NEARNESS_RANGE).clamp(min=0.0)
+        if AVOIDANCE_TARGET in self.config.targets:
+            groups[AVOIDANCE_TARGET] = self.avoidance_velocity
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:
@@ -428,6 +449,7 @@ class OmniEnv(VecEnv):
         self.actions: tuple[torch.Tensor, ...] = (zero, zero, zero)
         self.last_joint_vel = zero
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._past: tuple[torch.Tensor, torch.Tensor] | None = None
         if self.randomizer.delay is not None:

@@ -1,4 +1,4 @@
-"""Domain randomization: the thirteen rows of the paper's table, each absent when its range is null."""
+"""Domain randomization: the thirteen rows of the paper's table and the LiDAR's own noise, each absent when null."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 import torch
 
-from omniperception.lidar import DistanceNoise, MaskNoise
+from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.random import EnvRandom
 from omniperception.sim import Simulator
 from omniperception.world.terrain import contact_solref
@@ -22,6 +22,10 @@ class RandomizationConfig:
     Attributes:
         lidar_mask: points replaced by short distances.
         lidar_distance: multiplicative noise of the measured distances.
+        lidar_gaussian: normal noise of the measured distances.
+        lidar_jitter: noise of the rays' directions.
+        lidar_dropout: points lost.
+        lidar_mixed: points between foreground and background at depth edges.
         added_mass: mass (kg) added to the base at its centre of mass.
         payload_mass: mass (kg) carried at `payload_position`.
         com_x, com_y, com_z: displacement (m) of the base's centre of mass.
@@ -36,6 +40,10 @@ class RandomizationConfig:
 
     lidar_mask: MaskNoise | None = None
     lidar_distance: DistanceNoise | None = None
+    lidar_gaussian: GaussianNoise | None = None
+    lidar_jitter: AngularJitter | None = None
+    lidar_dropout: Dropout | None = None
+    lidar_mixed: MixedPixels | None = None
     added_mass: Range = None
     payload_mass: Range = None
     com_x: Range = None
@@ -63,9 +71,10 @@ class RandomizationConfig:
                 raise ValueError(f"randomization.{name}={list(value)} must not be negative")
 
     @property
-    def noise(self) -> tuple[MaskNoise | DistanceNoise, ...]:
-        """The LiDAR noise models, in the order in which they act."""
-        return tuple(noise for noise in (self.lidar_distance, self.lidar_mask) if noise is not None)
+    def noise(self) -> tuple[Noise, ...]:
+        """The LiDAR noise models."""
+        models = (getattr(self, item.name) for item in fields(self) if item.name.startswith("lidar_"))
+        return tuple(model for model in models if model is not None)
 
 
 class Randomizer:

@@ -14,8 +14,9 @@ from omniperception.lidar import (
     Noise,
     RayScene,
     ScanPattern,
-    sector_distances,
+    SectorDistances,
 )
+from omniperception.perception import Attitude
 from omniperception.sim import Simulator
 from omniperception.world import ray_shapes
 from omniperception.world.rays import HitClass
@@ -79,6 +80,11 @@ class LidarSensing:
         sampler: Callable | None = None,
         history: int = 0,
     ) -> None:
+        if config.sensor.motion_segments > 1:
+            raise ValueError(
+                f"lidar.sensor.motion_segments={config.sensor.motion_segments} must be 0 or 1: the task gives the LiDAR"
+                " the poses of its frames only"
+            )
         ratio = config.sensor.period_s / control_dt
         self.period_steps = round(ratio)
         if abs(ratio - self.period_steps) > 1e-6 or self.period_steps < 1:
@@ -101,7 +107,10 @@ class LidarSensing:
             exclude_shapes=shapes.indices(tuple(config.exclude_geoms)),
             noise=tuple(noise),
             seed=seed,
+            outputs=_outputs_read(needs, sampler is not None),
         )
+        self._placed_anew = torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
+        self._time = torch.zeros(sim.num_envs, dtype=torch.float64, device=sim.device)
         self.frame: LidarFrame | None = None
         self.tick = 0
         self.frame_count = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
@@ -112,8 +121,8 @@ class LidarSensing:
             self.frames = torch.zeros(sim.num_envs, history, sampler.num_points, 3, device=sim.device)
         self.sector_distance: torch.Tensor | None = None
         if needs.sectors:
-            shape = (sim.num_envs, needs.sectors)
-            self.sector_distance = torch.full(shape, needs.sector_max, device=sim.device)
+            self._measure_sectors = self._record_sectors(num_threads)
+            self.sector_distance = self._measure_sectors.distances
         self._distal_range: dict[float, torch.Tensor] = {}
 
     def due(self, step: int) -> bool:
@@ -125,36 +134,28 @@ class LidarSensing:
         pos, quat = self._sim.body_poses(self._bodies)
         self.scene.body_pos.copy_(pos)
         self.scene.body_quat.copy_(quat)
-        time = torch.full((self._sim.num_envs,), time_s, dtype=torch.float64, device=self._sim.device)
-        self.frame = self.lidar.cast(time)
+        if self.lidar.track is not None:
+            self.lidar.track.reset(self._placed_anew.nonzero().flatten())
+            self._placed_anew.zero_()
+        self.frame = self.lidar.cast(self._time.fill_(time_s))
         self.tick += 1
         self.frame_tick.fill_(self.tick)
         self._distal_range.clear()
 
-    def sample(self) -> None:
-        """Appends the sampled points of the newest frame to the history."""
+    def sample(self, base_quat: torch.Tensor) -> None:
+        """Appends the sampled points of the newest frame to the history; `base_quat` (num_envs, 4) as sensed."""
         if self.frames is None:
             return
-        self._sampler(
-            self.frame.ranges, self.frame.directions_s, self.frame.elevation, self.frame.azimuth, self._newest
-        )
+        frame, sensor = self.frame, self.config.sensor
+        attitude = Attitude(base_quat.contiguous(), sensor.mount_pos, sensor.quat)
+        self._sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, self._newest, attitude)
         self.frames = torch.cat((self.frames[:, 1:], self._newest[:, None]), 1)
         self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
 
     def measure_sectors(self) -> None:
         """Distances to the nearest obstacle per azimuth sector."""
         if self.sector_distance is not None:
-            self.sector_distance = sector_distances(
-                self.frame.true_ranges,
-                self.frame.directions_s,
-                self.frame.class_id,
-                self.scene.body_quat[:, self._base],
-                self.config.sensor.mount_pos,
-                self.config.sensor.quat,
-                obstacle_class=int(HitClass.OBSTACLE),
-                max_distance=self._needs.sector_max,
-                num_sectors=self._needs.sectors,
-            )
+            self._measure_sectors()
 
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
         """(num_envs,) mean of the noise-free distal ranges (m), each capped at `max_distance`."""
@@ -169,11 +170,12 @@ class LidarSensing:
     def state_dict(self) -> dict:
         return {
             "tick": self.tick,
-            "noise_frame": self.lidar.frame_count,
+            "noise_frame": self.lidar.frame_count.clone(),
             "frame_count": self.frame_count,
             "frames": self.frames,
-            "sector_distance": self.sector_distance,
+            "sector_distance": None if self.sector_distance is None else self.sector_distance.clone(),
             "distal_range": {str(key): value for key, value in self._distal_range.items()},
+            "motion": self._last_poses(),
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -184,11 +186,18 @@ class LidarSensing:
         if self.frames is not None:
             self.frames = state["frames"].clone()
         if self.sector_distance is not None:
-            self.sector_distance = state["sector_distance"].clone()
+            self.sector_distance.copy_(state["sector_distance"])
         self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
+        if self.lidar.track is not None and state.get("motion") is not None:
+            pos, quat, placed_anew = state["motion"]
+            self.scene.body_pos.copy_(pos)
+            self.scene.body_quat.copy_(quat)
+            self.lidar.track.reset()
+            self._placed_anew.copy_(placed_anew)
 
     def reset(self, env_ids: torch.Tensor) -> None:
-        """Forgets what some environments have seen."""
+        """Forgets what some environments have seen, and how their bodies moved."""
+        self._placed_anew[env_ids] = True
         self.frame_count[env_ids] = 0
         if self.frames is not None:
             self.frames[env_ids] = 0.0
@@ -196,3 +205,37 @@ class LidarSensing:
             self.sector_distance[env_ids] = self._needs.sector_max
         for max_distance, mean in self._distal_range.items():
             mean[env_ids] = max_distance
+
+    def _last_poses(self) -> list[torch.Tensor] | None:
+        """Where the next frame's motion starts, if it needs that."""
+        if self.lidar.track is None:
+            return None
+        return [self.scene.body_pos.clone(), self.scene.body_quat.clone(), self._placed_anew.clone()]
+
+    def _record_sectors(self, num_threads: int | None) -> SectorDistances:
+        frame, sensor = self.lidar.frame, self.config.sensor
+        return SectorDistances(
+            frame.true_ranges,
+            frame.directions_s,
+            frame.class_id,
+            self.scene.body_quat,
+            self._base,
+            sensor.mount_pos,
+            sensor.quat,
+            obstacle_class=int(HitClass.OBSTACLE),
+            max_distance=self._needs.sector_max,
+            num_sectors=self._needs.sectors,
+            num_threads=num_threads,
+        )
+
+
+def _outputs_read(needs: SensingNeeds, sampled: bool) -> tuple[str, ...]:
+    """The outputs of the LiDAR that the task reads."""
+    outputs: set[str] = set()
+    if sampled:
+        outputs |= {"ranges", "directions_s", "elevation", "azimuth"}
+    if needs.sectors:
+        outputs |= {"true_ranges", "directions_s", "class_id"}
+    if needs.rays:
+        outputs |= {"true_ranges", "elevation"}
+    return tuple(sorted(outputs))

@@ -1,12 +1,15 @@
 """One description of robot, terrain and obstacles, from which the physics model and the ray scene are built."""
 
 from omniperception.world.build import World, build_world
-from omniperception.world.obstacles import ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.world.obstacle_field import ObstacleField
+from omniperception.world.obstacles import ApproachConfig, FreePathConfig, ObstacleGroup, ObstaclesConfig
 from omniperception.world.rays import ray_shapes
 from omniperception.world.robot import RobotConfig
 from omniperception.world.terrain import TerrainConfig
 
 __all__ = [
+    "ApproachConfig",
+    "FreePathConfig",
     "ObstacleField",
     "ObstacleGroup",
     "ObstaclesConfig",

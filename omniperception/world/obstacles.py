@@ -1,4 +1,4 @@
-"""Obstacles: their shapes, where they are placed, and how they move."""
+"""Obstacles: their shapes, and what says where they are placed and how they move."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-import torch
-
-from omniperception.random import EnvRandom
 
 _GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -18,22 +15,52 @@ _GEOM_TYPES = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
 }
 _NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
-PARKED_HEIGHT = -100.0
-"""Height (m) at which an obstacle that takes no part waits, below the ground where no ray and no contact finds it."""
-_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-_PUSH_OFF_TURNS = 16
+
+
+@dataclass(frozen=True)
+class ApproachConfig:
+    """How obstacles come at the robot: each walks straight on, on a course that leads past the robot.
+
+    One starts at a random bearing, all sides alike. Its course is such that its centre would pass within `within` of
+    the robot's base if the robot kept the velocity that it is commanded at that moment; where no course does because
+    the robot outruns it, it heads for where the robot is. Once it is farther than `distance[1]` + 1 m from the robot
+    it starts anew.
+
+    Attributes:
+        within: (m); the miss distance is uniform in [-within, within].
+        distance: (low, high) range (m) of the distance from the robot at which one starts.
+    """
+
+    within: float
+    distance: Sequence[float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "distance", tuple(float(d) for d in self.distance))
+        if self.within < 0:
+            raise ValueError(f"obstacles: approach.within={self.within} must not be negative")
+        if len(self.distance) != 2 or not self.within < self.distance[0] <= self.distance[1]:
+            raise ValueError(
+                f"obstacles: approach.distance={list(self.distance)} must be a range [low, high] with low >"
+                f" approach.within={self.within}"
+            )
 
 
 @dataclass(frozen=True)
 class ObstacleGroup:
-    """Obstacles of one kind.
+    """Obstacles of one kind. What is a range is drawn uniformly for every obstacle at every reset, sizes once.
 
     Attributes:
-        kind: 'box', 'cylinder' or 'sphere'; each stands on the ground.
+        kind: 'box', 'cylinder' or 'sphere'.
         count: number of them.
         size: one (low, high) range (m) per size: box half extents x, y, z; cylinder radius, half height; sphere radius.
-        speed: (low, high) range (m/s) from which each draws its speed at every reset; (0, 0) stands still.
+        speed: (low, high) range (m/s); (0, 0) stands still.
         poses: fixed (x, y, yaw in degrees) of each obstacle, for walls; None: placed anew at every reset.
+        bottom: (low, high) range (m) of the height of its lowest point above the ground; (0, 0) stands on it.
+        heading_deg: (low, high) range (deg) of the direction in which it sets out, 0 along x.
+        yaw_deg: (low, high) range (deg) of its orientation about the vertical.
+        area: where this group is placed and moves, in place of the preset's `area`; see `ObstaclesConfig`.
+        approach: None: it keeps its heading, up to the boundary; otherwise it comes at the robot, and neither area,
+            boundary nor heading apply.
     """
 
     kind: str
@@ -41,6 +68,11 @@ class ObstacleGroup:
     size: Sequence[Sequence[float]]
     speed: Sequence[float] = (0.0, 0.0)
     poses: Sequence[Sequence[float]] | None = None
+    bottom: Sequence[float] = (0.0, 0.0)
+    heading_deg: Sequence[float] = (-180.0, 180.0)
+    yaw_deg: Sequence[float] = (-180.0, 180.0)
+    area: Sequence[float] | None = None
+    approach: ApproachConfig | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in _GEOM_TYPES:
@@ -59,17 +91,40 @@ class ObstacleGroup:
             object.__setattr__(self, "poses", tuple(tuple(float(x) for x in pose) for pose in self.poses))
             if len(self.poses) != self.count or any(len(pose) != 3 for pose in self.poses):
                 raise ValueError(f"obstacles: poses must be {self.count} triples (x, y, yaw_deg)")
+        for key in ("bottom", "heading_deg", "yaw_deg"):
+            bounds = tuple(float(bound) for bound in getattr(self, key))
+            object.__setattr__(self, key, bounds)
+            if len(bounds) != 2 or bounds[0] > bounds[1]:
+                raise ValueError(f"obstacles: {key}={list(bounds)} must be a range [low, high] with low <= high")
+        if self.bottom[0] < 0:
+            raise ValueError(f"obstacles: bottom={list(self.bottom)} must not lie below the ground")
+        if self.area is not None:
+            object.__setattr__(self, "area", _area("a group's area", self.area))
+        if self.poses is not None and (self.bottom != (0.0, 0.0) or self.approach is not None):
+            raise ValueError("obstacles: a group with fixed poses stands on the ground; leave out bottom and approach")
+        if self.approach is not None and self.speed[0] <= 0:
+            raise ValueError(f"obstacles: speed={list(self.speed)} of a group that approaches must be positive")
+
+
+def _area(name: str, bounds: Sequence[float]) -> tuple[float, float, float, float]:
+    area = tuple(float(x) for x in bounds)
+    if len(area) != 4 or area[0] >= area[1] or area[2] >= area[3]:
+        raise ValueError(f"obstacles: {name}={list(area)} must be [x_low, x_high, y_low, y_high]")
+    return area
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """One obstacle slot; the same shape in every environment."""
+    """One obstacle slot: its name, its group, its shape (the same in every environment) and its fixed pose if any."""
 
     name: str
-    kind: str
+    group: ObstacleGroup
     size: tuple[float, ...]
-    speed: tuple[float, float]
     pose: tuple[float, float, float] | None
+
+    @property
+    def kind(self) -> str:
+        return self.group.kind
 
     @property
     def half_height(self) -> float:
@@ -102,8 +157,30 @@ class CurriculumConfig:
 
 
 @dataclass(frozen=True)
+class FreePathConfig:
+    """A way from the robot's start to its goal that no standing obstacle blocks, drawn anew at every reset.
+
+    It is the set of points within width / 2 of a line with two bends: from the start over one point each at a third
+    and at two thirds of the way, both off the straight line by up to `bend` to either side, to the goal.
+
+    Attributes:
+        width: (m).
+        bend: (m).
+    """
+
+    width: float
+    bend: float
+
+    def __post_init__(self) -> None:
+        if self.width <= 0:
+            raise ValueError(f"obstacles.free_path.width={self.width} must be positive")
+        if self.bend < 0:
+            raise ValueError(f"obstacles.free_path.bend={self.bend} must not be negative")
+
+
+@dataclass(frozen=True)
 class ObstaclesConfig:
-    """What stands and moves around the robot.
+    """What stands, hangs and moves around the robot.
 
     Attributes:
         groups: obstacle groups by name.
@@ -114,6 +191,13 @@ class ObstaclesConfig:
         clearance: free distance (m) kept at a reset between the robot's centre and an obstacle's edge.
         shape_seed: seed of the sizes drawn for the slots.
         curriculum: None: everything is there from the first step.
+        spacing: free distance (m) kept at a reset between the edges of any two standing obstacles, so that a robot fits
+            through; 0 lets them overlap.
+        free_path: a way to the goal that standing obstacles keep free; None for none.
+        headroom: spacing and free path do not count obstacles that hang at least this high (m).
+
+    Edges are those of the circles around the footprints. A standing obstacle that finds no place with the spacing and
+    off the free path is left out of the episode.
     """
 
     groups: Mapping[str, ObstacleGroup] = field(default_factory=dict)
@@ -122,16 +206,27 @@ class ObstaclesConfig:
     clearance: float = 0.8
     shape_seed: int = 0
     curriculum: CurriculumConfig | None = None
+    spacing: float = 0.0
+    free_path: FreePathConfig | None = None
+    headroom: float = 0.45
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", dict(self.groups))
-        object.__setattr__(self, "area", tuple(float(x) for x in self.area))
-        if len(self.area) != 4 or self.area[0] >= self.area[1] or self.area[2] >= self.area[3]:
-            raise ValueError(f"obstacles.area={list(self.area)} must be [x_low, x_high, y_low, y_high]")
+        object.__setattr__(self, "area", _area("area", self.area))
         if self.boundary not in ("bounce", "wrap"):
             raise ValueError(f"obstacles.boundary={self.boundary} must be bounce or wrap")
         if self.clearance <= 0:
             raise ValueError(f"obstacles.clearance={self.clearance} must be positive")
+        for key in ("spacing", "headroom"):
+            if getattr(self, key) < 0:
+                raise ValueError(f"obstacles.{key}={getattr(self, key)} must not be negative")
+        for slot in self.slots():
+            start = slot.group.approach.distance[0] if slot.group.approach is not None else math.inf
+            if start < self.clearance + slot.radius:
+                raise ValueError(
+                    f"obstacles: approach.distance={list(slot.group.approach.distance)} lets {slot.name} start on the"
+                    f" robot; its low end must be at least clearance + radius = {self.clearance + slot.radius:.2f}"
+                )
 
     @property
     def num_obstacles(self) -> int:
@@ -145,7 +240,7 @@ class ObstaclesConfig:
             for i in range(group.count):
                 size = tuple(float(rng.uniform(low, high)) for low, high in group.size)
                 pose = group.poses[i] if group.poses is not None else None
-                slots.append(Obstacle(f"obstacle_{group_name}_{i}", group.kind, size, group.speed, pose))
+                slots.append(Obstacle(f"obstacle_{group_name}_{i}", group, size, pose))
         return tuple(slots)
 
     def geom_names(self) -> tuple[str, ...]:
@@ -176,111 +271,3 @@ class ObstaclesConfig:
                 condim=3,
                 friction=[0.5, 0.005, 0.0001],
             )
-
-
-class ObstacleField:
-    """Places and moves the kinematic obstacles of all environments.
-
-    Attributes:
-        pos_w: (num_envs, num_placed, 3) float64, m, environment frame; the simulator's own kinematic positions.
-        quat_w: (num_envs, num_placed, 4) float64; the simulator's own kinematic orientations.
-        velocity_w: (num_envs, num_placed, 2) float64, m/s.
-        active: (num_envs, num_placed) bool: whether an obstacle takes part in the current episode.
-        level: share of obstacles and of their speed that the curriculum lets in, 0 to 1.
-    """
-
-    def __init__(self, config: ObstaclesConfig, pos_w: torch.Tensor, quat_w: torch.Tensor, random: EnvRandom) -> None:
-        self.config = config
-        self.pos_w, self.quat_w = pos_w, quat_w
-        slots = config.placed_slots()
-        device = pos_w.device
-        self.radius = torch.tensor([s.radius for s in slots], dtype=torch.float64, device=device)
-        self._half_height = torch.tensor([s.half_height for s in slots], dtype=torch.float64, device=device)
-        self._speed_low = torch.tensor([s.speed[0] for s in slots], dtype=torch.float64, device=device)
-        self._speed_high = torch.tensor([s.speed[1] for s in slots], dtype=torch.float64, device=device)
-        x_low, x_high, y_low, y_high = config.area
-        self._low = torch.tensor([x_low, y_low], dtype=torch.float64, device=device)
-        self._high = torch.tensor([x_high, y_high], dtype=torch.float64, device=device)
-        self._random = random
-        self._any_moves = any(s.speed[1] > 0 for s in slots)
-        self.velocity_w = torch.zeros(pos_w.shape[0], len(slots), 2, dtype=torch.float64, device=device)
-        self.active = torch.zeros(pos_w.shape[0], len(slots), dtype=torch.bool, device=device)
-        self.level = 1.0 if config.curriculum is None else 0.0
-
-    def reset(self, env_ids: torch.Tensor, robot_xy_w: torch.Tensor) -> None:
-        """Places the obstacles of some environments anew.
-
-        Args:
-            env_ids: (n,) environments.
-            robot_xy_w: (n, 2) where the robot stands, m.
-        """
-        shape = (self.pos_w.shape[1],)
-        u = self._random.uniform(env_ids, (6, *shape)).double()
-        anchor = robot_xy_w.double()[:, None] if self.config.boundary == "wrap" else 0.0
-        xy = self._low + torch.stack((u[:, 0], u[:, 1]), -1) * (self._high - self._low) + anchor
-        xy = self._push_off(xy, robot_xy_w.double())
-        speed = (self._speed_low + u[:, 3] * (self._speed_high - self._speed_low)) * self.level
-        heading, yaw = 2 * math.pi * u[:, 4], 2 * math.pi * u[:, 2]
-        active = u[:, 5] < self.level
-        self.active[env_ids] = active
-        self.velocity_w[env_ids] = torch.stack((heading.cos(), heading.sin()), -1) * (speed * active)[..., None]
-        z = torch.where(active, self._half_height, PARKED_HEIGHT)
-        self.pos_w[env_ids] = torch.cat((xy, z[..., None]), -1)
-        zero = torch.zeros_like(yaw)
-        self.quat_w[env_ids] = torch.stack(((yaw / 2).cos(), zero, zero, (yaw / 2).sin()), -1)
-
-    def advance(self, dt: float, robot_xy_w: torch.Tensor) -> None:
-        """Moves every obstacle by `dt` (s); `robot_xy_w` (num_envs, 2) is the centre of a wrapping area."""
-        if self._any_moves:
-            self.pos_w[..., :2] += self.velocity_w * dt
-        if self.config.boundary == "bounce":
-            if self._any_moves:
-                self._bounce()
-        else:
-            self._wrap(robot_xy_w)
-
-    def raise_level(self, velocity_error: float, seconds: float) -> None:
-        """Raises the curriculum's level while the robot walks well (`velocity_error` in m/s)."""
-        curriculum = self.config.curriculum
-        if curriculum is None:
-            return
-        bound = curriculum.max_velocity_error if self.level > 0 else curriculum.start_velocity_error
-        if velocity_error < bound:
-            self.level = min(1.0, self.level + curriculum.rise * seconds)
-
-    def state_dict(self) -> dict:
-        """What `load_state_dict` needs to go on; positions belong to the simulator's state."""
-        return {"velocity_w": self.velocity_w.clone(), "active": self.active.clone(), "level": self.level}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.velocity_w.copy_(state["velocity_w"])
-        self.active.copy_(state["active"])
-        self.level = state["level"]
-
-    def _push_off(self, xy: torch.Tensor, robot_xy: torch.Tensor) -> torch.Tensor:
-        """Moves obstacles that would stand on the robot radially out of its clearance, inside the area."""
-        keep = self.config.clearance + self.radius
-        offset = xy - robot_xy[:, None]
-        bearing = torch.atan2(offset[..., 1], offset[..., 0])
-        for turn in range(_PUSH_OFF_TURNS):  # another direction each time, for robots close to an edge
-            near = (xy - robot_xy[:, None]).norm(dim=-1) < keep
-            if not near.any():
-                break
-            angle = bearing + turn * _GOLDEN_ANGLE
-            outside = robot_xy[:, None] + torch.stack((angle.cos(), angle.sin()), -1) * (keep + 1e-6)[:, None]
-            xy = torch.where(near[..., None], outside, xy)
-            if self.config.boundary == "bounce":
-                xy = xy.clamp(self._low, self._high)
-        return xy
-
-    def _bounce(self) -> None:
-        xy = self.pos_w[..., :2]
-        below, above = xy < self._low, xy > self._high
-        inward = torch.where(below, self.velocity_w.abs(), torch.where(above, -self.velocity_w.abs(), self.velocity_w))
-        self.velocity_w.copy_(inward)
-        xy.copy_(torch.where(below, 2 * self._low - xy, torch.where(above, 2 * self._high - xy, xy)))
-
-    def _wrap(self, robot_xy_w: torch.Tensor) -> None:
-        low = self._low + robot_xy_w.double()[:, None]
-        xy = self.pos_w[..., :2]
-        xy.copy_(low + torch.remainder(xy - low, self._high - self._low))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
-import mujoco
-
-from omniperception.lidar import Shape, ShapeKind
+from omniperception.lidar import Shape
+from omniperception.lidar.mujoco import geom_shapes
 from omniperception.world.build import World
 
 
@@ -41,50 +40,19 @@ class RayShapes:
         return tuple(self.geom_names.index(name) for name in geom_names)
 
 
-_KINDS = {
-    mujoco.mjtGeom.mjGEOM_PLANE: ShapeKind.PLANE,
-    mujoco.mjtGeom.mjGEOM_SPHERE: ShapeKind.SPHERE,
-    mujoco.mjtGeom.mjGEOM_CAPSULE: ShapeKind.CAPSULE,
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: ShapeKind.ELLIPSOID,
-    mujoco.mjtGeom.mjGEOM_CYLINDER: ShapeKind.CYLINDER,
-    mujoco.mjtGeom.mjGEOM_BOX: ShapeKind.BOX,
-}
-_SIZES = {
-    ShapeKind.PLANE: 0,
-    ShapeKind.SPHERE: 1,
-    ShapeKind.CAPSULE: 2,
-    ShapeKind.CYLINDER: 2,
-    ShapeKind.ELLIPSOID: 3,
-    ShapeKind.BOX: 3,
-}
-
-
 def ray_shapes(world: World) -> RayShapes:
     """Every geom of the environment as an exact shape; bodies that cannot move carry no pose."""
     model = world.model
     obstacles = set(world.obstacles.geom_names())
-    bodies = tuple(sorted({int(b) for b in model.geom_bodyid if _moves(model, int(b))}))
-    shapes, names = [], []
-    for i in range(model.ngeom):
-        geom, body = model.geom(i), int(model.geom_bodyid[i])
-        kind = _KINDS[mujoco.mjtGeom(int(model.geom_type[i]))]
-        if geom.name in obstacles:
-            hit_class = HitClass.OBSTACLE
-        else:
-            hit_class = HitClass.ROBOT if _moves(model, body) else HitClass.TERRAIN
-        shapes.append(
-            Shape(
-                kind=kind,
-                size=tuple(float(s) for s in model.geom_size[i][: _SIZES[kind]]),
-                body=bodies.index(body) if body in bodies else -1,
-                pos=tuple(float(x) for x in model.geom_pos[i]),
-                quat=tuple(float(x) for x in model.geom_quat[i]),
-                class_id=int(hit_class),
-            )
-        )
-        names.append(geom.name)
-    return RayShapes(tuple(shapes), tuple(names), bodies)
+    names = tuple(model.geom(k).name for k in range(model.ngeom))
+    found = geom_shapes(model, geoms=range(model.ngeom))
 
+    def hit_class(name: str, shape: Shape) -> HitClass:
+        if name in obstacles:
+            return HitClass.OBSTACLE
+        return HitClass.ROBOT if shape.body >= 0 else HitClass.TERRAIN
 
-def _moves(model: mujoco.MjModel, body: int) -> bool:
-    return bool(model.body_mocapid[body] >= 0 or model.body_weldid[body] != 0)
+    shapes = (
+        replace(shape, class_id=int(hit_class(name, shape))) for name, shape in zip(names, found.shapes, strict=True)
+    )
+    return RayShapes(tuple(shapes), names, found.body_ids)

@@ -1,4 +1,4 @@
-"""The perceptive actor: caching, windows of an update, height supervision."""
+"""The perceptive actor: caching, windows of an update, supervision, the avoidance velocity."""
 
 import functools
 
@@ -163,3 +163,67 @@ def test_height_supervision_needs_a_predictor_and_a_fitting_target():
     obs["height_target"] = torch.zeros(3, 7)
     with pytest.raises(ValueError, match="of 5 values within the embedding's 8, the environment gives 7"):
         PerceptionActor(obs, {"actor": ["policy"]}, "actor", 2, NETWORKS["pd"], {"height_target": 1.0}, hidden_dims=[8])
+
+
+def avoiding_actor(env, network="mlp", **options):
+    actor = actor_for(env, network, supervision={"avoidance_target": 1.0}, command_group="policy", **options)
+    with torch.no_grad():
+        actor.avoidance[-1].weight.normal_()
+        actor.avoidance[-1].bias.normal_()
+    return actor
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_avoidance_velocity_shifts_the_command(normalize):
+    """The MLP sees exactly what it would see of the sum as a command; without a frame, the command itself."""
+    env = ToyEnv(4)
+    advance(env, 7)
+    env.frame_count[2] = 0
+    obs = env.get_observations()
+    actor = avoiding_actor(env, obs_normalization=normalize)
+    if normalize:
+        actor.update_normalization(obs)
+    with torch.no_grad():
+        velocity = actor.avoidance(actor.perception(obs["frames"], obs["frame_count"])[:, 0])
+        velocity[2] = 0.0
+        seen = actor.get_latent(obs)[:, :3]
+        command = obs["policy"] + torch.cat([velocity, torch.zeros(4, 1)], 1)
+        expected = (command - actor.obs_normalizer.mean) / (actor.obs_normalizer.std + 1e-2) if normalize else command
+    assert velocity[[0, 1, 3]].abs().min() > 1e-3
+    assert torch.allclose(seen, expected, atol=1e-6)
+
+
+def test_an_untrained_actor_follows_the_command_alone():
+    env = ToyEnv(4)
+    advance(env, 7)
+    actor = actor_for(env, supervision={"avoidance_target": 1.0}, command_group="policy")
+    with torch.no_grad():
+        assert torch.equal(actor.get_latent(env.get_observations())[:, :3], env.get_observations()["policy"])
+
+
+def test_avoidance_velocity_of_an_update_equals_that_of_the_rollout_and_is_learnt():
+    torch.manual_seed(5)
+    env = ToyEnv(5, episode=11)
+    advance(env, 7)
+    actor = avoiding_actor(env)
+    storage = PerceptiveStorage(5, 9, env.get_observations(), ["policy", "avoidance_target"], 2, frames=True)
+    seen = rollout(env, storage, 9)
+    [batch] = storage.mini_batch_generator(1, 1)
+    with torch.no_grad():
+        by_step = torch.stack([actor(obs) for obs in seen])
+        for row, action in zip(actor(batch.observations), batch.actions, strict=True):
+            step, env_id = (storage.actions == action).all(-1).nonzero()[0].tolist()
+            assert torch.allclose(row, by_step[step, env_id], atol=1e-5)
+    optimizer = torch.optim.Adam(actor.parameters(), 0.02)
+    losses = []
+    for _ in range(150):
+        optimizer.zero_grad()
+        (0.0 * actor(batch.observations).sum()).backward()
+        optimizer.step()
+        losses.append(actor.pop_supervised_losses()["avoidance_target"])
+    assert losses[-1] < 0.2 * losses[0]
+
+
+def test_avoidance_needs_an_observed_command():
+    with pytest.raises(ValueError, match="needs the actor to observe 'command', it observes \\['policy'\\]"):
+        actor_for(ToyEnv(3), supervision={"avoidance_target": 1.0})

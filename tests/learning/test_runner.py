@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_env import ToyEnv, config
+from toy_env import SUPERVISED, ToyEnv, config
 
 from omniperception.learning import (
     CheckpointError,
@@ -24,10 +24,10 @@ from omniperception.learning.checkpoint import checkpoint_path, list_checkpoints
 HERE = Path(__file__).parent
 
 
-def runner_for(run_dir, frames=True, **overrides):
+def runner_for(run_dir, frames=True, supervision=None, **overrides):
     torch.manual_seed(0)
     np.random.seed(0)
-    return Runner(ToyEnv(frames=frames), config(frames, **overrides), str(run_dir) if run_dir else None)
+    return Runner(ToyEnv(frames=frames), config(frames, supervision, **overrides), str(run_dir) if run_dir else None)
 
 
 def differences(a, b, where=""):
@@ -40,14 +40,15 @@ def differences(a, b, where=""):
     return [] if same else [where]
 
 
-@pytest.mark.parametrize("frames", [True, False])
-def test_resume_in_a_new_process_is_exact(tmp_path, frames):
-    whole = runner_for(tmp_path / "whole", frames)
+@pytest.mark.parametrize("kind", ["end_to_end", "supervised", "blind"])
+def test_resume_in_a_new_process_is_exact(tmp_path, kind):
+    options = {"frames": kind != "blind", "supervision": SUPERVISED if kind == "supervised" else None}
+    whole = runner_for(tmp_path / "whole", **options)
     whole.learn(5)
-    part = runner_for(tmp_path / "part", frames)
+    part = runner_for(tmp_path / "part", **options)
     part.learn(2)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])])}
-    command = [sys.executable, str(HERE / "resume_process.py"), str(tmp_path / "part"), "3", str(frames)]
+    command = [sys.executable, str(HERE / "resume_process.py"), str(tmp_path / "part"), "3", kind]
     subprocess.run(command, check=True, env=environment, capture_output=True)
     expected = load_checkpoint(checkpoint_path(tmp_path / "whole", 5))
     resumed = load_checkpoint(latest_checkpoint(tmp_path / "part"))

@@ -36,6 +36,7 @@ class ToyEnv(VecEnv):
     def get_observations(self):
         groups = {
             "policy": torch.cat([self.position, self.episode_length_buf.unsqueeze(1) / 10.0], -1),
+            "avoidance_target": -0.3 * self.position,
             "height_target": (self.position[:, :1] * torch.linspace(0.1, 0.5, 5)).clamp(-1, 1),
         }
         if self.has_frames:
@@ -84,7 +85,11 @@ class ToyEnv(VecEnv):
             setattr(self, name, state[name])
 
 
-def config(frames=True, **overrides):
+SUPERVISED = {"epochs": 2, "learning_rate": 1e-2}
+"""Of a perception network that PPO does not train."""
+
+
+def config(frames=True, supervision=None, **overrides):
     """Runner configuration; keyword arguments replace top-level entries."""
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5}
     mlp = {"hidden_dims": [16], "activation": "elu", "obs_normalization": True}
@@ -94,11 +99,13 @@ def config(frames=True, **overrides):
             "class_name": "omniperception.learning.models:PerceptionActor",
             "perception": functools.partial(PdRiskNet, 2, 1, HISTORY, proximal_dim=5, distal_dim=3),
             "supervision": {"height_target": 1.0},
+            "end_to_end": supervision is None,
         }
     return {
         "num_steps_per_env": 8,
         "save_interval": 100,
         "steps_per_frame": PERIOD,
+        "supervision": supervision,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
         "actor": actor,
         "critic": {"class_name": "MLPModel", **mlp},

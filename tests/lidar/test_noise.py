@@ -6,14 +6,20 @@ import pytest
 import torch
 
 from omniperception.lidar import (
+    AngularJitter,
     DistanceNoise,
+    Dropout,
+    GaussianNoise,
     Lidar,
     LidarConfig,
     MaskNoise,
+    MixedPixels,
     RayScene,
     Shape,
     ShapeKind,
+    grid,
     mid360,
+    sensor,
 )
 
 SPHERE = Shape(ShapeKind.SPHERE, (2.0,), body=0)
@@ -27,7 +33,8 @@ def pattern():
 
 def make(pattern, *noise, seed=1, radius=2.0, threads=2, **options):
     scene = RayScene([Shape(ShapeKind.SPHERE, (radius,), body=0)], 4, 1, num_threads=threads)
-    return Lidar(LidarConfig(5000, **options), pattern, scene, -1, noise=noise, seed=seed)
+    outputs = ("ranges", "true_ranges")
+    return Lidar(LidarConfig(5000, **options), pattern, scene, -1, noise=noise, seed=seed, outputs=outputs)
 
 
 def test_mask_replaces_its_share_of_the_hits(pattern):
@@ -84,10 +91,156 @@ def test_distance_noise_respects_the_sensors_limits(pattern):
     assert far.max() == pytest.approx(2.1)
 
 
+def normal_cdf(x):
+    return 0.5 * (1.0 + torch.erf(x / math.sqrt(2.0)))
+
+
+def kolmogorov(samples, cdf):
+    """Largest distance between the empirical and the given distribution, times sqrt(n); above 1.95 once in 1000."""
+    ordered = samples.double().sort().values
+    steps = torch.arange(len(ordered) + 1, dtype=torch.float64) / len(ordered)
+    expected = cdf(ordered)
+    gap = torch.maximum((steps[1:] - expected).max(), (expected - steps[:-1]).max())
+    return float(gap) * math.sqrt(len(ordered))
+
+
+@pytest.mark.parametrize(("sigma", "per_metre", "radius"), [(0.02, 0.0, 2.0), (0.01, 0.005, 20.0), (0.0, 0.01, 5.0)])
+def test_gaussian_noise_is_normal_with_a_deviation_that_grows_with_distance(pattern, sigma, per_metre, radius):
+    frame = make(pattern, GaussianNoise(sigma, per_metre), radius=radius, max_range=100.0).cast(NOW)
+    error = (frame.ranges.double() - frame.true_ranges.double()).flatten() / (sigma + per_metre * radius)
+    assert kolmogorov(error, normal_cdf) < 1.95
+    assert error.std() == pytest.approx(1.0, abs=4.0 / math.sqrt(2 * 20_000))
+
+
+@pytest.mark.parametrize(("ratio", "per_metre"), [(0.3, 0.0), (0.0, 0.05), (0.1, 0.1), (0.5, 1.0)])
+def test_dropout_loses_its_share_of_the_hits(pattern, ratio, per_metre):
+    frame = make(pattern, Dropout(ratio, per_metre)).cast(NOW)
+    expected = min(ratio + 2.0 * per_metre, 1.0)
+    lost = (frame.ranges == math.inf).float().mean()
+    assert lost == pytest.approx(expected, abs=4.0 * math.sqrt(expected * (1.0 - expected) / 20_000) + 1e-9)
+    kept = frame.ranges < math.inf
+    assert torch.equal(frame.ranges[kept], frame.true_ranges[kept])
+
+
+def test_jitter_turns_the_ray_by_a_normal_variable_along_each_axis():
+    """At a wall 10 m ahead, a ray turned upwards by a small angle from 30 deg down travels farther by closed form."""
+    sigma = math.radians(0.5)
+    scene = RayScene([Shape(ShapeKind.PLANE)], 8, 0, num_threads=2)
+    config = LidarConfig(4000, 1.0, 0.0, 1e6, (0.0, 0.0, 5.0), (0.0, math.radians(30.0), 0.0))
+    lidar = Lidar(config, grid(1, 1, 1.0, 4000.0), scene, -1, noise=(AngularJitter(0.5),), seed=3)
+    ranges = lidar.cast(torch.ones(8, dtype=torch.float64)).ranges.double()
+    down = torch.asin(5.0 / ranges)  # the vertical component of each ray's direction
+    turned = (down - math.radians(30.0)).flatten() / sigma
+    assert kolmogorov(turned, normal_cdf) < 1.95 + 0.3  # to first order in sigma: second-order bias sigma tan(30) / 2
+    assert turned.std() == pytest.approx(1.0, abs=0.02)
+    assert torch.corrcoef(turned.reshape(8, 4000)).triu(1).abs().max() < 5.0 / math.sqrt(4000)
+
+
+def test_jitter_reports_the_nominal_direction(pattern):
+    """Inside a sphere around the sensor the distance does not depend on the direction: points lie on nominal rays."""
+    outputs = ("ranges", "points_s", "directions_s", "row")
+    scene = RayScene([SPHERE], 4, 1, num_threads=2)
+    noise = (AngularJitter(2.0),)
+    frame = Lidar(LidarConfig(1000), pattern, scene, -1, noise=noise, seed=1, outputs=outputs).cast(NOW)
+    torch.testing.assert_close(frame.directions_s, pattern.directions_s[frame.row.long()])
+    torch.testing.assert_close(frame.points_s, frame.ranges[..., None] * frame.directions_s)
+    torch.testing.assert_close(frame.ranges, torch.full_like(frame.ranges, 2.0), rtol=1e-5, atol=0.0)
+
+
+def edge_scene():
+    """A post in front of a wall: half-width 0.5 m at 3 m, wall at 8 m, nothing above 2 m."""
+    post = Shape(ShapeKind.BOX, (0.01, 0.5, 2.0), pos=(3.01, 0.0, 0.0))
+    wall = Shape(ShapeKind.BOX, (0.01, 20.0, 2.0), pos=(8.01, 0.0, 0.0))
+    return RayScene([post, wall], 1, 0, num_threads=2)
+
+
+def test_mixed_pixels_lie_between_foreground_and_background_at_edges_only():
+    divergence = 1.0
+    config, pattern = LidarConfig(160 * 120, 1 / 30, 0.0, 30.0), grid(160, 120, 60.0)
+    outputs = ("ranges", "true_ranges", "directions_s")
+    noise = (MixedPixels(divergence, min_gap=1.0),)
+    frame = Lidar(config, pattern, edge_scene(), -1, noise=noise, outputs=outputs).cast(NOW[:1])
+    changed = frame.ranges != frame.true_ranges
+    assert 50 < changed.sum() < 400
+    angle = torch.atan2(frame.directions_s[..., 1], frame.directions_s[..., 0]).abs()
+    to_edge = (angle - math.atan2(0.5, 3.0)).abs()
+    top = (frame.directions_s[..., 2] - 2.0 / 3.02).abs()  # over the post's top only the sky is behind it
+    assert (to_edge[changed] < math.radians(divergence) / 2.0 + 0.02).all() and top[changed].min() > 0.0
+    depth = frame.ranges[changed] * frame.directions_s[changed][:, 0]
+    assert (depth > 3.5).all() and (depth < 7.5).all()
+    assert depth.mean() == pytest.approx(5.5, abs=0.1)
+    assert torch.equal(frame.ranges == math.inf, frame.true_ranges == math.inf)
+    again = Lidar(config, pattern, edge_scene(), -1, noise=noise, seed=9, outputs=outputs)
+    again.phase_rows.copy_(torch.zeros(1, dtype=torch.int64))
+    first = Lidar(config, pattern, edge_scene(), -1, noise=noise, seed=4, outputs=outputs)
+    first.phase_rows.copy_(torch.zeros(1, dtype=torch.int64))
+    assert torch.equal(first.cast(NOW[:1]).ranges, again.cast(NOW[:1]).ranges)  # a function of the scene alone
+
+
+def test_gaps_beyond_the_largest_are_two_echoes():
+    config, pattern = LidarConfig(160 * 120, 1 / 30, 0.0, 30.0), grid(160, 120, 60.0)
+    noise = (MixedPixels(1.0, min_gap=1.0, max_gap=4.0),)
+    frame = Lidar(config, pattern, edge_scene(), -1, noise=noise, outputs=("ranges", "true_ranges")).cast(NOW[:1])
+    assert torch.equal(frame.ranges, frame.true_ranges)
+
+
+ALL = (MaskNoise(), DistanceNoise(), GaussianNoise(), AngularJitter(), Dropout(0.1), MixedPixels())
+
+
+@pytest.mark.parametrize("model", ALL, ids=lambda model: type(model).__name__)
+def test_every_model_leaves_misses_alone_and_repeats_with_its_seed(pattern, model):
+    lidars = [make(pattern, model, seed=seed) for seed in (1, 1, 2)]
+    for lidar in lidars:
+        lidar.scene.body_pos[1, 0, 2] = -1000.0
+    frames = [lidar.cast(NOW).ranges.clone() for lidar in lidars]
+    assert (frames[0][1] == math.inf).all()
+    assert torch.equal(frames[0], frames[1])
+    if not isinstance(model, (MixedPixels, AngularJitter)):  # inside a sphere these two change nothing that matters
+        assert not torch.equal(frames[0], frames[2])
+
+
+def test_models_draw_independently_of_each_other(pattern):
+    """Adding a model does not change what another one draws, and their draws are uncorrelated."""
+    alone, together = make(pattern, GaussianNoise(0.02)), make(pattern, GaussianNoise(0.02), Dropout(0.5))
+    first, second = alone.cast(NOW).ranges.clone(), together.cast(NOW).ranges
+    kept = second < math.inf
+    assert torch.equal(first[kept], second[kept])
+    draws = torch.stack([(first - 2.0).flatten(), kept.float().flatten()])
+    assert torch.corrcoef(draws)[0, 1].abs() < 5.0 / math.sqrt(20_000)
+
+
+def test_a_reset_repeats_an_environments_noise_and_no_others(pattern):
+    lidar = make(pattern, GaussianNoise(0.02))
+    frames = [lidar.cast(NOW).ranges.clone() for _ in range(3)]
+    lidar.reset(torch.tensor([2]))
+    after = lidar.cast(NOW).ranges.clone()
+    assert torch.equal(after[2], frames[0][2])
+    for env in (0, 1, 3):
+        assert not any(torch.equal(after[env], frame[env]) for frame in frames)
+    lidar.reset()
+    assert torch.equal(lidar.cast(NOW).ranges, frames[0])
+
+
+@pytest.mark.parametrize("model", ALL, ids=lambda model: type(model).__name__)
+def test_a_kernel_holds_only_the_models_that_are_configured(pattern, model, monkeypatch):
+    """Figures of models that are not configured may be anything: they are not read."""
+    expected = make(pattern, model).cast(NOW).ranges
+    plain = sensor.noise_figures
+
+    def poisoned(named, *args):
+        figures, used = plain(named, *args), f"{next(iter(named))}_"
+        for name in ("jitter_sigma", "mixed_radius", "gaussian_sigma", "distance_ratio", "dropout_ratio", "mask_ratio"):
+            if not name.startswith(used):
+                setattr(figures, name, math.nan)
+        return figures
+
+    monkeypatch.setattr(sensor, "noise_figures", poisoned)
+    assert torch.equal(make(pattern, model).cast(NOW).ranges, expected)
+
+
 def test_without_noise_there_is_neither_kernel_nor_copy(pattern):
     lidar = make(pattern)
     assert lidar.cast(NOW).ranges is lidar.frame.true_ranges
-    assert int(lidar.frame_count) == 0
 
 
 @pytest.mark.parametrize(
@@ -96,6 +249,14 @@ def test_without_noise_there_is_neither_kernel_nor_copy(pattern):
         (lambda: MaskNoise(1.5), "mask.ratio=1.5"),
         (lambda: MaskNoise(0.1, 0.3, 0.2), "low <= high"),
         (lambda: DistanceNoise(-0.1), "distance.ratio=-0.1"),
+        (lambda: GaussianNoise(-0.1), "gaussian.sigma=-0.1"),
+        (lambda: GaussianNoise(0.1, math.inf), "gaussian.sigma_per_metre=inf"),
+        (lambda: AngularJitter(11.0), "jitter.sigma_deg=11.0"),
+        (lambda: Dropout(1.1), "dropout.ratio=1.1"),
+        (lambda: Dropout(0.1, -1.0), "dropout.ratio_per_metre=-1.0"),
+        (lambda: MixedPixels(0.0), "mixed.divergence_deg=0.0"),
+        (lambda: MixedPixels(min_gap=2.0, max_gap=1.0), "min_gap <= max_gap"),
+        (lambda: MixedPixels(foreground=2.0), "mixed.foreground=2.0"),
     ],
 )
 def test_wrong_noise_is_refused(build, message):

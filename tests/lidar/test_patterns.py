@@ -1,6 +1,6 @@
-"""Scan patterns: the Mid-360, camera grids, and which rows a frame holds."""
+"""Scan tables: validation, and which rows a frame holds at any time, against exact arithmetic."""
 
-import importlib.util
+import itertools
 import math
 from fractions import Fraction
 
@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.lidar import ScanPattern, grid, mid360, select_rows
+from omniperception.lidar import ScanPattern, grid, mid360, select_rows, vlp16, xt32
 
-needs_table = pytest.mark.skipif(
-    importlib.util.find_spec("mujoco_lidar") is None, reason="the extra 'tables' is not installed"
-)
 RATE = 200_000
 
 
@@ -25,56 +22,35 @@ def seconds(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def test_mid360_model_has_the_devices_field_of_view(model):
-    elevation = np.degrees(model.elevation.numpy())
-    assert model.num_rows == 800_000 and model.points_per_second == RATE
-    assert elevation.min() == pytest.approx(-7.21, abs=0.3) and elevation.max() == pytest.approx(52.16, abs=0.3)
-    filled, _ = np.histogram(model.azimuth.numpy(), bins=360, range=(0.0, 2.0 * math.pi))
-    assert filled.min() > 0.9 * filled.mean()
-    assert model.azimuth.min() >= 0.0 and model.azimuth.max() <= np.float32(2.0 * math.pi)
+def expected_first(time: float, period: Fraction, rate: Fraction, num_rows: int) -> int:
+    """First point not before time - period, in exact arithmetic."""
+    return math.ceil((Fraction(time) - period) * rate) % num_rows
+
+
+def tiny(points_per_second=10.0, **fields):
+    return ScanPattern.from_angles(np.zeros(6), np.arange(6.0), points_per_second, **fields)
 
 
 def test_directions_agree_with_the_angles(model):
-    for pattern in (model, grid(7, 5, 90.0)):
+    for pattern in (model, grid(7, 5, 90.0), xt32()):
         x, y, z = pattern.directions_s.double().T
         assert torch.allclose(torch.asin(z), pattern.elevation.double(), atol=1e-6)
         turn = torch.atan2(y, x) - pattern.azimuth.double()
         assert torch.allclose(torch.cos(turn), torch.ones(len(turn), dtype=torch.float64), atol=1e-6)
 
 
-@needs_table
-def test_mid360_model_covers_what_the_table_covers(model):
-    table = mid360("table")
-    assert table.num_rows == model.num_rows and table.points_per_second == model.points_per_second
-    histograms = [
-        np.histogram(np.degrees(p.elevation.numpy()), bins=120, range=(-8.0, 53.0))[0] / p.num_rows
-        for p in (model, table)
-    ]
-    assert np.minimum(*histograms).sum() > 0.97
-    angle = torch.acos((model.directions_s.double() * table.directions_s.double()).sum(1).clamp(-1.0, 1.0))
-    assert math.degrees(angle.mean()) < 0.1 and math.degrees(angle.max()) < 0.5
+def test_angles_and_directions_make_the_same_pattern():
+    elevation, azimuth = np.array([0.3, -1.2, math.pi / 2.0]), np.array([1.0, -0.5, 0.0])
+    given = ScanPattern.from_angles(elevation, azimuth, 3.0)
+    again = ScanPattern.from_directions(given.directions_s.numpy(), 3.0)
+    assert torch.allclose(again.elevation, given.elevation, atol=1e-3)  # float32 at the zenith
+    assert torch.allclose(again.azimuth[:2], torch.tensor([1.0, 2.0 * math.pi - 0.5]), atol=1e-6)
+    assert given.duration_s == 1.0
 
 
-@needs_table
-def test_a_frame_of_the_model_fills_the_sphere_like_the_table(model):
-    def cells(pattern):
-        ring = torch.floor(torch.rad2deg(pattern.elevation[:20_000]) / 2.0).long()
-        column = torch.floor(torch.rad2deg(pattern.azimuth[:20_000]) / 2.0).long()
-        return set((ring * 1000 + column).tolist())
-
-    ours, theirs = cells(model), cells(mid360("table"))
-    assert len(ours & theirs) / len(ours | theirs) > 0.95
-
-
-def test_missing_table_names_the_extra(monkeypatch):
-    def absent(name):
-        raise ModuleNotFoundError(name)
-
-    monkeypatch.setattr("omniperception.lidar.patterns.files", absent)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install omniperception\[tables\]"):
-        mid360("table")
-    with pytest.raises(ValueError, match="'model' or 'table'"):
-        mid360("tabel")
+def test_azimuths_stay_below_a_turn_also_after_rounding():
+    azimuth = ScanPattern.from_angles(np.zeros(3), np.array([-1e-12, 2.0 * math.pi, 7.0]), 1.0).azimuth
+    assert azimuth.tolist() == pytest.approx([0.0, 0.0, 7.0 - 2.0 * math.pi], abs=1e-6)
 
 
 def test_a_frame_holds_every_kth_point_of_its_period_of_all_lasers(model):
@@ -103,8 +79,31 @@ def test_rows_are_exact_also_late(model, late):
 
 def test_rows_between_ticks_are_those_of_exact_arithmetic(model):
     times = [0.123456, 17.00000251, 3.14159265]
-    expected = [math.ceil((Fraction(t) - Fraction(1, 10)) * RATE) for t in times]
-    assert model.first_rows(seconds(*times), 0.1).tolist() == [row % 800_000 for row in expected]
+    expected = [expected_first(t, Fraction(1, 10), Fraction(RATE), 800_000) for t in times]
+    assert model.first_rows(seconds(*times), 0.1).tolist() == expected
+
+
+@pytest.mark.parametrize("make", [vlp16, xt32], ids=["vlp16", "xt32"])
+@pytest.mark.parametrize("step_s", [Fraction(1, 50), Fraction(7, 1000), Fraction(1, 3)])
+def test_a_rate_that_is_no_multiple_of_the_step_loses_and_repeats_no_point(make, step_s):
+    """289,352 points/s are 5787.04 per 20 ms: frames of 5787 and 5788 points that follow one another."""
+    pattern = make()
+    rate = Fraction(16, 55_296) * 10**9 if make is vlp16 else Fraction(640_000)
+    steps = range(1, 400)
+    first = pattern.first_rows(seconds(*(float(k * step_s) for k in steps)), float(step_s)).tolist()
+    exact = [math.ceil((k - 1) * step_s * rate) for k in steps]
+    assert first == [row % pattern.num_rows for row in exact]
+    points = pattern.points_per_frame(float(step_s))
+    assert {b - a for a, b in itertools.pairwise(exact)} <= {points, points + 1}
+
+
+def test_a_pause_a_reset_and_a_replay_see_what_belongs_to_their_time(model):
+    phase = torch.tensor([0, 123_457])
+    straight = {t: select_rows(model, seconds(t, t), 0.1, 50, phase) for t in (0.1, 0.2, 0.3, 0.4)}
+    for t in (0.4, 0.1, 0.1, 0.3):  # backwards, twice, after a gap: nothing is remembered
+        assert torch.equal(select_rows(model, seconds(t, t), 0.1, 50, phase), straight[t])
+    mixed = select_rows(model, seconds(0.1, 0.3), 0.1, 50, phase)  # environment 0 was reset
+    assert torch.equal(mixed[0], straight[0.1][0]) and torch.equal(mixed[1], straight[0.3][1])
 
 
 def test_phase_shifts_each_environment(model):
@@ -112,25 +111,32 @@ def test_phase_shifts_each_environment(model):
     assert rows[:, 0].tolist() == [0, 799_999] and rows[1, 1] == 1998
 
 
+def test_first_rows_write_where_they_are_told(model):
+    out, scratch = torch.zeros(3, dtype=torch.int64), torch.zeros(3, dtype=torch.float64)
+    times = seconds(0.1, 0.7, 9.3)
+    assert model.first_rows(times, 0.1, 5, out, scratch) is out
+    assert torch.equal(out, model.first_rows(times, 0.1, 5)) and times.tolist() == [0.1, 0.7, 9.3]
+
+
 def test_more_rays_than_points_are_refused(model):
     with pytest.raises(ValueError, match=r"lidar.num_rays=20001 must be in 1..20000"):
         select_rows(model, seconds(0.1), 0.1, 20_001)
 
 
-def test_grid_is_a_pinhole_camera():
-    pattern = grid(3, 3, fov_deg=90.0)
-    rays = pattern.directions_s.reshape(3, 3, 3)
-    assert torch.allclose(rays[1, 1], torch.tensor([1.0, 0.0, 0.0]))
-    pixel = 2.0 / 3.0  # at distance 1, 90 degrees span 2
-    assert torch.allclose(rays[1, 0] / rays[1, 0, 0], torch.tensor([1.0, pixel, 0.0]))
-    assert torch.allclose(rays[0, 2] / rays[0, 2, 0], torch.tensor([1.0, -pixel, pixel]))
-    assert pattern.points_per_frame(1.0 / 30.0) == 9
-    with pytest.raises(ValueError, match="fov_deg=180"):
-        grid(3, 3, 180.0)
-
-
-def test_a_pattern_must_be_unit_vectors():
-    with pytest.raises(ValueError, match="unit vectors"):
-        ScanPattern(torch.ones(2, 3), torch.zeros(2), torch.zeros(2), 10.0)
-    with pytest.raises(ValueError, match="points_per_second"):
-        ScanPattern(torch.eye(3), torch.zeros(3), torch.zeros(3), 0.0)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ScanPattern(torch.ones(2, 3), torch.zeros(2), torch.zeros(2), 10.0), "unit vectors"),
+        (lambda: ScanPattern(torch.eye(3), torch.zeros(3), torch.zeros(3), 0.0), "points_per_second"),
+        (lambda: ScanPattern(torch.eye(3), torch.zeros(2), torch.zeros(3), 1.0), r"directions_s \(M, 3\)"),
+        (lambda: ScanPattern(torch.eye(3) * math.nan, torch.zeros(3), torch.zeros(3), 1.0), "finite"),
+        (lambda: tiny(num_lasers=0), "num_lasers=0 must be at least 1"),
+        (lambda: tiny(rows_per_shot=4), "rows_per_shot=4 must divide the 6 rows"),
+        (lambda: tiny(origins_s=torch.zeros(5, 3)), r"origins_s must be finite \(6, 3\), got \(5, 3\)"),
+        (lambda: tiny(origins_s=torch.full((6, 3), math.inf)), "origins_s must be finite"),
+    ],
+)
+def test_wrong_patterns_are_told_in_one_line(make, message):
+    with pytest.raises(ValueError, match=message) as error:
+        make()
+    assert "\n" not in str(error.value)

@@ -6,7 +6,20 @@ import math
 import pytest
 import torch
 
-from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid, mid360, quat_from_rpy
+from omniperception.lidar import (
+    OUTPUTS,
+    Lidar,
+    LidarConfig,
+    RayScene,
+    ScanPattern,
+    Shape,
+    ShapeKind,
+    grid,
+    mid360,
+    quat_from_rpy,
+)
+from omniperception.lidar.kernels.search import FEW_SLOTS
+from omniperception.lidar.patterns import make_selection, select_rows
 
 K = ShapeKind
 
@@ -49,7 +62,7 @@ def crowd(num_envs, seed=0, num_threads=2):
 def test_scan_meets_what_general_rays_meet(pattern):
     config = LidarConfig(2000, 0.1, 0.05, 5.0, mount_pos=(0.3, 0.0, -0.05), mount_rpy=(0.0, -2.8782, 3.14))
     scene = crowd(6)
-    lidar = Lidar(config, pattern, scene, mount_body=0, exclude_shapes=(2,))
+    lidar = Lidar(config, pattern, scene, 0, (2,), outputs=("ranges", "shape_id", "class_id", "directions_s"))
     frame = lidar.cast(clock(6, 3.7))
     quat = scene.body_quat[:, :1]
     mount = torch.tensor(config.quat).expand(6, 1, 4)
@@ -66,7 +79,8 @@ def test_scan_meets_what_general_rays_meet(pattern):
 
 
 def test_frame_reports_its_rows(pattern):
-    lidar = Lidar(LidarConfig(100), pattern, RayScene([], 3, 1, num_threads=2), 0, seed=5)
+    outputs = ("row", "directions_s", "elevation", "azimuth")
+    lidar = Lidar(LidarConfig(100), pattern, RayScene([], 3, 1, num_threads=2), 0, seed=5, outputs=outputs)
     frame = lidar.cast(clock(3, 0.7))
     rows = frame.row.long()
     assert ((rows[:, 1] - rows[:, 0]) % 800_000 == 199).all()
@@ -78,7 +92,7 @@ def test_frame_reports_its_rows(pattern):
 
 
 def test_scan_moves_on_with_time_and_repeats(pattern):
-    lidar = Lidar(LidarConfig(100), pattern, RayScene([], 1, 0), -1)
+    lidar = Lidar(LidarConfig(100), pattern, RayScene([], 1, 0), -1, outputs=("row",))
     first, second, again, late = (lidar.cast(clock(1, t)).row.clone() for t in (0.1, 0.2, 4.1, 1_000_000.1))
     assert not torch.equal(first, second)
     assert torch.equal(first, again) and torch.equal(first, late)
@@ -86,19 +100,24 @@ def test_scan_moves_on_with_time_and_repeats(pattern):
 
 def test_every_output_is_rewritten_after_a_hit(pattern):
     scene = RayScene([Shape(K.SPHERE, (1.0,), body=0, class_id=4)], 2, 1)
-    lidar = Lidar(LidarConfig(500), pattern, scene, -1)
+    lidar = Lidar(LidarConfig(500), pattern, scene, -1, outputs=OUTPUTS)
     frame = lidar.cast(clock(2, 0.1))  # the sensor is inside the sphere
     assert torch.allclose(frame.ranges, torch.ones(2, 500), atol=1e-5) and (frame.class_id == 4).all()
     scene.body_pos[1, 0, 2] = -1000.0
     frame = lidar.cast(clock(2, 0.1))
     assert torch.isfinite(frame.ranges[0]).all()
     assert (frame.ranges[1] == math.inf).all()
-    assert (frame.shape_id[1] == -1).all() and (frame.class_id[1] == -1).all()
+    assert (frame.shape_id[1] == -1).all() and (frame.class_id[1] == -1).all() and (frame.body_id[1] == -2).all()
+    assert not frame.valid[1].any() and frame.valid[0].all()
+    for points in (frame.points_s, frame.points_b, frame.points_w, frame.incidence):
+        assert points[0].isfinite().all() and points[1].isnan().all()
+    assert (frame.normals_w[1] == 0.0).all() and (frame.intensity[1] == 0.0).all()
 
 
 def test_a_surface_nearer_than_the_minimum_blocks_and_returns_nothing(pattern):
     near, far = Shape(K.SPHERE, (0.09,)), Shape(K.SPHERE, (3.0,))
-    lidar = Lidar(LidarConfig(50, min_range=0.1), pattern, RayScene([near, far], 1, 0), -1)
+    scene, outputs = RayScene([near, far], 1, 0), ("ranges", "shape_id")
+    lidar = Lidar(LidarConfig(50, min_range=0.1), pattern, scene, -1, outputs=outputs)
     frame = lidar.cast(clock(1, 0.1))
     assert (frame.ranges == math.inf).all() and (frame.shape_id == -1).all()
     excluding = Lidar(LidarConfig(50, min_range=0.1), pattern, lidar.scene, -1, exclude_shapes=(0,))
@@ -127,13 +146,14 @@ def test_mounting_follows_the_body():
 @pytest.mark.parametrize("shapes", [[], [Shape(K.SPHERE, (2.0,))]], ids=["empty", "one"])
 def test_odd_counts_give_the_same_on_one_thread_and_two(pattern, num_envs, num_rays, shapes):
     frames = [
-        Lidar(LidarConfig(num_rays), pattern, RayScene(shapes, num_envs, 0, num_threads=n), -1).cast(
+        Lidar(LidarConfig(num_rays), pattern, RayScene(shapes, num_envs, 0, num_threads=n), -1, outputs=OUTPUTS).cast(
             clock(num_envs, 0.3)
         )
         for n in (1, 2)
     ]
     for name in (field.name for field in dataclasses.fields(frames[0])):
-        assert torch.equal(getattr(frames[0], name), getattr(frames[1], name)), name
+        first, second = getattr(frames[0], name), getattr(frames[1], name)
+        assert torch.equal(first.nan_to_num(-7.0), second.nan_to_num(-7.0)), name
     assert frames[0].ranges.shape == (num_envs, num_rays)
 
 
@@ -145,7 +165,7 @@ def test_threads_agree_on_a_crowd(pattern):
 
 
 def test_a_frame_allocates_nothing_new(pattern):
-    lidar = Lidar(LidarConfig(10), pattern, crowd(2), 0)
+    lidar = Lidar(LidarConfig(10), pattern, crowd(2), 0, outputs=OUTPUTS)
     addresses = [getattr(lidar.frame, f.name).data_ptr() for f in dataclasses.fields(lidar.frame)]
     frame = lidar.cast(clock(2, 0.5))
     assert frame is lidar.frame and frame.ranges is frame.true_ranges
@@ -183,3 +203,96 @@ def test_wrong_sensors_are_refused(pattern):
         Lidar(LidarConfig(10), pattern, scene, 1)
     with pytest.raises(ValueError, match="float64"):
         Lidar(LidarConfig(10), pattern, scene, 0).cast(torch.zeros(2))
+    with pytest.raises(ValueError, match=r"lidar.outputs=\['colour'\] must be names out of ranges, true_ranges"):
+        Lidar(LidarConfig(10), pattern, scene, 0, outputs=("ranges", "colour"))
+    with pytest.raises(ValueError, match=r"lidar.reflectivity=\{2: -1.0\}"):
+        Lidar(LidarConfig(10), pattern, scene, 0, outputs=("intensity",), reflectivity={2: -1.0})
+
+
+@pytest.mark.parametrize(("num_rows", "stride"), [(12, 1), (12, 5), (12, 4), (12, 6), (35, 10), (7, 7), (1, 3)])
+def test_a_frame_is_every_kth_row_whatever_the_table(num_rows, stride):
+    """Also where the steps do not reach every row, and where a frame is longer than the table."""
+    num_rays, period = 5, 5 * stride / 100.0
+    angles = torch.linspace(-0.5, 0.5, num_rows).numpy()
+    pattern = ScanPattern.from_angles(angles, 2.0 * angles, 100.0)
+    assert pattern.stride(period, num_rays) == stride
+    lidar = Lidar(LidarConfig(num_rays, period), pattern, RayScene([], 20, 0), -1, outputs=("row", "directions_s"))
+    for frame_number in range(3):
+        frame = lidar.cast(clock(20, (frame_number + 1) * period))
+        first = frame_number * num_rays * stride + lidar.phase_rows[:, None]
+        rows = (first + stride * torch.arange(num_rays)) % num_rows
+        assert torch.equal(frame.row.long(), rows)
+        assert torch.equal(frame.directions_s, pattern.directions_s[rows])
+
+
+@pytest.mark.parametrize("selection", ["stratified", "random"])
+def test_a_selection_reports_and_casts_its_rows(pattern, selection):
+    """Rows and directions are those of the pattern's own function, and hits are those of its directions."""
+    config = LidarConfig(500, selection=selection, max_range=10.0)
+    scene = RayScene([Shape(K.SPHERE, (2.0,)), Shape(K.BOX, (0.3, 0.2, 0.4), pos=(0.9, 0.4, 0.2))], 3, 0)
+    lidar = Lidar(config, pattern, scene, -1, seed=4, outputs=("ranges", "row", "directions_s"))
+    bank = make_selection(pattern, 0.1, 500, selection, 4)
+    for number, time in enumerate((0.1, 0.2, 0.3)):
+        frame = lidar.cast(clock(3, time))
+        rows = select_rows(pattern, clock(3, time), 0.1, 500, lidar.phase_rows, bank, number)
+        assert torch.equal(frame.row.long(), rows)
+        assert torch.equal(frame.directions_s, pattern.directions_s[rows])
+        hits = scene.cast(torch.zeros(3, 500, 3), frame.directions_s, 10.0)
+        assert torch.isclose(frame.ranges, hits.ranges, rtol=1e-4, atol=1e-4).float().mean() > 0.995
+
+
+def sphere_grid():
+    """Directions all over the sphere, the poles and the azimuth of 360 degrees included."""
+    elevation, azimuth = torch.meshgrid(
+        torch.linspace(-math.pi / 2, math.pi / 2, 46), torch.linspace(0.0, 2.0 * math.pi, 61), indexing="ij"
+    )
+    return ScanPattern.from_angles(elevation.flatten().numpy(), azimuth.flatten().numpy(), 46 * 61 * 10.0)
+
+
+@pytest.mark.parametrize("num_bodies", [FEW_SLOTS // 2, 60, 200])
+def test_searching_many_shapes_at_once_finds_what_one_by_one_finds(num_bodies):
+    """Shapes of all kinds: around the sensor, beside it, above and below it, behind one another."""
+    generator = torch.Generator().manual_seed(num_bodies)
+    closed = [K.BOX, K.SPHERE, K.CYLINDER, K.CAPSULE, K.ELLIPSOID]
+    sizes = {K.BOX: (0.3, 0.2, 0.5), K.SPHERE: (0.4,), K.CYLINDER: (0.2, 0.6), K.CAPSULE: (0.1, 0.5)}
+    shapes = [Shape(closed[i % 5], sizes.get(closed[i % 5], (0.2, 0.4, 0.6)), body=i) for i in range(num_bodies)]
+    shapes += [Shape(K.PLANE, pos=(0.0, 0.0, -2.0)), Shape(K.BOX, (5.0, 6.0, 7.0), quat=quat_from_rpy(0.1, 0.2, 0.3))]
+    scene = RayScene(shapes, 8, num_bodies, num_threads=2)
+    scene.body_pos[:] = 2.5 * torch.randn(scene.body_pos.shape, generator=generator)
+    scene.body_pos[:, :3] = torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, -1.5], [1.5, 0.0, 0.0]])
+    scene.body_quat[:] = torch.nn.functional.normalize(torch.randn(scene.body_quat.shape, generator=generator), dim=-1)
+    pattern = sphere_grid()
+    config = LidarConfig(pattern.num_rows, 0.1, 0.0, 20.0)
+    frame = Lidar(config, pattern, scene, -1, outputs=("ranges", "shape_id", "directions_s")).cast(clock(8, 0.1))
+    hits = scene.cast(torch.zeros_like(frame.directions_s), frame.directions_s, 20.0)
+    assert (frame.shape_id == hits.shape_id).float().mean() > 0.9999
+    same = frame.shape_id == hits.shape_id
+    torch.testing.assert_close(frame.ranges[same], hits.ranges[same], rtol=2e-5, atol=2e-5)
+
+
+def test_several_sensors_see_one_scene_at_their_own_rates(pattern):
+    scene = RayScene([Shape(K.PLANE), Shape(K.SPHERE, (0.5,), body=1, class_id=3)], 2, 2)
+    front = Lidar(LidarConfig(400, 0.1, mount_pos=(0.2, 0.0, 0.0)), pattern, scene, 0, outputs=("ranges", "row"))
+    depth = Lidar(
+        LidarConfig(16, 1 / 30, 0.1, 5.0, mount_rpy=(0.0, math.pi / 2, 0.0)),
+        grid(4, 4, 60.0),
+        scene,
+        0,
+        outputs=("points_w",),
+    )
+    fixed = Lidar(LidarConfig(1, 1 / 30, 0.0, 50.0, (-4.0, 0.0, 1.0)), grid(1, 1, 10.0), scene, -1)
+    for step in range(1, 31):
+        time = step / 300.0
+        scene.body_pos[:, 0] = torch.tensor([0.01 * step, 3.0, 1.0])
+        scene.body_pos[:, 1] = torch.tensor([0.0, 0.0, 1.0 + 0.01 * step])
+        if step % 30 == 0:
+            front.cast(clock(2, time))
+        if step % 10 == 0:
+            below = depth.cast(clock(2, time)).points_w
+            assert torch.allclose(below[..., 2], torch.zeros(2, 16), atol=1e-5)  # it looks at the ground
+            assert torch.allclose(below[..., 0].mean(1), scene.body_pos[:, 0, 0], atol=1e-4)
+            ahead = fixed.cast(clock(2, time)).ranges
+            height = 0.01 * step
+            assert torch.allclose(ahead, torch.tensor(4.0 - math.sqrt(0.25 - height**2)), atol=1e-4)
+    single = Lidar(front.config, pattern, scene, 0, outputs=("ranges", "row")).cast(clock(2, 0.1))
+    assert torch.equal(front.frame.ranges, single.ranges) and torch.equal(front.frame.row, single.row)

@@ -30,9 +30,9 @@ def random_rays(num_envs, num_rays, seed=0, miss=0.2):
     return tuple(torch.tensor(a, dtype=torch.float32) for a in (ranges, directions, theta, phi))
 
 
-def sample(sampler, rays):
+def sample(sampler, rays, attitude=None):
     """Sampled points, from an output full of NaN so that an unwritten element shows."""
     out = torch.full((rays[0].shape[0], sampler.num_points, 3), math.nan)
-    sampler(*rays, out)
+    sampler(*rays, out, attitude)
     assert torch.isfinite(out).all()
     return out

@@ -21,10 +21,9 @@ def test_kernels_compile_for_cuda(tmp_path):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize("distal_bins", ["points", "cells"])
-def test_cuda_equals_cpu(distal_bins):
+def test_cuda_equals_cpu():
     rays = random_rays(37, 500, seed=1)
-    sampler = PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0, distal_bins=distal_bins)
+    sampler = PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0)
     on_gpu = torch.empty(37, 96, 3, device="cuda")
     sampler(*(t.cuda() for t in rays), on_gpu)
     assert torch.allclose(on_gpu.cpu(), sample(sampler, rays), atol=1e-5)

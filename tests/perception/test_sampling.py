@@ -131,44 +131,6 @@ class TestDistal:
             expected = [b.mean(0) if reduce == "average" else b[len(b) // 2] for b in bins]
             np.testing.assert_allclose(got[env, 8:], expected, atol=1e-5)
 
-    def test_cells_average_their_hits_and_show_free_space(self):
-        rays = random_rays(4, 400, seed=8, miss=0.5)
-        rings, columns, lowest, blind = 3, 5, -70.0, 0.8
-        cells = {"distal_bins": "cells", "distal_rings": rings, "lowest_deg": lowest, "blind": blind}
-        got = sample(PdSampler(8, rings * columns, max_range=MAX_RANGE, split_deg=self.SPLIT, **cells), rays)
-        ranges, directions, theta, phi = (x.double().numpy() for x in rays)
-        height, width = np.radians(self.SPLIT - lowest) / rings, 2 * np.pi / columns
-        seen_empty = False
-        for env, ring, column in itertools.product(range(4), range(rings), range(columns)):
-            low = np.radians(lowest) + ring * height
-            in_ring = (theta[env] >= low) if ring else (theta[env] <= low + height)
-            in_ring &= (theta[env] <= low + height) if ring == rings - 1 else (theta[env] < low + height)
-            in_column = (phi[env] % (2 * np.pi)) // width == column
-            hit = np.isfinite(ranges[env]) & (ranges[env] >= blind) & in_ring & in_column
-            expected = (ranges[env][hit, None] * directions[env][hit] / MAX_RANGE).mean(0) if hit.any() else None
-            if expected is None:
-                seen_empty = True
-                up, around = low + height / 2, (column + 0.5) * width
-                expected = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)]
-            np.testing.assert_allclose(got[env, 8 + ring * columns + column], expected, atol=1e-5)
-        empty = torch.full_like(rays[0], math.inf)
-        free = sample(PdSampler(8, 15, max_range=MAX_RANGE, split_deg=self.SPLIT, **cells), (empty, *rays[1:]))
-        assert (free[:, :8] == 0).all() and torch.allclose(free[:, 8:].norm(dim=-1), torch.ones(4, 15), atol=1e-5)
-        assert not seen_empty or torch.isfinite(got).all()
-
-    @pytest.mark.parametrize(
-        ("options", "named"),
-        [
-            ({"reduce": "pick"}, "reduce='average'"),
-            ({"distal_rings": 3}, "distal_rings=3"),
-            ({"lowest_deg": 50.0}, "lowest_deg=50.0"),
-            ({"blind": -1.0}, "blind=-1.0"),
-        ],
-    )
-    def test_impossible_cells_are_refused(self, options, named):
-        with pytest.raises(ValueError, match=named):
-            PdSampler(8, 16, max_range=MAX_RANGE, split_deg=self.SPLIT, distal_bins="cells", **options)
-
     def test_partition_by_elevation(self):
         rays = random_rays(3, 300, seed=10)
         got = sample(PdSampler(32, 32, max_range=MAX_RANGE, split_deg=self.SPLIT, reduce="pick"), rays).double()
@@ -237,7 +199,6 @@ class TestInterface:
         [
             {"ring_deg": 0.0},
             {"reduce": "median"},
-            {"distal_bins": "rays"},
             {"num_proximal": -1},
             {"num_proximal": 0, "num_distal": 0},
             {"max_range": 0.0},

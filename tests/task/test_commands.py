@@ -88,11 +88,12 @@ def robots(positions, yaws):
 
 
 class TestGoal:
-    config = GoalCommandConfig(10.0, 0.0, 0.8, 2.0, 1.0, SpawnConfig())
+    config = GoalCommandConfig((10.0, 10.0), (0.0, 0.0), None, 0.8, 2.0, 1.0, SpawnConfig())
 
     def command(self, positions, yaws):
         kinematics = robots(positions, yaws)
-        command = self.config.build(len(positions), torch.device("cpu"), None)
+        n, device = len(positions), torch.device("cpu")
+        command = self.config.build(n, device, EnvRandom(0, n, device))
         command.reset(torch.arange(len(positions)), kinematics)
         return command.value, command.reached(kinematics)
 
@@ -117,7 +118,7 @@ class TestGoal:
 
     def test_wrong_settings_are_refused(self):
         with pytest.raises(ValueError, match=r"commands\.speed=0"):
-            GoalCommandConfig(10.0, 0.0, 0.0, 2.0, 1.0, SpawnConfig())
+            GoalCommandConfig((10.0, 10.0), (0.0, 0.0), None, 0.0, 2.0, 1.0, SpawnConfig())
 
 
 def test_robots_start_where_the_preset_says(make_env):

@@ -57,7 +57,9 @@ def test_the_papers_table(make_config):
     assert {name: getattr(config, name) for name in PAPER} == PAPER
     assert config.lidar_mask == MaskNoise(ratio=0.1, low=0.0, high=0.3)
     assert config.lidar_distance == DistanceNoise(ratio=0.1)
-    rows = [f.name for f in fields(RandomizationConfig) if f.name != "payload_position"]
+    own = {"lidar_gaussian", "lidar_jitter", "lidar_dropout", "lidar_mixed"}  # of the device, not in the table
+    rows = [f.name for f in fields(RandomizationConfig) if f.name not in {"payload_position", *own}]
+    assert all(getattr(config, name) is None for name in own)
     assert len(rows) == 13 and all(getattr(config, name) is not None for name in rows)
 
 
@@ -256,3 +258,8 @@ def test_a_reset_starts_in_the_default_pose_at_rest(make_env):
 def test_wrong_ranges_are_refused(make_config, row, message):
     with pytest.raises(ValueError, match=message):
         make_config(f"+randomization.{row}")
+
+
+def test_the_devices_own_noise_reaches_the_lidar(make_env):
+    names = [type(model).__name__ for model in make_env("randomization=device").config.randomization.noise]
+    assert names == ["GaussianNoise", "AngularJitter", "Dropout", "MixedPixels"]

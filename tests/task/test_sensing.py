@@ -5,6 +5,8 @@ import math
 import pytest
 import torch
 
+from omniperception.lidar import OUTPUTS
+
 
 def still(env):
     return torch.zeros(env.num_envs, env.num_actions)
@@ -133,3 +135,48 @@ def test_the_lidar_sleeps_until_the_curriculum_lets_obstacles_in(make_env):
     for _ in range(5):
         observations = env.step(actions)[0]
     assert env.sensing.tick == 1 and (observations["frame_count"] == 1).all()
+
+
+def test_nothing_is_computed_that_the_task_does_not_read(make_env):
+    def outputs(*overrides):
+        frame = make_env(*overrides).sensing.lidar.frame
+        return {name for name in OUTPUTS if getattr(frame, name) is not None}
+
+    sampled, sectors = {"ranges", "directions_s", "elevation", "azimuth"}, {"true_ranges", "directions_s", "class_id"}
+    assert outputs("rewards=default") == sampled | sectors
+    assert outputs("rewards=default", "perception=none") == sectors
+    assert outputs("rewards=paper", "perception=none") == sectors | {"elevation"}
+
+
+def test_motion_distortion_forgets_the_last_episode(make_env):
+    """A robot that is placed anew has not swept there; a robot that turns has."""
+    env = make_env("obstacles=static", "lidar.sensor.motion_segments=1", "lidar.sensor.motion_jump=100.0", num_envs=2)
+    still_env = make_env("obstacles=static", num_envs=2)
+    for each in (env, still_env):
+        each.sim.qpos[:, :2] += 3.0
+        each.sensing.reset(torch.tensor([0]))
+        each.sensing.cast(0.1)
+    moving, still = env.sensing.frame.true_ranges, still_env.sensing.frame.true_ranges
+    torch.testing.assert_close(moving[0], still[0], rtol=1e-6, atol=1e-6)
+    assert not torch.allclose(moving[1], still[1], rtol=1e-3)
+
+
+def test_a_saved_state_goes_on_with_its_motion(make_env):
+    """The frame after a resumption starts where the frame before it ended."""
+    whole, resumed = (make_env("obstacles=static", "lidar.sensor.motion_segments=1", num_envs=2) for _ in range(2))
+    whole.sim.qpos[:, :2] += 0.3
+    whole.sensing.cast(0.1)
+    resumed.sensing.load_state_dict(whole.sensing.state_dict())
+    for env in (whole, resumed):
+        env.sim.qpos[:, :2] = 0.5
+        env.sensing.cast(0.2)
+    assert torch.equal(whole.sensing.frame.true_ranges, resumed.sensing.frame.true_ranges)
+    still = make_env("obstacles=static", num_envs=2)
+    still.sim.qpos[:, :2] = 0.5
+    still.sensing.cast(0.2)
+    assert not torch.allclose(whole.sensing.frame.true_ranges, still.sensing.frame.true_ranges, rtol=1e-3)
+
+
+def test_more_pieces_than_the_task_knows_poses_for_are_refused(make_env):
+    with pytest.raises(ValueError, match=r"lidar\.sensor\.motion_segments=2 must be 0 or 1"):
+        make_env("lidar.sensor.motion_segments=2")

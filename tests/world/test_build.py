@@ -66,7 +66,7 @@ def test_fixed_poses_are_geoms_of_the_world(make_config):
     data = mujoco.MjData(world.model)
     mujoco.mj_forward(world.model, data)
     expected = {"obstacle_wall_0": (5.5, 2.05, 0.5), "obstacle_wall_1": (5.5, -2.05, 0.5)}
-    for name, pos in {**expected, "obstacle_wall_2": (-7.6, 0.0, 0.5)}.items():
+    for name, pos in {**expected, "obstacle_back_wall_0": (-1.15, 0.0, 0.5)}.items():
         np.testing.assert_allclose(data.geom(name).xpos, pos, atol=1e-12)
         assert world.model.geom(name).bodyid[0] == 0
     assert world.model.nmocap == 6

@@ -7,7 +7,8 @@ import torch
 
 from omniperception.random import EnvRandom
 from omniperception.world import ObstacleField, ObstacleGroup, ObstaclesConfig
-from omniperception.world.obstacles import PARKED_HEIGHT, CurriculumConfig
+from omniperception.world.obstacle_field import PARKED_HEIGHT
+from omniperception.world.obstacles import ApproachConfig, CurriculumConfig
 
 
 def field_of(num_envs=2000, seed=0, speed=(0.0, 1.0), **settings):
@@ -171,6 +172,13 @@ def test_footprint_radius():
         ({"size": [[0.2, 0.1], [0.5, 0.5]]}, "0 < low <= high"),
         ({"speed": (-1.0, 1.0)}, "speed="),
         ({"poses": [[0.0, 0.0]]}, "poses must be 1 triples"),
+        ({"bottom": [0.5, 0.4]}, r"bottom=\[0\.5, 0\.4\]"),
+        ({"bottom": [-0.1, 0.4]}, "below the ground"),
+        ({"bottom": [0.1, 0.4], "poses": [[0.0, 0.0, 0.0]]}, "leave out bottom"),
+        ({"heading_deg": [90.0]}, "heading_deg"),
+        ({"yaw_deg": [30.0, -30.0]}, "yaw_deg"),
+        ({"area": [0.0, 1.0, 1.0]}, "a group's area"),
+        ({"approach": ApproachConfig(0.2, [3.0, 4.0])}, "approaches must be positive"),
     ],
 )
 def test_wrong_groups_are_refused(settings, message):

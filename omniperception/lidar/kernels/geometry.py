@@ -1,6 +1,6 @@
 """Exact intersections of rays with shapes, compiled for the kinds of shapes that a scene has."""
 
-# ruff: noqa: UP018, SIM102  (in a kernel, int(0) and float(0) declare a variable that may change, and a branch on
+# ruff: noqa: SIM102, SIM109  (in a kernel, a branch on wp.static stands alone, and there is no 'in')
 # wp.static stands alone)
 
 import math
@@ -10,6 +10,10 @@ from functools import cache
 
 import warp as wp
 
+from .heightfield import FieldPart, heightfield_normal, meet_heightfield, refine_heightfield
+from .intersections import intersections
+from .mesh import MeshPart, corner_of, descend, plane_through, slab_inverse
+
 wp.set_module_options({"enable_backward": False})
 
 PLANE = wp.constant(0)
@@ -18,30 +22,53 @@ SPHERE = wp.constant(2)
 CYLINDER = wp.constant(3)
 CAPSULE = wp.constant(4)
 ELLIPSOID = wp.constant(5)
+MESH = wp.constant(6)
+HEIGHTFIELD = wp.constant(7)
+DEFORMABLE = wp.constant(8)
 
 INF = wp.constant(wp.float32(math.inf))
 PI = wp.constant(wp.float32(math.pi))
-FAR = wp.constant(wp.float32(1.0e9))
-PARALLEL = wp.constant(wp.float32(1.0e-12))
 SLACK = wp.constant(wp.float32(1.0e-5))
+REFINE = wp.constant(wp.float32(50.0))
 
 
 @wp.struct
 class Geometry:
-    """What the shapes of a scene are, indexed by shape."""
+    """What the shapes of a scene are, indexed by shape; the data of meshes and height fields follow one another.
+
+    ``part`` is a shape's place in ``mesh_part`` or ``field_part``. The tree of a mesh has boxes ``mesh_bounds`` (node,
+    axis of lows then highs) of four children ``mesh_child``: a node if > 0, none if 0, leaf -1 - child if < 0. A leaf
+    is four triangles ``mesh_triangle`` (leaf, 3 * corner + axis). A height field's level is (first, columns) in
+    ``field_extreme``, which holds lowest and highest heights.
+    """
 
     kind: wp.array(dtype=wp.int32)
     size: wp.array(dtype=wp.vec3)
+    exact_size: wp.array(dtype=wp.vec3d)
     radius: wp.array(dtype=wp.float32)
     class_id: wp.array(dtype=wp.int32)
+    part: wp.array(dtype=wp.int32)
+    mesh_part: wp.array(dtype=MeshPart)
+    mesh_bounds: wp.array2d(dtype=wp.vec4)
+    mesh_child: wp.array(dtype=wp.vec4i)
+    mesh_triangle: wp.array2d(dtype=wp.vec4)
+    field_part: wp.array(dtype=FieldPart)
+    field_height: wp.array(dtype=wp.float32)
+    field_level: wp.array(dtype=wp.vec2i)
+    field_extreme: wp.array(dtype=wp.vec2)
 
 
 @wp.struct
 class Hit:
-    """Where a ray meets a shape: distance, infinite for a miss, and which face of a mesh, -1 for other shapes."""
+    """Where a ray meets a shape.
+
+    Distance, infinite for a miss; which face of a mesh or height field, -1 for other shapes; sine of the angle between
+    ray and surface, 0 where it is not known.
+    """
 
     t: wp.float32
     face: wp.int32
+    slope: wp.float32
 
 
 # --- frames -------------------------------------------------------------------------------------------------
@@ -50,142 +77,6 @@ class Hit:
 @wp.func
 def to_quat(wxyz: wp.vec4):
     return wp.normalize(wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
-
-
-@wp.func
-def away_from_zero(x: float):
-    if wp.abs(x) < PARALLEL:
-        return wp.where(x < 0.0, -PARALLEL, PARALLEL)
-    return x
-
-
-# --- intersections: a ray from the frame's origin along unit d with a shape centred at c --------------------
-# ``axes`` holds the shape's x, y and z axis in its rows. A closed shape is convex, so a line meets it between
-# t_in and t_out; a ray that starts inside hits the exit surface, as in mj_ray.
-
-
-@wp.func
-def first_crossing(t_in: float, t_out: float):
-    if t_in > t_out or t_out < 0.0:
-        return INF
-    return wp.where(t_in >= 0.0, t_in, t_out)
-
-
-@wp.func
-def meet_plane(d: wp.vec3, c: wp.vec3, axes: wp.mat33):
-    """Hit from the side of the normal only."""
-    slope = axes[2, 0] * d[0] + axes[2, 1] * d[1] + axes[2, 2] * d[2]
-    height = axes[2, 0] * c[0] + axes[2, 1] * c[1] + axes[2, 2] * c[2]
-    if slope > -PARALLEL or height > 0.0:
-        return INF
-    return height / slope
-
-
-@wp.func
-def meet_sphere(d: wp.vec3, c: wp.vec3, radius: float):
-    t_mid = wp.dot(d, c)
-    across = c - t_mid * d
-    disc = radius * radius - wp.dot(across, across)
-    if disc < 0.0:
-        return INF
-    half = wp.sqrt(disc)
-    return first_crossing(t_mid - half, t_mid + half)
-
-
-@wp.func
-def meet_box(d: wp.vec3, c: wp.vec3, axes: wp.mat33, size: wp.vec3):
-    direction = axes * d
-    centre = axes * c
-    t_in = -FAR
-    t_out = FAR
-    for i in range(3):
-        inv = 1.0 / away_from_zero(direction[i])
-        mid = centre[i] * inv
-        half = size[i] * wp.abs(inv)
-        t_in = wp.max(t_in, mid - half)
-        t_out = wp.min(t_out, mid + half)
-    return first_crossing(t_in, t_out)
-
-
-@wp.func
-def meet_ellipsoid(d: wp.vec3, c: wp.vec3, axes: wp.mat33, size: wp.vec3):
-    direction = wp.cw_div(axes * d, size)
-    centre = wp.cw_div(axes * c, size)
-    dd = wp.dot(direction, direction)
-    t_mid = wp.dot(centre, direction) / dd
-    across = centre - t_mid * direction
-    disc = 1.0 - wp.dot(across, across)
-    if disc < 0.0:
-        return INF
-    half = wp.sqrt(disc / dd)
-    return first_crossing(t_mid - half, t_mid + half)
-
-
-@wp.func
-def meet_tube(d: wp.vec3, c: wp.vec3, axis: wp.vec3, radius: float):
-    """t_in and t_out of the infinite cylinder around ``axis``; t_in > t_out if the line misses it."""
-    across = wp.cross(d, axis)
-    moment = wp.cross(axis, c)
-    a = wp.dot(across, across)
-    offset = wp.dot(d, moment)
-    disc = radius * radius * a - offset * offset
-    if a < PARALLEL:
-        inside = wp.dot(moment, moment) <= radius * radius
-        return wp.where(inside, wp.vec2(-FAR, FAR), wp.vec2(FAR, -FAR))
-    if disc < 0.0:
-        return wp.vec2(FAR, -FAR)
-    t_mid = -wp.dot(across, moment) / a
-    half = wp.sqrt(disc) / a
-    return wp.vec2(t_mid - half, t_mid + half)
-
-
-@wp.func
-def meet_cylinder(d: wp.vec3, c: wp.vec3, axes: wp.mat33, size: wp.vec3):
-    axis = wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-    tube = meet_tube(d, c, axis, size[0])
-    if tube[0] > tube[1]:
-        return INF
-    inv = 1.0 / away_from_zero(wp.dot(d, axis))
-    mid = wp.dot(c, axis) * inv
-    half = size[1] * wp.abs(inv)
-    return first_crossing(wp.max(tube[0], mid - half), wp.min(tube[1], mid + half))
-
-
-@wp.func
-def cap_half_chord(d: wp.vec3, c: wp.vec3, radius: float):
-    """Half the chord that the line cuts from a sphere; negative if it misses."""
-    across = c - wp.dot(d, c) * d
-    disc = radius * radius - wp.dot(across, across)
-    if disc < 0.0:
-        return float(-1.0)
-    return wp.sqrt(disc)
-
-
-@wp.func
-def meet_capsule(d: wp.vec3, c: wp.vec3, axes: wp.mat33, size: wp.vec3):
-    axis = wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-    tube = meet_tube(d, c, axis, size[0])
-    if tube[0] > tube[1]:
-        return INF
-    slope = wp.dot(d, axis)
-    height = wp.dot(c, axis)
-    t_in = tube[0]
-    t_out = tube[1]
-    z_in = t_in * slope - height
-    z_out = t_out * slope - height
-    if wp.abs(z_in) > size[1]:
-        cap = c + wp.clamp(z_in, -size[1], size[1]) * axis
-        half = cap_half_chord(d, cap, size[0])
-        if half < 0.0:
-            return INF
-        t_in = wp.dot(d, cap) - half
-    if wp.abs(z_out) > size[1]:
-        cap_out = c + wp.clamp(z_out, -size[1], size[1]) * axis
-        half_out = cap_half_chord(d, cap_out, size[0])
-        if half_out < 0.0:
-            return INF
-        t_out = wp.dot(d, cap_out) + half_out
-    return first_crossing(t_in, t_out)
 
 
 @wp.func
@@ -218,11 +109,13 @@ def outward_normal(kind: int, point: wp.vec3, size: wp.vec3):
 
 @wp.func
 def distance_to_shape(kind: int, c: wp.vec3, axes: wp.mat33, size: wp.vec3, radius: float):
-    """A lower bound (exact except for ellipsoids) of the origin's distance to the shape; 0 inside."""
+    """A lower bound of the origin's distance to the shape; 0 inside. Meshes and height fields count as their boxes."""
+    if kind == DEFORMABLE:
+        return 0.0
     p = axes * c
     if kind == PLANE:
         return wp.max(-p[2], 0.0)
-    if kind == BOX:
+    if kind == BOX or kind == MESH or kind == HEIGHTFIELD:
         away = wp.vec3(
             wp.max(wp.abs(p[0]) - size[0], 0.0),
             wp.max(wp.abs(p[1]) - size[1], 0.0),
@@ -250,10 +143,19 @@ class ShapeFunctions:
         meet: (geometry, shape, env, d, c, axes, best) -> Hit; the nearest hit before ``best`` along unit d from the
             origin, for a shape centred at c whose axes are the rows of ``axes``.
         normal: (geometry, shape, env, face, point) -> outward unit normal next to ``point``, in the shape's frame.
+        refine: (geometry, shape, env, face, d, pose, t) -> t in float64, for the nearest hit if it is ``uncertain``;
+            d is a wp.vec3d, pose the shape's wp.transformd in the frame of the ray.
     """
 
     meet: wp.Function
     normal: wp.Function
+    refine: wp.Function
+
+
+@wp.func
+def uncertain(hit: Hit, c: wp.vec3):
+    """Whether rounding may have moved a hit on a shape centred at c by more than 1e-5 of its range plus 1e-5 m."""
+    return hit.slope * (1.0 + hit.t) * REFINE < hit.t + wp.abs(c[0]) + wp.abs(c[1]) + wp.abs(c[2])
 
 
 def shape_functions(kinds: Iterable[int]) -> ShapeFunctions:
@@ -265,36 +167,143 @@ def shape_functions(kinds: Iterable[int]) -> ShapeFunctions:
 def _shape_functions(kinds: frozenset[int]) -> ShapeFunctions:
     has_plane, has_box, has_sphere = PLANE in kinds, BOX in kinds, SPHERE in kinds
     has_cylinder, has_capsule, has_ellipsoid = CYLINDER in kinds, CAPSULE in kinds, ELLIPSOID in kinds
+    has_mesh, has_heightfield = bool(kinds & {MESH, DEFORMABLE}), HEIGHTFIELD in kinds
+    single, double = intersections(wp.float32), intersections(wp.float64)
+    meet_plane, meet_box, meet_sphere = single.plane, single.box, single.sphere
+    meet_cylinder, meet_capsule, meet_ellipsoid = single.cylinder, single.capsule, single.ellipsoid
+    exact_plane, exact_box, exact_sphere = double.plane, double.box, double.sphere
+    exact_cylinder, exact_capsule, exact_ellipsoid = double.cylinder, double.capsule, double.ellipsoid
 
     @wp.func
     def meet(geometry: Geometry, shape: int, env: int, d: wp.vec3, c: wp.vec3, axes: wp.mat33, best: float):
         kind = geometry.kind[shape]
-        t = INF
+        met = wp.vec2(INF, 0.0)
+        face = wp.int32(-1)
         if wp.static(has_plane):
             if kind == PLANE:
-                t = meet_plane(d, c, axes)
+                met = meet_plane(d, c, axes, geometry.size[shape])
         if wp.static(has_capsule):
             if kind == CAPSULE:
-                t = meet_capsule(d, c, axes, geometry.size[shape])
+                met = meet_capsule(d, c, axes, geometry.size[shape])
         if wp.static(has_sphere):
             if kind == SPHERE:
-                t = meet_sphere(d, c, geometry.size[shape][0])
+                met = meet_sphere(d, c, geometry.size[shape])
         if wp.static(has_box):
             if kind == BOX:
-                t = meet_box(d, c, axes, geometry.size[shape])
+                met = meet_box(d, c, axes, geometry.size[shape])
         if wp.static(has_cylinder):
             if kind == CYLINDER:
-                t = meet_cylinder(d, c, axes, geometry.size[shape])
+                met = meet_cylinder(d, c, axes, geometry.size[shape])
         if wp.static(has_ellipsoid):
             if kind == ELLIPSOID:
-                t = meet_ellipsoid(d, c, axes, geometry.size[shape])
+                met = meet_ellipsoid(d, c, axes, geometry.size[shape])
+        if wp.static(has_mesh):
+            if kind == MESH or kind == DEFORMABLE:
+                part = geometry.mesh_part[geometry.part[shape]]
+                direction = axes * d
+                found = descend(
+                    geometry.mesh_bounds,
+                    geometry.mesh_child,
+                    geometry.mesh_triangle,
+                    part.first_child,
+                    part.first_node + env * part.node_stride,
+                    part.first_leaf + env * part.leaf_stride,
+                    -(axes * c),
+                    direction,
+                    wp.vec3(slab_inverse(direction[0]), slab_inverse(direction[1]), slab_inverse(direction[2])),
+                    best,
+                )
+                met = wp.vec2(float(found[0]), float(found[2]))
+                face = int(found[1])
+        if wp.static(has_heightfield):
+            if kind == HEIGHTFIELD:
+                crossing = meet_heightfield(
+                    geometry.field_part[geometry.part[shape]],
+                    geometry.field_height,
+                    geometry.field_level,
+                    geometry.field_extreme,
+                    -(axes * c),
+                    axes * d,
+                    best,
+                )
+                met = wp.vec2(crossing.t, crossing.slope)
+                face = crossing.face
         hit = Hit()
-        hit.t = t
-        hit.face = -1
+        hit.t = met[0]
+        hit.slope = met[1]
+        hit.face = face
         return hit
 
     @wp.func
     def normal(geometry: Geometry, shape: int, env: int, face: int, point: wp.vec3):
-        return outward_normal(geometry.kind[shape], point, geometry.size[shape])
+        kind = geometry.kind[shape]
+        n = wp.vec3(0.0, 0.0, 1.0)
+        if wp.static(has_mesh):
+            if kind == MESH or kind == DEFORMABLE:
+                part = geometry.mesh_part[geometry.part[shape]]
+                leaves = part.first_leaf + env * part.leaf_stride
+                a = corner_of(geometry.mesh_triangle, leaves, face, 0)
+                b = corner_of(geometry.mesh_triangle, leaves, face, 1)
+                c = corner_of(geometry.mesh_triangle, leaves, face, 2)
+                n = wp.vec3(wp.normalize(wp.cross(b - a, c - a)))
+        if wp.static(has_heightfield):
+            if kind == HEIGHTFIELD:
+                n = heightfield_normal(geometry.field_part[geometry.part[shape]], geometry.field_height, face, point)
+        if kind < MESH:
+            n = outward_normal(kind, point, geometry.size[shape])
+        return n
 
-    return ShapeFunctions(meet, normal)
+    @wp.func
+    def refine(geometry: Geometry, shape: int, env: int, face: int, d: wp.vec3d, pose: wp.transformd, t: float):
+        kind = geometry.kind[shape]
+        q = wp.transform_get_rotation(pose)
+        direction = wp.quat_rotate_inv(q, d)
+        centre = wp.quat_rotate_inv(q, wp.transform_get_translation(pose))
+        exact = wp.float64(t)
+        own = wp.identity(n=3, dtype=wp.float64)
+        size = geometry.exact_size[shape]
+        if wp.static(has_plane):
+            if kind == PLANE:
+                exact = exact_plane(direction, centre, own, size)[0]
+        if wp.static(has_capsule):
+            if kind == CAPSULE:
+                exact = exact_capsule(direction, centre, own, size)[0]
+        if wp.static(has_sphere):
+            if kind == SPHERE:
+                exact = exact_sphere(direction, centre, size)[0]
+        if wp.static(has_box):
+            if kind == BOX:
+                exact = exact_box(direction, centre, own, size)[0]
+        if wp.static(has_cylinder):
+            if kind == CYLINDER:
+                exact = exact_cylinder(direction, centre, own, size)[0]
+        if wp.static(has_ellipsoid):
+            if kind == ELLIPSOID:
+                exact = exact_ellipsoid(direction, centre, own, size)[0]
+        if wp.static(has_mesh):
+            if kind == MESH or kind == DEFORMABLE:
+                part = geometry.mesh_part[geometry.part[shape]]
+                leaves = part.first_leaf + env * part.leaf_stride
+                exact = plane_through(
+                    corner_of(geometry.mesh_triangle, leaves, face, 0),
+                    corner_of(geometry.mesh_triangle, leaves, face, 1),
+                    corner_of(geometry.mesh_triangle, leaves, face, 2),
+                    -centre,
+                    direction,
+                    exact,
+                )
+        if wp.static(has_heightfield):
+            if kind == HEIGHTFIELD:
+                exact = refine_heightfield(
+                    geometry.field_part[geometry.part[shape]],
+                    geometry.field_height,
+                    face,
+                    -centre,
+                    direction,
+                    exact,
+                )
+        if wp.isfinite(exact):
+            return float(exact)
+        return t
+
+    return ShapeFunctions(meet, normal, refine)

@@ -1,37 +1,119 @@
-"""Range noise."""
+"""Noise of a LiDAR, compiled for the models that are configured.
+
+The random numbers are a function of seed, environment, frame, ray and model: none depends on what else is configured.
+"""
+
+from collections.abc import Iterable
+from functools import cache
 
 import warp as wp
 
-from .geometry import INF
+from .geometry import INF, PI
+
+wp.set_module_options({"enable_backward": False})
+
+JITTER, GAUSSIAN, DISTANCE, DROPOUT, MASK = (wp.constant(k) for k in range(5))
+MAX_SIGMAS = 5.0
+"""Jitter ends here, so that a ray stays within known bounds; exp(-12.5), or 4 in a million, would go beyond."""
+
+GOLDEN_ANGLE = wp.constant(wp.float32(2.399963229728653))
 
 
-@wp.kernel(module="unique", enable_backward=False)
-def add_noise(
-    env_offset: int,
-    seed: int,
-    frame: wp.array(dtype=wp.int32),
-    distance_ratio: float,
-    mask_ratio: float,
-    mask_low: float,
-    mask_high: float,
-    min_range: float,
-    max_range: float,
-    true_ranges: wp.array2d(dtype=wp.float32),
-    # out
-    ranges_out: wp.array2d(dtype=wp.float32),
-):
-    """Disturbs the hits of one ray; the random numbers are a function of seed, environment, frame and ray."""
-    i, ray = wp.tid()
-    env = i + env_offset
-    measured = true_ranges[env, ray]
-    if measured < INF:
-        env_state = wp.rand_init(seed, env)
-        frame_state = wp.rand_init(int(env_state), frame[0])
-        state = wp.rand_init(int(frame_state), ray)
-        factor = 1.0 + distance_ratio * (2.0 * wp.randf(state) - 1.0)
-        measured = wp.min(measured * factor, max_range)
-        if measured < min_range:
+@wp.struct
+class NoiseFigures:
+    """The figures of all models; those of models that are not configured are not read."""
+
+    seed: wp.int32
+    min_range: wp.float32
+    max_range: wp.float32
+    jitter_sigma: wp.float32  # tangent of the angle
+    mixed_radius: wp.float32  # of the circle on which the second ray lies, tangent of the angle
+    mixed_min_gap: wp.float32
+    mixed_max_gap: wp.float32
+    mixed_weight: wp.float32  # of the nearer surface
+    gaussian_sigma: wp.float32
+    gaussian_sigma_per_metre: wp.float32
+    distance_ratio: wp.float32
+    dropout_ratio: wp.float32
+    dropout_ratio_per_metre: wp.float32
+    mask_ratio: wp.float32
+    mask_low: wp.float32
+    mask_high: wp.float32
+
+
+@wp.func
+def child_key(key: wp.uint32, index: int):
+    """Key of the ``index``-th of a key's independent streams."""
+    return wp.rand_init(int(key), index)
+
+
+@wp.func
+def leaning(d: wp.vec3, sideways: wp.vec2):
+    """Unit d moved by ``sideways`` across itself, in units of its length.
+
+    The axes across d are those of Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6(1), 2017.
+    """
+    sign = wp.where(d[2] < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + d[2])
+    b = d[0] * d[1] * a
+    first = wp.vec3(1.0 + sign * d[0] * d[0] * a, sign * b, -sign * d[0])
+    second = wp.vec3(b, sign + d[1] * d[1] * a, -d[1])
+    return wp.normalize(d + sideways[0] * first + sideways[1] * second)
+
+
+@wp.func
+def jittered(d: wp.vec3, sigma: float, key: wp.uint32):
+    """Unit d moved by a normal variable along each of two axes across it."""
+    state = child_key(key, JITTER)
+    radius = sigma * wp.min(wp.sqrt(-2.0 * wp.log(1.0 - wp.randf(state))), MAX_SIGMAS)  # by Box and Muller
+    bearing = 2.0 * PI * wp.randf(state)
+    return leaning(d, radius * wp.vec2(wp.cos(bearing), wp.sin(bearing)))
+
+
+@wp.func
+def beside(d: wp.vec3, radius: float, row: int):
+    """A direction across d by ``radius``, on a side that changes evenly from row to row."""
+    bearing = GOLDEN_ANGLE * float(row % 4096)
+    return leaning(d, radius * wp.vec2(wp.cos(bearing), wp.sin(bearing)))
+
+
+@wp.func
+def mixed(figures: NoiseFigures, first: float, second: float):
+    """The distance measured by a beam that meets two surfaces."""
+    gap = wp.abs(second - first)
+    if gap <= figures.mixed_min_gap or gap > figures.mixed_max_gap:  # an infinite second distance, too
+        return first
+    near = wp.min(first, second)
+    return near + (1.0 - figures.mixed_weight) * gap
+
+
+@cache
+def disturb_function(models: Iterable[str]) -> wp.Function:
+    """(figures, distance, true distance, key) -> what is measured of a hit; for the models named here."""
+    has_gaussian, has_distance = "gaussian" in models, "distance" in models
+    has_dropout, has_mask = "dropout" in models, "mask" in models
+
+    @wp.func
+    def disturb(figures: NoiseFigures, distance: float, true_distance: float, key: wp.uint32):
+        measured = distance
+        if wp.static(has_gaussian):
+            gaussian = child_key(key, GAUSSIAN)
+            sigma = figures.gaussian_sigma + figures.gaussian_sigma_per_metre * true_distance
+            measured += sigma * wp.sqrt(-2.0 * wp.log(1.0 - wp.randf(gaussian))) * wp.cos(2.0 * PI * wp.randf(gaussian))
+        if wp.static(has_distance):
+            uniform = child_key(key, DISTANCE)
+            measured *= 1.0 + figures.distance_ratio * (2.0 * wp.randf(uniform) - 1.0)
+        measured = wp.min(measured, figures.max_range)
+        if measured < figures.min_range:
             measured = INF
-        if wp.randf(state) < mask_ratio:
-            measured = mask_low + (mask_high - mask_low) * wp.randf(state)
-    ranges_out[env, ray] = measured
+        if wp.static(has_mask):
+            mask = child_key(key, MASK)
+            if wp.randf(mask) < figures.mask_ratio:
+                measured = figures.mask_low + (figures.mask_high - figures.mask_low) * wp.randf(mask)
+        if wp.static(has_dropout):
+            dropout = child_key(key, DROPOUT)
+            if wp.randf(dropout) < figures.dropout_ratio + figures.dropout_ratio_per_metre * true_distance:
+                measured = INF
+        return measured
+
+    return disturb

@@ -1,91 +1,327 @@
-"""Shapes in a viewer's frame, nearest first."""
+"""Shapes in a viewer's frame, nearest first, or in their environment's, neighbours together."""
+
+# ruff: noqa: UP018  (in a kernel, wp.int32(0) declares a variable that may change)
+
+import math
+from functools import cache
 
 import warp as wp
 
-from .geometry import INF, PLANE, SLACK, distance_to_shape, to_quat
+from .geometry import INF, PLANE, SLACK, distance_to_shape
 
 wp.set_module_options({"enable_backward": False})
 
+GROUP_SIZE = 16
+"""Slots that general rays pass by with one comparison."""
+
+GROUP = wp.constant(GROUP_SIZE)
+ROUNDING = wp.constant(wp.float32(1.0e-6))
+FEW = wp.constant(24)
+NUM_BUCKETS = wp.constant(64)
+Buckets = wp.types.vector(length=64, dtype=wp.int32)
+NOTHING = wp.constant(wp.float32(1.0e-9))
+MARGIN = wp.constant(wp.float32(1.0e-3))
+HALF_PI = wp.constant(wp.float32(0.5 * math.pi))
+
+
+@wp.func
+def _settled(v: wp.vec3):
+    """``v`` without parts so small that products of two would be denormal, on which a CPU is a hundred times slower."""
+    return wp.vec3(
+        wp.where(wp.abs(v[0]) < NOTHING, 0.0, v[0]),
+        wp.where(wp.abs(v[1]) < NOTHING, 0.0, v[1]),
+        wp.where(wp.abs(v[2]) < NOTHING, 0.0, v[2]),
+    )
+
+
+@wp.func
+def _sort_into_buckets(
+    env: int,
+    count: int,
+    near: wp.array2d(dtype=wp.float32),
+    order: wp.array2d(dtype=wp.int32),
+    spare: wp.array2d(dtype=wp.float32),
+):
+    """Sorts one environment's slots into buckets of equal width; returns how many the fullest bucket holds."""
+    lowest = near[env, 0]
+    highest = near[env, 0]
+    for slot in range(count):
+        spare[env, slot] = near[env, slot]
+        lowest = wp.min(lowest, near[env, slot])
+        highest = wp.max(highest, near[env, slot])
+    scale = float(NUM_BUCKETS) / wp.max(highest - lowest, NOTHING)
+    end = Buckets()
+    for slot in range(count):
+        bucket = wp.clamp(int(scale * (near[env, slot] - lowest)), 0, NUM_BUCKETS - 1)
+        end[bucket] = end[bucket] + 1
+    fullest = wp.int32(0)
+    for bucket in range(NUM_BUCKETS):
+        fullest = wp.max(fullest, end[bucket])
+        if bucket > 0:
+            end[bucket] = end[bucket] + end[bucket - 1]
+    for i in range(count):
+        slot = count - 1 - i
+        bucket = wp.clamp(int(scale * (spare[env, slot] - lowest)), 0, NUM_BUCKETS - 1)
+        rank = end[bucket] - 1
+        end[bucket] = rank
+        near[env, rank] = spare[env, slot]
+        order[env, rank] = slot
+    return fullest
+
+
+@wp.func
+def _sort_by_distance(
+    env: int,
+    count: int,
+    near: wp.array2d(dtype=wp.float32),
+    order: wp.array2d(dtype=wp.int32),
+    spare: wp.array2d(dtype=wp.float32),
+):
+    """Sorts one environment's slots: many into buckets, then all by Shell's method as far as they may be misplaced."""
+    misplaced = count
+    if count > FEW:
+        misplaced = _sort_into_buckets(env, count, near, order, spare)
+    gap = wp.int32(1)
+    while 4 * gap < misplaced:
+        gap = 9 * gap // 4 + 1
+    while gap > 0:
+        for i in range(gap, count):
+            distance = near[env, i]
+            if near[env, i - gap] > distance:
+                slot = order[env, i]
+                j = int(i)
+                while j >= gap and near[env, wp.max(j - gap, 0)] > distance:
+                    near[env, j] = near[env, j - gap]
+                    order[env, j] = order[env, j - gap]
+                    j -= gap
+                near[env, j] = distance
+                order[env, j] = slot
+        gap = 4 * gap // 9
+    return 0
+
+
+@wp.func
+def _curve_position(p: wp.vec3):
+    """Position along a Morton curve through the unit cube, exact in float32: points near each other have near ones."""
+    code = wp.int32(0)
+    for bit in range(8):
+        for axis in range(3):
+            cell = wp.clamp(int(p[axis] * 256.0), 0, 255)
+            code = code | (((cell >> bit) & 1) << (3 * bit + axis))
+    return float(code)
+
+
+@wp.func
+def _order_along_curve(
+    env: int,
+    count: int,
+    radius: wp.array(dtype=wp.float32),
+    shape: wp.array2d(dtype=wp.int32),
+    bound: wp.array2d(dtype=wp.vec4),
+    # out
+    key: wp.array2d(dtype=wp.float32),
+):
+    """Keys that put neighbours next to each other, and what has no end before all others."""
+    low = wp.vec3(INF, INF, INF)
+    high = wp.vec3(-INF, -INF, -INF)
+    for slot in range(count):
+        if radius[shape[env, slot]] < INF:
+            c = wp.vec3(bound[env, slot][0], bound[env, slot][1], bound[env, slot][2])
+            low = wp.min(low, c)
+            high = wp.max(high, c)
+    extent = high - low
+    scale = 1.0 / wp.max(wp.max(extent[0], wp.max(extent[1], extent[2])), NOTHING)
+    for slot in range(count):
+        key[env, slot] = -1.0
+        if radius[shape[env, slot]] < INF:
+            c = wp.vec3(bound[env, slot][0], bound[env, slot][1], bound[env, slot][2])
+            key[env, slot] = _curve_position(scale * (c - low))
+    return 0
+
 
 @wp.kernel(module="unique", enable_backward=False)
-def place_shapes(
+def bound_groups(
     env_offset: int,
-    # scene
-    body_pos: wp.array2d(dtype=wp.vec3),
-    body_quat: wp.array2d(dtype=wp.vec4),
-    shape_kind: wp.array(dtype=wp.int32),
-    shape_body: wp.array(dtype=wp.int32),
-    shape_pos: wp.array(dtype=wp.vec3),
-    shape_quat: wp.array(dtype=wp.vec4),
-    shape_size: wp.array(dtype=wp.vec3),
-    shape_radius: wp.array(dtype=wp.float32),
-    # view
-    viewed: wp.array(dtype=wp.int32),
-    num_viewed: int,
-    view_body: int,
-    view_pos: wp.vec3,
-    view_quat: wp.vec4,
-    cull: int,
-    max_range: float,
-    elevation_min: float,
-    elevation_max: float,
+    radius: wp.array(dtype=wp.float32),
+    slot_shape: wp.array2d(dtype=wp.int32),
+    slot_pose: wp.array2d(dtype=wp.transformd),
+    num_slots: wp.array(dtype=wp.int32),
     # out
-    slot_bound_out: wp.array2d(dtype=wp.vec4),
-    slot_near_out: wp.array2d(dtype=wp.float32),
-    slot_shape_out: wp.array2d(dtype=wp.int32),
-    slot_axes_out: wp.array2d(dtype=wp.mat33),
-    num_slots_out: wp.array(dtype=wp.int32),
+    group_out: wp.array2d(dtype=wp.vec4d),
 ):
-    """Expresses one environment's shapes in the viewer's frame, nearest first, without those out of reach."""
+    """Centre and radius of a sphere around every GROUP consecutive slots of one environment."""
     env = wp.tid() + env_offset
-    p_view = view_pos
-    q_view = to_quat(view_quat)
-    if view_body >= 0:
-        q_carrier = to_quat(body_quat[env, view_body])
-        p_view = body_pos[env, view_body] + wp.quat_rotate(q_carrier, view_pos)
-        q_view = q_carrier * q_view
-    count = wp.int32(0)
-    for i in range(num_viewed):
-        shape = viewed[i]
-        body = shape_body[shape]
-        p = shape_pos[shape]
-        q = to_quat(shape_quat[shape])
-        if body >= 0:
-            q_body = to_quat(body_quat[env, body])
-            p = body_pos[env, body] + wp.quat_rotate(q_body, p)
-            q = q_body * q
-        kind = shape_kind[shape]
-        c = wp.quat_rotate_inv(q_view, p - p_view)
-        axes = wp.transpose(wp.quat_to_matrix(wp.quat_inverse(q_view) * q))
-        radius = shape_radius[shape]
-        near = distance_to_shape(kind, c, axes, shape_size[shape], radius)
-        distance = wp.length(c)
-        threshold = -INF
-        if distance > radius * (1.0 + SLACK):
-            threshold = (distance - radius) * (distance + radius) * (1.0 - SLACK) - radius * radius * SLACK
-        bound = wp.vec4(c[0], c[1], c[2], threshold)
-        reachable = cull == 0 or near < max_range
-        if cull != 0 and kind == PLANE:
-            height = -wp.dot(c, wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2]))
-            foot = -height * wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-            bound = wp.vec4(foot[0], foot[1], foot[2], 0.0)
-            reachable = height >= 0.0 and near < max_range
-        elif cull != 0 and distance > radius * (1.0 + SLACK):
-            elevation = wp.asin(wp.clamp(c[2] / distance, -1.0, 1.0))
-            spread = wp.asin(wp.clamp(radius / distance, 0.0, 1.0)) + 0.001
-            if elevation + spread < elevation_min or elevation - spread > elevation_max:
-                reachable = False
-        if reachable:
-            slot = count
-            while slot > 0 and slot_near_out[env, wp.max(slot - 1, 0)] > near:
-                slot_bound_out[env, slot] = slot_bound_out[env, slot - 1]
-                slot_near_out[env, slot] = slot_near_out[env, slot - 1]
-                slot_shape_out[env, slot] = slot_shape_out[env, slot - 1]
-                slot_axes_out[env, slot] = slot_axes_out[env, slot - 1]
-                slot -= 1
-            slot_bound_out[env, slot] = bound
-            slot_near_out[env, slot] = near
-            slot_shape_out[env, slot] = shape
-            slot_axes_out[env, slot] = axes
-            count += 1
-    num_slots_out[env] = count
+    count = num_slots[env]
+    for group in range((count + GROUP - 1) // GROUP):
+        first = group * GROUP
+        last = wp.min(first + GROUP, count)
+        low = wp.transform_get_translation(slot_pose[env, first])
+        high = low
+        for slot in range(first + 1, last):
+            low = wp.min(low, wp.transform_get_translation(slot_pose[env, slot]))
+            high = wp.max(high, wp.transform_get_translation(slot_pose[env, slot]))
+        centre = wp.float64(0.5) * (low + high)
+        reach = wp.float64(0.0)
+        for slot in range(first, last):
+            away = wp.length(wp.transform_get_translation(slot_pose[env, slot]) - centre)
+            reach = wp.max(reach, away + wp.float64(radius[slot_shape[env, slot]]))
+        group_out[env, group] = wp.vec4d(centre[0], centre[1], centre[2], reach)
+
+
+@wp.func
+def _is_between(c: wp.vec3, distance: float, radius: float, sin_low: float, sin_high: float):
+    """Whether a sphere around c, which does not hold the origin, reaches between two elevations given by their sines.
+
+    Its lowest and highest elevation are that of c minus and plus the angle that its radius fills; where the sum is
+    beyond the zenith or the nadir, its cosine is negative, and the sphere holds the pole.
+    """
+    tangent = wp.sqrt((distance - radius) * (distance + radius))
+    level = wp.sqrt(c[0] * c[0] + c[1] * c[1])
+    square = distance * distance
+    above = level * tangent < c[2] * radius or c[2] * tangent + level * radius >= sin_low * square
+    below = level * tangent < -c[2] * radius or c[2] * tangent - level * radius <= sin_high * square
+    return above and below
+
+
+@cache
+def place_kernel(pose_type: type) -> wp.Kernel:
+    """The kernel for poses of bodies in ``wp.float32`` or ``wp.float64``. Poses are composed in float64."""
+    vec3 = wp.types.vector(3, pose_type)
+    vec4 = wp.types.vector(4, pose_type)
+
+    @wp.func
+    def is_pose(p: wp.vec3d, q: wp.vec4d):
+        """Whether a position and an orientation are finite and the orientation is one."""
+        norm = wp.dot(q, q)
+        away = wp.dot(p, p)
+        return norm > wp.float64(1.0e-12) and norm < wp.float64(1.0e12) and away < wp.float64(1.0e30)
+
+    @wp.func
+    def to_pose(p: wp.vec3d, q: wp.vec4d):
+        """The pose with its orientation normalised; a norm that is 1 but for rounding needs no square root."""
+        square = wp.dot(q, q)
+        scale = wp.float64(1.5) - wp.float64(0.5) * square
+        if wp.abs(square - wp.float64(1.0)) > wp.float64(1.0e-6):
+            scale = wp.float64(1.0) / wp.sqrt(square)
+        return wp.transformation(p, wp.quatd(scale * q[1], scale * q[2], scale * q[3], scale * q[0]))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def place_shapes(
+        env_offset: int,
+        # scene
+        body_pos: wp.array2d(dtype=vec3),
+        body_quat: wp.array2d(dtype=vec4),
+        shape_kind: wp.array(dtype=wp.int32),
+        shape_body: wp.array(dtype=wp.int32),
+        shape_pose: wp.array(dtype=wp.transformd),
+        shape_size: wp.array(dtype=wp.vec3),
+        shape_radius: wp.array(dtype=wp.float32),
+        visible: wp.array2d(dtype=wp.bool),
+        # view
+        viewed: wp.array(dtype=wp.int32),
+        num_viewed: int,
+        view_body: int,
+        view_pose: wp.transformd,
+        cull: int,
+        max_range: float,
+        elevation_min: float,
+        elevation_max: float,
+        # scratch
+        order: wp.array2d(dtype=wp.int32),
+        spare: wp.array2d(dtype=wp.float32),
+        # out
+        slot_bound_out: wp.array2d(dtype=wp.vec4),
+        slot_near_out: wp.array2d(dtype=wp.float32),
+        slot_shape_out: wp.array2d(dtype=wp.int32),
+        slot_axes_out: wp.array2d(dtype=wp.mat33),
+        slot_pose_out: wp.array2d(dtype=wp.transformd),
+        num_slots_out: wp.array(dtype=wp.int32),
+    ):
+        """Expresses one environment's shapes in the viewer's frame, nearest first, without those out of reach.
+
+        With ``cull`` 0 none is left out and neighbours stand together; ``slot_near_out`` then holds no distances.
+        """
+        env = wp.tid() + env_offset
+        count = wp.int32(0)
+        view = view_pose
+        seeing = bool(True)
+        if view_body >= 0:
+            p_carrier = wp.vec3d(body_pos[env, view_body])
+            q_carrier = wp.vec4d(body_quat[env, view_body])
+            seeing = is_pose(p_carrier, q_carrier)
+            view = to_pose(p_carrier, q_carrier) * view
+        to_view = wp.transform_inverse(view)
+        sin_low = wp.sin(wp.max(elevation_min - MARGIN, -HALF_PI)) - ROUNDING
+        sin_high = wp.sin(wp.min(elevation_max + MARGIN, HALF_PI)) + ROUNDING
+        for i in range(num_viewed):
+            shape = viewed[i]
+            body = shape_body[shape]
+            pose = shape_pose[shape]
+            there = bool(seeing)
+            if visible.shape[0] > 0:
+                there = there and visible[env, shape]
+            if body >= 0:
+                p_body = wp.vec3d(body_pos[env, body])
+                q_body = wp.vec4d(body_quat[env, body])
+                there = there and is_pose(p_body, q_body)
+                pose = to_pose(p_body, q_body) * pose
+            pose = to_view * pose
+            if there:
+                kind = shape_kind[shape]
+                c = _settled(wp.vec3(wp.transform_get_translation(pose)))
+                turn = wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
+                x_axis = _settled(wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0]))
+                y_axis = _settled(wp.vec3(turn[0, 1], turn[1, 1], turn[2, 1]))
+                up = _settled(wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]))
+                axes = wp.matrix_from_rows(x_axis, y_axis, up)
+                radius = shape_radius[shape]
+                distance = wp.length(c)
+                near = distance_to_shape(kind, c, axes, shape_size[shape], radius)
+                near = wp.max(near - ROUNDING * distance, 0.0)
+                threshold = -INF
+                if distance > radius * (1.0 + SLACK):
+                    threshold = (distance - radius) * (distance + radius) * (1.0 - SLACK) - radius * radius * SLACK
+                bound = wp.vec4(c[0], c[1], c[2], threshold)
+                if cull != 0:
+                    there = near < max_range
+                    if kind == PLANE:
+                        height = -wp.dot(c, up)
+                        there = there and height >= 0.0
+                        if shape_size[shape][0] <= 0.0 and shape_size[shape][1] <= 0.0:
+                            bound = wp.vec4(-height * up[0], -height * up[1], -height * up[2], 0.0)
+                    elif distance > radius * (1.0 + SLACK):
+                        there = there and _is_between(c, distance, radius, sin_low, sin_high)
+                if there:
+                    slot_bound_out[env, count] = bound
+                    slot_near_out[env, count] = near
+                    slot_shape_out[env, count] = shape
+                    slot_axes_out[env, count] = axes
+                    slot_pose_out[env, count] = pose
+                    order[env, count] = count
+                    count += 1
+        num_slots_out[env] = count
+        if cull == 0:
+            _order_along_curve(env, count, shape_radius, slot_shape_out, slot_bound_out, slot_near_out)
+        _sort_by_distance(env, count, slot_near_out, order, spare)
+        for start in range(count):
+            if order[env, start] != start:
+                bound = slot_bound_out[env, start]
+                shape = slot_shape_out[env, start]
+                axes = slot_axes_out[env, start]
+                pose = slot_pose_out[env, start]
+                slot = int(start)
+                while order[env, slot] != start:
+                    other = order[env, slot]
+                    slot_bound_out[env, slot] = slot_bound_out[env, other]
+                    slot_shape_out[env, slot] = slot_shape_out[env, other]
+                    slot_axes_out[env, slot] = slot_axes_out[env, other]
+                    slot_pose_out[env, slot] = slot_pose_out[env, other]
+                    order[env, slot] = slot
+                    slot = other
+                slot_bound_out[env, slot] = bound
+                slot_shape_out[env, slot] = shape
+                slot_axes_out[env, slot] = axes
+                slot_pose_out[env, slot] = pose
+                order[env, slot] = slot
+
+    return place_shapes

@@ -1,78 +1,267 @@
-"""One frame of a LiDAR."""
+"""One frame of a LiDAR, compiled for the shapes, the outputs and the noise that a sensor has."""
 
+# ruff: noqa: UP018, SIM102  (in a kernel, wp.int32(0) and float(0) declare a variable that may change, and a branch on
+# wp.static stands alone)
+
+from dataclasses import dataclass
 from functools import cache
 
 import warp as wp
 
 from .geometry import INF, Geometry, shape_functions
+from .motion import Moment, Track, Viewpoint, moment_at, to_quatd
+from .noise import NoiseFigures, beside, child_key, disturb_function, jittered, mixed
+from .search import Slots, locate_functions, search_function
 
-ScanRow = wp.types.vector(length=5, dtype=wp.float32)
+NAN = wp.constant(wp.float32(float("nan")))
+NO_BODY = wp.constant(-2)
+
+
+@dataclass(frozen=True)
+class ScanVariant:
+    """What one compiled scan serves.
+
+    Attributes:
+        kinds: Kinds of shapes in the scene.
+        outputs: Names of the fields of ``ScanOutputs`` that are written.
+        noise: Names of the noise models.
+        packed: Whether slots are searched by words.
+        moving: Whether every ray is cast at its own time.
+        displaced: Whether rays start beside the sensor's origin.
+        selected: Whether the rays of a frame are listed, rather than every k-th row.
+        shots: Whether several rows fire at one instant.
+        pose_type: Of the bodies' poses, ``wp.float32`` or ``wp.float64``.
+    """
+
+    kinds: frozenset[int]
+    outputs: frozenset[str]
+    noise: frozenset[str]
+    packed: bool
+    moving: bool
+    displaced: bool
+    selected: bool
+    shots: bool
+    pose_type: type
+
+
+@wp.struct
+class Rays:
+    """Which rays a frame has; M rows of the table."""
+
+    directions: wp.array(dtype=wp.vec3)  # (M,) unit vectors in the sensor frame
+    origins: wp.array(dtype=wp.vec3)  # (M,) where rays start, if beside the sensor's origin
+    angles: wp.array(dtype=wp.vec2)  # (M,) elevation and azimuth
+    cycle: wp.int32  # rows before the table repeats
+    start: wp.array2d(dtype=wp.int32)  # (num_envs, 2) the frame's first row: start of its cycle, steps into it
+    offsets: wp.array2d(dtype=wp.int32)  # (V, N) rows after the first, if the rays are listed
+    variant: wp.array(dtype=wp.int64)  # (num_envs,) which list
+    first_row: wp.array(dtype=wp.int64)  # (num_envs,) the frame's first row in the pattern
+    num_rows: wp.int32  # M
+    stride: wp.int32  # rows of the pattern from ray to ray, if they are not listed
+    lag: wp.array(dtype=wp.float32)  # (num_envs,) time of the first row after the frame's start, s
+    seconds_per_row: wp.float32
+    rows_per_shot: wp.int32
+    period: wp.float32  # of a frame, s
+    count: wp.int32  # rays per frame, N
+    block: wp.int32  # rays per task
+    num_blocks: wp.int32  # tasks per frame
+    min_range: wp.float32
+    max_range: wp.float32
+
+
+@wp.struct
+class Labels:
+    """What is known of the shapes and of the sensor beside where they are."""
+
+    body: wp.array(dtype=wp.int32)  # by shape
+    reflectivity: wp.array(dtype=wp.float32)  # by class, times the square of the reference range, m^2
+    frame: wp.array(dtype=wp.int32)  # (num_envs,) frames cast, for the noise
+
+
+@wp.struct
+class ScanOutputs:
+    """(num_envs, N) each; only those that the variant writes exist."""
+
+    ranges: wp.array2d(dtype=wp.float32)
+    true_ranges: wp.array2d(dtype=wp.float32)
+    valid: wp.array2d(dtype=wp.bool)
+    points_s: wp.array2d(dtype=wp.vec3)
+    points_b: wp.array2d(dtype=wp.vec3)
+    points_w: wp.array2d(dtype=wp.vec3)
+    normals_w: wp.array2d(dtype=wp.vec3)
+    incidence: wp.array2d(dtype=wp.float32)
+    intensity: wp.array2d(dtype=wp.float32)
+    body_id: wp.array2d(dtype=wp.int32)
+    shape_id: wp.array2d(dtype=wp.int32)
+    class_id: wp.array2d(dtype=wp.int32)
+    time_s: wp.array2d(dtype=wp.float32)
+    directions_s: wp.array2d(dtype=wp.vec3)
+    elevation: wp.array2d(dtype=wp.float32)
+    azimuth: wp.array2d(dtype=wp.float32)
+    row: wp.array2d(dtype=wp.int32)
 
 
 @cache
-def scan_kernel(kinds: frozenset[int]) -> wp.Kernel:
-    """The kernel for scenes of these kinds of shapes."""
-    meet = shape_functions(kinds).meet
+def scan_kernel(variant: ScanVariant) -> wp.Kernel:
+    """The kernel of one variant; a task casts ``Rays.block`` rays of one environment, one after the other."""
+    outputs, noise = variant.outputs, variant.noise
+    moving, displaced, selected, shots = variant.moving, variant.displaced, variant.selected, variant.shots
+    search = search_function(variant.kinds, variant.packed, moving, displaced)
+    locate, _ = locate_functions(moving, displaced)
+    normal_of = shape_functions(variant.kinds).normal
+    disturb = disturb_function(noise)
+    noisy, has_jitter, has_mixed = bool(noise), "jitter" in noise, "mixed" in noise
+    in_base, in_world = "points_b" in outputs, "points_w" in outputs
+    faces = bool(outputs & {"normals_w", "incidence", "intensity"})
+    placed_at_end = not moving and bool(outputs & {"points_w", "normals_w"})
+    timed = moving or "time_s" in outputs
+    writes_ranges, writes_truth = "ranges" in outputs, "true_ranges" in outputs
+    writes_valid, writes_points = "valid" in outputs, "points_s" in outputs
+    writes_normals, writes_incidence = "normals_w" in outputs, "incidence" in outputs
+    writes_intensity, writes_body = "intensity" in outputs, "body_id" in outputs
+    writes_shape, writes_class = "shape_id" in outputs, "class_id" in outputs
+    writes_time, writes_direction = "time_s" in outputs, "directions_s" in outputs
+    writes_elevation, writes_azimuth, writes_row = "elevation" in outputs, "azimuth" in outputs, "row" in outputs
+    vec3 = wp.types.vector(3, variant.pose_type)
+    vec4 = wp.types.vector(4, variant.pose_type)
 
     @wp.kernel(module="unique", enable_backward=False)
     def cast_scan(
-        env_offset: int,
-        # scan
-        scan: wp.array(dtype=ScanRow),
-        first_row: wp.array(dtype=wp.int64),
-        stride: int,
-        min_range: float,
-        max_range: float,
-        # scene
+        task_offset: int,
+        rays: Rays,
+        viewpoint: Viewpoint,
+        body_pos: wp.array2d(dtype=vec3),
+        body_quat: wp.array2d(dtype=vec4),
         geometry: Geometry,
-        slot_bound: wp.array2d(dtype=wp.vec4),
-        slot_near: wp.array2d(dtype=wp.float32),
-        slot_shape: wp.array2d(dtype=wp.int32),
-        slot_axes: wp.array2d(dtype=wp.mat33),
-        num_slots: wp.array(dtype=wp.int32),
-        # out
-        ranges_out: wp.array2d(dtype=wp.float32),
-        shape_id_out: wp.array2d(dtype=wp.int32),
-        class_id_out: wp.array2d(dtype=wp.int32),
-        directions_out: wp.array2d(dtype=wp.vec3),
-        elevation_out: wp.array2d(dtype=wp.float32),
-        azimuth_out: wp.array2d(dtype=wp.float32),
-        row_out: wp.array2d(dtype=wp.int32),
+        slots: Slots,
+        track: Track,
+        labels: Labels,
+        figures: NoiseFigures,
+        out: ScanOutputs,
     ):
-        """Casts one ray of the scan from the sensor's origin, in the sensor's frame."""
-        i, ray = wp.tid()
-        env = i + env_offset
-        row = int(first_row[env]) + ray * stride
-        if row >= scan.shape[0]:
-            row = row % scan.shape[0]
-        entry = scan[row]
-        d = wp.vec3(entry[0], entry[1], entry[2])
-        best = max_range
-        hit = wp.int32(-1)
-        for s in range(num_slots[env]):
-            if slot_near[env, s] >= best:
-                break
-            bound = slot_bound[env, s]
-            ahead = d[0] * bound[0] + d[1] * bound[1] + d[2] * bound[2]
-            if ahead * wp.abs(ahead) >= bound[3]:
-                shape = slot_shape[env, s]
-                c = wp.vec3(bound[0], bound[1], bound[2])
-                t = meet(geometry, shape, env, d, c, slot_axes[env, s], best).t
-                if t < best:
-                    best = t
-                    hit = shape
-        if hit < 0 or best < min_range:
-            best = INF
-            hit = wp.int32(-1)
-        label = wp.int32(-1)
-        if hit >= 0:
-            label = geometry.class_id[hit]
-        ranges_out[env, ray] = best
-        shape_id_out[env, ray] = hit
-        class_id_out[env, ray] = label
-        directions_out[env, ray] = d
-        elevation_out[env, ray] = entry[3]
-        azimuth_out[env, ray] = entry[4]
-        row_out[env, ray] = row
+        """Casts a block of one environment's rays in the sensor's frame."""
+        task = wp.tid() + task_offset
+        env = task // rays.num_blocks
+        first = (task - env * rays.num_blocks) * rays.block
+        last = wp.min(first + rays.block, rays.count)
+        cycle = rays.start[env, 0]
+        steps = rays.start[env, 1]
+        moment = Moment()
+        if wp.static(placed_at_end):
+            moment.view = viewpoint.pose
+            if viewpoint.body >= 0:
+                p_carrier = wp.vec3d(body_pos[env, viewpoint.body])
+                q_carrier = to_quatd(wp.vec4d(body_quat[env, viewpoint.body]))
+                moment.view = wp.transformation(p_carrier, q_carrier) * viewpoint.pose
+        q_view = wp.quat(wp.transform_get_rotation(moment.view))
+        if wp.static(in_base):
+            p_mount = wp.vec3(wp.transform_get_translation(viewpoint.pose))
+            q_mount = wp.quat(wp.transform_get_rotation(viewpoint.pose))
+        if wp.static(selected):
+            listed = int(rays.variant[env])
+        if wp.static(shots):
+            into_shot = int(rays.first_row[env]) % rays.rows_per_shot
+        if wp.static(noisy):
+            env_key = child_key(child_key(wp.rand_init(figures.seed), env), labels.frame[env])
+        for ray in range(first, last):
+            at = steps + ray
+            if wp.static(selected):
+                at = steps + rays.offsets[listed, ray]
+            if at >= rays.cycle:
+                at = at % rays.cycle
+            at += cycle
+            d = rays.directions[at]
+            cast_d = d
+            if wp.static(timed):
+                row_in_frame = ray * rays.stride
+                if wp.static(selected):
+                    row_in_frame = rays.offsets[listed, ray]
+                if wp.static(shots):
+                    row_in_frame = (row_in_frame + into_shot) // rays.rows_per_shot * rays.rows_per_shot - into_shot
+                time = rays.lag[env] + float(row_in_frame) * rays.seconds_per_row
+            if wp.static(moving):
+                moment = moment_at(track, env, viewpoint, time / rays.period)
+                q_view = wp.quat(wp.transform_get_rotation(moment.view))
+            if wp.static(displaced):
+                moment.origin = rays.origins[at]
+            if wp.static(noisy):
+                key = child_key(env_key, ray)
+            if wp.static(has_jitter):
+                cast_d = jittered(d, figures.jitter_sigma, key)
+            met = search(geometry, slots, track, moment, env, cast_d, rays.max_range)
+            is_hit = met.slot >= 0 and met.t >= rays.min_range
+            true_range = wp.where(is_hit, met.t, INF)
+            measured = true_range
+            if wp.static(noisy):
+                if is_hit:
+                    if wp.static(has_mixed):
+                        second_d = beside(cast_d, figures.mixed_radius, at)
+                        second = search(geometry, slots, track, moment, env, second_d, rays.max_range)
+                        if second.slot >= 0 and second.t >= rays.min_range:
+                            measured = mixed(figures, measured, second.t)
+                    measured = disturb(figures, measured, true_range, key)
+            if wp.static(writes_ranges):
+                out.ranges[env, ray] = measured
+            if wp.static(writes_truth):
+                out.true_ranges[env, ray] = true_range
+            if wp.static(writes_valid):
+                out.valid[env, ray] = measured < INF
+            point = wp.vec3(NAN, NAN, NAN)
+            if measured < INF:
+                point = measured * d
+                if wp.static(displaced):
+                    point = point + moment.origin
+            if wp.static(writes_points):
+                out.points_s[env, ray] = point
+            if wp.static(in_base):
+                out.points_b[env, ray] = p_mount + wp.quat_rotate(q_mount, point)
+            if wp.static(in_world):
+                away = wp.vec3d(wp.quat_rotate(q_view, point))
+                out.points_w[env, ray] = wp.vec3(wp.transform_get_translation(moment.view) + away)
+            shape = wp.int32(-1)
+            if is_hit:
+                shape = slots.shape[env, met.slot]
+            if wp.static(writes_shape):
+                out.shape_id[env, ray] = shape
+            if wp.static(writes_class):
+                class_id = wp.int32(-1)
+                if is_hit:
+                    class_id = geometry.class_id[shape]
+                out.class_id[env, ray] = class_id
+            if wp.static(writes_body):
+                body_id = wp.int32(NO_BODY)
+                if is_hit:
+                    body_id = labels.body[shape]
+                out.body_id[env, ray] = body_id
+            if wp.static(faces):
+                normal = wp.vec3(0.0, 0.0, 0.0)
+                cosine = float(0.0)
+                if is_hit:
+                    met_at = locate(slots, track, moment, env, met.slot)
+                    at_shape = met_at.axes * (true_range * cast_d - met_at.c)
+                    normal = wp.transpose(met_at.axes) * normal_of(geometry, shape, env, met.face, at_shape)
+                    cosine = wp.min(wp.abs(wp.dot(normal, cast_d)), 1.0)
+                if wp.static(writes_normals):
+                    out.normals_w[env, ray] = wp.quat_rotate(q_view, normal)
+                if wp.static(writes_incidence):
+                    out.incidence[env, ray] = wp.where(is_hit, wp.acos(cosine), NAN)
+                if wp.static(writes_intensity):
+                    intensity = float(0.0)
+                    if is_hit:
+                        intensity = labels.reflectivity[geometry.class_id[shape]] * cosine / (true_range * true_range)
+                    out.intensity[env, ray] = intensity
+            if wp.static(writes_time):
+                out.time_s[env, ray] = time
+            if wp.static(writes_direction):
+                out.directions_s[env, ray] = d
+            if wp.static(writes_elevation):
+                out.elevation[env, ray] = rays.angles[at][0]
+            if wp.static(writes_azimuth):
+                out.azimuth[env, ray] = rays.angles[at][1]
+            if wp.static(writes_row):
+                row = int(rays.first_row[env]) + ray * rays.stride
+                if wp.static(selected):
+                    row = int(rays.first_row[env]) + rays.offsets[listed, ray]
+                out.row[env, ray] = row % rays.num_rows
 
     return cast_scan

@@ -1,0 +1,1 @@
+"""The evidence: speed against error, and what features cost."""

@@ -1,0 +1,386 @@
+"""How far the LiDAR toolkit's rays are from mj_ray in float64, for every kind of shape, far away, tiny and huge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import mujoco
+import numpy as np
+import torch
+
+from omniperception.lidar import (
+    HeightField,
+    Lidar,
+    LidarConfig,
+    RayScene,
+    ScanPattern,
+    Shape,
+    ShapeKind,
+    TriangleMesh,
+)
+from omniperception.lidar.mujoco import MujocoScene
+
+RELATIVE, ABSOLUTE = 1e-5, 1e-5
+"""A range is right within this fraction of it plus this many metres."""
+GRAZING_RAD = 1e-4
+"""A ray so near to a silhouette may go either way."""
+TOUCHING_M, TOUCHING = 1e-5, 1e-7
+"""A ray that starts within these metres of a surface, or this fraction of the body's size, may be on either side."""
+
+GEOMS = mujoco.mjtGeom
+SIZES: dict[mujoco.mjtGeom, Callable[[np.random.Generator], np.ndarray]] = {
+    GEOMS.mjGEOM_PLANE: lambda rng: np.array([*rng.choice([0.0, 1.5], 2), 0.01]),
+    GEOMS.mjGEOM_BOX: lambda rng: rng.uniform(0.1, 1.0, 3),
+    GEOMS.mjGEOM_SPHERE: lambda rng: np.array([rng.uniform(0.1, 1.0), 0.0, 0.0]),
+    GEOMS.mjGEOM_CYLINDER: lambda rng: np.array([*rng.uniform(0.1, 1.0, 2), 0.0]),
+    GEOMS.mjGEOM_CAPSULE: lambda rng: np.array([*rng.uniform(0.1, 1.0, 2), 0.0]),
+    GEOMS.mjGEOM_ELLIPSOID: lambda rng: rng.uniform(0.1, 1.0, 3),
+}
+SHAPES = (*SIZES, GEOMS.mjGEOM_MESH, GEOMS.mjGEOM_HFIELD)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is compared: scenes of a kind at a place and of a size.
+
+    Attributes:
+        name: Of the row.
+        kinds: Geoms of one scene.
+        scale: Metres that stand for the length 1 of the random sizes, distances and spreads.
+        offset: Distance of the scene from the origin of the world, metres.
+        carried: Whether the geoms hang on a mocap body, whose pose is copied, or on the world.
+        distance: How far from a surface rays start at most, metres; 0: anywhere within four times the scale.
+        scanned: Whether a sensor casts the rays, all of a scene from one place along directions in float32.
+    """
+
+    name: str
+    kinds: tuple[mujoco.mjtGeom, ...]
+    scale: float = 1.0
+    offset: float = 0.0
+    carried: bool = True
+    distance: float = 0.0
+    scanned: bool = False
+
+
+@dataclass
+class Tally:
+    """What came out of one case.
+
+    Attributes:
+        rays: How many were cast.
+        hits: How many of them meet something in mj_ray.
+        within: How many have mj_ray's geom (or miss) and its range within the tolerance.
+        explained: How many of the others graze a silhouette or start on a surface.
+        unexplained: The rest.
+        disagreements: How many differ in hit or miss.
+        worst: Largest error of a range as a multiple of the tolerance, over rays with mj_ray's geom: not explained,
+            explained.
+        examples: Of the unexplained, in words.
+    """
+
+    rays: int = 0
+    hits: int = 0
+    within: int = 0
+    explained: int = 0
+    unexplained: int = 0
+    disagreements: int = 0
+    worst: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    examples: list[str] = field(default_factory=list)
+
+    @property
+    def share_within(self) -> float:
+        return self.within / max(self.rays, 1)
+
+
+def cases() -> list[Case]:
+    """Every kind and a crowd of all at the origin, 1 km away, and of 1 mm and 1 km, also seen from within 5 m."""
+    names = {kind: kind.name.removeprefix("mjGEOM_").lower() for kind in SHAPES}
+    single = [Case(names[kind], (kind,)) for kind in SHAPES]
+    crowd = tuple(SHAPES) * 3
+    far = [Case(f"{names[kind]}, 1 km away", (kind,), offset=1000.0) for kind in SHAPES]
+    small = [Case(f"{names[kind]}, 1 mm", (kind,), scale=1e-3) for kind in SHAPES]
+    large = [Case(f"{names[kind]}, 1 km", (kind,), scale=1e3) for kind in SHAPES]
+    fixed = Case("crowd, fixed", crowd, carried=False)
+    close = [replace(case, name=f"{case.name} from 5 m", distance=5.0) for case in (*small, *large)]
+    crowds = [Case("crowd", crowd), fixed, Case("crowd, 1 km away", crowd, offset=1000.0)]
+    scans = [Case("crowd, scanned", crowd, scanned=True), Case("scanned, 1 km away", crowd, offset=1e3, scanned=True)]
+    return [*single, *far, *small, *large, *close, *crowds, *scans]
+
+
+def compare(case: Case, num_rays: int, seed: int, rays_per_scene: int = 10_000) -> Tally:
+    """Casts rays through random scenes of a case with both and counts where they differ."""
+    rng = np.random.default_rng(seed)
+    tally = Tally()
+    while tally.rays < num_rays:
+        model = random_model(case, rng)
+        data = random_state(case, model, rng)
+        origins, directions = random_rays(case, model, data, min(rays_per_scene, num_rays - tally.rays), rng)
+        scene = MujocoScene(model)
+        scene.copy_data(data)
+        if case.scanned:
+            origins[:] = origins[0]
+            ranges, shape, directions = scan(scene, origins[0], directions)
+        else:
+            hits = scene.cast(torch.from_numpy(origins)[None], torch.from_numpy(directions)[None])
+            ranges, shape = hits.ranges[0].double().numpy(), hits.shape_id[0].numpy()
+        geom = np.where(shape >= 0, np.array([*scene.geom_ids, -1])[shape], -1)
+        _count(model, data, origins, directions, ranges, geom, max(TOUCHING_M, TOUCHING * case.scale), tally)
+    return tally
+
+
+def scan(scene: RayScene, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ranges, shapes and directions of a sensor's rays, whose order is the sensor's, (count,) and (count, 3)."""
+    table = torch.from_numpy(directions).float()
+    pattern = ScanPattern(table, torch.zeros(len(table)), torch.zeros(len(table)), float(len(table)))
+    config = LidarConfig(len(table), period_s=1.0, min_range=0.0, max_range=1e6, mount_pos=tuple(origin))
+    lidar = Lidar(config, pattern, scene, mount_body=-1, outputs=("ranges", "shape_id", "directions_s"))
+    frame = lidar.cast(torch.zeros(1, dtype=torch.float64))
+    cast = frame.directions_s[0].double().numpy()
+    lengths = np.linalg.norm(cast, axis=1, keepdims=True)
+    return frame.ranges[0].double().numpy(), frame.shape_id[0].numpy(), cast / lengths
+
+
+def random_model(case: Case, rng: np.random.Generator) -> mujoco.MjModel:
+    """A model of the case's geoms, each on a body of its own or on the world."""
+    spec = mujoco.MjSpec()
+    spec.compiler.balanceinertia = True
+    for k, kind in enumerate(case.kinds):
+        parent = spec.worldbody.add_body(name=f"body_{k}", mocap=True) if case.carried else spec.worldbody
+        place = {"quat": _unit(rng, 4)}
+        spread = 0.3 if len(case.kinds) == 1 or case.carried else 3.0
+        place["pos"] = rng.uniform(-spread, spread, 3) * case.scale
+        if not case.carried:
+            place["pos"] = place["pos"] + _far_point(case)
+        if kind == GEOMS.mjGEOM_MESH:
+            vertices, faces = random_mesh(rng)
+            spec.add_mesh(
+                name=f"mesh_{k}",
+                uservert=(vertices * case.scale).ravel(),
+                userface=faces.ravel(),
+                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+            )
+            parent.add_geom(type=kind, meshname=f"mesh_{k}", **place)
+        elif kind == GEOMS.mjGEOM_HFIELD:
+            rows, cols = rng.integers(2, 40, 2)
+            size = np.array([*rng.uniform(0.5, 1.5, 2), rng.uniform(0.1, 0.6), rng.uniform(0.05, 0.3)]) * case.scale
+            heights = rng.uniform(0.0, 1.0, rows * cols) * rng.choice([0.0, 1.0], rows * cols, p=[0.2, 0.8])
+            spec.add_hfield(name=f"field_{k}", nrow=rows, ncol=cols, size=size, userdata=heights)
+            parent.add_geom(type=kind, hfieldname=f"field_{k}", **place)
+        else:
+            size = SIZES[kind](rng) * case.scale
+            parent.add_geom(type=kind, size=size, **place)
+    return spec.compile()
+
+
+def random_mesh(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A closed bumpy ball, (V, 3) and (T, 3): an octahedron divided three times, with noise on the radii."""
+    vertices = [*np.eye(3), *-np.eye(3)]
+    faces = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
+    for _ in range(3):
+        middles: dict[tuple[int, int], int] = {}
+
+        def middle(a: int, b: int, known: dict[tuple[int, int], int] = middles) -> int:
+            key = (min(a, b), max(a, b))
+            if key not in known:
+                known[key] = len(vertices)
+                vertices.append((vertices[a] + vertices[b]) / 2)
+            return known[key]
+
+        split = []
+        for a, b, c in faces:
+            ab, bc, ca = middle(a, b), middle(b, c), middle(c, a)
+            split += [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        faces = split
+    points = np.array(vertices)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    radii = rng.uniform(0.4, 1.0, (len(points), 1)) * rng.uniform(0.5, 1.0)
+    return points * radii * rng.uniform(0.5, 1.0, 3), np.array(faces)
+
+
+def random_state(case: Case, model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjData:
+    """Random poses of the bodies around the case's place."""
+    data = mujoco.MjData(model)
+    if model.nmocap:
+        spread = 0.0 if model.nmocap == 1 else 3.0
+        data.mocap_pos[:] = _far_point(case) + rng.uniform(-spread, spread, (model.nmocap, 3)) * case.scale
+        data.mocap_quat[:] = [_unit(rng, 4) for _ in range(model.nmocap)]
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def random_rays(
+    case: Case, model: mujoco.MjModel, data: mujoco.MjData, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays around the bodies, half of them aimed at one, (count, 3) each; a tenth starts in one, or all near one."""
+    target = data.geom_xpos[rng.integers(0, len(data.geom_xpos), count)]
+    origins = _far_point(case) + rng.uniform(-4.0, 4.0, (count, 3)) * case.scale
+    at = target + rng.uniform(-1.0, 1.0, (count, 3)) * case.scale
+    if case.distance:
+        towards = at - origins
+        ranges, _ = mj_ray(model, data, origins, towards)  # in units of `towards`
+        on = np.where(np.isfinite(ranges), ranges, 1.0)[:, None]
+        at = origins + on * towards + rng.uniform(-0.1, 0.1, (count, 3)) * min(case.scale, case.distance)
+        origins = rng.permutation(at) if case.scale > case.distance else at
+        origins = origins + rng.uniform(-1.0, 1.0, (count, 3)) * case.distance
+    else:
+        inside = rng.random(count) < 0.1
+        origins[inside] = target[inside] + rng.uniform(-0.3, 0.3, (inside.sum(), 3)) * case.scale
+    directions = rng.normal(size=(count, 3))
+    aimed = rng.random(count) < 0.5
+    directions[aimed] = (at - origins)[aimed]
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def mj_ray(
+    model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges, ``inf`` for a miss, and geoms, -1 for a miss, (count,) each."""
+    ranges, geoms = np.empty(len(origins)), np.empty(len(origins), np.int32)
+    geom = np.zeros((1, 1), np.int32)
+    cast = mujoco.mj_ray
+    for i, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
+        ranges[i] = cast(model, data, origin, direction, None, 1, -1, geom)
+        geoms[i] = geom[0, 0]
+    ranges[geoms < 0] = math.inf
+    return ranges, geoms
+
+
+def _count(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    ours: np.ndarray,
+    geom: np.ndarray,
+    touching: float,
+    tally: Tally,
+) -> None:
+    """Adds our ranges and geoms to the tally."""
+    ranges, geoms = mj_ray(model, data, origins, directions)
+    both = (geom >= 0) & (geoms >= 0)
+    error = np.zeros(len(ranges))
+    error[both] = np.abs(ours[both] - ranges[both]) / (RELATIVE * ranges[both] + ABSOLUTE)
+    right = ((geom >= 0) == (geoms >= 0)) & (error <= 1.0)
+    tally.rays += len(ranges)
+    tally.hits += int((geoms >= 0).sum())
+    tally.within += int(right.sum())
+    tally.disagreements += int(((geom >= 0) != (geoms >= 0)).sum())
+    tally.worst[0] = max(tally.worst[0], error[right].max(initial=0.0))
+    for i in np.flatnonzero(~right):
+        explained = is_explained(model, data, origins[i], directions[i], touching)
+        tally.explained += explained
+        tally.unexplained += not explained
+        kind = 1 if explained else 0
+        tally.worst[kind] = max(tally.worst[kind], error[i])
+        if not explained and len(tally.examples) < 5:
+            tally.examples.append(
+                f"geom {geom[i]} at {ours[i]:.9g} m, mj_ray {geoms[i]} at {ranges[i]:.9g} m; "
+                f"origin {origins[i].tolist()}, direction {directions[i].tolist()}"
+            )
+
+
+def is_explained(
+    model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, direction: np.ndarray, touching: float
+) -> bool:
+    """Whether mj_ray itself changes its mind about what is met within GRAZING_RAD of the direction.
+
+    Or within ``touching`` metres of the origin. A jump of the range to another part of the same geom counts as well.
+    """
+    side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    side /= np.linalg.norm(side)
+    other = np.cross(direction, side)
+    angles = np.linspace(0.0, 2.0 * math.pi, 16, endpoint=False)
+    ring = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * other
+    turned = direction + GRAZING_RAD * ring
+    moved = origin + touching * np.concatenate([ring, [direction, -direction]])
+    start = np.concatenate([np.broadcast_to(origin, (17, 3)), moved])
+    along = np.concatenate([direction[None], turned, np.broadcast_to(direction, (18, 3))])
+    ranges, geoms = mj_ray(model, data, start, along)
+    if len(set(geoms.tolist())) > 1:
+        return True
+    steepest = ranges[0] * GRAZING_RAD / 1e-2 + touching / 1e-2  # a surface met at 0.01 rad goes no farther
+    return bool(np.abs(ranges - ranges[0]).max() > steepest) if math.isfinite(ranges[0]) else False
+
+
+@dataclass(frozen=True)
+class Leaks:
+    """Rays out of closed rooms.
+
+    Attributes:
+        name: What the rooms are made of.
+        rays: How many were cast, aimed at corners, at edges and anywhere.
+        escaped: How many met nothing.
+    """
+
+    name: str
+    rays: int
+    escaped: int
+
+
+def leaks(num_rays: int, seed: int) -> list[Leaks]:
+    """Casts rays from inside closed meshes and from inside and above height fields, of 1 mm to 1 km, turned at will."""
+    rng = np.random.default_rng(seed)
+    return [_leaks_of(name, room, num_rays, rng) for name, room in (("mesh", _mesh_room), ("hfield", _field_room))]
+
+
+def _leaks_of(name: str, room: Callable, num_rays: int, rng: np.random.Generator) -> Leaks:
+    rays = escaped = 0
+    while rays < num_rays:
+        scale, quat, place = 10.0 ** rng.uniform(-3, 3), _unit(rng, 4), rng.uniform(-10, 10, 3)
+        shape, origins, targets = room(rng, scale)
+        turn = np.empty(9)
+        mujoco.mju_quat2Mat(turn, quat)
+        turn = turn.reshape(3, 3)
+        scene = RayScene([replace(shape, body=0)], 1, 1, pose_dtype=torch.float64)
+        scene.body_pos[:], scene.body_quat[:] = torch.from_numpy(place), torch.from_numpy(quat)
+        start, end = (torch.from_numpy(points @ turn.T + place)[None] for points in (origins, targets))
+        ranges = scene.cast(start, end - start).ranges
+        rays += ranges.numel()
+        escaped += int(ranges.isinf().sum())
+    return Leaks(name, rays, escaped)
+
+
+def _edge_points(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Corners, middles of edges and other points of edges."""
+    edges = np.concatenate([vertices[faces[:, [k, (k + 1) % 3]]] for k in range(3)])
+    along = rng.uniform(0, 1, (len(edges), 1))
+    return np.concatenate([vertices, edges.mean(1), edges[:, 0] * along + edges[:, 1] * (1 - along)])
+
+
+def _mesh_room(rng: np.random.Generator, scale: float) -> tuple[Shape, np.ndarray, np.ndarray]:
+    """A bumpy room as it is in float32, rays from its middle and from anywhere near it."""
+    vertices, faces = random_mesh(rng)
+    mesh = TriangleMesh(vertices * scale, faces)
+    points = _edge_points(mesh.vertices.astype(np.float64), mesh.triangles, rng)
+    near = rng.uniform(-0.05, 0.05, points.shape) * scale
+    anywhere = rng.normal(size=points.shape) * scale
+    origins = np.concatenate([np.zeros_like(points), near, near])
+    return Shape(ShapeKind.MESH, asset=mesh), origins, np.concatenate([points, points, anywhere])
+
+
+def _field_room(rng: np.random.Generator, scale: float) -> tuple[Shape, np.ndarray, np.ndarray]:
+    """A field with a base: rays from inside to anywhere, and straight down on the grid's points and lines."""
+    rows, cols = rng.integers(2, 60, 2)
+    heights = rng.uniform(0.2, 1.0, (rows, cols)).astype(np.float32)
+    half_x, half_y, top = rng.uniform(0.5, 2.0) * scale, rng.uniform(0.5, 2.0) * scale, rng.uniform(0.1, 2.0) * scale
+    shape = Shape(ShapeKind.HEIGHTFIELD, asset=HeightField(heights, half_x, half_y, 0.1 * scale, top))
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, cols), np.linspace(-half_y, half_y, rows))
+    grid = np.stack([x, y, heights.astype(np.float64) * top], -1)
+    lines = [(grid[1:] + grid[:-1]) / 2, (grid[:, 1:] + grid[:, :-1]) / 2, (grid[1:, 1:] + grid[:-1, :-1]) / 2]
+    points = np.concatenate([grid.reshape(-1, 3), *(line.reshape(-1, 3) for line in lines)])
+    within = points * np.array([1 - 1e-6, 1 - 1e-6, 1.0])  # the rim is a silhouette
+    above = within * np.array([1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 3.0 * top])
+    inside = np.broadcast_to([0.0, 0.0, 0.1 * top], points.shape)
+    anywhere = rng.normal(size=points.shape) * scale
+    return shape, np.concatenate([above, inside, inside]), np.concatenate([within, points, anywhere])
+
+
+def _far_point(case: Case) -> np.ndarray:
+    return case.offset * np.array([0.6, -0.64, 0.48])
+
+
+def _unit(rng: np.random.Generator, size: int) -> np.ndarray:
+    vector = rng.normal(size=size)
+    return vector / np.linalg.norm(vector)

@@ -1,0 +1,75 @@
+"""One adapter per peer; nothing of a peer is imported before it is asked for."""
+
+from __future__ import annotations
+
+from functools import partial
+from importlib import import_module
+
+from ..methods import Build, Entry, Method
+from ..scenes import BenchmarkScene
+
+
+def _later(module: str, name: str, **options) -> Build:
+    """Imports an adapter when it is built."""
+
+    def build(scene: BenchmarkScene, num_threads: int, device: str) -> Method:
+        adapter = getattr(import_module(f".{module}", __package__), name)
+        return partial(adapter, **options)(scene, num_threads, device)
+
+    return build
+
+
+NOT_COMPARED = {"Genesis": "no adapter; its LiDAR sensor needs some 35 further packages, among them a renderer and VTK"}
+"""Peers that are known and not compared, and why."""
+
+ANY = ("cpu", "cuda")
+BATCH_RAY, EMBREE, ONE_MESH = "mujoco.batch Batch.ray", "Embree (embreex)", "paper's scheme"
+MUJOCO_LIDAR, NEWTON, OPEN3D = "mujoco-lidar", "Newton intersect_ray", "Open3D"
+
+PEERS = (
+    Entry(BATCH_RAY, _later("mujoco_native", "BatchRay"), ("mujoco",), "mujoco-core", own_threads=True),
+    Entry(
+        f"{MUJOCO_LIDAR} warp tree",
+        _later("mujoco_lidar", "WarpBackend"),
+        ("mujoco_lidar",),
+        "mujoco-lidar",
+        shared_scan=True,
+        devices=ANY,
+    ),
+    Entry(
+        f"{MUJOCO_LIDAR} warp",
+        _later("mujoco_lidar", "WarpBackend", tree=False),
+        ("mujoco_lidar",),
+        "mujoco-lidar",
+        shared_scan=True,
+        devices=ANY,
+    ),
+    Entry(
+        f"{MUJOCO_LIDAR} cpu",
+        _later("mujoco_lidar", "CpuBackend"),
+        ("mujoco_lidar",),
+        "mujoco-lidar",
+        shared_scan=True,
+    ),
+    Entry(
+        f"{MUJOCO_LIDAR} taichi",
+        _later("mujoco_lidar", "TaichiBackend"),
+        ("mujoco_lidar", "taichi", "tibvh"),
+        "mujoco-lidar[taichi]",
+        own_threads=True,
+        shared_scan=True,
+    ),
+    Entry(
+        f"{MUJOCO_LIDAR} jax",
+        _later("mujoco_lidar", "JaxBackend"),
+        ("mujoco_lidar", "jax"),
+        "mujoco-lidar jax",
+        own_threads=True,
+        shared_scan=True,
+    ),
+    Entry(NEWTON, _later("warp_worlds", "Newton"), ("newton",), "newton", devices=ANY),
+    Entry("mujoco_warp rays", _later("warp_worlds", "MujocoWarp"), ("mujoco_warp",), "mujoco-warp", devices=ANY),
+    Entry(ONE_MESH, _later("one_mesh", "OneMesh"), devices=ANY),
+    Entry(EMBREE, _later("embree", "Embree"), ("embreex",), "embreex"),
+    Entry(OPEN3D, _later("embree", "Open3D"), ("open3d",), "open3d", own_threads=True),
+)

@@ -1,0 +1,131 @@
+"""What is printed and written of evaluated episodes: a table, one line per episode, and where it was measured."""
+
+from __future__ import annotations
+
+import csv
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from omniperception.evaluation.episodes import CLEARANCE_CAP, Episodes
+
+LIBRARIES = ("omniperception", "torch", "mujoco-core", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
+
+DEFINITIONS = {
+    "success": "goal reached without a fall within the time (without a goal: time limit reached); touches allowed",
+    "success_untouched": "success without any contact between robot and obstacle",
+    "collision": "share of trials with at least one contact; the trial goes on (counting convention)",
+    "rates_to_first_contact": "as if each trial ended at its first contact: exclusive outcomes that add up to one",
+    "interval": "low and high are the ends of Wilson's 95 % interval",
+    "clearance_m": "smallest distance in space between any robot link and any obstacle in a trial, by true geometry, "
+    f"at the end of every control step; 0 with a contact, at most {CLEARANCE_CAP:g}",
+    "velocity_error_m_s": "mean over time of |horizontal velocity - commanded velocity|, avoiding included",
+    "energy_j": "sum over joints and control steps of |torque * joint velocity| * control step",
+    "cost_of_transport": "energy / (weight * length of the base's horizontal way), over all trials",
+}
+"""What the figures of a summary mean."""
+
+
+def table(summaries: Mapping[str, dict]) -> str:
+    """Summaries side by side, one column each."""
+    first = next(iter(summaries.values()))
+    lines = [f"{first['episodes']} episodes, success: {first['success_means']}"]
+    if len(summaries) > 1:
+        lines.append(_line("", list(summaries)))
+    lines += _rate_lines("rates", summaries)
+    lines.append("  ending at the first contact:")
+    lines += _rate_lines("rates_to_first_contact", summaries, indent="  ")
+    for key, label, unit in _QUANTILES:
+        if any(summary[key] for summary in summaries.values()):
+            lines.append(_line(f"{label} ({unit})", [_spread(summary[key]) for summary in summaries.values()]))
+    for key, label, unit in _FIGURES:
+        values = [summary[key] for summary in summaries.values()]
+        if any(value is not None for value in values):
+            cells = ["" if value is None else f"{value:.3f}" for value in values]
+            lines.append(_line(f"{label} ({unit})" if unit else label, cells))
+    return "\n".join(lines)
+
+
+def times_line(summary: dict) -> str:
+    """Wall time of one control step of one environment, by stage."""
+    times = sorted(summary["us_per_env_step"].items(), key=lambda item: -item[1])
+    return "  time per environment step: " + ", ".join(f"{name} {spent:.1f}" for name, spent in times) + " us"
+
+
+def write_trials(path: Path, by_policy: Mapping[str, Episodes]) -> None:
+    """One line per trial and policy as CSV; trial k of environment i is the same scene for every policy."""
+    with open(path, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["policy", "environment", "trial", "outcome", *_COLUMNS])
+        for policy, episodes in by_policy.items():
+            columns = [_plain(getattr(episodes, name), len(episodes)) for name in _COLUMNS.values()]
+            for k, (outcome, *values) in enumerate(zip(episodes.verdict, *columns, strict=True)):
+                writer.writerow([policy, *divmod(k, episodes.per_env), outcome, *values])
+
+
+def provenance(device: object) -> dict:
+    """When, on what machine and against which versions something was measured."""
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "machine": {"cpu": platform.machine(), "system": platform.system(), "device": str(device)},
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+    }
+
+
+_QUANTILES = (
+    ("time_to_goal_s", "time to goal", "s"),
+    ("clearance_m", "least clearance", "m"),
+    ("energy_j", "energy", "J"),
+)
+_FIGURES = (
+    ("cost_of_transport", "cost of transport", ""),
+    ("velocity_error_m_s", "velocity error", "m/s"),
+    ("free_velocity_error_m_s", "velocity error, nothing near", "m/s"),
+    ("yaw_rate_error_rad_s", "yaw rate error", "rad/s"),
+    ("contacts_per_minute", "contacts per minute", ""),
+    ("mean_length_s", "episode length", "s"),
+)
+_COLUMNS = {
+    "length_s": "length_s",
+    "contacts": "contacts",
+    "first_contact_s": "first_contact_s",
+    "clearance_m": "clearance",
+    "energy_j": "energy",
+    "path_m": "path",
+    "velocity_error_m_s": "velocity_error",
+    "yaw_rate_error_rad_s": "yaw_rate_error",
+}
+"""Columns of the CSV file and the fields of Episodes they hold."""
+
+
+def _line(label: str, cells: list[str]) -> str:
+    return (f"  {label:<30}" + "".join(f"{cell:<26}" for cell in cells)).rstrip()
+
+
+def _rate_lines(group: str, summaries: Mapping[str, dict], indent: str = "") -> list[str]:
+    names = next(iter(summaries.values()))[group]
+    lines = []
+    for name in names:
+        cells = [_rate(summary[group][name]) for summary in summaries.values()]
+        lines.append(_line(indent + name.replace("_", " "), cells))
+    return lines
+
+
+def _rate(rate: dict) -> str:
+    interval = f"[{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
+    return f"{100 * rate['rate']:5.1f} %  {interval}"
+
+
+def _spread(spread: dict | None) -> str:
+    if spread is None:
+        return ""
+    return f"{spread['median']:.2f}  [{spread['p05']:.2f}, {spread['p95']:.2f}]"
+
+
+def _plain(values: object, count: int) -> list:
+    """A tensor as numbers with six digits; nothing where there is none, or where it is infinite."""
+    if values is None:
+        return [""] * count
+    return ["" if value == float("inf") else float(f"{value:.6g}") for value in values.tolist()]

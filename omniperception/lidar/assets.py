@@ -1,0 +1,116 @@
+"""Lays the shapes of a scene, their meshes and height fields into the arrays that the kernels read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from .heightfield import HeightField
+from .kernels.geometry import Geometry
+from .kernels.heightfield import FieldPart
+from .kernels.mesh import MeshPart
+from .meshes import TriangleMesh
+from .shapes import Shape, ShapeKind
+
+
+@dataclass
+class _Arrays:
+    """What has been laid out so far; ``num_nodes`` and ``num_leaves`` include the copies of deformables."""
+
+    mesh_parts: list[MeshPart] = field(default_factory=list)
+    child: list[np.ndarray] = field(default_factory=list)
+    bounds: list[np.ndarray] = field(default_factory=list)
+    triangles: list[np.ndarray] = field(default_factory=list)
+    num_children: int = 0
+    num_nodes: int = 0
+    num_leaves: int = 0
+    field_parts: list[FieldPart] = field(default_factory=list)
+    heights: list[np.ndarray] = field(default_factory=list)
+    levels: list[tuple[int, int]] = field(default_factory=list)
+    extremes: list[np.ndarray] = field(default_factory=list)
+    num_heights: int = 0
+    num_extremes: int = 0
+
+    def add_mesh(self, mesh: TriangleMesh, copies: int) -> int:
+        """Lays out a mesh once, or ``copies`` times for a deformable; its part."""
+        tree = mesh.tree
+        part = MeshPart()
+        part.first_child, part.first_node, part.first_leaf = self.num_children, self.num_nodes, self.num_leaves
+        if copies:
+            part.node_stride, part.leaf_stride = len(tree.child), len(tree.leaf_triangle)
+        times = max(copies, 1)
+        self.child.append(tree.child)
+        self.bounds.append(np.broadcast_to(tree.bounds, (times, *tree.bounds.shape)).reshape(-1, 6, 4))
+        triangles = mesh.leaf_corners
+        self.triangles.append(np.broadcast_to(triangles, (times, *triangles.shape)).reshape(-1, 9, 4))
+        self.num_children += len(tree.child)
+        self.num_nodes += times * len(tree.child)
+        self.num_leaves += times * len(triangles)
+        if max(self.num_nodes * 6, self.num_leaves * 9) >= 2**31:
+            raise ValueError(f"meshes fill {self.num_leaves} leaves of four triangles; 238 million are the limit")
+        self.mesh_parts.append(part)
+        return len(self.mesh_parts) - 1
+
+    def add_field(self, asset: HeightField) -> int:
+        """Lays out a height field; its part."""
+        extremes, columns = asset.pyramid
+        part = FieldPart()
+        part.rows, part.cols = asset.heights.shape
+        part.half_x, part.half_y, part.base, part.scale = asset.half_x, asset.half_y, asset.base, asset.scale
+        part.per_x = (part.cols - 1) / (2.0 * asset.half_x)
+        part.per_y = (part.rows - 1) / (2.0 * asset.half_y)
+        part.top = float(asset.heights.max())
+        part.first_height, part.first_level, part.top_level = self.num_heights, len(self.levels), len(columns)
+        self.heights.append(asset.heights.ravel())
+        self.num_heights += asset.heights.size
+        self.levels.append((0, 0))  # level 0 is the cells, whose extremes are their corners'
+        for nodes, cols in zip(extremes, columns, strict=True):
+            self.levels.append((self.num_extremes, cols))
+            self.extremes.append(nodes)
+            self.num_extremes += len(nodes)
+        self.field_parts.append(part)
+        return len(self.field_parts) - 1
+
+
+def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[Geometry, dict[int, MeshPart]]:
+    """The shapes on the device, and the part of each deformable shape; an asset that shapes share is there once."""
+    arrays = _Arrays()
+    parts, shared, deformables = [], {}, {}
+    for k, shape in enumerate(shapes):
+        part = 0
+        if shape.kind == ShapeKind.DEFORMABLE:
+            part = arrays.add_mesh(shape.asset, num_envs)
+            deformables[k] = arrays.mesh_parts[part]
+        elif shape.asset is not None and id(shape.asset) in shared:
+            part = shared[id(shape.asset)]
+        elif shape.asset is not None:
+            is_mesh = shape.kind == ShapeKind.MESH
+            part = arrays.add_mesh(shape.asset, 0) if is_mesh else arrays.add_field(shape.asset)
+            shared[id(shape.asset)] = part
+        parts.append(part)
+
+    def upload(values: Sequence, dtype: type) -> wp.array:
+        return wp.array(values if len(values) else [dtype()], dtype=dtype, device=device)
+
+    def concatenated(chunks: list[np.ndarray], dtype: type, ndim: int = 1) -> wp.array:
+        if not chunks:
+            return wp.empty((0,) * ndim, dtype=dtype, device=device)
+        return wp.array(np.concatenate(chunks), dtype=dtype, device=device)
+
+    geometry = Geometry()
+    geometry.kind = upload([int(shape.kind) for shape in shapes], wp.int32)
+    geometry.size = upload([shape.extents for shape in shapes], wp.vec3)
+    geometry.exact_size = upload([shape.extents for shape in shapes], wp.vec3d)
+    geometry.radius = upload([shape.bounding_radius for shape in shapes], wp.float32)
+    geometry.class_id = upload([shape.class_id for shape in shapes], wp.int32)
+    geometry.part = upload(parts, wp.int32)
+    geometry.mesh_part = wp.array(arrays.mesh_parts, dtype=MeshPart, device=device)
+    geometry.mesh_bounds = concatenated(arrays.bounds, wp.vec4, 2)
+    geometry.mesh_child = concatenated(arrays.child, wp.vec4i)
+    geometry.mesh_triangle = concatenated(arrays.triangles, wp.vec4, 2)
+    geometry.field_part = wp.array(arrays.field_parts, dtype=FieldPart, device=device)
+    geometry.field_height = concatenated(arrays.heights, wp.float32)
+    geometry.field_level = concatenated([np.array(arrays.levels, np.int32)] if arrays.levels else [], wp.vec2i)
+    geometry.field_extreme = concatenated(arrays.extremes, wp.vec2)
+    return geometry, deformables

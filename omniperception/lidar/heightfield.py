@@ -1,0 +1,83 @@
+"""Height fields: a regular grid of heights, and the pyramid of extremes under which rays walk over it."""
+
+from functools import cached_property
+
+import numpy as np
+
+from .kernels.heightfield import LEVEL_SHIFT
+
+
+class HeightField:
+    """Heights above the plane z = 0 on a regular grid, solid down to there and down to ``base`` below it.
+
+    It is MuJoCo's height field. Point (row, col) of the grid lies at x = -half_x + 2 half_x col / (cols - 1),
+    y = -half_y + 2 half_y row / (rows - 1). A cell is two triangles, divided by the diagonal from (row, col) to
+    (row + 1, col + 1). The four sides are walls from the surface down to z = 0, and under the whole lies a box of
+    thickness ``base`` with walls, bottom and top. Rays meet all of these from both sides, so that a ray that starts
+    inside ends at the exit, or at the top of the base. With ``base`` 0 there is no bottom: a ray from below comes in
+    and meets the surface from its underside.
+
+    Attributes:
+        heights: (rows, cols) float32, in units of ``scale``, >= 0.
+        half_x, half_y: Half extents, metres.
+        base: Thickness of the box under z = 0, metres.
+        scale: Metres per unit of ``heights``.
+
+    Raises:
+        ValueError: Fewer than two points along an axis, a height that is negative or not finite, a length <= 0.
+    """
+
+    def __init__(
+        self, heights: np.ndarray, half_x: float, half_y: float, base: float = 0.0, scale: float = 1.0
+    ) -> None:
+        self.heights = np.ascontiguousarray(heights, dtype=np.float32)
+        self.half_x, self.half_y, self.base, self.scale = float(half_x), float(half_y), float(base), float(scale)
+        if self.heights.ndim != 2 or min(self.heights.shape) < 2:
+            raise ValueError(f"heights {self.heights.shape} must be (rows, cols) with at least 2 of each")
+        if not np.isfinite(self.heights).all():
+            raise ValueError(f"heights has {int((~np.isfinite(self.heights)).sum())} values that are not finite")
+        if self.heights.min() < 0.0:
+            raise ValueError(
+                f"heights go down to {self.heights.min():.6g} and must be >= 0: subtract the lowest and put it in "
+                "shape.pos"
+            )
+        lengths = (self.half_x, self.half_y, self.scale)
+        if not (min(lengths) > 0.0 and np.isfinite(lengths).all()):
+            raise ValueError(f"half_x={half_x}, half_y={half_y} and scale={scale} must be positive and finite")
+        if not (self.base >= 0.0 and np.isfinite(self.base)):
+            raise ValueError(f"base={base} must be >= 0 and finite")
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """Half of the smallest box around the frame's origin that holds the field, metres."""
+        return self.half_x, self.half_y, max(float(self.heights.max()) * self.scale, self.base)
+
+    @property
+    def radius(self) -> float:
+        """Radius of a sphere around the frame's origin that holds the field, metres."""
+        return float(np.linalg.norm(self.half_extents)) * (1.0 + 1e-6)
+
+    @cached_property
+    def pyramid(self) -> tuple[list[np.ndarray], list[int]]:
+        """(lowest, highest) of the nodes of each level from 1 on, (nodes, 2) float32, row by row, and their columns.
+
+        In units of ``scale``.
+        """
+        h = self.heights
+        quads = np.stack([h[:-1, :-1], h[1:, :-1], h[:-1, 1:], h[1:, 1:]])
+        low, high = quads.min(axis=0), quads.max(axis=0)
+        extremes, columns = [], []
+        while max(low.shape) > 1:
+            low, high = _reduce(low, np.inf).min(axis=(1, 3)), _reduce(high, -np.inf).max(axis=(1, 3))
+            extremes.append(np.stack([low, high], axis=-1).reshape(-1, 2))
+            columns.append(low.shape[1])
+        return extremes, columns
+
+
+def _reduce(values: np.ndarray, fill: float) -> np.ndarray:
+    """Values in tiles, (rows, tile, columns, tile), filled up at the end."""
+    tile = 2**LEVEL_SHIFT
+    rows, cols = (-(-n // tile) for n in values.shape)
+    padded = np.full((rows * tile, cols * tile), fill, np.float32)
+    padded[: values.shape[0], : values.shape[1]] = values
+    return padded.reshape(rows, tile, cols, tile)

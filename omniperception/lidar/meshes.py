@@ -1,0 +1,160 @@
+"""Triangle meshes, from arrays or from files, and the trees in which rays look for their triangles."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from .kernels.mesh import STACK_SIZE
+from .kernels.tree import NUM_BINS, split_triangles, widen_tree
+
+HEURISTIC_DEPTH = 48
+"""Below this depth of the binary tree, ranges of triangles are halved: no input makes a descent too deep."""
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A tree of boxes, four children to a node and four triangles to a leaf, nodes level by level.
+
+    Attributes:
+        bounds: Lows (x, y, z) and highs (x, y, z) of each node's children, (N, 6, 4) float32; no child is inside out.
+        child: Node index if > 0, no child if 0, leaf -1 - child if < 0, (N, 4) int32.
+        levels: (first node, number of nodes) of each level from the root.
+        leaf_triangle: Indices of each leaf's triangles, -1 for none, (L, 4) int32.
+    """
+
+    bounds: np.ndarray
+    child: np.ndarray
+    levels: tuple[tuple[int, int], ...]
+    leaf_triangle: np.ndarray
+
+
+class TriangleMesh:
+    """A triangle mesh in a frame of its own. Rays meet both sides of a triangle.
+
+    Coordinates are kept in float32. Triangles without area are left out (a ray cannot meet them), duplicates are kept
+    (the nearer hit is reported, of equal ones either). The mesh may be open, and its triangles may turn either way; the
+    normal is that about which the corners go counter-clockwise.
+
+    Attributes:
+        vertices: (V, 3) float32, metres.
+        triangles: Vertex indices, (T, 3) int32, those with area.
+        num_degenerate: How many triangles were left out.
+
+    Raises:
+        ValueError: A shape is wrong, an index names no vertex, or a vertex that a triangle uses is not finite.
+    """
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
+        self.vertices = np.ascontiguousarray(vertices, dtype=np.float32)
+        triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+        if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
+            raise ValueError(f"mesh needs vertices (V, 3), triangles (T, 3); got {vertices.shape}, {triangles.shape}")
+        outside = (triangles < 0) | (triangles >= len(self.vertices))
+        if outside.any():
+            raise ValueError(f"mesh.triangles has index {triangles[outside][0]}; vertices are 0..{len(vertices) - 1}")
+        corners = self.vertices[triangles].astype(np.float64)
+        broken = ~np.isfinite(corners).all(axis=(1, 2))
+        if broken.any():
+            first = int(np.flatnonzero(broken)[0])
+            raise ValueError(f"mesh.vertices of {broken.sum()} triangles are not finite, the first is triangle {first}")
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        has_area = (normal != 0.0).any(axis=1)
+        self.triangles = triangles[has_area].astype(np.int32)
+        self.num_degenerate = int((~has_area).sum())
+
+    @classmethod
+    def from_file(cls, path: str | Path, scale: float = 1.0) -> "TriangleMesh":
+        """A mesh in any format that trimesh reads (extra ``meshes``), all its parts together, times ``scale``.
+
+        Raises:
+            ImportError: trimesh is not installed.
+        """
+        try:
+            import trimesh
+        except ImportError:
+            raise ImportError(f"reading {path} needs trimesh: pip install 'omniperception[meshes]'") from None
+        mesh = trimesh.load(path, force="mesh", process=False)
+        return cls(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces)
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """Half of the smallest box around the frame's origin that holds the mesh, metres."""
+        return tuple(float(x) for x in self._reach) if len(self.triangles) else (0.0, 0.0, 0.0)
+
+    @property
+    def radius(self) -> float:
+        """Radius of the smallest sphere around the frame's origin that holds the mesh, metres."""
+        corners = self.vertices[self.triangles].astype(np.float64)
+        return float(np.linalg.norm(corners, axis=-1).max(initial=0.0)) * (1.0 + 1e-6)
+
+    @property
+    def _reach(self) -> np.ndarray:
+        return np.abs(self.vertices[self.triangles]).max(axis=(0, 1))
+
+    @cached_property
+    def tree(self) -> Tree:
+        """The tree over the triangles, built on the CPU."""
+        return build_tree(self.vertices[self.triangles])
+
+    @property
+    def leaf_vertex(self) -> np.ndarray:
+        """Vertex indices of each leaf's triangles by corner, -1 for none, (L, 3, 4) int32."""
+        none = np.full((1, 3), -1, np.int32)  # the last row, which index -1 takes
+        return np.ascontiguousarray(np.concatenate([self.triangles, none])[self.tree.leaf_triangle].transpose(0, 2, 1))
+
+    @property
+    def leaf_corners(self) -> np.ndarray:
+        """Coordinates of each leaf's triangles, rows 3 * corner + axis, NaN for none, (L, 9, 4) float32."""
+        none = np.full((1, 3), np.nan, np.float32)
+        corners = np.concatenate([self.vertices, none])[self.leaf_vertex]  # (L, corner, triangle, axis)
+        return np.ascontiguousarray(corners.transpose(0, 1, 3, 2)).reshape(-1, 9, 4)
+
+
+def build_tree(corners: np.ndarray) -> Tree:
+    """The tree over triangles with these corners, (T, 3, 3) float32."""
+    if len(corners) == 0:
+        return Tree(_no_boxes(1), np.zeros((1, 4), np.int32), ((0, 1),), np.full((1, 4), -1, np.int32))
+    for heuristic_depth in (HEURISTIC_DEPTH, 0):
+        tree, need = _build_tree(corners, heuristic_depth)
+        if need <= STACK_SIZE:
+            break
+    return tree
+
+
+def _build_tree(corners: np.ndarray, heuristic_depth: int) -> tuple[Tree, int]:
+    """The tree, and how many entries of a stack its descent may need."""
+    count = len(corners)
+    size = 2 * count
+
+    def new(shape: int, dtype: type = wp.int32) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device="cpu")
+
+    lower, upper = (wp.array(extreme(axis=1), dtype=wp.vec3, device="cpu") for extreme in (corners.min, corners.max))
+    order = wp.array(np.arange(count, dtype=np.int32), dtype=wp.int32, device="cpu")
+    bins = [new(NUM_BINS, dtype) for dtype in (wp.vec3, wp.vec3, wp.int32, wp.float32)]
+    first, number, left, depth = (new(size) for _ in range(4))
+    node_lower, node_upper = new(size, wp.vec3), new(size, wp.vec3)
+    split = [lower, upper, heuristic_depth, *bins, order, first, number, left, depth, node_lower, node_upper]
+    wp.launch(split_triangles, dim=1, inputs=split, device="cpu")
+
+    bounds = wp.array(_no_boxes(count), dtype=wp.float32, device="cpu")
+    child, leaf = new((count, 4)), wp.full((count, 4), -1, dtype=wp.int32, device="cpu")
+    depth, totals = new(count), new(3)
+    binary = [order, first, number, left, node_lower, node_upper, new(size), new(size)]
+    wp.launch(widen_tree, dim=1, inputs=[*binary, bounds, child, depth, leaf, totals], device="cpu")
+
+    num_nodes, num_leaves, need = (int(x) for x in totals.numpy())
+    sizes = np.bincount(depth.numpy()[:num_nodes])
+    firsts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    levels = tuple((int(a), int(b)) for a, b in zip(firsts, sizes, strict=True))
+    tree = Tree(bounds.numpy()[:num_nodes].copy(), child.numpy()[:num_nodes].copy(), levels, leaf.numpy()[:num_leaves])
+    return tree, need
+
+
+def _no_boxes(count: int) -> np.ndarray:
+    boxes = np.full((count, 6, 4), np.inf, np.float32)
+    boxes[:, 3:] = -np.inf
+    return boxes

@@ -1,0 +1,127 @@
+"""Motion within a frame: the bodies' poses at several moments of it."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+
+from .kernels.motion import BROKEN, Track, Viewpoint, bound_swept_shapes, record_kernel
+from .launch import SplitLaunch
+from .scene import POSE_TYPES, RayScene, View, wp_pose
+
+
+class PoseTrack:
+    """Poses of a scene's bodies at K + 1 evenly spaced moments of a frame.
+
+    ``advance`` takes the scene's poses as the newest moment. In between, a body moves evenly along a line and turns
+    evenly about an axis, by the shorter way: for moments h seconds apart, positions are off by at most
+    max|acceleration| * h^2 / 8, angles likewise by angular acceleration, and constant velocities are exact. A body that
+    is placed anew instead of moving, because it went farther than ``jump`` in one piece, has its new pose from the
+    piece's beginning; one without a valid pose in some piece is not there during the whole frame.
+
+    Attributes:
+        segments: K, the pieces of a frame.
+        arrays: The poses as the kernels read them.
+    """
+
+    def __init__(self, scene: RayScene, segments: int, jump: float = math.inf) -> None:
+        """Allocates the poses.
+
+        Args:
+            scene: Whose bodies move.
+            segments: K, at least 1.
+            jump: A body that moves farther than this between two moments was placed anew, metres.
+        """
+        if segments < 1:
+            raise ValueError(f"a track's segments={segments} must be at least 1")
+        if not jump > 0.0:
+            raise ValueError(f"a track's jump={jump} must be a positive distance in metres")
+        self.segments, self._scene = segments, scene
+        shape = (segments + 1, scene.num_envs, max(scene.num_bodies, 1))
+        self._pos = torch.zeros(*shape, 3, dtype=torch.float64, device=scene.device)
+        self._quat = torch.zeros(*shape, 4, dtype=torch.float64, device=scene.device)
+        self._turn = torch.zeros_like(self._quat)
+        self._oldest = torch.zeros(1, dtype=torch.int32, device=scene.device)
+        self._newest = torch.full_like(self._oldest, segments)
+        self.arrays = self._as_arrays()
+        args = [scene.wp_body_pos, scene.wp_body_quat, wp.from_torch(self._newest), min(jump, 3.0e38)]
+        args += [self.arrays.pos, self.arrays.quat, self.arrays.turn]
+        kernel = record_kernel(POSE_TYPES[scene.body_pos.dtype])
+        self._record = scene.launch(kernel, (), args, work_per_env=20 * scene.num_bodies)
+        self._is_new = True
+
+    def advance(self) -> None:
+        """Takes the scene's poses as the newest moment; the oldest one is forgotten."""
+        if self._is_new:
+            self.reset()
+        self._newest.copy_(self._oldest)
+        self._oldest.add_(1).remainder_(self.segments + 1)
+        self._record()
+
+    def reset(self, env_ids: torch.Tensor | slice = slice(None)) -> None:
+        """Forgets how the bodies of some environments moved: they have always been where the scene has them now."""
+        bodies = slice(0, self._scene.num_bodies)
+        self._pos[:, env_ids, bodies] = self._scene.body_pos[env_ids].double()
+        xyzw = self._scene.body_quat[env_ids].double().roll(-1, -1)
+        self._quat[:, env_ids, bodies] = torch.nn.functional.normalize(xyzw, dim=-1)
+        self._turn[:, env_ids] = 0.0
+        self._turn[:, env_ids, bodies, 3] = self._scene.broken_poses()[env_ids].double() * float(BROKEN)
+        self._is_new = False
+
+    def _as_arrays(self) -> Track:
+        track = Track()
+        track.pos, track.quat = wp.from_torch(self._pos, dtype=wp.vec3d), wp.from_torch(self._quat, dtype=wp.quatd)
+        track.turn, track.oldest = wp.from_torch(self._turn, dtype=wp.vec4d), wp.from_torch(self._oldest)
+        track.segments = self.segments
+        track.shape_body, track.shape_pose = self._scene.body, self._scene.pose
+        return track
+
+
+class SweptShapes:
+    """Bounds of a scene's shapes over a frame in a viewer's frame, nearest first, refreshed by ``refresh``.
+
+    ``bound``, ``near``, ``shape`` and ``count`` are those of ``PlacedShapes``; ``axes`` and ``pose`` are None: every
+    ray works them out for its own time.
+    """
+
+    axes: wp.array | None = None
+    pose: wp.array | None = None
+
+    def __init__(self, scene: RayScene, exclude_shapes: Sequence[int], view: View, track: PoseTrack) -> None:
+        excluded = scene.check_shape_ids(exclude_shapes)
+        viewed = [k for k in range(len(scene.shapes)) if k not in excluded]
+        slots, device = (scene.num_envs, max(len(viewed), 1)), scene.wp_device
+        self.bound = wp.zeros(slots, dtype=wp.vec4, device=device)
+        self.near = wp.zeros(slots, dtype=wp.float32, device=device)
+        self.shape = wp.zeros(slots, dtype=wp.int32, device=device)
+        self.count = wp.zeros(scene.num_envs, dtype=wp.int32, device=device)
+        self._scene, self._view, self._track, self._num_viewed = scene, view, track, len(viewed)
+        self._viewed = wp.array(viewed or [0], dtype=wp.int32, device=device)
+        self._visible: torch.Tensor | None = None
+        self._launch = self._record()
+
+    def refresh(self) -> None:
+        """Bounds the shapes along the track."""
+        if self._visible is not self._scene.visible_if_used:
+            self._visible = self._scene.visible_if_used
+            self._launch = self._record()
+        self._launch()
+
+    def _record(self) -> SplitLaunch:
+        scene, view, track = self._scene, self._view, self._track
+        if self._visible is None:
+            visible = wp.empty((0, 0), dtype=wp.bool, device=scene.wp_device)
+        else:
+            visible = wp.from_torch(self._visible)
+        args = [track.arrays, scene.geometry.radius, visible, self._viewed, self._num_viewed]
+        args += [viewpoint_of(view), view.max_range, self.bound, self.near, self.shape, self.count]
+        work = 40 * self._num_viewed * track.segments
+        return scene.launch(bound_swept_shapes, (), args, work_per_env=work)
+
+
+def viewpoint_of(view: View) -> Viewpoint:
+    """Where a view is taken from, as the kernels read it."""
+    viewpoint = Viewpoint()
+    viewpoint.body, viewpoint.pose = view.body, wp_pose(view.pos, view.quat)
+    return viewpoint

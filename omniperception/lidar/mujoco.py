@@ -1,0 +1,173 @@
+"""A ray scene from a compiled MuJoCo model. MuJoCo is imported when a function is called, not before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from .heightfield import HeightField
+from .meshes import TriangleMesh
+from .scene import RayScene
+from .shapes import SIZE_NAMES, Shape, ShapeKind
+
+if TYPE_CHECKING:
+    import mujoco
+
+Assets = dict[tuple[ShapeKind, int], TriangleMesh | HeightField]
+
+
+@dataclass(frozen=True)
+class GeomShapes:
+    """The geoms of a model as shapes, in the model's order, and the bodies that carry them.
+
+    Attributes:
+        shapes: One for each geom; ``shape.body`` is an index into ``body_ids``, -1 where the geom cannot move.
+        geom_ids: The geom of each shape.
+        body_ids: MuJoCo's ids of the bodies that move and have such geoms, ascending.
+    """
+
+    shapes: tuple[Shape, ...]
+    geom_ids: tuple[int, ...]
+    body_ids: tuple[int, ...]
+
+
+def geom_shapes(
+    model: mujoco.MjModel,
+    class_of: Callable[[int], int] | None = None,
+    geoms: Sequence[int] | None = None,
+) -> GeomShapes:
+    """Every geom of a model as the exact shape that ``mj_ray`` meets.
+
+    A body moves if it has a joint above it or is a mocap body; geoms of the others are placed where the model's
+    reference configuration has them.
+
+    Args:
+        model: The compiled model.
+        class_of: Class id (>= 0) of a geom by its id; 0 for all if None.
+        geoms: Ids of the geoms to take; all that ``mj_ray`` meets if None, which leaves out the fully transparent.
+
+    Raises:
+        ValueError: A geom is a signed distance field, which has no surface that rays could be cast at.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    geom_ids = [k for k in range(model.ngeom) if _is_seen(model, k)] if geoms is None else [int(k) for k in geoms]
+    body_ids = tuple(sorted({int(model.geom_bodyid[k]) for k in geom_ids if _moves(model, int(model.geom_bodyid[k]))}))
+    assets: Assets = {}
+    shapes = []
+    for k in geom_ids:
+        kind = _kind(model, k)
+        body = int(model.geom_bodyid[k])
+        moves = body in body_ids
+        quat = np.empty(4)
+        mujoco.mju_mat2Quat(quat, data.geom_xmat[k])
+        shapes.append(
+            Shape(
+                kind=kind,
+                size=tuple(model.geom_size[k][: len(SIZE_NAMES[kind])]),
+                body=body_ids.index(body) if moves else -1,
+                pos=tuple(model.geom_pos[k] if moves else data.geom_xpos[k]),
+                quat=tuple(model.geom_quat[k] if moves else quat),
+                class_id=class_of(k) if class_of is not None else 0,
+                asset=_asset(model, kind, int(model.geom_dataid[k]), assets),
+            )
+        )
+    return GeomShapes(tuple(shapes), tuple(geom_ids), body_ids)
+
+
+class MujocoScene(RayScene):
+    """A ray scene of a compiled model's geoms; rays meet what they meet in ``mj_ray``.
+
+    Attributes:
+        geom_ids: The geom of each shape.
+        body_ids: MuJoCo's id of each body of the scene.
+
+    Args:
+        model: The compiled model.
+        num_envs: Environments, each with poses of its own.
+        class_of: Class id (>= 0) of a geom by its id; 0 for all if None.
+        geoms: Ids of the geoms to take; all that ``mj_ray`` meets if None.
+        device, num_threads, pose_dtype: As for ``RayScene``; poses are MuJoCo's float64 unless told otherwise.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int = 1,
+        class_of: Callable[[int], int] | None = None,
+        geoms: Sequence[int] | None = None,
+        device: str | torch.device = "cpu",
+        num_threads: int | None = None,
+        pose_dtype: torch.dtype = torch.float64,
+    ) -> None:
+        found = geom_shapes(model, class_of, geoms)
+        self.geom_ids, self.body_ids = found.geom_ids, found.body_ids
+        self._rows = torch.tensor(found.body_ids, dtype=torch.int64, device=device)
+        super().__init__(found.shapes, num_envs, len(found.body_ids), device, num_threads, pose_dtype)
+
+    def copy_poses(self, xpos: np.ndarray | torch.Tensor, xquat: np.ndarray | torch.Tensor) -> None:
+        """Takes the bodies' poses from those of all bodies of the model.
+
+        Args:
+            xpos: Positions, metres, (nbody, 3), or (num_envs, nbody, 3).
+            xquat: Orientations, (w, x, y, z), (nbody, 4), or (num_envs, nbody, 4).
+        """
+        for own, given in ((self.body_pos, xpos), (self.body_quat, xquat)):
+            own.copy_(torch.as_tensor(given, device=self.device)[..., self._rows, :])
+
+    def copy_data(self, data: mujoco.MjData) -> None:
+        """Takes the bodies' poses from a simulation, the same for all environments."""
+        self.copy_poses(data.xpos, data.xquat)
+
+
+def _is_seen(model: mujoco.MjModel, geom: int) -> bool:
+    material = int(model.geom_matid[geom])
+    return bool((model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[3] != 0.0)
+
+
+def _moves(model: mujoco.MjModel, body: int) -> bool:
+    return bool(model.body_mocapid[model.body_rootid[body]] >= 0 or model.body_weldid[body] != 0)
+
+
+def _kind(model: mujoco.MjModel, geom: int) -> ShapeKind:
+    import mujoco
+
+    name = mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_")
+    kind = "HEIGHTFIELD" if name == "HFIELD" else name
+    if kind not in ShapeKind.__members__:
+        raise ValueError(
+            f"geom {geom} ({model.geom(geom).name!r}) is of type {name.lower()}, which rays cannot meet: "
+            "make it a mesh, or leave it out with geoms=[...]"
+        )
+    return ShapeKind[kind]
+
+
+def _asset(
+    model: mujoco.MjModel,
+    kind: ShapeKind,
+    data_id: int,
+    assets: dict[tuple[ShapeKind, int], TriangleMesh | HeightField],
+) -> TriangleMesh | HeightField | None:
+    """The mesh or the height field of a geom, one object for all geoms that share it."""
+    if kind not in (ShapeKind.MESH, ShapeKind.HEIGHTFIELD):
+        return None
+    if (kind, data_id) not in assets:
+        if kind == ShapeKind.MESH:
+            vertices, faces = int(model.mesh_vertadr[data_id]), int(model.mesh_faceadr[data_id])
+            assets[kind, data_id] = TriangleMesh(
+                model.mesh_vert[vertices : vertices + model.mesh_vertnum[data_id]],
+                model.mesh_face[faces : faces + model.mesh_facenum[data_id]],
+            )
+        else:
+            rows, cols = int(model.hfield_nrow[data_id]), int(model.hfield_ncol[data_id])
+            first = int(model.hfield_adr[data_id])
+            half_x, half_y, scale, base = (float(x) for x in model.hfield_size[data_id])
+            heights = np.array(model.hfield_data[first : first + rows * cols]).reshape(rows, cols)
+            assets[kind, data_id] = HeightField(heights, half_x, half_y, base, scale)
+    return assets[kind, data_id]

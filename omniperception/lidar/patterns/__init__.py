@@ -1,0 +1,39 @@
+"""Scan patterns: the directions in which a sensor looks, as a function of time, and which of them are kept."""
+
+from .custom import custom
+from .grid import grid, height_scanner
+from .livox import LIVOX, avia, hap, horizon, mid40, mid70, mid360, tele15
+from .selection import Selection, make_selection, select_rows
+from .spinning import airy, hdl32e, hdl64e, os0, os1, os2, ouster, spinning, vlp16, vlp32c, xt16, xt32
+from .table import ROW_SLACK, ScanPattern
+
+__all__ = [
+    "LIVOX",
+    "ROW_SLACK",
+    "ScanPattern",
+    "Selection",
+    "airy",
+    "avia",
+    "custom",
+    "grid",
+    "hap",
+    "hdl32e",
+    "hdl64e",
+    "height_scanner",
+    "horizon",
+    "make_selection",
+    "mid40",
+    "mid70",
+    "mid360",
+    "os0",
+    "os1",
+    "os2",
+    "ouster",
+    "select_rows",
+    "spinning",
+    "tele15",
+    "vlp16",
+    "vlp32c",
+    "xt16",
+    "xt32",
+]

@@ -1,0 +1,236 @@
+"""Which points of a frame are kept when fewer rays are wanted than the device measures."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+
+from .cells import SphereCells
+from .table import ScanPattern
+
+Strategy = Literal["every_kth", "stratified", "random"]
+
+RANDOM_VARIANTS = 64
+MAX_STRATIFIED_VARIANTS = 256
+DISTINCT_FRAMES = 16
+"""A stratified choice is made anew so many times where the table repeats after fewer frames, as a spinning one does."""
+MAX_OFFSETS = 1 << 22
+"""Bound on variants x rays of a bank (16 MiB), and on variants x points of which a stratified one is chosen."""
+FIELD_SAMPLE = 50_000
+"""Rows of the table from which the size of the field of view is found."""
+WEYL = 0x9E3779B97F4A7C15 - (1 << 64)
+"""2^64 over the golden ratio, as int64: multiples of it spread evenly over all integers."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A bank of choices of N among the P points of a frame.
+
+    Ray i of a frame is row ``(first_row + offsets[variant, i]) mod M`` of the pattern's table, where ``first_row`` is
+    what ``ScanPattern.first_rows`` gives and ``variant`` what ``variants`` gives. Nothing else is kept from frame to
+    frame: a reset, a pause or a replay at the same time and frame number gives the same points.
+
+    Attributes:
+        strategy: "every_kth", "stratified" or "random".
+        offsets: Rows after the frame's first, increasing, in 0..P-1, (V, N) int32.
+        num_rows: Rows of the pattern's table, M.
+        phase_step: Phases of environments should be multiples of this many rows. It divides M. For "stratified" it is
+            the distance between the frames that the variants were made for (a frame that begins in between gets the
+            nearest one's offsets, and its cells are filled less evenly); otherwise the rows of one shot.
+        seed: Of the random choices.
+    """
+
+    strategy: Strategy
+    offsets: torch.Tensor
+    num_rows: int
+    phase_step: int
+    seed: int
+
+    @property
+    def num_variants(self) -> int:
+        """V."""
+        return self.offsets.shape[0]
+
+    @property
+    def num_rays(self) -> int:
+        """N."""
+        return self.offsets.shape[1]
+
+    def to(self, device: torch.device | str) -> "Selection":
+        """The same with ``offsets`` on a device."""
+        offsets = self.offsets.to(device)
+        return Selection(self.strategy, offsets, self.num_rows, self.phase_step, self.seed)
+
+    def draw_phases(self, num_envs: int, generator: torch.Generator | None = None) -> torch.Tensor:
+        """Random rows by which each environment's device is ahead, multiples of ``phase_step``, (num_envs,) int64."""
+        steps = self.num_rows // self.phase_step
+        return torch.randint(steps, (num_envs,), generator=generator) * self.phase_step
+
+    def salts(self, num_envs: int) -> torch.Tensor:
+        """A random number per environment from the seed, drawn once and given to ``variants``, (num_envs,) int64."""
+        generator = torch.Generator().manual_seed(self.seed)
+        return torch.randint(-(1 << 63), (1 << 63) - 1, (num_envs,), generator=generator)
+
+    def variants(
+        self,
+        first_row: torch.Tensor,
+        frame: torch.Tensor,
+        salts: torch.Tensor,
+        out: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Variant of each environment's frame, a function of its arguments only; allocates nothing if given ``out``.
+
+        Args:
+            first_row: Of each frame, (num_envs,) int64; used by "stratified".
+            frame: Number of the frame, one for all (1,) or (num_envs,), any integer type; "every_kth" ignores it, and
+                "stratified" where the table's frames are many.
+            salts: From ``salts``, (num_envs,) int64, on the device of ``first_row``; used by "random".
+            out: Where to write, (num_envs,) int64.
+
+        Returns:
+            ``out``, in 0..V-1.
+        """
+        out = torch.empty_like(first_row) if out is None else out
+        if self.strategy == "every_kth":
+            return out.zero_()
+        if self.strategy == "stratified":  # the bank holds all starts for one choice, then all for the next
+            starts = self.num_rows // self.phase_step
+            torch.add(first_row, self.phase_step // 2, out=out)
+            out.floor_divide_(self.phase_step).remainder_(starts)
+            return out.add_(frame, alpha=starts).remainder_(self.num_variants)
+        out.copy_(frame).mul_(WEYL).add_(salts)
+        for _ in range(3):  # the middle of the square of a sequence that never repeats
+            out.mul_(out).add_(salts).bitwise_right_shift_(16)
+        return out.remainder_(self.num_variants)
+
+
+def make_selection(
+    pattern: ScanPattern, period_s: float, num_rays: int, strategy: Strategy = "every_kth", seed: int = 0
+) -> Selection:
+    """The bank of a strategy.
+
+    Args:
+        pattern: The device's table.
+        period_s: Length of a frame, s.
+        num_rays: Points kept of each frame.
+        strategy: "every_kth": every k-th point from the frame's first, k having no factor in common with the number of
+            lasers; one variant. The last P - k N points of each frame are never kept: where a frame is a whole turn
+            of a spinning sensor, that is always the same sector. "stratified": cells of the field of view, of equal
+            solid angle and about as many as rays, each give their most central point, then another, until there are
+            enough; one variant, with the cells shifted at random, for each of at most 256 places in the table where a
+            frame can begin, and several where few frames differ. "random": any points with equal chance, anew in each
+            frame of each environment, from 64 variants.
+        seed: Of the random choices.
+    """
+    points = pattern.check_num_rays(period_s, num_rays)
+    if strategy == "every_kth":
+        offsets = (torch.arange(num_rays) * pattern.stride(period_s, num_rays))[None]
+        return Selection(strategy, offsets.int(), pattern.num_rows, pattern.rows_per_shot, seed)
+    if strategy == "random":
+        offsets = _random_offsets(points, num_rays, min(RANDOM_VARIANTS, max(1, MAX_OFFSETS // num_rays)), seed)
+        return Selection(strategy, offsets, pattern.num_rows, pattern.rows_per_shot, seed)
+    if strategy == "stratified":
+        variants = min(MAX_STRATIFIED_VARIANTS, max(1, MAX_OFFSETS // points))
+        frames = pattern.num_rows // math.gcd(pattern.num_rows, points)
+        choices = 1 if num_rays == points else min(variants, math.ceil(DISTINCT_FRAMES / frames))
+        step = _frame_step(pattern.num_rows, points, variants // choices)
+        offsets = _stratified_offsets(pattern, points, num_rays, step, choices, seed)
+        return Selection(strategy, offsets, pattern.num_rows, step, seed)
+    raise ValueError(f"lidar.selection={strategy!r} must be one of {', '.join(get_args(Strategy))}")
+
+
+def select_rows(
+    pattern: ScanPattern,
+    time: torch.Tensor,
+    period_s: float,
+    num_rays: int,
+    phase_rows: torch.Tensor | int = 0,
+    selection: Selection | None = None,
+    frame: torch.Tensor | int = 0,
+) -> torch.Tensor:
+    """Table rows of the frame that ends at ``time``, chosen among the points of [time - period_s, time).
+
+    Args:
+        pattern: The device's table.
+        time: End of the frame, s, (num_envs,) float64.
+        period_s: Length of the frame, s.
+        num_rays: Points kept.
+        phase_rows: Rows by which each environment's device is ahead, int64, (num_envs,) or scalar.
+        selection: From ``make_selection`` for this pattern, period and number; None: every k-th.
+        frame: Number of the frame, scalar or (num_envs,); "random" depends on it.
+
+    Returns:
+        Rows in 0..M-1, (num_envs, num_rays) int64; exact also after 10^6 s.
+    """
+    if selection is None:
+        selection = make_selection(pattern, period_s, num_rays)
+    if selection.num_rays != num_rays or selection.num_rows != pattern.num_rows:
+        raise ValueError(
+            f"selection holds {selection.num_rays} rays of {selection.num_rows} rows, "
+            f"asked for {num_rays} of {pattern.num_rows}"
+        )
+    first = pattern.first_rows(time, period_s, phase_rows)
+    frame = torch.as_tensor(frame, device=time.device)
+    variants = selection.variants(first, frame, selection.salts(len(time)).to(time.device))
+    return (first[:, None] + selection.offsets.to(time.device)[variants]).remainder_(pattern.num_rows)
+
+
+def _random_offsets(points: int, num_rays: int, variants: int, seed: int) -> torch.Tensor:
+    random = np.random.default_rng(seed)
+    rows = [np.sort(random.choice(points, num_rays, replace=False)) for _ in range(variants)]
+    return torch.from_numpy(np.stack(rows).astype(np.int32))
+
+
+def _frame_step(num_rows: int, points: int, max_variants: int) -> int:
+    """Smallest divisor of the table, and of the frame if possible, that makes at most ``max_variants`` steps of it.
+
+    Frames of a device whose phase is a multiple of such a step begin at multiples of it.
+    """
+    for base in (math.gcd(num_rows, points), num_rows):
+        if num_rows // base <= max_variants:
+            pieces = max(k for k in _divisors(base) if k * (num_rows // base) <= max_variants)
+            return base // pieces
+    raise AssertionError("a table is one step of itself")
+
+
+def _divisors(number: int) -> list[int]:
+    small = [k for k in range(1, math.isqrt(number) + 1) if number % k == 0]
+    return small + [number // k for k in small]
+
+
+def _stratified_offsets(
+    pattern: ScanPattern, points: int, num_rays: int, step: int, choices: int, seed: int
+) -> torch.Tensor:
+    elevation, azimuth = (a.double().cpu().numpy() for a in (pattern.elevation, pattern.azimuth))
+    cells = field_cells(pattern, num_rays)
+    random = np.random.default_rng(seed)
+    chosen = []
+    for start in list(range(0, pattern.num_rows, step)) * choices:
+        rows = np.arange(start, start + points)
+        turned = azimuth.take(rows, mode="wrap") + 2.0 * math.pi * random.random()
+        tilted = elevation.take(rows, mode="wrap") + math.radians(cells.edge_deg) * (random.random() - 0.5)
+        chosen.append(_one_per_cell(*cells.locate(tilted, turned), num_rays, random))
+    return torch.from_numpy(np.stack(chosen).astype(np.int32))
+
+
+def field_cells(pattern: ScanPattern, count: int) -> SphereCells:
+    """Cells of equal solid angle, about ``count`` of which the pattern's table touches."""
+    rows = np.random.default_rng(0).permutation(pattern.num_rows)[:FIELD_SAMPLE]
+    elevation, azimuth = (a.double().cpu().numpy()[rows] for a in (pattern.elevation, pattern.azimuth))
+    small, large = 0.05, 90.0
+    while large > 1.02 * small:
+        edge = math.sqrt(small * large)
+        touched = len(np.unique(SphereCells(edge).index(elevation, azimuth)))
+        small, large = (edge, large) if touched > count else (small, edge)
+    return SphereCells(large)
+
+
+def _one_per_cell(cell: np.ndarray, off_centre: np.ndarray, num_rays: int, random: np.random.Generator) -> np.ndarray:
+    """Positions of ``num_rays`` points, increasing: the most central of every cell, then the next of every cell, ..."""
+    by_cell = np.lexsort((off_centre, cell))
+    sorted_cells = cell[by_cell]
+    turn = np.arange(len(cell)) - np.searchsorted(sorted_cells, sorted_cells)
+    taken = np.lexsort((random.random(len(cell)), turn))[:num_rays]
+    return np.sort(by_cell[taken])

@@ -1,0 +1,69 @@
+"""A perception network that supervision alone trains, beside PPO."""
+
+import torch
+from test_ppo import collect
+from toy_env import SUPERVISED, ToyEnv, config
+
+from omniperception.learning import PerceptivePpo
+
+
+def algorithm(env, **overrides):
+    torch.manual_seed(0)
+    cfg = config(supervision=SUPERVISED, multi_gpu=None, **overrides)
+    return PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
+
+
+def parameters(module):
+    return [p.detach().clone() for p in module.parameters()]
+
+
+def test_supervision_learns_the_target():
+    env = ToyEnv(6)
+    alg = algorithm(env)
+    collect(alg, env, 8)
+    errors = []
+    for _ in range(60):
+        alg.perception_trainer.train(alg.storage, 2, mixed_precision=False)
+        errors.append(alg.actor.pop_supervised_losses()["height_target"])
+    assert errors[-1] < 0.3 * errors[0]
+
+
+def test_an_update_trains_both_networks_and_nothing_without_a_target():
+    env = ToyEnv(6)
+    alg = algorithm(env)
+    before = parameters(alg.actor)
+    for _ in range(2):
+        collect(alg, env, 8)
+        assert alg.update()["height_target"] > 0
+    now = dict(alg.actor.named_parameters())
+    unchanged = [name for name, old in zip(now, before, strict=True) if torch.equal(now[name], old)]
+    assert unchanged == [name for name in now if name.startswith("perception.distal")]
+
+
+def test_ppo_sees_the_embedding_that_the_policy_acted_on_and_does_not_change_it():
+    env = ToyEnv(6, episode=9)
+    alg = algorithm(env)
+    collect(alg, env, 8)
+    acted_on = alg._embed_rollout()
+    alg.perception_trainer.train(alg.storage, 2, mixed_precision=False)
+    alg.storage.window_features = acted_on
+    after_supervision = parameters(alg.actor.perception)
+    alg.perception_trainer = None  # what follows is PPO alone
+    for batch in alg.storage.mini_batch_generator(2, 1):
+        alg.actor(batch.observations, stochastic_output=True)
+        log_prob = alg.actor.get_output_log_prob(batch.actions)
+        has_frame = batch.observations.step_count > 0
+        assert has_frame.any()
+        old = batch.old_actions_log_prob.squeeze(-1)
+        assert torch.allclose(log_prob[has_frame], old[has_frame], atol=1e-4)
+    super(PerceptivePpo, alg).update()
+    assert all(map(torch.equal, after_supervision, parameters(alg.actor.perception)))
+
+
+def test_a_rollout_without_a_frame_teaches_nothing():
+    env = ToyEnv(4, period=1000)
+    alg = algorithm(env)
+    before = parameters(alg.actor.perception)
+    collect(alg, env, 8)
+    assert "height_target" not in alg.update()
+    assert all(map(torch.equal, before, parameters(alg.actor.perception)))

@@ -1,0 +1,102 @@
+"""Depth cameras, height scanners and users' own tables."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from omniperception.lidar import custom, grid, height_scanner
+
+
+def test_grid_is_a_pinhole_camera():
+    pattern = grid(3, 3, fov_deg=90.0)
+    rays = pattern.directions_s.reshape(3, 3, 3)
+    assert torch.allclose(rays[1, 1], torch.tensor([1.0, 0.0, 0.0]))
+    pixel = 2.0 / 3.0  # at distance 1, 90 degrees span 2
+    assert torch.allclose(rays[1, 0] / rays[1, 0, 0], torch.tensor([1.0, pixel, 0.0]))
+    assert torch.allclose(rays[0, 2] / rays[0, 2, 0], torch.tensor([1.0, -pixel, pixel]))
+    assert pattern.points_per_frame(1.0 / 30.0) == 9 and pattern.rows_per_shot == 9
+    with pytest.raises(ValueError, match="fov_deg=180"):
+        grid(3, 3, 180.0)
+    with pytest.raises(ValueError, match="width=0"):
+        grid(0, 3, 90.0)
+
+
+def test_height_scanner_is_a_grid_of_vertical_rays():
+    pattern = height_scanner()
+    assert pattern.num_rows == 17 * 11 and pattern.points_per_frame(0.02) == 187
+    assert torch.equal(pattern.directions_s, torch.tensor([0.0, 0.0, -1.0]).expand(187, 3))
+    origins = pattern.origins_s.reshape(17, 11, 3)
+    assert torch.allclose(origins[0, 0], torch.tensor([-0.8, -0.5, 0.0]))
+    assert torch.allclose(origins[0, 1], torch.tensor([-0.8, -0.4, 0.0]))
+    assert torch.allclose(origins[16, 10], torch.tensor([0.8, 0.5, 0.0]))
+    assert torch.allclose(origins.mean(dim=(0, 1)), torch.zeros(3), atol=1e-7)
+    line = height_scanner(0.0, 0.2, 0.1)
+    assert line.origins_s[:, 1].tolist() == pytest.approx([-0.1, 0.0, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((1.65, 1.0, 0.1), "lidar.pattern.size_x=1.65 must be a multiple of lidar.pattern.spacing=0.1"),
+        ((1.6, -1.0, 0.1), "lidar.pattern.size_y=-1.0"),
+        ((1.6, 1.0, 0.0), "lidar.pattern.spacing=0.0 must be a positive length"),
+    ],
+)
+def test_wrong_height_scanners_are_told(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        height_scanner(*arguments)
+
+
+ANGLES = np.array([[0.0, 10.0], [90.0, -20.0], [-90.0, 0.0], [180.0, 45.0]])
+
+
+@pytest.mark.parametrize("header", ["", "azimuth_deg,elevation_deg\n"])
+def test_a_users_csv(tmp_path, header):
+    path = tmp_path / "scan.csv"
+    path.write_text(header + "".join(f"{a},{e}\n" for a, e in ANGLES))
+    pattern = custom(path, 40.0, unit="deg", num_lasers=2, rows_per_shot=2)
+    assert torch.rad2deg(pattern.elevation).tolist() == pytest.approx([10.0, -20.0, 0.0, 45.0], abs=1e-4)
+    assert torch.allclose(pattern.directions_s[2], torch.tensor([0.0, -1.0, 0.0]), atol=1e-6)
+    assert pattern.duration_s == 0.1 and (pattern.num_lasers, pattern.rows_per_shot) == (2, 2)
+
+
+def test_a_users_npy(tmp_path):
+    np.save(tmp_path / "scan.npy", np.radians(ANGLES).astype(np.float32))
+    pattern = custom(str(tmp_path / "scan.npy"), 40.0)
+    assert torch.rad2deg(pattern.azimuth).tolist() == pytest.approx([0.0, 90.0, 270.0, 180.0], abs=1e-4)
+
+
+def test_a_csv_of_one_row(tmp_path):
+    (tmp_path / "one.csv").write_text("0.5,0.25\n")
+    assert custom(tmp_path / "one.csv", 1.0).num_rows == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "unit", "message"),
+    [
+        ("absent.csv", None, "rad", "does not exist; give a .npy or .csv file"),
+        ("scan.txt", "0,0\n", "rad", "must end in .npy or .csv"),
+        ("scan.csv", "0,0,0\n1,1,1\n", "rad", r"holds \(2, 3\), expected \(M, 2\)"),
+        ("scan.csv", "0,0\n1,x\n", "rad", r"row 1 is \[1.0, nan\], expected two numbers"),
+        ("scan.csv", "0,0\n1\n", "rad", "cannot be read as numbers"),
+        ("scan.csv", "0,30\n", "rad", "elevation of 30 rad is beyond a right angle.*may have to be deg"),
+        ("scan.csv", "0,100\n", "deg", "elevation of 100 deg is beyond a right angle"),
+        ("scan.csv", "0,0\n", "turns", "lidar.pattern.unit='turns' must be deg or rad"),
+        ("scan.npy", "no array", "rad", "cannot be read as numbers"),
+    ],
+)
+def test_wrong_files_are_told_in_one_line(tmp_path, name, content, unit, message):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
+        custom(tmp_path / name, 10.0, unit=unit)
+    assert "\n" not in str(error.value)
+
+
+def test_the_rate_of_a_users_table_must_be_positive(tmp_path):
+    (tmp_path / "scan.csv").write_text("0,0\n")
+    for rate in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match="points_per_second"):
+            custom(tmp_path / "scan.csv", rate)

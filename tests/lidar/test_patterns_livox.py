@@ -1,0 +1,140 @@
+"""Livox scanners: fields of view, prism optics against Snell's law, closed forms against the manufacturer's tables."""
+
+import importlib.util
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from omniperception.lidar import LIVOX, hap, mid360
+from omniperception.lidar.patterns.coverage import angle_to_table, compare
+from omniperception.lidar.patterns.risley import RisleyScanner, Wedge
+
+needs_table = pytest.mark.skipif(
+    importlib.util.find_spec("mujoco_lidar") is None, reason="the extra 'tables' is not installed"
+)
+# name: (points/s, rows, half width and half height of the field of view of the table, deg)
+FIGURES = {
+    "avia": (240_000, 960_000, 35.31, 38.59),
+    "hap": (452_000, 1_808_000, 60.25, 13.25),
+    "horizon": (240_000, 960_000, 40.96, 14.09),
+    "mid40": (100_000, 400_000, 19.17, 19.17),
+    "mid70": (100_000, 400_000, 35.215, 35.215),
+    "tele15": (240_000, 960_000, 7.324, 8.127),
+}
+
+
+@pytest.fixture(scope="module")
+def models():
+    return {name: make() for name, make in LIVOX.items()}
+
+
+def test_mid360_has_the_devices_field_of_view(models):
+    model = models["mid360"]
+    elevation = np.degrees(model.elevation.numpy())
+    assert model.num_rows == 800_000 and model.points_per_second == 200_000.0
+    assert elevation.min() == pytest.approx(-7.21, abs=0.1) and elevation.max() == pytest.approx(52.16, abs=0.1)
+    filled, _ = np.histogram(model.azimuth.numpy(), bins=360, range=(0.0, 2.0 * math.pi))
+    assert filled.min() > 0.9 * filled.mean()
+    assert model.azimuth.min() >= 0.0 and model.azimuth.max() < 2.0 * math.pi
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_field_of_view_and_rate(models, name):
+    rate, rows, half_width, half_height = FIGURES[name]
+    model = models[name]
+    assert model.points_per_second == rate and model.num_rows == rows
+    azimuth = torch.rad2deg(torch.atan2(model.directions_s[:, 1], model.directions_s[:, 0]))
+    elevation = torch.rad2deg(model.elevation)
+    assert (azimuth.min().item(), azimuth.max().item()) == pytest.approx((-half_width, half_width), abs=0.02)
+    assert (elevation.min().item(), elevation.max().item()) == pytest.approx((-half_height, half_height), abs=0.02)
+
+
+def test_a_thin_wedge_bends_light_by_n_minus_one_times_its_angle():
+    """To first order, towards its thick side: away from the inclined normal at the exit, towards it at the entry."""
+    for flat_first, sign in ((True, -1.0), (False, 1.0)):
+        scanner = RisleyScanner((Wedge(1.5, 0.1, 60.0, 0.0, flat_first),))
+        at_start, quarter_later = scanner.directions(np.array([0.0, 0.25]), np.zeros(2))
+        bend = sign * math.radians(0.5 * 0.1)
+        assert at_start == pytest.approx([1.0, bend, 0.0], abs=1e-6)
+        assert quarter_later == pytest.approx([1.0, 0.0, bend], abs=1e-6)
+
+
+def test_a_wedge_bends_light_as_a_prism_in_its_plane():
+    """Flat face first: sin(out) = n sin(wedge), measured from the inclined face's normal."""
+    n, wedge = 1.8144, math.radians(18.0)
+    (ray,) = RisleyScanner((Wedge(n, 18.0, 0.0, 180.0, True),)).directions(np.zeros(1), np.zeros(1))
+    out = math.asin(n * math.sin(wedge)) - wedge
+    assert ray == pytest.approx([math.cos(out), math.sin(out), 0.0], abs=1e-12)
+
+
+def test_equal_wedges_in_opposite_turns_draw_a_line_through_the_centre(models):
+    """Two rotors at f and -f would draw a line; the Mid-40's meet at its centre when they cancel."""
+    scanner = RisleyScanner((Wedge(1.5, 5.0, 600.0, 0.0, True), Wedge(1.5, 5.0, -600.0, 0.0, True)))
+    rays = scanner.directions(np.linspace(0.0, 0.1, 101), np.zeros(101))
+    assert np.abs(rays[:, 2]).max() < 0.05 * np.abs(rays[:, 1]).max()
+    assert np.linalg.norm(rays, axis=1) == pytest.approx(np.ones(101), abs=1e-12)
+    assert torch.rad2deg(torch.acos(models["mid40"].directions_s[:, 0].clamp(max=1.0))).min() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"), [("horizon", 0.86, 0.92), ("tele15", 0.31, 0.33), ("avia", 0.85, 1.4)]
+)
+def test_the_six_lasers_of_a_shot_stand_in_a_fan(models, name, low, high):
+    """Uppermost first; the Avia's prisms, steep at the edge of its field, spread the fan there."""
+    shots = torch.rad2deg(models[name].elevation).reshape(-1, 6)
+    steps = shots[:, :-1] - shots[:, 1:]
+    assert steps.min() > low and steps.max() < high
+
+
+def test_the_haps_inner_field_is_scanned_more_finely(models):
+    """Across 20 deg of azimuth a laser's steps grow as its clock slows down from 550,002 to 424,998 shots/s."""
+    x, y, z = models["hap"].directions_s.T
+    azimuth, level = torch.rad2deg(torch.atan2(y, x)), torch.rad2deg(torch.asin(z)).abs() < 3.0
+    step = (azimuth[6:] - azimuth[:-6]).abs()
+    azimuth, level = azimuth[6:].abs(), level[6:]
+    inner = step[level & (azimuth > 16.0) & (azimuth < 19.0)].median()
+    outer = step[level & (azimuth > 21.0) & (azimuth < 24.0)].median()
+    assert (outer / inner).item() == pytest.approx(550_002 / 424_998, rel=0.05)
+
+
+@needs_table
+@pytest.mark.parametrize("name", [n for n in LIVOX if n != "hap"])
+def test_models_agree_with_the_tables_row_by_row(models, name):
+    mean, largest = angle_to_table(models[name], LIVOX[name]("table"))
+    assert mean < (0.02 if name == "mid360" else 0.0005)
+    assert largest < (0.1 if name == "mid360" else 0.001)
+
+
+@needs_table
+def test_the_haps_model_agrees_with_its_table_but_for_the_order_of_some_shots(models):
+    mean, _ = angle_to_table(models["hap"], LIVOX["hap"]("table"), slack_rows=1000)
+    assert mean < 0.001
+
+
+@needs_table
+@pytest.mark.parametrize("name", LIVOX)
+def test_models_cover_what_the_tables_cover(models, name):
+    for row in compare(models[name], LIVOX[name]("table")):
+        assert row.overlap > 0.99
+        assert row.seen_model == pytest.approx(row.seen_table, abs=0.005)
+
+
+@needs_table
+def test_tables_have_the_devices_rate():
+    table = mid360("table")
+    assert table.num_rows == 800_000 and table.points_per_second == 200_000.0 and table.rows_per_shot == 4
+    assert hap("table").num_rows == 1_048_575
+
+
+def test_a_missing_table_names_the_extra(monkeypatch):
+    def absent(name):
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr("omniperception.lidar.patterns.livox.files", absent)
+    for make in LIVOX.values():
+        with pytest.raises(ModuleNotFoundError, match=r"pip install omniperception\[tables\]"):
+            make("table")
+        with pytest.raises(ValueError, match=r"lidar.pattern.source='tabel' must be 'model' or 'table'"):
+            make("tabel")
