@@ -88,12 +88,13 @@ def robots(positions, yaws):
 
 
 class TestGoal:
-    config = GoalCommandConfig((10.0, 10.0), (0.0, 0.0), None, 0.8, 2.0, 1.0, SpawnConfig())
+    line = GoalCommandConfig((10.0, 10.0), (0.0, 0.0), None, 0.8, 2.0, 1.0, SpawnConfig())
+    point = GoalCommandConfig((3.0, 3.0), (4.0, 4.0), 0.5, 0.8, 2.0, 1.0, SpawnConfig())
 
-    def command(self, positions, yaws):
+    def command(self, positions, yaws, config=line):
         kinematics = robots(positions, yaws)
         n, device = len(positions), torch.device("cpu")
-        command = self.config.build(n, device, EnvRandom(0, n, device))
+        command = config.build(n, device, EnvRandom(0, n, device))
         command.reset(torch.arange(len(positions)), kinematics)
         return command.value, command.reached(kinematics)
 
@@ -116,9 +117,48 @@ class TestGoal:
         value, _ = self.command([[9.9, 3.0], [12.0, -1.0], [-20.0, 0.5]], [0.3, -2.0, 1.0])
         torch.testing.assert_close(value[:, :2].norm(dim=1), torch.full((3,), 0.8))
 
-    def test_wrong_settings_are_refused(self):
-        with pytest.raises(ValueError, match=r"commands\.speed=0"):
-            GoalCommandConfig((10.0, 10.0), (0.0, 0.0), None, 0.0, 2.0, 1.0, SpawnConfig())
+    def test_a_point_is_aimed_at_and_reached_within_its_radius(self):
+        value, reached = self.command(
+            [[0.0, 0.0], [3.0, 9.0], [3.3, 4.39], [3.3, 4.41]], [0.0, 0.0, 0.0, 0.0], self.point
+        )
+        assert value[0].tolist() == pytest.approx([0.48, 0.64, 1.0], abs=1e-6)  # 3-4-5
+        assert value[1, :2].tolist() == pytest.approx([0.0, -0.8], abs=1e-6)
+        assert reached.tolist() == [False, False, True, False]
+
+    def test_goals_fill_their_box_and_change_with_the_episode(self):
+        box = GoalCommandConfig([6.0, 7.5], [-1.5, 1.5], 0.5, 0.8, 2.0, 1.0, SpawnConfig())
+        kinematics = robots([[0.0, 0.0]] * N, [0.0] * N)
+        command = box.build(N, torch.device("cpu"), EnvRandom(0, N))
+        command.reset(torch.arange(N), kinematics)
+        goal = command.goal_w.clone()
+        torch.testing.assert_close(goal.amin(0), torch.tensor([6.0, -1.5]), atol=0.01, rtol=0)
+        torch.testing.assert_close(goal.amax(0), torch.tensor([7.5, 1.5]), atol=0.01, rtol=0)
+        torch.testing.assert_close(goal.mean(0), torch.tensor([6.75, 0.0]), atol=0.05, rtol=0)
+        command.reset(torch.tensor([2]), kinematics)
+        assert (command.goal_w != goal).any(1).nonzero().flatten().tolist() == [2]
+
+    def test_a_saved_goal_goes_on(self):
+        box = GoalCommandConfig([6.0, 7.5], [-1.5, 1.5], 0.5, 0.8, 2.0, 1.0, SpawnConfig())
+        kinematics = robots([[0.0, 0.0]] * 3, [0.0] * 3)
+        first, second = (box.build(3, torch.device("cpu"), EnvRandom(seed, 3)) for seed in (1, 2))
+        for command in (first, second):
+            command.reset(torch.arange(3), kinematics)
+        assert not torch.equal(first.goal_w, second.goal_w)
+        second.load_state_dict(first.state_dict())
+        second.advance(0.02, kinematics)
+        assert torch.equal(first.goal_w, second.goal_w) and torch.equal(first.value, second.value)
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            (([10.0, 10.0], [0.0, 0.0], None, 0.0), r"commands\.speed=0"),
+            (([7.0, 6.0], [0.0, 0.0], None, 1.0), r"commands\.goal_x=\[7\.0, 6\.0\]"),
+            (([7.0, 7.0], [0.0, 0.0], 0.0, 1.0), r"commands\.radius=0"),
+        ],
+    )
+    def test_wrong_settings_are_refused(self, settings, message):
+        with pytest.raises(ValueError, match=message):
+            GoalCommandConfig(*settings, 2.0, 1.0, SpawnConfig())
 
 
 def test_robots_start_where_the_preset_says(make_env):

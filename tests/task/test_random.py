@@ -74,6 +74,21 @@ def test_the_counter_is_the_whole_state():
     assert torch.equal(resumed.uniform(everyone(4)), expected)
 
 
+def test_an_episode_draws_the_same_whatever_was_drawn_before():
+    busy, idle = EnvRandom(1, 4), EnvRandom(1, 4)
+    busy.uniform(torch.tensor([0, 2]), (17,))
+    for random in (busy, idle):
+        random.start_episode(everyone(4))
+    first = idle.uniform(everyone(4), (5,))
+    assert torch.equal(busy.uniform(everyone(4), (5,)), first)
+    busy.uniform(torch.tensor([1]), (3,))
+    for random in (busy, idle):
+        random.start_episode(torch.tensor([1]))
+    second = idle.uniform(everyone(4), (5,))
+    assert torch.equal(busy.uniform(everyone(4), (5,)), second)
+    assert not torch.equal(second[1], first[1])  # another episode, another scene
+
+
 def test_range_and_shapes():
     random = EnvRandom(1, 4)
     draws = random.range(torch.tensor([1, 3]), -2.0, 3.0, (1000, 2))
