@@ -17,7 +17,7 @@ def test_ranges_are_those_of_mj_ray(case):
     """The long version, 10^6 rays of each case, is scripts/lidar_accuracy.py."""
     tally = compare(case, num_rays=3000, seed=1, rays_per_scene=500)
     assert tally.unexplained == 0, tally.examples
-    assert tally.share_within >= 0.999 and tally.hits > 300
+    assert tally.share_within >= 0.999 and tally.hits > 200
 
 
 def single(shape, origin, direction, **options):

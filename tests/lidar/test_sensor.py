@@ -5,9 +5,12 @@ import math
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from omniperception.lidar import (
     OUTPUTS,
+    GaussianNoise,
     Lidar,
     LidarConfig,
     RayScene,
@@ -170,6 +173,37 @@ def test_a_frame_allocates_nothing_new(pattern):
     frame = lidar.cast(clock(2, 0.5))
     assert frame is lidar.frame and frame.ranges is frame.true_ranges
     assert addresses == [getattr(frame, f.name).data_ptr() for f in dataclasses.fields(frame)]
+
+
+class Allocations(TorchDispatchMode):
+    """Operations whose result has memory of its own, rather than that of an argument."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        known = {a.untyped_storage().data_ptr() for a in tree_leaves((args, kwargs)) if isinstance(a, torch.Tensor)}
+        made = [a.untyped_storage().data_ptr() for a in tree_leaves(result) if isinstance(a, torch.Tensor)]
+        self.found += [str(func) for pointer in made if pointer not in known]
+        return result
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"selection": "stratified"}, {"selection": "random"}, {"motion_segments": 1}],
+    ids=lambda options: "-".join(map(str, options.values())) or "plain",
+)
+def test_a_cast_allocates_no_tensor(pattern, options):
+    scene = crowd(3)
+    scene.body_quat[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    lidar = Lidar(LidarConfig(50, **options), pattern, scene, 0, noise=(GaussianNoise(),), outputs=OUTPUTS)
+    time = clock(3, 0.5)
+    lidar.cast(time)
+    with Allocations() as allocations:
+        lidar.cast(time)
+    assert allocations.found == []
 
 
 def test_mount_published_for_the_go2_looks_forward_and_down():

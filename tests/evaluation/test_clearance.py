@@ -1,0 +1,119 @@
+"""Clearances by hand and against MuJoCo's own geometry."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from omniperception.evaluation.clearance import BOX, CAPSULE, CYLINDER, TOLERANCE, Clearance, convex_distance, support
+
+BLIND = ("experiment=walk", "rewards=walk")
+
+
+def distance(a, b, pos, mat=None):
+    """Between two shapes (kind, size) with B at `pos` in the frame of A."""
+    (kind_a, size_a), (kind_b, size_b) = a, b
+    mat = torch.eye(3) if mat is None else torch.tensor(mat)
+    rows = [torch.tensor(x)[None] for x in (kind_a, size_a, kind_b, size_b, pos)]
+    return convex_distance(*rows, mat[None], torch.tensor([10.0])).item()
+
+
+QUARTER_ABOUT_X = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+BALL = CAPSULE, (0.1, 0.0, 0.0)
+ROD = CAPSULE, (0.1, 0.5, 0.0)
+PILLAR = CYLINDER, (0.3, 1.0, 0.0)
+CRATE = BOX, (0.2, 0.3, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "pos", "mat", "expected"),
+    [
+        (BALL, BALL, (0.3, 0.4, 0.0), None, 0.5 - 0.2),
+        (BALL, PILLAR, (1.0, 0.0, 0.9), None, 1.0 - 0.4),
+        (BALL, PILLAR, (0.3 + 0.3, 0.0, 1.0 + 0.4), None, 0.5 - 0.1),  # the rim is 0.3 aside and 0.4 above
+        (BALL, CRATE, (0.2 + 0.3, 0.3 + 0.4, 0.0), None, 0.5 - 0.1),  # an edge
+        (BALL, CRATE, (0.0, 0.0, 1.0), None, 0.6 - 0.1),  # a face
+        (ROD, ROD, (0.5, 0.0, 0.9), None, 0.5 - 0.2),  # side by side
+        (ROD, ROD, (0.4, 0.0, 1.0 + 0.3), None, 0.5 - 0.2),  # end to end, aside
+        (ROD, ROD, (0.7, 0.0, 0.0), QUARTER_ABOUT_X, 0.7 - 0.2),  # crossed
+        (ROD, CRATE, (0.9, 0.0, 0.0), None, 0.7 - 0.1),
+        (PILLAR, CRATE, (0.0, 1.0, 1.0), None, 0.4),
+        (CRATE, CRATE, (1.0, 0.0, 0.0), None, 0.6),
+        (CRATE, CRATE, (0.4 + 0.3, 0.6 + 0.4, 0.8 + 1.2), None, 1.3),  # corner to corner
+        (CRATE, PILLAR, (0.3, 0.1, 0.0), None, 0.0),  # they overlap
+        (ROD, BALL, (0.05, 0.0, 0.2), None, 0.0),
+    ],
+)
+def test_by_hand(a, b, pos, mat, expected):
+    assert distance(a, b, pos, mat) == pytest.approx(expected, abs=TOLERANCE)
+
+
+def test_support_by_hand():
+    direction = torch.tensor([[0.6, 0.0, 0.8]])
+    for (kind, size), expected in (
+        (ROD, 0.8 * 0.5 + 0.1),
+        (PILLAR, 0.8 * 1.0 + 0.6 * 0.3),
+        (CRATE, 0.6 * 0.2 + 0.8 * 0.4),
+    ):
+        assert support(torch.tensor([kind]), torch.tensor([size]), direction).item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("scenario", ["static", "aerial", "rod"])
+def test_the_robot_as_mujoco_measures_it(make_env, scenario):
+    env = make_env(*BLIND, f"scenario={scenario}", "num_envs=6")
+    clearance, model = Clearance(env), env.world.model
+    data = mujoco.MjData(model)
+    robot = [g for g in range(model.ngeom) if model.body_rootid[model.geom_bodyid[g]] == env.world.base_body]
+    obstacles = [model.geom(name).id for name in env.world.obstacles.geom_names()]
+    assert len(robot) == 19
+    generator = torch.Generator().manual_seed(1)
+    overlaps = 0
+    for k in range(5):
+        uniform = torch.rand(6, 18, generator=generator).double() - 0.5
+        env.sim.qpos[:, :2] = env.sim.mocap_pos[:, k % env.sim.mocap_pos.shape[1], :2] + 1.4 * uniform[:, :2]
+        env.sim.qpos[:, 2] = 0.33 + 0.1 * uniform[:, 2]
+        quat = torch.cat((torch.ones(6, 1), uniform[:, 3:6]), 1)  # rolled, pitched and turned
+        env.sim.qpos[:, 3:7] = quat / quat.norm(dim=1, keepdim=True)
+        env.sim.qpos[:, 7:] = env.default_joint_pos + 0.5 * uniform[:, 6:]
+        got = clearance.measure(torch.full((6,), 2.0))
+        for i in range(6):
+            data.qpos[:] = env.sim.qpos[i].numpy()
+            data.mocap_pos[:], data.mocap_quat[:] = env.sim.mocap_pos[i].numpy(), env.sim.mocap_quat[i].numpy()
+            mujoco.mj_kinematics(model, data)
+            pairs = [mujoco.mj_geomDistance(model, data, r, o, 2.0, None) for r in robot for o in obstacles]
+            overlaps += min(pairs) < 0
+            assert got[i].item() == pytest.approx(max(min(pairs), 0.0), abs=TOLERANCE + 1e-5)
+    assert 0 < overlaps < 30
+
+
+def test_only_what_is_nearer_than_the_bound_is_measured(make_env):
+    env = make_env(*BLIND, "scenario=corridor", "num_envs=3")
+    clearance = Clearance(env)
+    # in the middle of the corridor the trunk's nearest wall is 2 m less half the robot's width away
+    env.sim.mocap_pos[..., 0] = 100.0
+    env.sim.qpos[:, :2] = torch.tensor([[3.0, 0.0], [3.0, 1.0], [3.0, 0.0]]).double()
+    far = clearance.measure(torch.full((3,), 9.0))
+    assert 1.7 < far[0] < 1.9 and far[1].item() == pytest.approx(far[0].item() - 1.0, abs=2 * TOLERANCE)
+    assert far[2] == far[0]
+    bounded = clearance.measure(torch.tensor([0.5, 9.0, 0.0]))
+    assert bounded[0] == 0.5 and bounded[1].item() == pytest.approx(far[1].item(), abs=TOLERANCE) and bounded[2] == 0
+
+
+def test_a_diverged_environment_measures_nothing(make_env):
+    env = make_env(*BLIND, "scenario=static", "num_envs=2")
+    env.sim.qpos[0, :3] = math.nan
+    assert Clearance(env).measure(torch.full((2,), 50.0)).isfinite().all()
+
+
+def test_shapes_beyond_the_primitives_are_their_bounding_boxes(make_env):
+    from omniperception.evaluation.clearance import Geoms
+
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=[0.1, 0.2, 0.3])
+    model = spec.compile()
+    geoms = Geoms(model, [0], torch.device("cpu"))
+    assert geoms.kind.tolist() == [BOX]
+    np.testing.assert_allclose(geoms.size[0], [0.1, 0.2, 0.3], rtol=1e-6)
+    assert geoms.radius[0].item() == pytest.approx(math.sqrt(0.14))
