@@ -20,7 +20,7 @@ SMALL = (
     "ppo.num_mini_batches=2",
     "ppo.hidden_dims=[32,16]",
 )
-SMALL_CLOUD = ("perception.sampler.num_proximal=8", "perception.sampler.num_distal=8", "perception.history=4")
+SMALL_CLOUD = ("perception.sampler.num_proximal=8", "perception.history=4")
 
 
 def train(folder, *arguments):
