@@ -60,7 +60,7 @@ def compose(overrides: Sequence[str]) -> DictConfig:
         with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
             config = hydra_compose("config", overrides=list(overrides))
             presets = hydra_compose("config", overrides=[o for o in overrides if _is_group(o)])
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_one_line(error)) from None
     _check_kinds(config, presets)
     return config
@@ -190,7 +190,7 @@ def one_line_errors(*also: type[Exception]) -> Iterator[None]:
 
 def _check_scenario(overrides: Sequence[str]) -> None:
     chosen = dict(override.split("=", 1) for override in overrides if "=" in override)
-    if chosen.get("scenario", "null") == "null":
+    if "scenario" not in chosen:
         return
     for group in DEFINED_BY_SCENARIO:
         if group in chosen:

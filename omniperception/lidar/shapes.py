@@ -55,7 +55,8 @@ class Shape:
         quat: Orientation in that body's frame, (w, x, y, z), unit length.
         class_id: What a hit on this shape is reported as, >= 0.
         asset: The ``TriangleMesh`` of a mesh (rigid) or a deformable (at rest), the ``HeightField`` of a height field.
-            Shapes may share one; it is uploaded once, or once for each deformable.
+            Shapes may share one; it is uploaded once, or once for each deformable. Triangles that have no area at
+            rest are no part of a deformable.
     """
 
     kind: ShapeKind

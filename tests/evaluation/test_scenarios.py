@@ -1,0 +1,161 @@
+"""Scenarios: fixed scenes, seeded, the same for every policy; what they replace and what they measure."""
+
+import pytest
+import torch
+
+from omniperception import config
+from omniperception.config import ConfigError
+from omniperception.evaluation import run_episodes
+from omniperception.evaluation.episodes import CLEARANCE_CAP
+from omniperception.evaluation.tracks import PERIOD_S
+
+BLIND = ("experiment=walk", "rewards=walk")
+SHORT = "terminations.episode_length_s=0.4"
+
+
+def stand(observations):
+    return torch.zeros(len(observations), 12)
+
+
+def fling(observations):
+    actions = torch.zeros(len(observations), 12)
+    actions[:, 1::3], actions[:, 2::3] = 8.0, -8.0
+    return actions
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    """A run with some settings of its own."""
+    path = tmp_path_factory.mktemp("run")
+    given = ["experiment=quickstart", "rewards.avoidance.alpha=1.7", "seed=5", "lidar.sensor.max_range=5.0"]
+    config.save(config.assemble(config.compose(given)).composed, path)
+    return path
+
+
+class TestOverlay:
+    def test_the_scene_is_the_scenarios_and_the_rest_the_runs(self, run_dir):
+        before, loaded = config.load(run_dir), config.load(run_dir, ["scenario=abs_hard"])
+        fresh = config.compose(["scenario=abs_hard"])
+        for key in loaded:
+            assert loaded[key] == (fresh if key in config.FIXED_BY_SCENARIO else before)[key], key
+        run = config.assemble(loaded).env
+        assert run.seed == 1007 and run.terminations.episode_length_s == 9.0 and run.obstacles.num_obstacles == 8
+        assert run.rewards.avoidance.alpha == 1.7 and run.lidar.sensor.max_range == 5.0
+        assert run.obstacles.curriculum is None and before.obstacles.curriculum is not None
+
+    def test_overrides_go_on_top(self, run_dir):
+        overrides = ["scenario=corridor", "commands.speed=0.7", "terminations=collision", "seed=9", "num_envs=3"]
+        run = config.assemble(config.load(run_dir, overrides)).env
+        assert run.commands.speed == 0.7 and run.commands.goal_x == (11.5, 11.5)
+        assert run.terminations.on_collision and run.terminations.episode_length_s == 30.0
+        assert run.seed == 9 and run.num_envs == 3
+
+    @pytest.mark.parametrize("group", ["obstacles=static", "commands=velocity"])
+    def test_another_scene_is_not_mixed_in(self, run_dir, group):
+        for compose in (config.compose, lambda overrides: config.load(run_dir, overrides)):
+            with pytest.raises(ConfigError, match=f"scenario=static defines the {group.split('=')[0]}"):
+                compose(["scenario=static", group])
+
+    def test_unknown_scenarios_are_named_with_the_known(self, run_dir):
+        with pytest.raises(ConfigError, match="abs_hard aerial corridor"):
+            config.load(run_dir, ["scenario=dragons"])
+
+    @pytest.mark.parametrize("scenario", config.scenarios())
+    def test_an_experiment_leaves_no_trace_in_the_scene(self, scenario):
+        alone, mixed = (config.compose([*given, f"scenario={scenario}"]) for given in ([], ["experiment=quickstart"]))
+        for key in config.FIXED_BY_SCENARIO:
+            assert alone[key] == mixed[key], key
+
+    def test_every_scenario_has_a_seed_of_its_own(self):
+        seeds = [config.compose([f"scenario={name}"]).seed for name in config.scenarios()]
+        assert len(set(seeds)) == len(seeds) == 7
+
+
+class TestScenes:
+    def test_a_trial_is_the_same_scene_for_every_policy(self, make_env):
+        tracks = {}
+        for policy in (stand, fling):
+            # people come anew all the time, and a fling falls early: the policies draw differently much
+            env = make_env(*BLIND, "scenario=moving", "terminations.min_base_height=0.25", SHORT, "num_envs=3")
+            env.obstacles._start *= 0.2
+            tracks[policy] = run_episodes(env, policy, 9, keep_tracks=True).tracks
+        assert not torch.equal(tracks[stand].xy[1], tracks[fling].xy[1])
+        # the first control step has moved them already, by the same law
+        torch.testing.assert_close(tracks[stand].obstacles, tracks[fling].obstacles, atol=1e-6, rtol=0)
+        assert len(tracks[stand].obstacles.flatten(1).unique(dim=0)) == 9  # nine different scenes
+
+    def test_goals_differ_between_trials_and_seeds_decide(self, make_env):
+        def goals(seed):
+            env = make_env(*BLIND, "scenario=abs_hard", SHORT, "num_envs=3", f"seed={seed}")
+            return run_episodes(env, stand, 6, keep_tracks=True).tracks.goal
+
+        first = goals(4)
+        assert len(first.unique(dim=0)) == 6 and torch.equal(first, goals(4)) and not torch.equal(first, goals(5))
+
+    def test_free_paths_need_a_goal(self):
+        run = config.compose(["experiment=walk", "scenario=abs_hard"])
+        run.commands = config.compose(["experiment=walk"]).commands
+        with pytest.raises(ConfigError, match="commands=goal"):
+            config.assemble(run)
+
+
+class TestMeasures:
+    def test_measuring_changes_nothing(self, make_env):
+        measured, plain = (
+            make_env(*BLIND, "scenario=static", SHORT, "num_envs=3", "commands.spawn.x=[1.2,1.2]") for _ in range(2)
+        )
+        steps = []
+        run_episodes(measured, fling, 6, on_step=lambda: steps.append(0), keep_tracks=True)
+        for _ in steps:
+            plain.step(fling(plain.get_observations()))
+        assert torch.equal(measured.sim.qpos, plain.sim.qpos) and torch.equal(measured.sim.qvel, plain.sim.qvel)
+        assert torch.equal(measured.observations["command"], plain.observations["command"])
+        assert not measured.probes
+
+    def test_clearance_is_the_least_of_the_trial_and_0_with_a_touch(self, make_env):
+        env = make_env(*BLIND, "scenario=static", SHORT, "num_envs=4", "commands.spawn.yaw_deg=[0,0]")
+        env.obstacles.advance = lambda dt, xy: None  # the test moves them
+        radius = float(env.obstacles.radius[0])
+
+        def place(observations):
+            step = int(env.episode_length_buf[0])
+            env.obstacles.pos_w[..., 0] = 50.0
+            at = {1: {3: 0.9, 10: 0.6, 15: 0.8}, 2: {10: 0.0}, 3: {10: 3.0}}
+            for env_id, steps in at.items():
+                beside = env.kinematics.base_pos_w[env_id, :2] + torch.tensor([0.0, radius + steps.get(step, 40.0)])
+                env.obstacles.pos_w[env_id, 0, :2] = beside.double()
+                env.obstacles.pos_w[env_id, 0, 2] = 0.3
+            return torch.zeros(4, 12)
+
+        episodes = run_episodes(env, place, 4)
+        touch = episodes.first_contact_s
+        assert touch.isinf().tolist() == [True, True, False, True] and touch[2] == pytest.approx(11 * 0.02)
+        assert episodes.clearance[[0, 2, 3]].tolist() == pytest.approx([CLEARANCE_CAP, 0.0, CLEARANCE_CAP])
+        # beside the robot: 0.6 m less half its width at the knees or feet, 0.14 to 0.2 m
+        assert 0.38 < episodes.clearance[1] < 0.47
+
+    def test_energy_is_power_over_time(self, make_env):
+        env = make_env(*BLIND, "scenario=static", SHORT, "num_envs=2")
+        power, speed = [], []
+        env.probes.append(
+            lambda: power.append((env.sim.joint_torque() * env.kinematics.joint_vel).abs().sum(1).clone())
+        )
+        env.probes.append(lambda: speed.append(env.sim.qvel[:, :2].norm(dim=1).clone()))
+        episodes = run_episodes(env, fling, 2)
+        steps = (episodes.length_s / 0.02).round().long()
+        for i in range(2):
+            energy = 0.02 * torch.stack(power)[: steps[i], i].double().sum()
+            assert episodes.energy[i].item() == pytest.approx(energy.item(), rel=1e-5)
+            path = 0.02 * torch.stack(speed)[: steps[i], i].sum()
+            assert episodes.path[i].item() == pytest.approx(path.item(), rel=1e-4)
+        assert episodes.weight == pytest.approx(15.2 * 9.81, rel=0.03)  # the Go2 weighs about 15 kg
+
+    def test_tracks_end_where_the_episode_ends(self, make_env):
+        env = make_env(*BLIND, "scenario=abs_hard", SHORT, "num_envs=2")
+        ends = []
+        env.probes.append(lambda: ends.extend(env.kinematics.base_pos_w[env.done, :2].tolist()))
+        tracks = run_episodes(env, stand, 2, keep_tracks=True).tracks
+        assert [len(way) for way in tracks.xy] == [1 + round(0.4 / PERIOD_S)] * 2
+        for way, end in zip(tracks.xy, ends, strict=True):
+            assert way[-1].tolist() == pytest.approx(end)
+        assert tracks.contact.isnan().all()
