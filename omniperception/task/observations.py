@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from omniperception.task.state import check_term, fields_read, reads
+from omniperception.task.state import checked_term, fields_read, reads
 
 if TYPE_CHECKING:
     from omniperception.task.env import OmniEnv
@@ -27,9 +27,8 @@ class ObservationGroup:
     history: int = 1
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "terms", {name: term for name, term in self.terms.items() if term is not None})
-        for name, term in self.terms.items():
-            check_term(f"terms.{name}", term)
+        used = {name: term for name, term in self.terms.items() if term is not None}
+        object.__setattr__(self, "terms", {name: checked_term(f"terms.{name}", term) for name, term in used.items()})
         if self.history < 1:
             raise ValueError(f"observations: history={self.history} must be at least 1")
 

@@ -7,12 +7,12 @@ paper lists the eleven of `rewards=paper`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 
-from omniperception.task.state import check_term, fields_read, reads
+from omniperception.task.state import checked_term, fields_read, reads
 
 if TYPE_CHECKING:
     from omniperception.task.env import OmniEnv
@@ -39,9 +39,9 @@ class RewardsConfig:
     avoidance: AvoidanceConfig
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "terms", {k: t for k, t in self.terms.items() if t is not None and t.weight != 0})
-        for name, term in self.terms.items():
-            check_term(f"terms.{name}.func", term.func)
+        used = {name: term for name, term in self.terms.items() if term is not None and term.weight != 0}
+        checked = {name: replace(t, func=checked_term(f"terms.{name}.func", t.func)) for name, t in used.items()}
+        object.__setattr__(self, "terms", checked)
 
     def fields_read(self) -> frozenset[str]:
         return frozenset().union(*(fields_read(term.func) for term in self.terms.values()))
