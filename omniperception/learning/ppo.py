@@ -35,8 +35,6 @@ class PerceptivePpo(PPO):
         super().__init__(*args, **kwargs)
         self.num_updates = 0
         self.perception_trainer: PerceptionTrainer | None = None
-        for group in self.optimizer.param_groups:  # one kernel for all parameters, not a dozen for each
-            group["fused"] = True
         self.optimizer.register_step_pre_hook(lambda *_: self._check_gradients())
 
     @staticmethod

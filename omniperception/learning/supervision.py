@@ -23,7 +23,7 @@ class PerceptionTrainer:
         """Args: actor; epochs: passes over a rollout; learning_rate; max_grad_norm: bound of a step's gradient."""
         self._actor, self._epochs, self._max_grad_norm = actor, epochs, max_grad_norm
         self._parameters = list(actor.perception_parameters())
-        self.optimizer = torch.optim.Adam(self._parameters, lr=learning_rate, fused=True)
+        self.optimizer = torch.optim.Adam(self._parameters, lr=learning_rate)
 
     def train(self, storage: PerceptiveStorage, num_mini_batches: int, mixed_precision: bool) -> None:
         """Fits the targets of a full rollout; a rollout without a frame teaches nothing."""
