@@ -200,6 +200,7 @@ class _Tally:
         self._clearance = Clearance(env) if env.config.obstacles.num_obstacles else None
         self._least = torch.full(shape, CLEARANCE_CAP, device=env.device)
         self._filed_least = torch.zeros(*shape, per_env, device=env.device)
+        env.sim.joint_torque()  # recorded from now on
         self._was_touching = torch.zeros(shape, dtype=torch.bool, device=env.device)
         self._knows_free = True
 

@@ -90,7 +90,10 @@ class Simulator(Protocol):
         """Puts some environments into a state, (n, nq) and (n, nv)."""
 
     def joint_torque(self) -> torch.Tensor:
-        """(num_envs, num_joints) actuator torque (N m) of the last physics step."""
+        """(num_envs, num_joints) actuator torque (N m) of the last physics step.
+
+        The first call begins the recording; it and whatever follows a reset gives 0 until the next step.
+        """
 
     def contact_sensor(self, kind: str) -> torch.Tensor:
         """(num_envs, width) float32 readings of one kind of contact sensor in the last physics step.

@@ -46,7 +46,8 @@ class MujocoSimulator:
         self._record = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
         self._records: dict[str, np.ndarray] = self._allocate_records(1)
         self._fields: dict[str, torch.Tensor] = {}
-        self._torque: np.ndarray | None = None
+        self._actuator_force: np.ndarray | None = None
+        self._torque: torch.Tensor | None = None
         self._poses: tuple[np.ndarray, np.ndarray] | None = None
         self._geom_poses: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -67,6 +68,8 @@ class MujocoSimulator:
                 self._roll_out(num_steps, mocap_path)
         except SimulationError as error:
             self.failed[torch.from_numpy(np.asarray(error.ids))] = True
+        if self._torque is not None:  # any later call, such as `forward` for poses, overwrites the engine's array
+            self._torque.numpy()[:] = self._actuator_force
 
     def _roll_out(self, num_steps: int, mocap_path: torch.Tensor | None) -> None:
         """Steps with the kinematic bodies on their way, recording what somebody reads after every step."""
@@ -97,11 +100,14 @@ class MujocoSimulator:
         self.failed[env_ids] = False
         for values in self._records.values():
             values[env_ids.numpy()] = 0.0
+        if self._torque is not None:
+            self._torque[env_ids] = 0.0
 
     def joint_torque(self) -> torch.Tensor:
         if self._torque is None:
-            self._torque = self.batch.bind("actuator_force")
-        return torch.from_numpy(self._torque.astype(np.float32))
+            self._actuator_force = self.batch.bind("actuator_force")
+            self._torque = torch.zeros(self._actuator_force.shape)
+        return self._torque.clone()
 
     def contact_sensor(self, kind: str) -> torch.Tensor:
         values = self._records["sensordata"][:, -1, self.world.sensor_slice(kind)]

@@ -1,0 +1,156 @@
+"""scripts/evaluate.py: results, determinism, files, baselines and mistakes."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from omniperception import config
+from omniperception.assembly import build_runner
+from omniperception.config import ConfigError
+from omniperception.evaluation import plots
+from omniperception.suite import Evaluation, evaluate
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = ("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1")
+SHORT = "terminations.episode_length_s=0.3"
+
+
+def make_run(path: Path, *overrides: str) -> Path:
+    run = config.assemble(config.compose([*overrides, *SMALL]))
+    config.save(run.composed, path)
+    build_runner(run, path).learn(1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def walker(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("walker"), "experiment=walk")
+
+
+@pytest.fixture(scope="module")
+def seeing(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("seeing"), "experiment=quickstart", "obstacles.curriculum=null")
+
+
+def figures(report: dict) -> dict:
+    """What the same seed has to repeat: everything but wall times."""
+    return {
+        name: {key: value for key, value in summary.items() if key != "us_per_env_step"}
+        for name, summary in report["policies"].items()
+    }
+
+
+def test_the_same_seed_gives_the_same_result_bit_for_bit(seeing, walker):
+    given = {
+        "run_dir": seeing,
+        "scenarios": ["moving"],
+        "policies": ["run", "blind", "scripted", "command"],
+        "trials": 6,
+        "num_envs": 3,
+        "walker": walker,
+        "plots": False,
+    }
+    first = evaluate(Evaluation(**given, overrides=[SHORT]))["moving"]
+    table = (seeing / "evaluation" / "moving.csv").read_text()
+    second = evaluate(Evaluation(**given, overrides=[SHORT]))["moving"]
+    assert figures(first) == figures(second)
+    assert (seeing / "evaluation" / "moving.csv").read_text() == table
+    other = evaluate(Evaluation(**given, overrides=[SHORT, "seed=8"]))["moving"]
+    assert figures(other) != figures(first) and other["seed"] == 8 and first["seed"] == 1005
+    run, blind = first["policies"]["run"], first["policies"]["blind"]
+    assert run["episodes"] == 6 and run["velocity_error_m_s"] != blind["velocity_error_m_s"]
+    assert first["policies"]["command"]["checkpoint"].startswith(str(walker))
+    assert run["checkpoint"].startswith(str(seeing))
+
+
+def test_files_and_tables(walker, capsys):
+    reports = evaluate(
+        Evaluation(walker, ["static", "corridor"], ["run", "scripted"], trials=4, num_envs=2, overrides=[SHORT])
+    )
+    assert list(reports) == ["static", "corridor"]
+    for scenario, report in reports.items():
+        folder = walker / "evaluation"
+        assert json.loads((folder / f"{scenario}.json").read_text()) == report
+        assert report["time_limit_s"] == 0.3 and report["overrides"] == [SHORT]
+        assert {"success", "collision", "rates_to_first_contact", "clearance_m"} <= set(report["definitions"])
+        assert {"python", "torch", "mujoco-core"} <= set(report["versions"])
+        with open(folder / f"{scenario}.csv") as file:
+            rows = list(csv.DictReader(file))
+        assert [row["policy"] for row in rows] == ["run"] * 4 + ["scripted"] * 4
+        assert (folder / f"{scenario}.png").read_bytes()[:4] == b"\x89PNG"
+    printed = capsys.readouterr().out
+    assert "ending at the first contact" in printed and "scripted" in printed and "time out" in printed
+
+
+def test_environments_default_to_even_rounds():
+    def envs(trials, **given):
+        return Evaluation(Path("x"), ["static"], trials=trials, **given).envs
+
+    assert [envs(1000), envs(256), envs(257), envs(3)] == [250, 256, 129, 3]
+    assert envs(1000, num_envs=7) == 7
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"scenarios": ["dragons"]}, "scenario=dragons is unknown; known: abs_hard, aerial, corridor"),
+        ({"scenarios": ["static", "static"]}, "names static twice"),
+        ({"policies": ["magic"]}, "policy=magic is unknown; known: run, blind, scripted, command"),
+        ({"policies": ["command"]}, "walker="),
+        ({"overrides": ["scenario=rod"]}, "scenario=rod is not an override here"),
+    ],
+)
+def test_mistakes_are_told_before_anything_runs(given, message):
+    with pytest.raises(ConfigError, match=message):
+        Evaluation(**{"run_dir": Path("x"), "scenarios": ["static"], **given})
+
+
+def test_a_blind_run_cannot_be_blinded(walker):
+    with pytest.raises(ConfigError, match="policy=blind: this policy does not look at the LiDAR"):
+        evaluate(Evaluation(walker, ["static"], ["blind"], trials=1, plots=False, overrides=[SHORT]))
+
+
+def test_missing_matplotlib_is_told_first(walker, monkeypatch):
+    monkeypatch.setattr(plots.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(plots.PlotsUnavailable, match=r"pip install 'omniperception\[plots\]', or give plots=false"):
+        evaluate(Evaluation(walker, ["static"], trials=1))
+
+
+def test_only_plots_import_matplotlib():
+    code = "import sys, omniperception.suite; assert 'matplotlib' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=120).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("trials=0",), "trials=0 must be a positive whole number"),
+        (("scenario=statik",), "scenario=statik is unknown"),
+        (("obstacles=moving",), "scenario=corridor defines the obstacles"),
+        (("run=nowhere",), "run=nowhere does not exist"),
+        (("plots=maybe",), "plots=maybe must be true or false"),
+    ],
+)
+def test_mistakes_are_one_line(walker, arguments, message):
+    own = () if arguments[0].startswith("run=") else (f"run={walker}",)
+    command = [sys.executable, str(ROOT / "scripts" / "evaluate.py"), *own, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
+    assert done.returncode == 2 and len(lines) == 1 and message in lines[0], done.stderr
+
+
+def test_the_number_of_threads_does_not_matter(walker):
+    results = []
+    for threads in (1, 2):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        given = [SHORT, f"sim.num_threads={threads}"]
+        results.append(figures(evaluate(Evaluation(walker, ["rod"], trials=4, plots=False, overrides=given))["rod"]))
+        torch.set_num_threads(before)
+    assert results[0] == results[1]
