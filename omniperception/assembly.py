@@ -67,7 +67,14 @@ def learning_settings(run: RunConfig, env: OmniEnv) -> dict:
     """rsl_rl's configuration for a run."""
     observations = run.env.observations
     steps_per_frame = env.sensing.period_steps if env.sensing is not None else 1
-    return runner_config(run.ppo, run.perception, observations.actor, observations.critic, steps_per_frame)
+    return runner_config(
+        run.ppo,
+        run.perception,
+        observations.actor,
+        observations.critic,
+        steps_per_frame,
+        run.env.rewards.avoidance.risk,
+    )
 
 
 def seed_everything(seed: int) -> None:

@@ -9,7 +9,8 @@ import torch
 from torch import nn
 
 from omniperception.perception import Sampler
-from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, SECTOR_TARGET
+from omniperception.perception.velocity_risk import VelocityRisk
+from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, RISK_TARGET, SECTOR_TARGET
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class PerceptionConfig:
         sector_weight: weight of the supervision with obstacle nearness by sector; 0, as in the paper, leaves it out.
         avoidance_weight: weight of the supervision of an avoidance velocity that is added to the command which the
             actor follows; 0, as in the paper, leaves it out.
+        risk_weight: weight of the supervision of the risk of candidate velocities, from which the velocity that is
+            added follows instead; 0, as in the paper, leaves it out.
         supervised_epochs: passes over each rollout in which the network is trained by supervision alone, while PPO
             takes the embedding as it is; 0, as in the paper: PPO's loss and the supervision together, end to end.
         learning_rate: of those passes.
@@ -35,21 +38,27 @@ class PerceptionConfig:
     height_weight: float
     sector_weight: float
     avoidance_weight: float = 0.0
+    risk_weight: float = 0.0
     supervised_epochs: int = 0
     learning_rate: float = 1.0e-3
 
     def __post_init__(self) -> None:
         if self.history < 1:
             raise ValueError(f"perception.history={self.history} must be at least 1")
-        for name in ("height_weight", "sector_weight", "avoidance_weight", "supervised_epochs"):
+        for name in ("height_weight", "sector_weight", "avoidance_weight", "risk_weight", "supervised_epochs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"perception.{name}={getattr(self, name)} must not be negative")
+        if self.avoidance_weight and self.risk_weight:
+            raise ValueError(
+                f"perception.avoidance_weight={self.avoidance_weight} and risk_weight={self.risk_weight} would both"
+                " change the command; set one of them to 0"
+            )
         if self.learning_rate <= 0:
             raise ValueError(f"perception.learning_rate={self.learning_rate} must be positive")
         if self.supervised_epochs and not self.supervision:
             raise ValueError(
                 f"perception.supervised_epochs={self.supervised_epochs} needs something to learn from; set"
-                " perception.avoidance_weight, sector_weight or height_weight, or supervised_epochs=0"
+                " perception.avoidance_weight, risk_weight, sector_weight or height_weight, or supervised_epochs=0"
             )
 
     @property
@@ -59,6 +68,7 @@ class PerceptionConfig:
             HEIGHT_TARGET: self.height_weight,
             SECTOR_TARGET: self.sector_weight,
             AVOIDANCE_TARGET: self.avoidance_weight,
+            RISK_TARGET: self.risk_weight,
         }
         return {target: weight for target, weight in weights.items() if weight > 0}
 
@@ -138,6 +148,7 @@ def runner_config(
     actor_groups: Sequence[str],
     critic_groups: Sequence[str],
     steps_per_frame: int,
+    velocity_risk: VelocityRisk | None = None,
 ) -> dict:
     """rsl_rl's runner configuration.
 
@@ -147,6 +158,7 @@ def runner_config(
         actor_groups: observation groups of the actor.
         critic_groups: observation groups of the critic.
         steps_per_frame: control steps between two LiDAR frames.
+        velocity_risk: how the risk of velocities becomes an avoidance velocity, where the actor is supervised with it.
     """
     network = {"hidden_dims": list(ppo.hidden_dims), "activation": ppo.activation}
     network["obs_normalization"] = ppo.obs_normalization
@@ -160,6 +172,7 @@ def runner_config(
         actor["class_name"] = "omniperception.learning.models:PerceptionActor"
         actor["perception"] = perception.network
         actor["supervision"] = perception.supervision
+        actor["velocity_risk"] = velocity_risk
         actor["end_to_end"] = perception.supervised_epochs == 0
         supervision = {"epochs": perception.supervised_epochs, "learning_rate": perception.learning_rate}
     return {

@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
+from omniperception.perception.velocity_risk import VelocityRisk
 
 
 class _AddLoss(torch.autograd.Function):
@@ -29,11 +30,12 @@ class _AddLoss(torch.autograd.Function):
         return gradient, torch.ones_like(loss)
 
 
-AVOIDANCE = "avoidance_target"
-"""The supervised target that is not a part of the embedding but read out of it and added to the command."""
+AVOIDANCE, RISK = "avoidance_target", "risk_target"
+"""The supervised targets that are not a part of the embedding but read out of it, for a velocity that is added to the
+command: this velocity itself, or the risk of candidate velocities."""
 
-AVOIDANCE_HIDDEN = 64
-"""Width of the read-out's hidden layer."""
+READ_OUT_HIDDEN = {AVOIDANCE: 64, RISK: 128}
+"""Widths of the read-outs' hidden layers."""
 
 
 class PerceptionActor(MLPModel):
@@ -51,7 +53,9 @@ class PerceptionActor(MLPModel):
 
     With supervision of ``avoidance_target`` an avoidance velocity is read out of the embedding and added to the
     commanded one before the MLP sees it, because that sum is what the reward wants tracked (paper, r_vel_avoid): a
-    gait that follows commands then avoids as soon as the read-out is right. Without a frame it is 0.
+    gait that follows commands then avoids as soon as the read-out is right. Without a frame it is 0. With supervision
+    of ``risk_target`` the risks of candidate velocities are read out, and the avoidance velocity follows from them and
+    the command.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class PerceptionActor(MLPModel):
         output_dim: int,
         perception: PerceptionNetwork | Callable[[], PerceptionNetwork],
         supervision: Mapping[str, float] | None = None,
+        velocity_risk: VelocityRisk | None = None,
         command_group: str = "command",
         end_to_end: bool = True,
         **mlp_options,
@@ -75,6 +80,7 @@ class PerceptionActor(MLPModel):
             output_dim: number of actions.
             perception: the network, or a function without arguments that builds it.
             supervision: weight of the regression on each privileged observation group; 0 leaves it out.
+            velocity_risk: needed for supervision of ``risk_target``.
             command_group: the group that begins with the commanded velocity (v_x, v_y).
             end_to_end: whether the loss of an update reaches the perception network; otherwise it is trained by a
                 :class:`~omniperception.learning.supervision.PerceptionTrainer` alone.
@@ -86,15 +92,17 @@ class PerceptionActor(MLPModel):
         for target, weight in supervision.items():
             if weight < 0.0:
                 raise ValueError(f"supervision: the weight of {target} must not be negative, got {weight}")
-        self.command_group, self.end_to_end, self.avoidance = command_group, end_to_end, None
+        self.command_group, self.end_to_end, self.velocity_risk = command_group, end_to_end, velocity_risk
+        self.read_out_target = next((target for target in (AVOIDANCE, RISK) if target in supervision), None)
         self._feature_dim = network.feature_dim  # read by _get_latent_dim while the base class builds the MLP
         super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
         self.perception: PerceptionNetwork = network
         with torch.no_grad():  # an untrained embedding is noise to the gait; it enters as its weights learn
             self.mlp[0].weight[:, self.obs_dim :] = 0.0
         self.supervision = supervision
-        if AVOIDANCE in supervision:
-            self.avoidance = self._build_avoidance(obs)
+        self.read_out = self._build_read_out(obs) if self.read_out_target else None
+        if self.read_out_target == RISK:
+            self.register_buffer("_candidates", velocity_risk.candidates(), persistent=False)
         for target in supervision:
             self._check_target(target, obs)
         self._cache_key: tuple | None = None
@@ -122,15 +130,15 @@ class PerceptionActor(MLPModel):
                 obs = obs.groups
             else:
                 features, has_frame = self._rollout_features(obs), obs["frame_count"].squeeze(-1) > 0
-            if self.avoidance is not None:
-                obs = self._avoiding(obs, self._read_avoidance(features, has_frame))
+            if self.read_out is not None:
+                obs = self._avoiding(obs, features, has_frame)
         return torch.cat([super().get_latent(obs, masks, hidden_state), features], dim=-1)
 
     def perception_parameters(self) -> Iterator[nn.Parameter]:
         """Parameters of the network and of what is read out of its embedding."""
         yield from self.perception.parameters()
-        if self.avoidance is not None:
-            yield from self.avoidance.parameters()
+        if self.read_out is not None:
+            yield from self.read_out.parameters()
 
     def embed(self, obs: WindowedObservations) -> torch.Tensor:
         """(B, D) embeddings of the steps of an update; each window is embedded once."""
@@ -147,8 +155,8 @@ class PerceptionActor(MLPModel):
         has_frame = obs.step_count > 0
         total = torch.zeros((), device=features.device)
         for target, weight in self.supervision.items():
-            if target == AVOIDANCE:
-                predicted = self._read_avoidance(features, has_frame)
+            if target == self.read_out_target:
+                predicted = self._read(features)
             else:
                 predicted = features[:, self.perception.supervised[target]]
             error = (predicted - obs[target]).square().mean(dim=-1)
@@ -203,31 +211,36 @@ class PerceptionActor(MLPModel):
             versions,
         )
 
-    def _build_avoidance(self, obs: TensorDict) -> nn.Module:
+    def _build_read_out(self, obs: TensorDict) -> nn.Module:
         if self.command_group not in self.obs_groups or obs[self.command_group].shape[-1] < 2:
             raise ValueError(
-                f"perception.avoidance_weight needs the actor to observe '{self.command_group}', it observes"
-                f" {self.obs_groups}; add it to observations.actor or set perception.avoidance_weight=0"
+                f"perception.avoidance_weight and risk_weight need the actor to observe '{self.command_group}', it"
+                f" observes {self.obs_groups}; add it to observations.actor or set both to 0"
             )
-        last = nn.Linear(AVOIDANCE_HIDDEN, 2)
+        width = READ_OUT_HIDDEN[self.read_out_target]
+        last = nn.Linear(width, obs[self.read_out_target].shape[-1])
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
-        return nn.Sequential(nn.Linear(self._feature_dim, AVOIDANCE_HIDDEN), nn.ELU(), last)
+        return nn.Sequential(nn.Linear(self._feature_dim, width), nn.ELU(), last)
 
-    def _read_avoidance(self, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor:
-        """(B, 2) avoidance velocity (m/s, yaw-aligned frame) in the embedding, 0 without a frame."""
-        return self.avoidance(features).float() * has_frame[:, None]
+    def _read(self, features: torch.Tensor) -> torch.Tensor:
+        """What is read out of the embedding: (B, 2) an avoidance velocity (m/s), or (B, K) risks."""
+        values = self.read_out(features).float()
+        return values if self.read_out_target == AVOIDANCE else values.sigmoid()
 
-    def _avoiding(self, groups: TensorDict, avoidance: torch.Tensor) -> TensorDict:
-        """The observations with the avoidance velocity added to the commanded one."""
+    def _avoiding(self, groups: TensorDict, features: torch.Tensor, has_frame: torch.Tensor) -> TensorDict:
+        """The observations with the avoidance velocity, 0 without a frame, added to the commanded one."""
         groups = groups.clone(recurse=False)
-        groups[self.command_group] = groups[self.command_group] + functional.pad(
-            avoidance, (0, groups[self.command_group].shape[-1] - 2)
-        )
+        command = groups[self.command_group]
+        velocity = self._read(features)
+        if self.read_out_target == RISK:
+            velocity = self.velocity_risk.avoidance(velocity, command[:, :2], self._candidates)
+        velocity = velocity * has_frame[:, None]
+        groups[self.command_group] = command + functional.pad(velocity, (0, command.shape[-1] - 2))
         return groups
 
     def _check_target(self, target: str, obs: TensorDict) -> None:
-        if target == AVOIDANCE:
+        if target == self.read_out_target:
             return
         if target not in self.perception.supervised:
             raise ValueError(

@@ -3,6 +3,7 @@
 from omniperception.perception.networks import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
 from omniperception.perception.pd_risknet import PdRiskNet
 from omniperception.perception.sampling import Attitude, FpsSampler, PdSampler, ProximitySampler, RawSampler, Sampler
+from omniperception.perception.velocity_risk import VelocityRisk
 
 __all__ = [
     "Attitude",
@@ -16,4 +17,5 @@ __all__ = [
     "ProximitySampler",
     "RawSampler",
     "Sampler",
+    "VelocityRisk",
 ]

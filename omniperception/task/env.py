@@ -22,12 +22,14 @@ from omniperception.task.sensing import LidarSensing, SensingNeeds, SensorConfig
 from omniperception.task.state import Kinematics
 from omniperception.task.terminations import TerminationsConfig
 from omniperception.task.timing import StageTimer
+from omniperception.task.true_risk import TrueVelocityRisk
 from omniperception.world import ObstacleField, ObstaclesConfig, RobotConfig, TerrainConfig, build_world
 from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 
 HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target", "avoidance_target"
-"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector, and the
-avoidance velocity."""
+RISK_TARGET = "risk_target"
+"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector, the
+avoidance velocity, and the risk of candidate velocities."""
 
 NEARNESS_RANGE = 4.0
 """Distance (m) from which on an obstacle counts as not near at all."""
@@ -77,6 +79,11 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
             raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
+        if RISK_TARGET in self.targets and self.rewards.avoidance.risk is None:
+            raise ValueError(
+                "perception.risk_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
+                " perception.risk_weight=0"
+            )
         if self.lidar is None:
             if self.sampler is not None:
                 raise ValueError(
@@ -94,7 +101,7 @@ class EnvConfig:
         fields = self.rewards.fields_read() | self.observations.fields_read()
         if HEIGHT_TARGET in self.targets:
             fields |= {"heights"}
-        if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
+        if {SECTOR_TARGET, AVOIDANCE_TARGET, RISK_TARGET} & set(self.targets):
             fields |= {"sectors"}
         if self.obstacles.num_obstacles:
             fields |= {"obstacle_contact"}
@@ -115,8 +122,9 @@ class OmniEnv(VecEnv):
     contacts with obstacles are those of all physics steps of the control step.
 
     Attributes:
-        avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from the sector distances of the newest frame
-            when a term reads them, else 0.
+        avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from what was near at the newest frame when a
+            term reads it, else 0.
+        risk: (num_envs, K) true risk of each candidate velocity at the newest frame; None where V_avoid is the paper's.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -142,6 +150,7 @@ class OmniEnv(VecEnv):
             if config.initial_obstacle_level is not None:
                 self.obstacles.level = config.initial_obstacle_level
         self.sensing = self._build_sensing(fields) if config.uses_lidar else None
+        self.true_risk = self._build_true_risk(fields)
         self._allocate()
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self.probes: list[Callable[[], None]] = []  # called in each step before finished environments are reset
@@ -172,6 +181,7 @@ class OmniEnv(VecEnv):
         if self.sensing is not None and self.sensing.due(self.step_count):
             self._sense()
         with self.timer.stage("rewards"):
+            self._choose_avoidance()
             outcomes, done = self._terminate()
             rewards = self._reward()
             self._record(done, outcomes)
@@ -201,6 +211,7 @@ class OmniEnv(VecEnv):
             "episode_length": self.episode_length_buf,
             "actions": list(self.actions),
             "past": list(self._past or ()),
+            "risk": self.risk,
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -219,7 +230,9 @@ class OmniEnv(VecEnv):
             self._groups[name].buffer = buffer
         self._read_state()
         if self.sensing is not None:
+            self.risk = state["risk"]
             self._read_avoidance()
+            self._choose_avoidance()
         self.observations = self._collect(dict(state["observations"]))
 
     # ---- the parts of a step -----------------------------------------------------------------------------------------
@@ -297,10 +310,20 @@ class OmniEnv(VecEnv):
         with self.timer.stage("sectors"):
             self.sensing.measure_sectors()
             self._read_avoidance()
+        if self.true_risk is not None:
+            with self.timer.stage("risk"):
+                self.risk = self.true_risk.measure(self.kinematics)
 
     def _read_avoidance(self) -> None:
-        if "sectors" in self._reads:
+        """V_avoid of the paper, which holds from one frame to the next."""
+        if "sectors" in self._reads and self.true_risk is None:
             self.avoidance_velocity = avoidance_velocity(self.sensing.sector_distance, self.config.rewards.avoidance)
+
+    def _choose_avoidance(self) -> None:
+        """V_avoid from the risk of velocities, which depends on the command of the moment."""
+        if self.true_risk is not None:
+            law, command = self.config.rewards.avoidance.risk, self.command.value[:, :2]
+            self.avoidance_velocity = law.avoidance(self.risk, command, self.true_risk.candidates)
 
     def _terminate(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Why environments end, each environment for one reason, and whether they do."""
@@ -376,6 +399,8 @@ class OmniEnv(VecEnv):
         if self.sensing is not None:
             self.sensing.reset(env_ids)
             self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
+            if self.risk is not None:
+                self.risk = self.risk.index_fill(0, env_ids, 0.0)
 
     def _observe(self) -> TensorDict:
         return self._collect({name: buffer.update(self, self._fresh) for name, buffer in self._groups.items()})
@@ -392,6 +417,8 @@ class OmniEnv(VecEnv):
             groups[SECTOR_TARGET] = (1.0 - self.sensing.sector_distance / NEARNESS_RANGE).clamp(min=0.0)
         if AVOIDANCE_TARGET in self.config.targets:
             groups[AVOIDANCE_TARGET] = self.avoidance_velocity
+        if RISK_TARGET in self.config.targets:
+            groups[RISK_TARGET] = self.risk
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:
@@ -439,6 +466,12 @@ class OmniEnv(VecEnv):
             config.frame_history,
         )
 
+    def _build_true_risk(self, fields: frozenset[str]) -> TrueVelocityRisk | None:
+        config, law = self.config, self.config.rewards.avoidance.risk
+        if self.sensing is None or law is None or "sectors" not in fields:
+            return None
+        return TrueVelocityRisk(law, config.obstacles, self.obstacles, self.num_envs, self.device)
+
     def _allocate(self) -> None:
         robot, model = self.robot, self.world.model
         joint_ids = [model.joint(name).id for name in robot.joints]
@@ -450,6 +483,9 @@ class OmniEnv(VecEnv):
         self.last_joint_vel = zero
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
+        self.risk: torch.Tensor | None = None
+        if self.true_risk is not None:
+            self.risk = torch.zeros(self.num_envs, len(self.true_risk.candidates), device=self.device)
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._past: tuple[torch.Tensor, torch.Tensor] | None = None
         if self.randomizer.delay is not None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from omniperception.perception.velocity_risk import VelocityRisk
 from omniperception.task.state import checked_term, fields_read, reads
 
 if TYPE_CHECKING:
@@ -56,12 +57,15 @@ class AvoidanceConfig:
         threshold: sectors with an obstacle nearer than this (m) push.
         alpha: decay (1/m) of the push with distance.
         max_speed: bound (m/s) of the sum's magnitude; None leaves it as the paper has it.
+        risk: None: V_avoid is the paper's sum; otherwise it follows from the risk of velocities, and the sectors only
+            tell whether an obstacle is near.
     """
 
     num_sectors: int
     threshold: float
     alpha: float
     max_speed: float | None = None
+    risk: VelocityRisk | None = None
 
     def __post_init__(self) -> None:
         for key in ("num_sectors", "threshold", "alpha"):

@@ -168,8 +168,8 @@ def test_height_supervision_needs_a_predictor_and_a_fitting_target():
 def avoiding_actor(env, network="mlp", **options):
     actor = actor_for(env, network, supervision={"avoidance_target": 1.0}, command_group="policy", **options)
     with torch.no_grad():
-        actor.avoidance[-1].weight.normal_()
-        actor.avoidance[-1].bias.normal_()
+        actor.read_out[-1].weight.normal_()
+        actor.read_out[-1].bias.normal_()
     return actor
 
 
@@ -184,7 +184,7 @@ def test_avoidance_velocity_shifts_the_command(normalize):
     if normalize:
         actor.update_normalization(obs)
     with torch.no_grad():
-        velocity = actor.avoidance(actor.perception(obs["frames"], obs["frame_count"])[:, 0])
+        velocity = actor.read_out(actor.perception(obs["frames"], obs["frame_count"])[:, 0])
         velocity[2] = 0.0
         seen = actor.get_latent(obs)[:, :3]
         command = obs["policy"] + torch.cat([velocity, torch.zeros(4, 1)], 1)
@@ -225,5 +225,5 @@ def test_avoidance_velocity_of_an_update_equals_that_of_the_rollout_and_is_learn
 
 
 def test_avoidance_needs_an_observed_command():
-    with pytest.raises(ValueError, match="needs the actor to observe 'command', it observes \\['policy'\\]"):
+    with pytest.raises(ValueError, match="need the actor to observe 'command', it observes \\['policy'\\]"):
         actor_for(ToyEnv(3), supervision={"avoidance_target": 1.0})
