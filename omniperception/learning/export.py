@@ -1,0 +1,127 @@
+"""The actor without exploration as a network of plain tensors, written as TorchScript and as ONNX."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from pathlib import Path
+
+import torch
+from rsl_rl.models import MLPModel
+from torch import nn
+
+from omniperception.learning.models import PerceptionActor
+
+OPSET = 18
+"""ONNX operator set of the exported network."""
+
+
+class ExportUnavailable(RuntimeError):
+    """A package that exporting needs is not installed; the message is one line."""
+
+
+class BlindNetwork(nn.Module):
+    """Flat observations -> actions; the observations' normalisation is part of it."""
+
+    input_names = ("observations",)
+
+    def __init__(self, actor: MLPModel) -> None:
+        """Args: actor: copied, on the CPU."""
+        super().__init__()
+        actor = copy.deepcopy(actor).cpu().eval().requires_grad_(False)
+        self.normalizer, self.mlp = actor.obs_normalizer, actor.mlp
+        self.output = actor.distribution.as_deterministic_output_module() if actor.distribution else nn.Identity()
+        self.observation_size = actor.obs_dim
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """(B, observation_size), the actor's groups in order -> (B, num_actions)."""
+        return self.output(self.mlp(self.normalizer(observations)))
+
+    def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
+        """Random inputs."""
+        return (torch.randn(batch, self.observation_size),)
+
+
+class PerceptiveNetwork(BlindNetwork):
+    """Flat observations and a history of sampled frames -> actions."""
+
+    input_names = ("observations", "frames", "frame_count")
+
+    def __init__(self, actor: PerceptionActor, command_start: int) -> None:
+        """Args: actor: copied, on the CPU; command_start: where (v_x, v_y) begin in the observations."""
+        super().__init__(actor)
+        self.perception, self.avoidance = copy.deepcopy((actor.perception, actor.avoidance))
+        for module in (self.perception, self.avoidance):
+            if module is not None:
+                module.cpu().eval().requires_grad_(False)
+        self.command_start = command_start
+
+    def forward(self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor) -> torch.Tensor:
+        """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> (B, num_actions)."""
+        features = self.perception(frames, frame_count)[:, 0]
+        if self.avoidance is not None:
+            velocity = self.avoidance(features) * (frame_count > 0)
+            start, stop = self.command_start, self.command_start + 2
+            commanded = observations[:, start:stop] + velocity
+            observations = torch.cat((observations[:, :start], commanded, observations[:, stop:]), 1)
+        return self.output(self.mlp(torch.cat((self.normalizer(observations), features), 1)))
+
+    def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
+        """Random inputs, with every number of valid frames in turn."""
+        history, points = self.perception.history, self.perception.num_points
+        count = torch.arange(batch)[:, None] % (history + 1)
+        return *super().examples(batch), torch.randn(batch, history, points, 3) / 3, count
+
+
+def exportable(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
+    """The actor as a network of plain tensors.
+
+    Args:
+        actor: of a runner.
+        group_sizes: numbers in each of its observation groups, in order.
+    """
+    if not isinstance(actor, PerceptionActor):
+        return BlindNetwork(actor)
+    before = 0
+    if actor.avoidance is not None:
+        names = list(group_sizes)
+        before = sum(group_sizes[name] for name in names[: names.index(actor.command_group)])
+    return PerceptiveNetwork(actor, before)
+
+
+def trace(network: BlindNetwork) -> torch.jit.ScriptModule:
+    """The network as TorchScript, for any batch size."""
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # sizes become constants of the trace, as they should; and that it is deprecated
+        return torch.jit.trace(network, network.examples(2), check_trace=False)
+
+
+def write_torchscript(traced: torch.jit.ScriptModule, path: Path) -> None:
+    """Writes the traced network."""
+    traced.save(str(path))
+
+
+def write_onnx(traced: torch.jit.ScriptModule, network: BlindNetwork, path: Path) -> None:
+    """Writes the traced network as ONNX, batch size open.
+
+    torch's TorchScript-based exporter is used: the other one's packages, onnxscript and onnx-ir, are not needed then.
+    """
+    try:
+        import onnx  # noqa: F401  torch's exporter needs it
+    except ImportError:
+        raise ExportUnavailable(
+            "ONNX export needs onnx: pip install 'omniperception[export]', or give formats=torchscript"
+        ) from None
+    names = list(network.input_names)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            traced,
+            network.examples(2),
+            str(path),
+            input_names=names,
+            output_names=["actions"],
+            dynamic_axes={name: {0: "batch"} for name in (*names, "actions")},
+            opset_version=OPSET,
+            dynamo=False,
+        )
