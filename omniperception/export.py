@@ -16,7 +16,7 @@ from omniperception.deploy.description import Description, Group, Joints, Lidar,
 from omniperception.evaluation.report import provenance
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
-from omniperception.learning.export import BlindNetwork, exportable, trace, write_onnx, write_torchscript
+from omniperception.learning.export import BlindNetwork, exportable, write_onnx, write_torchscript
 from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler
 from omniperception.task import observations
 from omniperception.task.commands import VelocityCommandConfig
@@ -108,14 +108,13 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
 def _write(request: Export, network: BlindNetwork, described: Description) -> None:
     folder = request.folder
     folder.mkdir(parents=True, exist_ok=True)
-    traced = trace(network)
     if "torchscript" in request.formats:
         path = folder / FORMATS["torchscript"]
-        write_torchscript(traced, path)
+        write_torchscript(network, path)
         _check(network, torch.jit.load(str(path)), path)
     if "onnx" in request.formats:
         path = folder / FORMATS["onnx"]
-        write_onnx(traced, network, path)
+        write_onnx(network, path)
         session = _onnx_session(path)
         if session is not None:
             _check(network, session, path)

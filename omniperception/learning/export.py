@@ -89,20 +89,15 @@ def exportable(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
     return PerceptiveNetwork(actor, before)
 
 
-def trace(network: BlindNetwork) -> torch.jit.ScriptModule:
-    """The network as TorchScript, for any batch size."""
+def write_torchscript(network: BlindNetwork, path: Path) -> None:
+    """Writes the network as TorchScript, for any batch size."""
     with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # sizes become constants of the trace, as they should; and that it is deprecated
-        return torch.jit.trace(network, network.examples(2), check_trace=False)
+        warnings.simplefilter("ignore")  # that tracing is deprecated, and that checks of shapes are not traced
+        torch.jit.trace(network, network.examples(2), check_trace=False).save(str(path))
 
 
-def write_torchscript(traced: torch.jit.ScriptModule, path: Path) -> None:
-    """Writes the traced network."""
-    traced.save(str(path))
-
-
-def write_onnx(traced: torch.jit.ScriptModule, network: BlindNetwork, path: Path) -> None:
-    """Writes the traced network as ONNX, batch size open.
+def write_onnx(network: BlindNetwork, path: Path) -> None:
+    """Writes the network as ONNX, for any batch size.
 
     torch's TorchScript-based exporter is used: the other one's packages, onnxscript and onnx-ir, are not needed then.
     """
@@ -116,7 +111,7 @@ def write_onnx(traced: torch.jit.ScriptModule, network: BlindNetwork, path: Path
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            traced,
+            network,
             network.examples(2),
             str(path),
             input_names=names,
