@@ -127,7 +127,7 @@ def _check(network: BlindNetwork, written: Callable, path: Path) -> None:
     with torch.no_grad():
         error = float((written(*inputs) - network(*inputs)).abs().max())
     if not error <= TOLERANCE:
-        raise ConfigError(f"{path} differs from the policy by {error:.1e} in an action; this network cannot be exported")
+        raise ConfigError(f"{path} differs from the policy by {error:.1e} in an action: not exportable")
 
 
 def _onnx_session(path: Path) -> Callable | None:

@@ -162,7 +162,7 @@ class Description:
         """Reads policy.json from a folder."""
         path = Path(folder) / FILE
         if not path.is_file():
-            raise DeployError(f"{folder} holds no exported policy ({FILE}); write one: python scripts/export.py run=...")
+            raise DeployError(f"{folder} holds no exported policy ({FILE}); write it: scripts/export.py run=...")
         try:
             content = json.loads(path.read_text())
         except ValueError as error:

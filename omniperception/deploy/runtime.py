@@ -130,9 +130,7 @@ class ExportedPolicy:
         self.frames[-1] = self._sampler(points, attitude)
         self.frame_count = min(self.frame_count + 1, len(self.frames))
 
-    def step(
-        self, state: RobotState, command: Sequence[float], points: np.ndarray | None = None
-    ) -> np.ndarray:
+    def step(self, state: RobotState, command: Sequence[float], points: np.ndarray | None = None) -> np.ndarray:
         """One control step.
 
         Args:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from tensordict import TensorDict
 
 from omniperception.deploy import DeployError, ExportedPolicy, RobotState
+from omniperception.deploy.latency import Reading
+from omniperception.lidar import Lidar, LidarFrame
 from omniperception.task.env import OmniEnv
+from omniperception.world import ray_shapes
 
 
 class ExportedPolicies:
@@ -43,7 +48,7 @@ class ExportedPolicies:
         if self.robots[0].frames is None or env.sensing is None or env.sensing.tick == self._tick:
             return [None] * env.num_envs
         self._tick = env.sensing.tick
-        clouds = raw_points(env)
+        clouds = raw_points(env.sensing.frame)
         return [cloud if count else None for cloud, count in zip(clouds, env.sensing.frame_count, strict=True)]
 
 
@@ -60,8 +65,51 @@ def robot_states(env: OmniEnv) -> list[RobotState]:
     return [RobotState(*values) for values in zip(*(tensor.cpu().numpy() for tensor in tensors), strict=True)]
 
 
-def raw_points(env: OmniEnv) -> np.ndarray:
-    """(num_envs, num_rays, 3) points (m, sensor frame) of the newest frame, noise included, misses as zeros."""
-    frame = env.sensing.frame
+def raw_points(frame: LidarFrame) -> np.ndarray:
+    """(num_envs, num_rays, 3) points (m, sensor frame) of a frame, noise included, misses as zeros."""
     points = torch.where(frame.ranges.isfinite()[..., None], frame.ranges[..., None] * frame.directions_s, 0.0)
     return points.cpu().numpy()
+
+
+def record(env: OmniEnv, policy: ExportedPolicy, steps: int, whole_frames: bool) -> list[Reading]:
+    """What the first robot senses while the policy drives it.
+
+    Args:
+        env: at the start of its first episodes.
+        policy: what each robot runs.
+        steps: control steps.
+        whole_frames: all points that the device measures, in place of those that training kept; without noise.
+    """
+    policies = ExportedPolicies(env, policy)
+    device = _whole_device(env) if whole_frames else None
+    readings, tick = [], 0
+    for _ in range(steps):
+        state, command, points = robot_states(env)[0], env.command.value[0].cpu().numpy().copy(), None
+        if policies.robots[0].frames is not None and env.sensing.tick != tick:
+            tick = env.sensing.tick
+            frame = env.sensing.frame
+            if device is not None:
+                time_s = torch.full((env.num_envs,), env.step_count * env.control_dt, dtype=torch.float64)
+                frame = device.cast(time_s.to(env.device))
+            points = raw_points(frame)[0].copy()
+        readings.append(Reading(state, command, points))
+        with torch.no_grad():
+            env.step(policies(env.get_observations()))
+    return readings
+
+
+def _whole_device(env: OmniEnv) -> Lidar:
+    """The environment's LiDAR with every point that it measures."""
+    config, sensing = env.config.lidar, env.sensing
+    pattern, shapes = config.pattern(), ray_shapes(env.world)
+    lidar = Lidar(
+        replace(config.sensor, num_rays=pattern.points_per_frame(config.sensor.period_s), selection="every_kth"),
+        pattern,
+        sensing.scene,
+        mount_body=shapes.bodies.index(env.world.base_body),
+        exclude_shapes=shapes.indices(tuple(config.exclude_geoms)),
+        seed=env.config.seed,
+        outputs=("ranges", "directions_s"),
+    )
+    lidar.phase_rows.copy_(sensing.lidar.phase_rows)
+    return lidar
