@@ -3,7 +3,7 @@
 python scripts/benchmark_inference.py run=latest [steps=5000] [out=<folder of the exported policy>]
 
 The readings are recorded in the run's own environment, in which the policy drives one robot; then they are timed. A
-frame comes with every fifth control step or so, and costs sampling: steps with and without one are reported apart. Cases:
+frame comes with every fifth control step or so, and costs sampling: steps with and without one are apart. Cases:
     as trained      the points that training kept of each frame
     thinned         the device's whole frame, of which the runtime keeps what training kept
     whole frame     the device's whole frame, all of it sampled
