@@ -83,14 +83,9 @@ def benchmark(run_dir: Path, folder: Path, steps: int) -> None:
     timed = cases(run_dir, policy)
     where = use_one_core()
     results = {}
-    print(
-        f"{policy.description.provenance.get('checkpoint')}, {platform.processor() or platform.machine()}, {where}, ms"
-    )
-    print(
-        f"{'case':<13}{'points':>8}  {'step':<14}{'n':>7}"
-        + "".join(f"{f'p{p}':>9}" for p in PERCENTILES)
-        + f"{'max':>9}"
-    )
+    headings = "".join(f"{f'p{p}':>9}" for p in PERCENTILES)
+    print(f"{policy.description.provenance.get('checkpoint')}, {platform.machine()}, {where}, milliseconds")
+    print(f"{'case':<13}{'points':>8}  {'step':<14}{'n':>7}{headings}{'max':>9}")
     for case, readings in timed.items():
         latency: Latency = measure(Thinning(policy) if case == "thinned" else policy, readings, steps)
         points = max((len(r.points) for r in readings if r.points is not None), default=0)
