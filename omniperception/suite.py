@@ -147,7 +147,8 @@ def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolic
             avoidance = config.assemble(config.load(evaluation.run_dir)).env.rewards.avoidance
             policy = steered(trained.env, policy, avoidance, _learned_commands(run_dir))
         if name == "exported":
-            policy = ExportedPolicies(trained.env, ExportedPolicy.load(run_dir / EXPORTED))
+            exported = ExportedPolicies(trained.env, ExportedPolicy.load(run_dir / EXPORTED))
+            return TrainedPolicy(trained.env, exported, run_dir / EXPORTED)
     except ValueError as error:
         raise ConfigError(f"policy={name}: {error}") from None
     return TrainedPolicy(trained.env, policy, trained.checkpoint)
