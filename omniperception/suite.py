@@ -11,9 +11,12 @@ from pathlib import Path
 from omniperception import config
 from omniperception.assembly import TrainedPolicy, load_policy
 from omniperception.config import ConfigError
+from omniperception.deploy import ExportedPolicy
 from omniperception.evaluation.baselines import Limits, covered, steered
 from omniperception.evaluation.episodes import Episodes, run_episodes
+from omniperception.evaluation.exported import ExportedPolicies
 from omniperception.evaluation.report import DEFINITIONS, provenance, table, times_line, write_trials
+from omniperception.export import FOLDER as EXPORTED
 
 FOLDER = "evaluation"
 """Where in a run directory the results go."""
@@ -23,6 +26,7 @@ POLICIES = {
     "blind": "the same policy, its LiDAR covered: every ray a miss",
     "scripted": "a walking policy told V_cmd + V_avoid, V_avoid computed from the obstacles' true distances by sector",
     "command": "a walking policy told V_cmd alone",
+    "exported": "the run's exported policy on what a robot senses: scripts/export.py, onnxruntime",
 }
 """What can be evaluated; the walking policy is the one of `walker`, or for `scripted` the run's own, LiDAR covered."""
 
@@ -142,6 +146,9 @@ def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolic
         if name == "scripted":
             avoidance = config.assemble(config.load(evaluation.run_dir)).env.rewards.avoidance
             policy = steered(trained.env, policy, avoidance, _learned_commands(run_dir))
+        if name == "exported":
+            exported = ExportedPolicies(trained.env, ExportedPolicy.load(run_dir / EXPORTED))
+            return TrainedPolicy(trained.env, exported, run_dir / EXPORTED)
     except ValueError as error:
         raise ConfigError(f"policy={name}: {error}") from None
     return TrainedPolicy(trained.env, policy, trained.checkpoint)

@@ -140,6 +140,13 @@ class PerceptionActor(MLPModel):
         if self.read_out is not None:
             yield from self.read_out.parameters()
 
+    def avoidance(self, features: torch.Tensor, command: torch.Tensor) -> torch.Tensor:
+        """(B, 2) avoidance velocity (m/s, yaw-aligned frame) read out of embeddings (B, D) at commands (B, 2)."""
+        values = self._read(features)
+        if self.read_out_target == AVOIDANCE:
+            return values
+        return self.velocity_risk.avoidance(values, command, self._candidates)
+
     def embed(self, obs: WindowedObservations) -> torch.Tensor:
         """(B, D) embeddings of the steps of an update; each window is embedded once."""
         if not obs.has_frames:  # the sensor sleeps: there is nothing to embed
@@ -232,10 +239,7 @@ class PerceptionActor(MLPModel):
         """The observations with the avoidance velocity, 0 without a frame, added to the commanded one."""
         groups = groups.clone(recurse=False)
         command = groups[self.command_group]
-        velocity = self._read(features)
-        if self.read_out_target == RISK:
-            velocity = self.velocity_risk.avoidance(velocity, command[:, :2], self._candidates)
-        velocity = velocity * has_frame[:, None]
+        velocity = self.avoidance(features, command[:, :2]) * has_frame[:, None]
         groups[self.command_group] = command + functional.pad(velocity, (0, command.shape[-1] - 2))
         return groups
 

@@ -76,7 +76,7 @@ class VelocityRisk:
         Returns:
             (n, 2) m/s in the yaw-aligned frame.
         """
-        deviation = torch.cdist(command, candidates).square()
+        deviation = (command[:, None] - candidates).square().sum(-1)
         wary = torch.softmax(-(deviation + self.weight * risk) / self.temperature, 1)
         free = torch.softmax(-deviation / self.temperature, 1)
         return (wary - free) @ candidates

@@ -51,7 +51,31 @@ class WindowedGru(nn.GRU):
         window_count(frames, count, self.history)
         projected = functional.linear(frames, self.weight_ih_l0, self.bias_ih_l0)  # (B, F, 3 hidden)
         valid = valid_frames(count, self.history).unsqueeze(-1)  # (B, W, H, 1)
-        return _UnrolledGru.apply(projected.to(self.weight_hh_l0.dtype), valid, self.weight_hh_l0, self.bias_hh_l0)
+        unroll = _UnrolledGru.apply if torch.is_grad_enabled() else _last_states
+        return unroll(projected.to(self.weight_hh_l0.dtype), valid, self.weight_hh_l0, self.bias_hh_l0)
+
+
+def _last_states(
+    projected: torch.Tensor, valid: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, saved: list | None = None
+) -> torch.Tensor:
+    """(B, F, 3 h), (B, W, H, 1) bool, (3 h, h), (3 h,) -> last states (B, W, h).
+
+    Every step's (state before it, gates, new state, what recurs into it) is appended to `saved`.
+    """
+    batch, windows, history, _ = valid.shape
+    hidden = weight.shape[1]
+    state = projected.new_zeros(batch, windows, hidden)
+    for k in range(history):
+        from_frame = projected[:, k : k + windows]
+        recurrent = functional.linear(state, weight, bias).to(state.dtype)
+        gates = (from_frame[..., : 2 * hidden] + recurrent[..., : 2 * hidden]).sigmoid_()
+        reset, update = gates.split(hidden, dim=-1)
+        recurrent_new = recurrent[..., 2 * hidden :]
+        new = torch.addcmul(from_frame[..., 2 * hidden :], reset, recurrent_new).tanh_()
+        if saved is not None:
+            saved.append((state, gates, new, recurrent_new))
+        state = torch.where(valid[:, :, k], torch.lerp(new, state, update), state)
+    return state
 
 
 class _UnrolledGru(torch.autograd.Function):
@@ -66,22 +90,10 @@ class _UnrolledGru(torch.autograd.Function):
     def forward(
         ctx, projected: torch.Tensor, valid: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
     ) -> torch.Tensor:
-        """(B, F, 3 h), (B, W, H, 1) bool, (3 h, h), (3 h,) -> last states (B, W, h)."""
-        batch, windows, history, _ = valid.shape
-        hidden = weight.shape[1]
+        """As :func:`_last_states`."""
         keep = any(ctx.needs_input_grad)
-        state = projected.new_zeros(batch, windows, hidden)
-        saved = []
-        for k in range(history):
-            from_frame = projected[:, k : k + windows]
-            recurrent = functional.linear(state, weight, bias).to(state.dtype)
-            gates = (from_frame[..., : 2 * hidden] + recurrent[..., : 2 * hidden]).sigmoid_()
-            reset, update = gates.split(hidden, dim=-1)
-            recurrent_new = recurrent[..., 2 * hidden :]
-            new = torch.addcmul(from_frame[..., 2 * hidden :], reset, recurrent_new).tanh_()
-            if keep:
-                saved.append((state, gates, new, recurrent_new))
-            state = torch.where(valid[:, :, k], torch.lerp(new, state, update), state)
+        saved = [] if keep else None
+        state = _last_states(projected, valid, weight, bias, saved)
         if keep:
             ctx.save_for_backward(valid, weight, *(tensor for step in saved for tensor in step))
             ctx.num_frames = projected.shape[1]

@@ -1,0 +1,191 @@
+"""What an exported policy is: names, scales and rates, as written beside its network in policy.json."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+
+FORMAT = "omniperception-policy"
+VERSION = 1
+FILE = "policy.json"
+
+
+class DeployError(ValueError):
+    """An exported policy cannot be read or was given something else than it expects; the message is one line."""
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Joints in the order of joint states, actions and targets.
+
+    Attributes:
+        names: of the joints.
+        default_pos: default pose, rad.
+        action_scale: joint target = default_pos + action_scale * action, rad.
+        action_limit: actions are clipped to +- this.
+        kp: gain of the position controller that follows the targets, N m / rad.
+        kd: its damping, N m s / rad.
+        torque_limits: N m.
+        lower: joint limits, rad; the targets are not clipped to them.
+        upper: rad.
+    """
+
+    names: Sequence[str]
+    default_pos: Sequence[float]
+    action_scale: float
+    action_limit: float
+    kp: float
+    kd: float
+    torque_limits: Sequence[float]
+    lower: Sequence[float]
+    upper: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Term:
+    """A quantity in an observation group.
+
+    Attributes:
+        quantity: one of `omniperception.deploy.runtime.QUANTITIES`.
+        size: numbers.
+        scale: factor.
+    """
+
+    quantity: str
+    size: int
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Group:
+    """Terms concatenated in order, `history` control steps of them, newest last."""
+
+    name: str
+    history: int
+    terms: Sequence[Term]
+
+    @property
+    def width(self) -> int:
+        """Numbers of one control step."""
+        return sum(term.size for term in self.terms)
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """The sensor that the policy was trained with.
+
+    Attributes:
+        period_s: seconds between two frames.
+        mount_pos: of the sensor in the base frame, m.
+        mount_quat: of the sensor in the base frame, (w, x, y, z).
+        min_range: nearest distance that it measures, m.
+        max_range: points beyond are misses, m.
+        num_rays: rays of a frame that training used.
+        points_per_frame: points that the device measures in a frame.
+        keep_every: training used every so-manieth point of a frame; None where it chose otherwise.
+    """
+
+    period_s: float
+    mount_pos: Sequence[float]
+    mount_quat: Sequence[float]
+    min_range: float
+    max_range: float
+    num_rays: int
+    points_per_frame: int
+    keep_every: int | None
+
+
+@dataclass(frozen=True)
+class Perception:
+    """How frames become the network's input.
+
+    Attributes:
+        history: frames that the network sees.
+        num_points: points of a frame after sampling.
+        sampler: kind and figures of the sampler, see `omniperception.deploy.sampling.make_sampler`.
+    """
+
+    history: int
+    num_points: int
+    sampler: Mapping
+
+
+@dataclass(frozen=True)
+class Description:
+    """Everything that a robot has to know besides the network's weights.
+
+    Attributes:
+        control_period_s: seconds between two control steps.
+        joints: their names and figures.
+        observations: groups in the order in which they are concatenated.
+        command: range of each commanded value that training drew from, by name (m/s, rad/s).
+        lidar: the sensor; None for a blind policy.
+        perception: what is made of its frames; None for a blind policy.
+        files: name of the network's file by kind, "onnx" or "torchscript".
+        provenance: run, checkpoint, iteration, date and versions.
+    """
+
+    control_period_s: float
+    joints: Joints
+    observations: Sequence[Group]
+    command: Mapping[str, Sequence[float]]
+    lidar: Lidar | None = None
+    perception: Perception | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+    provenance: Mapping = field(default_factory=dict)
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers of the network's flat observation."""
+        return sum(group.history * group.width for group in self.observations)
+
+    @property
+    def inputs(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each input of the network without the batch: float32, `frame_count` int64."""
+        shapes: dict[str, tuple[int, ...]] = {"observations": (self.observation_size,)}
+        if self.perception is not None:
+            shapes["frames"] = (self.perception.history, self.perception.num_points, 3)
+            shapes["frame_count"] = (1,)
+        return shapes
+
+    def write(self, folder: Path) -> None:
+        """Writes policy.json."""
+        shapes = {name: ["batch", *shape] for name, shape in self.inputs.items()}
+        network = {"inputs": shapes, "outputs": {"actions": ["batch", len(self.joints.names)]}}
+        content = {"format": FORMAT, "version": VERSION, "network": network, **asdict(self)}
+        (folder / FILE).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+    @classmethod
+    def read(cls, folder: Path) -> Description:
+        """Reads policy.json from a folder."""
+        path = Path(folder) / FILE
+        if not path.is_file():
+            raise DeployError(f"{folder} holds no exported policy ({FILE}); write it: scripts/export.py run=...")
+        try:
+            content = json.loads(path.read_text())
+        except ValueError as error:
+            raise DeployError(f"{path} is no JSON ({error}); export the policy again") from None
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise DeployError(f"{path} describes no exported policy: it has no format '{FORMAT}'")
+        if content.get("version") != VERSION:
+            raise DeployError(
+                f"{path} has format version {content.get('version')}, this program reads {VERSION}; export again"
+            )
+        try:
+            return cls._of(content)
+        except (KeyError, TypeError) as error:
+            raise DeployError(f"{path} is incomplete ({error}); export the policy again") from None
+
+    @classmethod
+    def _of(cls, content: Mapping) -> Description:
+        parts = {item.name: content[item.name] for item in fields(cls)}
+        groups = [
+            Group(group["name"], group["history"], tuple(Term(**term) for term in group["terms"]))
+            for group in parts.pop("observations")
+        ]
+        parts["joints"] = Joints(**parts["joints"])
+        for name, kind in (("lidar", Lidar), ("perception", Perception)):
+            parts[name] = kind(**parts[name]) if parts[name] is not None else None
+        return cls(observations=tuple(groups), **parts)

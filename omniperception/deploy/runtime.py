@@ -1,0 +1,240 @@
+"""Runs an exported policy: joint states, IMU and LiDAR points in, joint targets out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from omniperception.deploy.description import DeployError, Description, Group
+from omniperception.deploy.sampling import Attitude, make_sampler
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """What a robot senses of itself at a control step.
+
+    Attributes:
+        joint_pos: (num_joints,) rad, in the order of `Description.joints`.
+        joint_vel: (num_joints,) rad/s.
+        base_quat: (4,) orientation of the base in the world from the IMU, (w, x, y, z); the heading does not matter.
+        base_ang_vel: (3,) angular velocity in the base frame from the gyroscope, rad/s.
+        base_lin_vel: (3,) linear velocity in the base frame from a state estimator, m/s; None if the policy does not
+            observe it.
+    """
+
+    joint_pos: Sequence[float]
+    joint_vel: Sequence[float]
+    base_quat: Sequence[float]
+    base_ang_vel: Sequence[float]
+    base_lin_vel: Sequence[float] | None = None
+
+
+class ExportedPolicy:
+    """The policy of one robot with its memory: proprioception, frames and the previous action.
+
+    Call :meth:`step` once per `description.control_period_s`, with the points of a LiDAR frame whenever one is
+    complete, once per `description.lidar.period_s`. Points are in the sensor frame, in metres, in the order of their
+    measurement, without a correction for the robot's motion. Rows that are not finite or zero are misses.
+
+    Attributes:
+        description: names, scales and rates.
+        action: (num_joints,) float32, the newest action.
+        observation: (observation_size,) float32 that the newest action was computed from.
+        frames: (history, num_points, 3) float32 sampled frames, newest last; None for a blind policy.
+        frame_count: how many of the newest frames are valid.
+    """
+
+    def __init__(self, description: Description, session: InferenceSession) -> None:
+        """Args: description: of the policy; session: its network."""
+        self.description, self._session = description, session
+        joints, perception = description.joints, description.perception
+        self._default_pos = np.asarray(joints.default_pos, np.float32)
+        self._sampler = make_sampler(perception.sampler) if perception is not None else None
+        self._histories = {group.name: deque(maxlen=group.history) for group in description.observations}
+        self.frames: np.ndarray | None = None
+        if perception is not None:
+            self.frames = np.zeros((perception.history, perception.num_points, 3), np.float32)
+        self.observation = np.zeros(description.observation_size, np.float32)
+        self._check_network()
+        self.reset()
+
+    @classmethod
+    def load(cls, folder: str | Path, num_threads: int = 1) -> ExportedPolicy:
+        """The policy in a folder that `scripts/export.py` wrote.
+
+        Args:
+            folder: with policy.json and the ONNX file.
+            num_threads: CPU threads of the network.
+        """
+        folder = Path(folder)
+        description = Description.read(folder)
+        try:
+            import onnxruntime
+        except ImportError:
+            raise DeployError(
+                "running an exported policy needs onnxruntime: pip install 'omniperception[deploy]'"
+            ) from None
+        if "onnx" not in description.files or not (folder / description.files["onnx"]).is_file():
+            raise DeployError(f"{folder} has no ONNX file; write it: python scripts/export.py run=... formats=onnx")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = num_threads, 1
+        path = str(folder / description.files["onnx"])
+        try:
+            session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's own exceptions have no common base
+            raise DeployError(f"{path} cannot be loaded ({str(error).splitlines()[0][:160]}); export again") from None
+        return cls(description, session)
+
+    def another(self) -> ExportedPolicy:
+        """The same policy for another robot, which shares the network and nothing else."""
+        return ExportedPolicy(self.description, self._session)
+
+    def reset(self) -> None:
+        """Forgets everything, as at the start of an episode: the next step's observation fills the histories."""
+        self.action = np.zeros(len(self._default_pos), np.float32)
+        for history in self._histories.values():
+            history.clear()
+        self.frame_count = 0
+        if self.frames is not None:
+            self.frames = np.zeros_like(self.frames)
+
+    def thin(self, points: np.ndarray) -> np.ndarray:
+        """Of a device's whole frame (n, 3), misses as zeros or left out, the points that training would have kept."""
+        lidar = self._lidar()
+        if lidar.keep_every is not None:
+            return points[:: lidar.keep_every][: lidar.num_rays]
+        count = min(len(points), -(-len(points) * lidar.num_rays // lidar.points_per_frame))
+        return points[np.arange(count) * len(points) // max(count, 1)]
+
+    def see(self, points: np.ndarray, base_quat: Sequence[float]) -> None:
+        """Appends a LiDAR frame to the history; :meth:`step` does it for points that it is given.
+
+        Args:
+            points: (n, 3) m in the sensor frame, in the order of measurement.
+            base_quat: (4,) orientation of the base at the end of the frame, (w, x, y, z).
+        """
+        lidar = self._lidar()
+        points = np.asarray(points, np.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
+        attitude = Attitude(_quaternion(base_quat), lidar.mount_pos, lidar.mount_quat)
+        self.frames[:-1] = self.frames[1:]
+        self.frames[-1] = self._sampler(points, attitude)
+        self.frame_count = min(self.frame_count + 1, len(self.frames))
+
+    def step(self, state: RobotState, command: Sequence[float], points: np.ndarray | None = None) -> np.ndarray:
+        """One control step.
+
+        Args:
+            state: what the robot senses of itself now.
+            command: (3,) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame.
+            points: (n, 3) m in the sensor frame of a LiDAR frame that has just been completed; None without one.
+
+        Returns:
+            (num_joints,) float32 joint targets, rad, in the order of `description.joints`.
+        """
+        if points is not None:
+            self.see(points, state.base_quat)
+        self.observation = self._observe(state, command)
+        feed = {"observations": self.observation[None]}
+        if self.frames is not None:
+            feed |= {"frames": self.frames[None], "frame_count": np.array([[self.frame_count]])}
+        joints = self.description.joints
+        actions = self._session.run(None, feed)[0][0]
+        self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
+        return self._default_pos + np.float32(joints.action_scale) * self.action
+
+    def _observe(self, state: RobotState, command: Sequence[float]) -> np.ndarray:
+        parts = []
+        for group in self.description.observations:
+            history = self._histories[group.name]
+            value = self._measure(group, state, command)
+            history.extend([value] * (1 if history else group.history))
+            parts += history
+        return np.concatenate(parts)
+
+    def _measure(self, group: Group, state: RobotState, command: Sequence[float]) -> np.ndarray:
+        """(width,) the group's terms at this step."""
+        values = []
+        for term in group.terms:
+            value = QUANTITIES[term.quantity](self, state, command)
+            if value.shape != (term.size,):
+                raise DeployError(f"{term.quantity}: shape ({term.size},) was expected, {value.shape} given")
+            if not np.isfinite(value).all():
+                raise DeployError(f"{term.quantity}: finite numbers were expected, {value} given")
+            values.append(value * np.float32(term.scale))
+        return np.concatenate(values)
+
+    def _lidar(self):
+        if self.frames is None:
+            raise DeployError("this policy is blind: it was trained without a LiDAR and takes no points")
+        return self.description.lidar
+
+    def _check_network(self) -> None:
+        """The network and its description belong together."""
+        for term in (term for group in self.description.observations for term in group.terms):
+            if term.quantity not in QUANTITIES:
+                raise DeployError(f"observation '{term.quantity}' is unknown; known: {', '.join(QUANTITIES)}")
+        given = {item.name: tuple(item.shape[1:]) for item in self._session.get_inputs()}
+        if given != self.description.inputs:
+            raise DeployError(
+                f"the network's inputs are {given}, its description says {self.description.inputs}; export again"
+            )
+        if self.frames is not None and self._sampler.num_points != self.frames.shape[1]:
+            raise DeployError(
+                f"the sampler gives {self._sampler.num_points} points, the network reads {self.frames.shape[1]};"
+                " export again"
+            )
+
+
+def _vector(name: str) -> Callable[[ExportedPolicy, RobotState, Sequence[float]], np.ndarray]:
+    """Reads a field of the state as float32."""
+
+    def read(policy: ExportedPolicy, state: RobotState, command: Sequence[float]) -> np.ndarray:
+        value = getattr(state, name)
+        if value is None:
+            raise DeployError(f"{name}: this policy observes it, None was given")
+        return np.asarray(value, np.float32)
+
+    return read
+
+
+def _joint_pos_offset(policy: ExportedPolicy, state: RobotState, command: Sequence[float]) -> np.ndarray:
+    """Joint position relative to the default pose, rad."""
+    joint_pos = np.asarray(state.joint_pos, np.float32)
+    return joint_pos - policy._default_pos if joint_pos.shape == policy._default_pos.shape else joint_pos
+
+
+def _projected_gravity(policy: ExportedPolicy, state: RobotState, command: Sequence[float]) -> np.ndarray:
+    """Unit vector of gravity in the base frame."""
+    w, x, y, z = _quaternion(state.base_quat)
+    return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], np.float32)
+
+
+def _quaternion(quat: Sequence[float]) -> np.ndarray:
+    """(4,) float64 of unit length."""
+    quat = np.asarray(quat, np.float64)
+    length = np.linalg.norm(quat) if quat.shape == (4,) else np.nan
+    if not abs(length - 1.0) < 1e-2:
+        raise DeployError(f"base_quat: a unit quaternion (w, x, y, z) was expected, {quat.tolist()} given")
+    return quat / length
+
+
+QUANTITIES: dict[str, Callable[[ExportedPolicy, RobotState, Sequence[float]], np.ndarray]] = {
+    "joint_pos_offset": _joint_pos_offset,
+    "joint_vel": _vector("joint_vel"),
+    "base_lin_vel": _vector("base_lin_vel"),
+    "base_ang_vel": _vector("base_ang_vel"),
+    "projected_gravity": _projected_gravity,
+    "command": lambda policy, state, command: np.asarray(command, np.float32),
+    "previous_action": lambda policy, state, command: policy.action,
+}
+"""What a policy can observe, by the name of training's observation term."""

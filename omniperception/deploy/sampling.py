@@ -1,0 +1,276 @@
+"""The samplers of `omniperception.perception` for one robot's cloud, in NumPy."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omniperception.deploy.description import DeployError
+
+_PHI_BITS = 16
+_MAX_RING = (1 << (31 - _PHI_BITS)) - 1
+_PI = np.float32(math.pi)
+_ROUNDING = 1.0 + 1e-6
+"""A distance at the end of the range may exceed it by rounding."""
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """How the sensor stands.
+
+    Attributes:
+        base_quat: (4,) orientation of the base in the world, (w, x, y, z); its heading does not matter.
+        mount_pos: (3,) sensor position in the base frame, m.
+        mount_quat: (4,) sensor orientation in the base frame, (w, x, y, z).
+    """
+
+    base_quat: np.ndarray
+    mount_pos: Sequence[float]
+    mount_quat: Sequence[float]
+
+
+class CloudSampler(ABC):
+    """Reduces one frame of points to a fixed number.
+
+    Attributes:
+        num_points: P.
+        max_range: m; points beyond are misses, and sampled points are divided by it.
+    """
+
+    num_points: int
+    max_range: float
+
+    @abstractmethod
+    def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
+        """(P, 3) float32 from (n, 3) float32 points (m, sensor frame) in the order of their measurement.
+
+        A row that is not finite, zero, or beyond the maximum range is a miss.
+        """
+
+    def _is_hit(self, points: np.ndarray) -> np.ndarray:
+        """(n,) bool."""
+        square = np.einsum("ij,ij->i", points, points)
+        return (square > 0.0) & (square <= np.float32((self.max_range * _ROUNDING) ** 2))  # false for nan
+
+
+class RawSampler(CloudSampler):
+    """Every ray's point in ray order, a miss as zeros."""
+
+    def __init__(self, num_points: int, max_range: float) -> None:
+        """Args: num_points: rays; max_range: m."""
+        self.num_points, self.max_range = num_points, max_range
+
+    def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
+        """See :meth:`CloudSampler.__call__`."""
+        if len(points) != self.num_points:
+            raise DeployError(
+                f"points: this network reads every ray, also misses (as zeros): ({self.num_points}, 3) was expected,"
+                f" ({len(points)}, 3) given; thin() reduces a device's whole frame"
+            )
+        return np.where(self._is_hit(points)[:, None], points * np.float32(1.0 / self.max_range), np.float32(0.0))
+
+
+class PdSampler(CloudSampler):
+    """Proximal points by farthest point sampling, distal points as means of bins, as in training's `PdSampler`."""
+
+    def __init__(
+        self,
+        num_proximal: int,
+        num_distal: int,
+        max_range: float,
+        split: float | None,
+        ring: float,
+        pick_middle: bool = False,
+    ) -> None:
+        """Configure both halves.
+
+        Args:
+            num_proximal: slots of the proximal half, written first.
+            num_distal: slots of the distal half.
+            max_range: m.
+            split: elevation in the sensor frame above which a point is proximal, rad; None: every point is.
+            ring: height of an elevation ring for sorting, rad.
+            pick_middle: whether a distal bin gives its middle point in place of the mean.
+        """
+        self.num_points, self.max_range = num_proximal + num_distal, max_range
+        self.num_proximal, self.num_distal = num_proximal, num_distal
+        self.split = np.float32(-math.inf if split is None else split)
+        self.ring, self.pick_middle = np.float32(ring), pick_middle
+
+    def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
+        """See :meth:`CloudSampler.__call__`."""
+        points = points[self._is_hit(points)]
+        theta, phi = angles_of(points)
+        near = theta > self.split
+        sampled = np.zeros((self.num_points, 3), np.float32)
+        scaled = points * np.float32(1.0 / self.max_range)
+        self._write_proximal(sampled, scaled[near], theta[near], phi[near])
+        far = ~near
+        self._write_distal(sampled[self.num_proximal :], points[far], scaled[far], theta[far], phi[far], attitude)
+        return sampled
+
+    def _write_proximal(self, out: np.ndarray, scaled: np.ndarray, theta: np.ndarray, phi: np.ndarray) -> None:
+        if not self.num_proximal:
+            return
+        picked = farthest_points(scaled, self.num_proximal)
+        order = np.argsort(sort_keys(theta[picked], phi[picked], self.ring), kind="stable")
+        out[: len(picked)] = scaled[picked[order]]
+
+    def _write_distal(
+        self,
+        out: np.ndarray,
+        points: np.ndarray,
+        scaled: np.ndarray,
+        theta: np.ndarray,
+        phi: np.ndarray,
+        attitude: Attitude,
+    ) -> None:
+        bins = min(len(scaled), self.num_distal)
+        if not bins:
+            return
+        ordered = scaled[np.argsort(sort_keys(theta, phi, self.ring), kind="stable")]
+        edges = np.arange(bins + 1) * len(scaled) // bins
+        first, size = edges[:-1], np.diff(edges)
+        if self.pick_middle:
+            out[:bins] = ordered[first + size // 2]
+        else:
+            out[:bins] = np.add.reduceat(ordered, first, axis=0) / size[:, None].astype(np.float32)
+
+
+class ProximitySampler(PdSampler):
+    """Proximal points as above; the distal half as proximities around the levelled base, as in training."""
+
+    def __init__(
+        self,
+        num_proximal: int,
+        num_sectors: int,
+        max_range: float,
+        split: float,
+        ring: float,
+        band_edges: Sequence[float],
+        decay: float,
+        blind: float,
+        body: Sequence[float],
+    ) -> None:
+        """Configure both halves.
+
+        Args:
+            num_proximal: slots of the proximal half, written first.
+            num_sectors: azimuth sectors.
+            max_range: m.
+            split: elevation in the sensor frame above which a point is proximal, rad.
+            ring: height of an elevation ring for sorting the proximal half, rad.
+            band_edges: heights that separate the bands, m above the base's origin.
+            decay: distance over which the proximity falls by e, m.
+            blind: nearest distance that counts, m.
+            body: half length and half width of the robot's own body, m.
+        """
+        super().__init__(num_proximal, num_sectors * (len(band_edges) - 1), max_range, split, ring)
+        self.num_sectors, self.decay, self.blind = num_sectors, decay, blind
+        self.edges, self.body = np.asarray(band_edges, np.float32), tuple(body)
+
+    def _write_distal(
+        self,
+        out: np.ndarray,
+        points: np.ndarray,
+        scaled: np.ndarray,
+        theta: np.ndarray,
+        phi: np.ndarray,
+        attitude: Attitude,
+    ) -> None:
+        level = _levelled(rotation_matrix(attitude.base_quat))
+        turn = (level @ rotation_matrix(attitude.mount_quat)).astype(np.float32)
+        offset = (level @ np.asarray(attitude.mount_pos, np.float64)).astype(np.float32)
+        at = points[np.linalg.norm(points, axis=1) >= np.float32(self.blind)] @ turn.T + offset
+        on_body = (abs(at[:, 0]) < self.body[0]) & (abs(at[:, 1]) < self.body[1])
+        x, y, z = at[~on_body & (at[:, 2] >= self.edges[0]) & (at[:, 2] < self.edges[-1])].T
+        band = np.searchsorted(self.edges, z, side="right") - 1
+        turned = (np.arctan2(y, x) + _PI) / (2 * _PI)
+        sector = np.clip((turned * np.float32(self.num_sectors)).astype(np.int64), 0, self.num_sectors - 1)
+        horizontal = np.sqrt(x * x + y * y)
+        proximity = np.exp(-horizontal / np.float32(self.decay))
+        bearing = proximity / np.maximum(horizontal, np.float32(1e-6))
+        # Written from the farthest to the nearest, so that the nearest stays; of equally near ones the first measured.
+        order = np.argsort(horizontal, kind="stable")[::-1]
+        out[(band * self.num_sectors + sector)[order]] = np.stack((bearing * x, bearing * y, proximity), 1)[order]
+
+
+_KINDS = {"raw": RawSampler, "pd": PdSampler, "proximity": ProximitySampler}
+
+
+def make_sampler(figures: Mapping) -> CloudSampler:
+    """The sampler that a description names: its `kind`, one of "raw", "pd" and "proximity", and its arguments."""
+    arguments = dict(figures)
+    kind = arguments.pop("kind", None)
+    if kind not in _KINDS:
+        raise DeployError(f"sampler '{kind}' is unknown; known: {', '.join(_KINDS)}")
+    try:
+        return _KINDS[kind](**arguments)
+    except TypeError as error:
+        raise DeployError(f"sampler '{kind}': {error}; export the policy again") from None
+
+
+def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices of exact farthest point sampling from point 0; no point twice, of equally far ones the first.
+
+    Args:
+        points: (n, 3) float32.
+        count: points to pick; all of them, in their order, when there are no more.
+    """
+    if len(points) <= count:
+        return np.arange(len(points))
+    coordinates = np.ascontiguousarray(points.T)
+    squares, nearest = np.empty_like(coordinates), np.full(len(points), np.finfo(np.float32).max, np.float32)
+    total, picked, current = squares[0], np.empty(count, np.int64), 0
+    for k in range(count):
+        picked[k] = current
+        nearest[current] = -1.0
+        np.subtract(coordinates, coordinates[:, current, None], out=squares)
+        np.multiply(squares, squares, out=squares)
+        np.add(total, squares[1], out=total)
+        np.add(total, squares[2], out=total)
+        np.minimum(nearest, total, out=nearest)
+        current = nearest.argmax()
+    return picked
+
+
+def angles_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Elevation and azimuth, rad in [0, 2 pi), of points (n, 3); (n,) float32 each, from float64 as in training."""
+    x, y, z = points.astype(np.float64).T
+    azimuth = np.arctan2(y, x)
+    azimuth[azimuth < 0.0] += 2.0 * math.pi
+    azimuth = azimuth.astype(np.float32)
+    azimuth[azimuth >= 2.0 * _PI] = 0.0
+    return np.arctan2(z, np.sqrt(x * x + y * y)).astype(np.float32), azimuth
+
+
+def sort_keys(theta: np.ndarray, phi: np.ndarray, ring: np.float32) -> np.ndarray:
+    """(elevation ring, azimuth) as one integer, the azimuth in 65536 steps from -pi."""
+    row = np.clip(np.floor((theta + _PI / 2) / ring), 0, _MAX_RING).astype(np.int32)
+    turn = (phi + _PI) / (2 * _PI)
+    turn -= np.floor(turn)
+    column = np.minimum((turn * np.float32(1 << _PHI_BITS)).astype(np.int32), (1 << _PHI_BITS) - 1)
+    return (row << _PHI_BITS) | column
+
+
+def rotation_matrix(quat: Sequence[float]) -> np.ndarray:
+    """(3, 3) float64 of a quaternion (w, x, y, z), which is normalised."""
+    w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _levelled(base: np.ndarray) -> np.ndarray:
+    """The base's rotation without its heading."""
+    yaw = math.atan2(base[1, 0], base[0, 0])
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ base

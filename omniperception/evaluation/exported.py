@@ -1,0 +1,115 @@
+"""An exported policy in the environments of a run: it gets what a robot would sense, not the observations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from omniperception.deploy import DeployError, ExportedPolicy, RobotState
+from omniperception.deploy.latency import Reading
+from omniperception.lidar import Lidar, LidarFrame
+from omniperception.task.env import OmniEnv
+from omniperception.world import ray_shapes
+
+
+class ExportedPolicies:
+    """A policy for `run_episodes`: one exported policy per environment, with the memory that a robot's would have.
+
+    Attributes:
+        robots: the exported policies.
+    """
+
+    def __init__(self, env: OmniEnv, policy: ExportedPolicy) -> None:
+        """Args: env: at the start of its first episodes; policy: what each robot runs."""
+        described = policy.description
+        if tuple(described.joints.names) != tuple(env.robot.joints):
+            raise DeployError(f"the policy moves {list(described.joints.names)}, this robot has {env.robot.joints}")
+        self._env = env
+        self.robots = [policy.another() for _ in range(env.num_envs)]
+        self._tick = 0
+
+    def __call__(self, observations: TensorDict) -> torch.Tensor:
+        """(num_envs, num_actions) for the environment's present state; the observations are not read."""
+        env = self._env
+        if env.step_count:
+            for index in env.done.nonzero().flatten().tolist():
+                self.robots[index].reset()
+        states, commands, clouds = robot_states(env), env.command.value.cpu().numpy(), self._new_clouds()
+        for robot, state, command, cloud in zip(self.robots, states, commands, clouds, strict=True):
+            robot.step(state, command, cloud)
+        return torch.from_numpy(np.stack([robot.action for robot in self.robots])).to(env.device)
+
+    def _new_clouds(self) -> list[np.ndarray | None]:
+        """Points of the frame that has just been cast; None without one, or where the episode has just begun."""
+        env = self._env
+        if self.robots[0].frames is None or env.sensing is None or env.sensing.tick == self._tick:
+            return [None] * env.num_envs
+        self._tick = env.sensing.tick
+        clouds = raw_points(env.sensing.frame)
+        return [cloud if count else None for cloud, count in zip(clouds, env.sensing.frame_count, strict=True)]
+
+
+def robot_states(env: OmniEnv) -> list[RobotState]:
+    """What each robot senses of itself, with the latency that the environment gives it."""
+    sensed = env.sensed
+    tensors = (
+        sensed.joint_pos,
+        sensed.joint_vel,
+        sensed.base_quat_w,
+        sensed.base_ang_vel_b,
+        sensed.base_lin_vel_b,
+    )
+    return [RobotState(*values) for values in zip(*(tensor.cpu().numpy() for tensor in tensors), strict=True)]
+
+
+def raw_points(frame: LidarFrame) -> np.ndarray:
+    """(num_envs, num_rays, 3) points (m, sensor frame) of a frame, noise included, misses as zeros."""
+    points = torch.where(frame.ranges.isfinite()[..., None], frame.ranges[..., None] * frame.directions_s, 0.0)
+    return points.cpu().numpy()
+
+
+def record(env: OmniEnv, policy: ExportedPolicy, steps: int, whole_frames: bool) -> list[Reading]:
+    """What the first robot senses while the policy drives it.
+
+    Args:
+        env: at the start of its first episodes.
+        policy: what each robot runs.
+        steps: control steps.
+        whole_frames: all points that the device measures, in place of those that training kept; without noise.
+    """
+    policies = ExportedPolicies(env, policy)
+    device = _whole_device(env) if whole_frames else None
+    readings, tick = [], 0
+    for _ in range(steps):
+        state, command, points = robot_states(env)[0], env.command.value[0].cpu().numpy().copy(), None
+        if policies.robots[0].frames is not None and env.sensing.tick != tick:
+            tick = env.sensing.tick
+            frame = env.sensing.frame
+            if device is not None:
+                time_s = torch.full((env.num_envs,), env.step_count * env.control_dt, dtype=torch.float64)
+                frame = device.cast(time_s.to(env.device))
+            points = raw_points(frame)[0].copy()
+        readings.append(Reading(state, command, points))
+        with torch.no_grad():
+            env.step(policies(env.get_observations()))
+    return readings
+
+
+def _whole_device(env: OmniEnv) -> Lidar:
+    """The environment's LiDAR with every point that it measures."""
+    config, sensing = env.config.lidar, env.sensing
+    pattern, shapes = config.pattern(), ray_shapes(env.world)
+    lidar = Lidar(
+        replace(config.sensor, num_rays=pattern.points_per_frame(config.sensor.period_s), selection="every_kth"),
+        pattern,
+        sensing.scene,
+        mount_body=shapes.bodies.index(env.world.base_body),
+        exclude_shapes=shapes.indices(tuple(config.exclude_geoms)),
+        seed=env.config.seed,
+        outputs=("ranges", "directions_s"),
+    )
+    lidar.phase_rows.copy_(sensing.lidar.phase_rows)
+    return lidar

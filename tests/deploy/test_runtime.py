@@ -1,0 +1,253 @@
+"""An exported policy drives MuJoCo: the actions are torch's, and so is what becomes of the robots."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from omniperception import config
+from omniperception.assembly import load_policy
+from omniperception.evaluation.episodes import run_episodes
+from omniperception.export import Export, describe, export
+from omniperception.learning import CheckpointError
+from omniperception.task.env import OmniEnv
+
+pytest.importorskip("onnxruntime", reason="extra deploy")
+pytest.importorskip("onnx", reason="extra export")
+
+from omniperception.deploy import DeployError, Description, ExportedPolicy, RobotState
+from omniperception.evaluation.exported import ExportedPolicies, raw_points, record
+
+ROOT = Path(__file__).resolve().parents[2]
+PRESETS = ("none", "fps_mlp", "fps_gru", "direct_mlp", "pd_risknet", "pd_risknet_small")
+STAND = RobotState([0.0] * 12, [0.0] * 12, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3)
+
+
+def trained(run_dir, *overrides):
+    """Torch's policy in a fresh environment."""
+    return load_policy(config.assemble(config.load(run_dir, overrides)), run_dir)
+
+
+def test_every_preset_is_tried():
+    assert {path.stem for path in (config.CONFIG_DIR / "perception").glob("*.yaml")} == set(PRESETS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", PRESETS)
+def test_the_actions_are_those_of_torch(exported_run, recipe):
+    """Over episodes of 0.5 s with LiDAR frames every fifth step, time-outs and a fall in one environment."""
+    run_dir = exported_run(recipe)
+    torch_side = trained(run_dir, "num_envs=2", "terminations.episode_length_s=0.5")
+    env, policies = torch_side.env, ExportedPolicies(torch_side.env, ExportedPolicy.load(run_dir / "exported"))
+    scripted = torch.jit.load(str(run_dir / "exported" / "policy.pt"))
+    ends, frames, without_frames = 0, 0, 0.0
+    with torch.no_grad():
+        for step in range(45):
+            expected = torch_side.policy(env.get_observations())
+            got = policies(env.get_observations())
+            torch.testing.assert_close(got, expected, atol=1e-5, rtol=0.0)
+            inputs = [torch.from_numpy(np.stack([robot.observation for robot in policies.robots]))]
+            if policies.robots[0].frames is not None:
+                assert [robot.frame_count for robot in policies.robots] == env.sensing.frame_count.flatten().tolist()
+                frames += policies.robots[0].frame_count
+                inputs.append(torch.from_numpy(np.stack([robot.frames for robot in policies.robots])))
+                blind = scripted(*inputs, torch.zeros(2, 1, dtype=torch.int64))
+                without_frames = max(without_frames, float((blind - expected).abs().max()))
+                inputs.append(env.sensing.frame_count)
+            torch.testing.assert_close(scripted(*inputs), expected, atol=1e-5, rtol=0.0)
+            if step == 28:
+                env.sim.qpos[1, 2] = 0.05
+            ends += int(env.step(expected)[2].sum())
+    assert ends == 3
+    assert recipe == "none" or (frames > 30 and without_frames > 1e-2)  # what it sees matters
+
+
+@pytest.mark.slow
+def test_the_evaluation_result_is_that_of_torch(exported_run):
+    """Two environments go their own ways, one driven by torch, the other by the exported policy."""
+    run_dir = exported_run("pd_risknet_small")
+    overrides = ("num_envs=4", "terminations.episode_length_s=0.8", "seed=5")
+    expected = trained(run_dir, *overrides)
+    expected = run_episodes(expected.env, expected.policy, 8)
+    env = trained(run_dir, *overrides).env
+    got = run_episodes(env, ExportedPolicies(env, ExportedPolicy.load(run_dir / "exported")), 8)
+    for name in ("outcome", "contacts", "length_s"):
+        assert torch.equal(getattr(got, name), getattr(expected, name)), name
+    for name in ("clearance", "path", "velocity_error", "yaw_rate_error", "free_s"):
+        torch.testing.assert_close(getattr(got, name), getattr(expected, name), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_robot_in_plain_mujoco_goes_where_the_training_environment_goes(exported_run):
+    """Its own mj_step loop with the exported joint targets; only obstacles and points come from the environment."""
+    run_dir = exported_run("pd_risknet")
+    side = trained(run_dir, "num_envs=1")
+    env, policy = side.env, ExportedPolicy.load(run_dir / "exported")
+    model = env.world.model
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = env.sim.qpos[0].numpy(), env.sim.qvel[0].numpy()
+    data.mocap_pos[:], data.mocap_quat[:] = env.sim.mocap_pos[0].numpy(), env.sim.mocap_quat[0].numpy()
+    tick = 0
+    for _ in range(40):
+        points = raw_points(env.sensing.frame)[0] if env.sensing.tick != tick else None
+        tick = env.sensing.tick
+        world_to_base = np.zeros(9)
+        mujoco.mju_quat2Mat(world_to_base, data.qpos[3:7])
+        velocity = world_to_base.reshape(3, 3).T @ data.qvel[:3]
+        state = RobotState(data.qpos[7:], data.qvel[6:], data.qpos[3:7], data.qvel[3:6], velocity)
+        data.ctrl[:] = policy.step(state, env.command.value[0].numpy(), points)
+        mujoco.mj_step(model, data, env.config.sim.decimation)
+        with torch.no_grad():
+            env.step(side.policy(env.get_observations()))
+        np.testing.assert_allclose(data.qpos, env.sim.qpos[0].numpy(), atol=1e-4)
+    assert policy.frame_count == 8 and abs(policy.action).max() > 0.05
+
+
+def test_histories_are_filled_by_the_first_observation_and_then_move(exported_run):
+    policy = ExportedPolicy.load(exported_run("none") / "exported").another()
+    described = policy.description
+    assert [group.name for group in described.observations] == ["proprioception", "command", "action"]
+    width, history = described.observations[0].width, described.observations[0].history
+    assert width == 33
+    targets = policy.step(STAND, [0.1, 0.2, 0.3])
+    first = policy.observation
+    assert first[history * width : history * width + 3].tolist() == pytest.approx([0.1, 0.2, 0.3])
+    assert first[-12:].tolist() == [0.0] * 12
+    assert first[:12].tolist() == pytest.approx([-x for x in described.joints.default_pos])
+    assert first[30:33].tolist() == [0.0, 0.0, -1.0]
+    assert targets.tolist() == pytest.approx(
+        [
+            q + described.joints.action_scale * a
+            for q, a in zip(described.joints.default_pos, policy.action, strict=True)
+        ]
+    )
+    action = policy.action
+    policy.step(STAND, [0.0, 0.0, 0.0])
+    assert np.array_equal(policy.observation[-12:], action)
+    policy.reset()
+    policy.step(STAND, [0.1, 0.2, 0.3])
+    assert np.array_equal(policy.observation, first)
+
+
+@pytest.mark.slow
+def test_thinning_keeps_what_training_kept(exported_run):
+    """Of the whole frame of 20,000 points, the 1000 that the environment's own LiDAR measured."""
+    run_dir = exported_run("pd_risknet")
+    policy = ExportedPolicy.load(run_dir / "exported")
+    whole = record(trained(run_dir, "num_envs=1").env, policy, 6, whole_frames=True)
+    kept = record(trained(run_dir, "num_envs=1").env, policy, 6, whole_frames=False)
+    frames = [(a.points, b.points) for a, b in zip(whole, kept, strict=True) if a.points is not None]
+    assert len(frames) == 2
+    for everything, expected in frames:
+        assert everything.shape == (20000, 3)
+        np.testing.assert_allclose(policy.thin(everything), expected, atol=1e-6)
+
+
+def test_the_description_says_what_was_trained(exported_run):
+    described = Description.read(exported_run("pd_risknet_small") / "exported")
+    assert described.control_period_s == 0.02 and described.lidar.period_s == 0.1
+    assert described.joints.names[0] == "FL_hip_joint" and described.joints.default_pos[:3] == [0.1, 0.8, -1.5]
+    assert (described.joints.kp, described.joints.kd, described.joints.action_scale) == (25.0, 0.6, 0.25)
+    assert described.lidar.mount_pos == [0.28945, 0.0, -0.046825] and described.lidar.max_range == 6.0
+    assert described.inputs == {"observations": (345,), "frames": (5, 280, 3), "frame_count": (1,)}
+    assert described.command == {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_z": [-1.0, 1.0]}
+    assert described.provenance["checkpoint"] == "model_7.pt" and described.provenance["iteration"] == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joint_pos": [0.0] * 11}, r"joint_pos_offset: shape \(12,\) was expected, \(11,\) given"),
+        ({"base_lin_vel": None}, "base_lin_vel: this policy observes it, None was given"),
+        ({"base_quat": [0.0, 0.0, 0.0, 0.0]}, "base_quat: a unit quaternion"),
+        ({"base_ang_vel": [0.0, float("nan"), 0.0]}, "base_ang_vel: finite numbers were expected"),
+    ],
+)
+def test_wrong_readings_are_named(exported_run, change, message):
+    policy = ExportedPolicy.load(exported_run("none") / "exported")
+    with pytest.raises(DeployError, match=message):
+        policy.step(RobotState(**{**STAND.__dict__, **change}), [0.0] * 3)
+
+
+def test_wrong_points_are_named(exported_run):
+    policy = ExportedPolicy.load(exported_run("pd_risknet") / "exported")
+    with pytest.raises(DeployError, match=r"points: shape \(n, 3\) was expected, \(20, 4\) given"):
+        policy.step(STAND, [0.0] * 3, np.zeros((20, 4)))
+    with pytest.raises(DeployError, match="this policy is blind"):
+        ExportedPolicy.load(exported_run("none") / "exported").step(STAND, [0.0] * 3, np.zeros((20, 3)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 99}, "format version 99, this program reads 1"),
+        ({"format": "something"}, "describes no exported policy"),
+        ({"joints": None}, "is incomplete"),
+        ({"observations": []}, "the network's inputs are"),
+    ],
+)
+def test_a_description_that_does_not_fit_is_refused(exported_run, tmp_path, change, message):
+    source = exported_run("none") / "exported"
+    content = json.loads((source / "policy.json").read_text()) | change
+    (tmp_path / "policy.json").write_text(json.dumps(content))
+    (tmp_path / "policy.onnx").write_bytes((source / "policy.onnx").read_bytes())
+    with pytest.raises(DeployError, match=message):
+        ExportedPolicy.load(tmp_path)
+    with pytest.raises(DeployError, match="holds no exported policy"):
+        ExportedPolicy.load(tmp_path / "elsewhere")
+
+
+def test_a_robot_needs_neither_torch_nor_warp_nor_hydra(exported_run):
+    """And without onnxruntime one line says what to install."""
+    folder = exported_run("none") / "exported"
+    script = (
+        "import sys\n"
+        "from omniperception.deploy import DeployError, ExportedPolicy, RobotState\n"
+        f"policy = ExportedPolicy.load({str(folder)!r})\n"
+        "policy.step(RobotState([0]*12, [0]*12, [1,0,0,0], [0]*3, [0]*3), [0]*3)\n"
+        "assert not {'torch', 'warp', 'hydra', 'mujoco', 'rsl_rl'} & set(sys.modules)\n"
+        "sys.modules['onnxruntime'] = None\n"
+        "try:\n"
+        f"    ExportedPolicy.load({str(folder)!r})\n"
+        "except DeployError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "pip install 'omniperception[deploy]'" in done.stdout
+
+
+@pytest.mark.slow
+def test_the_commands(exported_run, tmp_path):
+    run_dir = exported_run("none")
+
+    def call(script, *arguments):
+        command = [sys.executable, str(ROOT / "scripts" / script), *arguments]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+    done = call("export.py", f"run={run_dir}", f"out={tmp_path / 'there'}", "formats=torchscript")
+    assert done.returncode == 0 and "wrote" in done.stdout, done.stderr
+    assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["policy.json", "policy.pt"]
+    done = call("benchmark_inference.py", f"run={run_dir}", f"out={tmp_path / 'there'}")
+    assert done.returncode == 2 and "has no ONNX file" in done.stderr and "Traceback" not in done.stderr
+    done = call("benchmark_inference.py", f"run={run_dir}", "steps=20")
+    assert done.returncode == 0 and "without frame" in done.stdout and "p99" in done.stdout, done.stderr
+    timed = json.loads((run_dir / "exported" / "latency.json").read_text())["cases"]["as trained"]
+    assert timed["without_frame"]["steps"] == 20 and 0 < timed["without_frame"]["p50_ms"] < 1000
+
+
+def test_what_cannot_be_exported_is_named(exported_run, tmp_path):
+    (tmp_path / "config.yaml").write_bytes((exported_run("none") / "config.yaml").read_bytes())
+    with pytest.raises(CheckpointError, match="no checkpoint in"):
+        export(Export(tmp_path))
+    with pytest.raises(config.ConfigError, match="pickle is unknown; known: onnx, torchscript"):
+        Export(tmp_path, formats=("pickle",))
+    privileged = ("experiment=walk", "observations.actor=[privileged,command]", "num_envs=1")
+    run = config.assemble(config.compose(privileged))
+    with pytest.raises(config.ConfigError, match=r"privileged\.terms\.proprioception cannot be exported"):
+        describe(run, OmniEnv(run.env))

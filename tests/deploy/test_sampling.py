@@ -1,0 +1,121 @@
+"""The NumPy samplers of a robot against the Warp samplers of training, on the same clouds."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from omniperception.deploy import DeployError
+from omniperception.deploy.sampling import Attitude, farthest_points, make_sampler
+from omniperception.export import sampler_figures
+from omniperception.lidar.sensor import quat_from_rpy
+from omniperception.perception import Attitude as TorchAttitude
+from omniperception.perception import FpsSampler, PdSampler, ProximitySampler, RawSampler
+
+MAX_RANGE, RAYS = 6.0, 301
+MOUNT_POS, MOUNT_QUAT = (0.29, 0.0, -0.05), quat_from_rpy(0.0, -2.8782, 3.14)
+GRID = {
+    "split_deg": 20.0,
+    "ring_deg": 9.0,
+    "band_edges": (-0.34, -0.15, -0.05, 0.15, 3.0),
+    "decay": 0.5,
+    "blind": 0.3,
+    "body": (0.5, 0.28),
+}
+SAMPLERS = {
+    "pd": lambda: PdSampler(48, 32, max_range=MAX_RANGE, split_deg=20.0, ring_deg=9.0),
+    "pick": lambda: PdSampler(48, 32, max_range=MAX_RANGE, split_deg=20.0, ring_deg=9.0, reduce="pick"),
+    "fps": lambda: FpsSampler(64, max_range=MAX_RANGE, ring_deg=9.0),
+    "proximity": lambda: ProximitySampler(32, 36, max_range=MAX_RANGE, **GRID),
+    "raw": lambda: RawSampler(RAYS, max_range=MAX_RANGE),
+}
+
+
+def directions(count, rng, low=-7.0, high=52.0):
+    theta, phi = np.radians(rng.uniform(low, high, count)), rng.uniform(0.0, 2 * math.pi, count)
+    return np.stack((np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.sin(theta)), 1)
+
+
+def cloud(name, rng):
+    """(RAYS, 3) points, misses as zeros."""
+    if name == "all near":
+        return (directions(RAYS, rng, 21.0) * rng.uniform(0.05, 6.0, (RAYS, 1))).astype(np.float32)
+    points = directions(RAYS, rng) * rng.uniform(0.05, 6.0, (RAYS, 1))
+    if name == "all far":
+        points = directions(RAYS, rng, high=19.0) * rng.uniform(0.05, 6.0, (RAYS, 1))
+    elif name == "duplicates":
+        points = points[rng.integers(0, 20, RAYS)]
+    elif name == "few":
+        points[rng.permutation(RAYS)[7:]] = 0.0
+    elif name == "one":
+        points[1:] = 0.0
+    elif name == "empty":
+        points[:] = 0.0
+    else:
+        points[rng.uniform(size=RAYS) < 0.3] = 0.0
+    return points.astype(np.float32)
+
+
+CLOUDS = ("random", "all near", "all far", "duplicates", "few", "one", "empty")
+
+
+def by_training(sampler, points, base_quat):
+    """What the Warp sampler makes of one cloud."""
+    points = torch.from_numpy(points)[None]
+    ranges = points.norm(dim=-1)
+    miss = ranges == 0
+    rays = torch.where(miss[..., None], torch.tensor([1.0, 0.0, 0.0]), points / ranges[..., None])
+    x, y, z = rays.double().unbind(-1)
+    theta, phi = torch.atan2(z, torch.hypot(x, y)), torch.atan2(y, x).remainder(2 * math.pi)
+    out = torch.full((1, sampler.num_points, 3), math.nan)
+    attitude = TorchAttitude(torch.tensor([base_quat], dtype=torch.float32), MOUNT_POS, MOUNT_QUAT)
+    sampler(ranges.masked_fill(miss, math.inf), rays, theta.float(), phi.float(), out, attitude)
+    return out[0].numpy()
+
+
+def by_robot(sampler, points, base_quat):
+    return make_sampler(sampler_figures(sampler))(points, Attitude(np.array(base_quat), MOUNT_POS, MOUNT_QUAT))
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("scene", CLOUDS)
+def test_robot_and_training_sample_alike(name, scene):
+    rng, sampler = np.random.default_rng(CLOUDS.index(scene)), SAMPLERS[name]()
+    for _ in range(20):
+        base_quat = quat_from_rpy(*rng.uniform((-0.3, -0.3, -3.0), (0.3, 0.3, 3.0)))
+        points = cloud(scene, rng)
+        expected, got = by_training(sampler, points, base_quat), by_robot(sampler, points, base_quat)
+        assert got.dtype == np.float32 and got.shape == expected.shape
+        np.testing.assert_allclose(got, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 40, 60])
+def test_farthest_points_by_brute_force(count):
+    points = np.random.default_rng(count).normal(size=(50, 3)).astype(np.float32)
+    picked = [0]
+    while len(picked) < min(count, 50):
+        distance = np.linalg.norm(points[:, None].astype(float) - points[picked], axis=2).min(1)
+        distance[picked] = -1.0
+        picked.append(int(distance.argmax()))
+    found = farthest_points(points, count)
+    assert found.tolist() == (picked if count < 50 else list(range(50)))
+
+
+def test_what_is_no_point():
+    """Rows that are not finite, zero or beyond the range."""
+    rng, sampler = np.random.default_rng(5), SAMPLERS["pd"]()
+    points = cloud("all near", rng)
+    expected = by_robot(sampler, points, (1.0, 0.0, 0.0, 0.0))
+    noisy = np.insert(points, [3, 50, 100, 200], [[math.nan] * 3, [math.inf] * 3, [0.0] * 3, [0.0, 0.0, 6.01]], axis=0)
+    np.testing.assert_array_equal(by_robot(sampler, noisy.astype(np.float32), (1.0, 0.0, 0.0, 0.0)), expected)
+
+
+def test_the_raw_sampler_wants_every_ray():
+    with pytest.raises(DeployError, match=r"\(301, 3\) was expected, \(300, 3\) given"):
+        by_robot(SAMPLERS["raw"](), np.ones((300, 3), np.float32), (1.0, 0.0, 0.0, 0.0))
+
+
+def test_an_unknown_sampler_is_named():
+    with pytest.raises(DeployError, match="sampler 'voxels' is unknown; known: raw, pd, proximity"):
+        make_sampler({"kind": "voxels"})
