@@ -1,4 +1,5 @@
-"""Trains a policy: compose the configuration, assemble what it needs, learn. `run=<dir>` resumes a run."""
+"""Trains a policy: compose the configuration, assemble what it needs, learn. `run=<dir>` resumes a run, and so does a
+command line whose run directory holds checkpoints of the same configuration."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from omegaconf import DictConfig
 
 from omniperception import config
 from omniperception.assembly import build_runner
-from omniperception.learning import CheckpointError, TrainingDiverged, latest_checkpoint
+from omniperception.learning import CheckpointError, TrainingDiverged, latest_checkpoint, list_checkpoints
 
 
 def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
@@ -32,8 +33,9 @@ def train(composed: DictConfig) -> None:
     with config.one_line_errors(CheckpointError, TrainingDiverged):
         run_dir = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
         run = config.assemble(composed)
+        begun = config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir))
         config.save(run.composed, run_dir)
-        learn(run, run_dir, resume=False)
+        learn(run, run_dir, resume=begun)
 
 
 def resume(name: str, overrides: list[str]) -> None:

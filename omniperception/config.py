@@ -110,6 +110,19 @@ def save(composed: dict, run_dir: Path) -> None:
     (run_dir / CONFIG_FILE).write_text(yaml.safe_dump(composed, sort_keys=False))
 
 
+def is_begun(run_dir: Path, composed: dict) -> bool:
+    """Whether `run_dir` holds a run of exactly this configuration; one of another is a ConfigError."""
+    path = run_dir / CONFIG_FILE
+    if not path.is_file():
+        return False
+    if yaml.safe_load(path.read_text()) != yaml.safe_load(yaml.safe_dump(composed)):
+        raise ConfigError(
+            f"{run_dir} holds a run of another configuration; go on with it by python train.py run={run_dir}, or choose"
+            " another hydra.run.dir"
+        )
+    return True
+
+
 def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
     """The configuration of a run, changed by overrides.
 

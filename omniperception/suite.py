@@ -24,7 +24,7 @@ FOLDER = "evaluation"
 POLICIES = {
     "run": "the run's policy",
     "blind": "the same policy, its LiDAR covered: every ray a miss",
-    "scripted": "a walking policy told V_cmd + V_avoid, V_avoid computed from the obstacles' true distances by sector",
+    "scripted": "a walking policy told V_cmd + V_avoid, V_avoid by the run's own law from true distances",
     "command": "a walking policy told V_cmd alone",
     "exported": "the run's exported policy on what a robot senses: scripts/export.py, onnxruntime",
 }

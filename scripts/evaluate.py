@@ -8,7 +8,8 @@ run keeps its robot, LiDAR, observations, rewards and networks. Overrides go on 
 terminations=collision. The same seed, number of trials and of environments give the same result. Policies:
     run        the run's
     blind      the same, its LiDAR covered
-    scripted   told V_cmd + V_avoid from true distances: the walker's, or without one the run's own, LiDAR covered
+    scripted   told V_cmd + V_avoid, by the run's law from true distances: the walker's policy, or without one the
+               run's own, LiDAR covered
     command    the walker's, told V_cmd alone
     exported   the run's as scripts/export.py wrote it, on raw points, joint states and IMU
 Writes evaluation/<scenario>.json (summary), .csv (every trial) and .png (trajectories) into the run directory.

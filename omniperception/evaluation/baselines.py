@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDict
 
@@ -10,12 +12,10 @@ from omniperception.perception import Attitude
 from omniperception.task.env import OmniEnv
 from omniperception.task.rewards import AvoidanceConfig, avoidance_velocity
 from omniperception.task.rotations import rotate_yaw
+from omniperception.task.true_risk import HEADROOM, TrueVelocityRisk
 
 COMMAND_GROUP = "command"
 """The observation group that begins with the commanded velocity (v_x, v_y)."""
-
-HEADROOM = 0.45
-"""What hangs at least this high (m) is above the robot and does not push."""
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
 """Ranges of v_x and v_y (m/s)."""
@@ -41,7 +41,7 @@ def steered(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Li
     Args:
         env: where it walks.
         policy: follows velocity commands.
-        avoidance: how distances by sector become V_avoid.
+        avoidance: how distances by sector, or the risk of velocities, become V_avoid.
         limits: ranges to which the sum is clipped: what the policy has learned to follow; None for no limits.
     """
     shape = env.get_observations()[COMMAND_GROUP].shape if COMMAND_GROUP in env.get_observations() else None
@@ -50,10 +50,10 @@ def steered(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Li
             f"a steered policy needs observations with a group '{COMMAND_GROUP}' that holds the command alone, without"
             " history"
         )
-    sectors = TrueSectors(env, avoidance.num_sectors)
+    true_avoidance = _from_risk(env, avoidance) if avoidance.risk is not None else _from_sectors(env, avoidance)
 
     def steer(observations: TensorDict) -> torch.Tensor:
-        velocity = env.command.value[:, :2] + avoidance_velocity(sectors.measure(), avoidance)
+        velocity = env.command.value[:, :2] + true_avoidance()
         if limits is not None:
             low, high = velocity.new_tensor(limits).unbind(1)
             velocity = velocity.clamp(low, high)
@@ -62,6 +62,17 @@ def steered(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Li
         return policy(observations)
 
     return steer
+
+
+def _from_sectors(env: OmniEnv, avoidance: AvoidanceConfig) -> Callable[[], torch.Tensor]:
+    sectors = TrueSectors(env, avoidance.num_sectors)
+    return lambda: avoidance_velocity(sectors.measure(), avoidance)
+
+
+def _from_risk(env: OmniEnv, avoidance: AvoidanceConfig) -> Callable[[], torch.Tensor]:
+    law = avoidance.risk
+    risk = TrueVelocityRisk(law, env.world.obstacles, env.obstacles, env.num_envs, env.device)
+    return lambda: law.avoidance(risk.measure(env.kinematics), env.command.value[:, :2], risk.candidates)
 
 
 def _empty_points(env: OmniEnv) -> torch.Tensor:

@@ -4,6 +4,7 @@ runner."""
 from omniperception.learning.checkpoint import (
     CheckpointError,
     latest_checkpoint,
+    list_checkpoints,
     load_checkpoint,
     save_checkpoint,
 )
@@ -21,6 +22,7 @@ __all__ = [
     "TrainingDiverged",
     "WindowedObservations",
     "latest_checkpoint",
+    "list_checkpoints",
     "load_checkpoint",
     "point_cloud_bytes",
     "save_checkpoint",

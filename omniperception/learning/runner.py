@@ -171,6 +171,7 @@ class Runner(OnPolicyRunner):
             self.current_learning_iteration = state["iteration"]
             self.total_time = state["total_time"]
             self.logger.load_state_dict(state["logger"])
+            self._last_saved = Path(path)
         if parts.get("env") and state["env"] is not None and hasattr(self.env, "load_state_dict"):
             self.env.load_state_dict(state["env"])
         if parts.get("rng"):

@@ -1,0 +1,71 @@
+"""The ablation study: one command trains, goes on, evaluates and writes the table."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from omniperception.ablation import Ablation, pooled
+from omniperception.config import ConfigError
+
+ROOT = Path(__file__).resolve().parents[1]
+GIVEN = {"out": Path("x"), "experiment": "avoid", "variants": ["fps_gru"], "seeds": [1], "scenarios": ["corridor"]}
+
+
+def test_pooled_rates_by_hand():
+    rate = pooled([(8, 10), (4, 10)])
+    assert (rate["rate"], rate["least"], rate["most"], rate["n"]) == (0.6, 0.4, 0.8, 20)
+    assert rate["low"] == pytest.approx(0.3866, abs=1e-4) and rate["high"] == pytest.approx(0.7812, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"variants": ["fps_gru", "fps_gru"]}, "variants=fps_gru,fps_gru must name at least one, and none twice"),
+        ({"seeds": []}, "seeds= must name"),
+        ({"overrides": ["seed=4"]}, "seed=4: give experiment=, variants= and seeds= instead"),
+    ],
+)
+def test_mistakes_are_told_before_anything_runs(change, message):
+    with pytest.raises(ConfigError, match=message):
+        Ablation(**GIVEN | change)
+
+
+@pytest.mark.slow
+def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path):
+    arguments = [
+        f"out={tmp_path}",
+        "variants=fps_mlp,pd_risknet_small",
+        "seeds=1,2",
+        "scenarios=corridor",
+        "trials=2",
+        "num_envs=2",
+        "ppo.num_steps_per_env=4",
+        "ppo.num_mini_batches=1",
+        "ppo.max_iterations=1",
+        "observations.groups.proprioception.history=1",
+        "obstacles.curriculum=null",
+        "terminations.episode_length_s=0.3",
+        "perception.sampler.max_range=20.0",
+    ]
+
+    def study(*more):
+        command = [sys.executable, str(ROOT / "scripts" / "ablation.py"), *arguments, *more]
+        return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=600)
+
+    done = study("stage=train")
+    assert done.returncode == 0, done.stderr
+    checkpoints = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/seed*/checkpoints/model_1.pt")}
+    assert len(checkpoints) == 4
+    done = study()
+    assert done.returncode == 0, done.stderr
+    assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
+    table = (tmp_path / "ablation.md").read_text()
+    assert re.search(r"\| fps_mlp \| .*33\.3 \\\| 93\.3 \|", table) and re.search(r"pd_risknet_small .*76\.7", table)
+    rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert rows["fps_mlp"]["corridor"]["collision"]["n"] == 4
+    done = study("ppo.gamma=0.9")
+    assert done.returncode == 2 and "holds a run of another configuration" in done.stderr
