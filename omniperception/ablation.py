@@ -1,4 +1,4 @@
-"""The ablation study: trains the variants over seeds, evaluates all of them, and writes the paper's table beside ours."""
+"""The ablation study: trains variants over seeds, evaluates them, and writes the paper's table beside ours."""
 
 from __future__ import annotations
 
