@@ -2,6 +2,7 @@
 
     python scripts/view_scan.py lidar=avia [out=outputs/view_scan/avia] [seed=0] [rays=all] [seconds=0.1]
                                 [colour=class|height] [lidar.sensor.max_range=30 and other overrides of the preset]
+    python scripts/view_scan.py lidar=mid360,avia,os0_128,vlp16      # each of them, and comparison.png
 
 Any preset of conf/lidar will do. The scene is a room with people, thin rods, a shelf without legs, a rock, rubble and
 the robot itself, which carries the sensor. Writes pattern.png, scan.png and scan.ply; the pictures need the extra
@@ -17,11 +18,13 @@ import omniperception  # noqa: F401  before torch, whose threads it sets up
 
 # isort: split
 from omniperception import config
+from omniperception.analysis.demo_scene import demo_scene
 from omniperception.analysis.figures import PlotsUnavailable
-from omniperception.analysis.view_scan import summary, view_scan
+from omniperception.analysis.view_scan import draw_comparison, summary, take_scan, write_scan
 
 DEFAULTS = {"out": "", "seed": "0", "rays": "all", "seconds": "", "colour": "class"}
 COLOURS = ("class", "height")
+FILES = ("pattern.png", "scan.png", "scan.ply")
 NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
 """A sensor is looked at, no task is run."""
 
@@ -29,25 +32,28 @@ NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
 def main() -> None:
     with config.one_line_errors(PlotsUnavailable, ModuleNotFoundError, ValueError):
         own, overrides = config.split_arguments(sys.argv[1:], DEFAULTS)
-        name = next((o.split("=", 1)[1] for o in overrides if o.startswith("lidar=")), "mid360")
-        if name == "none":
-            raise config.ConfigError("lidar=none has nothing to view; give a sensor, such as lidar=mid360")
         if own["colour"] not in COLOURS:
             raise config.ConfigError(f"colour={own['colour']} must be one of {', '.join(COLOURS)}")
-        env = config.assemble(config.compose([*NO_TASK, *overrides])).env
-        out = Path(own["out"] or f"outputs/view_scan/{name}")
-        scan = view_scan(
-            name,
-            env.lidar,
-            env.robot,
-            out,
-            seconds=float(config.positive("seconds", own["seconds"], float)) if own["seconds"] else None,
-            num_rays=None if own["rays"] == "all" else int(config.positive("rays", own["rays"], int)),
-            seed=_whole("seed", own["seed"]),
-            colour=own["colour"],
-        )
-        print(summary(scan))
-        print(f"written: {', '.join(str(out / file) for file in ('pattern.png', 'scan.png', 'scan.ply'))}")
+        seconds = float(config.positive("seconds", own["seconds"], float)) if own["seconds"] else None
+        rays = None if own["rays"] == "all" else int(config.positive("rays", own["rays"], int))
+        seed = _whole("seed", own["seed"])
+        given = [o.split("=", 1)[1] for o in overrides if o.startswith("lidar=")]
+        names = (given or ["mid360"])[-1].split(",")
+        if "none" in names:
+            raise config.ConfigError("lidar=none has nothing to view; give a sensor, such as lidar=mid360")
+        out = Path(own["out"] or "outputs/view_scan")
+        scans = []
+        for name in names:
+            others = [o for o in overrides if not o.startswith("lidar=")]
+            env = config.assemble(config.compose([*NO_TASK, f"lidar={name}", *others])).env
+            demo = demo_scene(env.robot)
+            scans.append(take_scan(name, env.lidar, demo, seconds, rays, seed))
+            folder = out if own["out"] and len(names) == 1 else out / name
+            write_scan(scans[-1], env.lidar, demo, folder, own["colour"])
+            print(f"{summary(scans[-1])}\nwritten: {', '.join(str(folder / file) for file in FILES)}", flush=True)
+        if len(names) > 1:
+            draw_comparison(scans, demo, out / "comparison.png")
+            print(f"written: {out / 'comparison.png'}")
 
 
 def _whole(key: str, text: str) -> int:

@@ -28,7 +28,7 @@ class DemoClass(IntEnum):
     SHELF = 2
     ROD = 3
     PERSON = 4
-    ROCK = 5
+    STONE = 5
     ROBOT = 6
 
 
@@ -38,7 +38,7 @@ COLOURS = {
     DemoClass.SHELF: "#b5793a",
     DemoClass.ROD: "#d81b60",
     DemoClass.PERSON: "#e8a317",
-    DemoClass.ROCK: "#3f9142",
+    DemoClass.STONE: "#3f9142",
     DemoClass.ROBOT: "#1d1d29",
 }
 REFLECTIVITY = {
@@ -47,7 +47,7 @@ REFLECTIVITY = {
     DemoClass.SHELF: 0.5,
     DemoClass.ROD: 0.6,
     DemoClass.PERSON: 0.4,
-    DemoClass.ROCK: 0.35,
+    DemoClass.STONE: 0.35,
     DemoClass.ROBOT: 0.1,
 }
 """Of matt surfaces; rough values by eye."""
@@ -159,8 +159,8 @@ def _stones() -> list[Shape]:
     rng = np.random.default_rng(3)
     rubble = HeightField(rng.random((33, 33)) ** 2, half_x=0.7, half_y=0.5, scale=0.08)
     return [
-        Shape(ShapeKind.MESH, pos=(0.7, -2.0, 0.20), class_id=DemoClass.ROCK, asset=_rock(rng)),
-        Shape(ShapeKind.HEIGHTFIELD, pos=(-0.2, 1.25, 0.0), class_id=DemoClass.ROCK, asset=rubble),
+        Shape(ShapeKind.MESH, pos=(0.7, -2.0, 0.20), class_id=DemoClass.STONE, asset=_rock(rng)),
+        Shape(ShapeKind.HEIGHTFIELD, pos=(0.35, 0.78, 0.0), class_id=DemoClass.STONE, asset=rubble),
     ]
 
 

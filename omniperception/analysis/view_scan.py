@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from omniperception.analysis.demo_scene import COLOURS, REFLECTIVITY, ROOM, DemoClass, DemoScene, demo_scene
+from omniperception.analysis.demo_scene import COLOURS, REFLECTIVITY, ROOM, DemoClass, DemoScene
 from omniperception.analysis.figures import new_figure
 from omniperception.analysis.ply import write_ply
 from omniperception.lidar import Lidar, ScanPattern
 from omniperception.task.sensing import SensorConfig
-from omniperception.world import RobotConfig
 
 DURATIONS_S = (0.1, 0.5, 1.0)
-CAMERA, TARGET, FOCAL = (-4.3, -6.2, 4.9), (0.8, -0.15, 0.35), 1.45
+CAMERA, TARGET, FOCAL = (-4.3, -6.2, 5.0), (0.85, -0.3, 0.3), 1.38
 """The camera of the picture from outside: position and where it looks, metres, and focal length over half its width."""
 TO_LIGHT = (-0.45, -0.55, 0.70)
 PIXELS = (1200, 660)
-OUTPUTS = ("ranges", "valid", "points_w", "class_id", "shape_id", "intensity", "elevation", "azimuth", "time_s")
+OUTPUTS = ("ranges", "valid", "points_w", "class_id", "shape_id", "intensity", "row", "time_s")
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class Scan:
         class_id: What was hit, a ``DemoClass``, (P,).
         shape_id: Which shape of the scene, (P,).
         intensity: 1 is a white wall seen perpendicularly at 10 m, (P,).
-        elevation, azimuth: In the sensor's frame, degrees, azimuth in [-180, 180), (P,) each.
+        across, along: Where in the sensor's field of view, see ``_coordinates``, (P,) each.
+        labels: Names and units of these two.
         time_s: Since the scan's beginning, (P,).
     """
 
@@ -50,9 +52,10 @@ class Scan:
     class_id: np.ndarray
     shape_id: np.ndarray
     intensity: np.ndarray
-    elevation: np.ndarray
-    azimuth: np.ndarray
     time_s: np.ndarray
+    across: np.ndarray
+    along: np.ndarray
+    labels: tuple[str, str]
 
 
 def take_scan(
@@ -92,32 +95,29 @@ def take_scan(
     frame = lidar.cast(torch.full((1,), seconds, dtype=torch.float64))
     hit = frame.valid[0]
     values = {key: getattr(frame, key)[0][hit].numpy() for key in OUTPUTS if key != "valid"}
-    for key in ("elevation", "azimuth"):
-        values[key] = (np.degrees(values[key]) + 180.0) % 360.0 - 180.0
+    across, along, labels = _coordinates(pattern)
+    rows = values.pop("row")
     base = demo.scene.body_pos[0, demo.mount_body].numpy()
-    return Scan(name, seconds, config.num_rays, base + np.array(config.mount_pos), **values)
+    return Scan(
+        name,
+        seconds,
+        config.num_rays,
+        base + np.array(config.mount_pos),
+        **values,
+        across=across[rows],
+        along=along[rows],
+        labels=labels,
+    )
 
 
-def view_scan(
-    name: str,
-    sensor: SensorConfig,
-    robot: RobotConfig,
-    out: Path,
-    seconds: float | None = None,
-    num_rays: int | None = None,
-    seed: int = 0,
-    colour: str = "class",
-) -> Scan:
+def write_scan(scan: Scan, sensor: SensorConfig, demo: DemoScene, out: Path, colour: str = "class") -> None:
     """Writes ``pattern.png``, ``scan.png`` and ``scan.ply`` (coloured by "class" or by "height") into ``out``."""
-    demo = demo_scene(robot)
-    scan = take_scan(name, sensor, demo, seconds, num_rays, seed)
     out.mkdir(parents=True, exist_ok=True)
-    draw_pattern(name, sensor.pattern(), out / "pattern.png")
+    draw_pattern(scan.name, sensor.pattern(), out / "pattern.png")
     draw_scan(scan, demo, out / "scan.png")
     rgb = _class_colours(scan) if colour == "class" else _height_colours(scan)
     fields = {"class_id": scan.class_id, "intensity": scan.intensity, "time_s": scan.time_s}
     write_ply(out / "scan.ply", scan.points_w, (255.0 * rgb).round().astype(np.uint8), **fields)
-    return scan
 
 
 def summary(scan: Scan) -> str:
@@ -131,9 +131,10 @@ def summary(scan: Scan) -> str:
 
 def draw_pattern(name: str, pattern: ScanPattern, path: Path) -> None:
     """Where the sensor looks after each of ``DURATIONS_S``; where its parallel rays start, for a height scanner."""
-    figure = new_figure(5.2 * len(DURATIONS_S) + 0.8, 4.6)
-    axes = figure.subplots(1, len(DURATIONS_S), sharex=True, sharey=True)
     across, along, labels = _coordinates(pattern)
+    shape = np.ptp(across) / max(np.ptp(along), 1e-6)
+    figure = new_figure(float(np.clip(3.9 * shape, 3.6, 5.2)) * len(DURATIONS_S) + 1.2, 4.6)
+    axes = figure.subplots(1, len(DURATIONS_S), sharex=True, sharey=True)
     for axis, seconds in zip(axes, DURATIONS_S, strict=True):
         count = pattern.points_per_frame(seconds)
         rows = np.arange(min(count, pattern.num_rows))
@@ -153,6 +154,7 @@ def draw_pattern(name: str, pattern: ScanPattern, path: Path) -> None:
 
 
 def _coordinates(pattern: ScanPattern) -> tuple[np.ndarray, np.ndarray, tuple[str, str]]:
+    """Azimuth in [-180, 180) and elevation of each row, degrees; of parallel rays where they start, metres."""
     if pattern.origins_s is not None:
         x, y, _ = pattern.origins_s.numpy().T
         return x, y, ("start of the ray, x, m", "start of the ray, y, m")
@@ -168,10 +170,24 @@ def draw_scan(scan: Scan, demo: DemoScene, path: Path) -> None:
     seen, above = lower.subplots(1, 2, width_ratios=(1.25, 1.0))
     _draw_ranges(seen, scan)
     _draw_from_above(above, scan)
+    figure.get_layout_engine().set(w_pad=0.12)
     figure.suptitle(
         f"{scan.name}: one scan of {scan.seconds:g} s, {len(scan.ranges):,} of {scan.num_rays:,} rays hit", fontsize=14
     )
     figure.savefig(path, dpi=110)
+
+
+def draw_comparison(scans: Sequence[Scan], demo: DemoScene, path: Path) -> None:
+    """Several sensors' points in the room from outside, two beside each other."""
+    rows = math.ceil(len(scans) / 2)
+    figure = new_figure(14.0, 4.6 * rows)
+    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    for axis, scan in zip(panels, scans, strict=False):
+        _draw_outside(axis, scan, demo)
+        axis.set_title(f"{scan.name}, {scan.seconds:g} s: {len(scan.ranges):,} of {scan.num_rays:,} rays hit")
+    for axis in panels[len(scans) :]:
+        axis.set_axis_off()
+    figure.savefig(path, dpi=100)
 
 
 def _draw_outside(axis, scan: Scan, demo: DemoScene) -> None:
@@ -179,30 +195,26 @@ def _draw_outside(axis, scan: Scan, demo: DemoScene) -> None:
     shown = ~hidden & _visible_from_camera(scan.points_w, demo)
     axis.imshow(_picture(demo), interpolation="bilinear")
     column, row = _project(scan.points_w)
-    for kind in DemoClass:
+    for kind in (kind for kind in DemoClass if (scan.class_id == kind).any()):
         of_kind = scan.class_id == kind
-        axis.scatter(
-            column[of_kind & shown],
-            row[of_kind & shown],
-            s=float(np.clip(60_000.0 / max(len(shown), 1), 1.2, 7.0)),
-            c=COLOURS[kind],
-            linewidths=0,
-            label=f"{kind.name.lower()}: {of_kind.sum():,}",
-        )
+        label = f"{kind.name.lower()}: {of_kind.sum():,}"
+        drawn = of_kind & shown
+        axis.scatter(column[drawn], row[drawn], s=_dot(scan, 60_000.0), c=COLOURS[kind], linewidths=0, label=label)
     column, row = _project(scan.sensor_w[None])
-    axis.plot(column, row, "*", color="red", markeredgecolor="white", markersize=13, linestyle="none", label="sensor")
+    axis.plot(column, row, "*", color="red", markeredgecolor="white", markersize=11, linestyle="none", label="sensor")
     axis.set(xlim=(0, PIXELS[0]), ylim=(PIXELS[1], 0))
     axis.set_axis_off()
-    legend = axis.legend(loc="upper right", markerscale=2.5, title="points by what they hit", fontsize=9)
-    legend.legend_handles[-1].set_markersize(10)
+    legend = axis.legend(loc="upper right", title="points by what they hit", fontsize=8, title_fontsize=8)
+    for handle in legend.legend_handles[:-1]:
+        handle.set_sizes([30.0])
     note = f"not drawn: {hidden.sum():,} points on the ceiling and the two near walls"
-    axis.text(0.01, 0.01, note, transform=axis.transAxes, fontsize=9, color="#555555")
+    axis.text(0.01, 0.01, note, transform=axis.transAxes, fontsize=8, color="#555555")
 
 
 def _draw_ranges(axis, scan: Scan) -> None:
-    marks = axis.scatter(scan.azimuth, scan.elevation, s=_dot(scan), c=scan.ranges, cmap="turbo", linewidths=0)
-    axis.set(title="what the sensor sees", xlabel="azimuth, deg", ylabel="elevation, deg")
-    if len(scan.azimuth) and np.ptp(scan.azimuth) < 180.0:
+    marks = axis.scatter(scan.across, scan.along, s=_dot(scan), c=scan.ranges, cmap="turbo", linewidths=0)
+    axis.set(title="what the sensor sees", xlabel=scan.labels[0], ylabel=scan.labels[1])
+    if len(scan.across) and np.ptp(scan.across) < 180.0:
         axis.set_aspect("equal", adjustable="datalim")
     axis.figure.colorbar(marks, ax=axis, label="range, m")
 
@@ -222,8 +234,9 @@ def _draw_from_above(axis, scan: Scan) -> None:
     axis.figure.colorbar(marks, ax=axis, label="height, m")
 
 
-def _dot(scan: Scan) -> float:
-    return float(np.clip(30_000.0 / max(len(scan.ranges), 1), 0.3, 6.0))
+def _dot(scan: Scan, area: float = 30_000.0) -> float:
+    """Size of a point's mark, so that all points together cover the same area."""
+    return float(np.clip(area / max(len(scan.ranges), 1), 0.4, 6.0))
 
 
 def _camera() -> tuple[np.ndarray, np.ndarray]:
