@@ -60,8 +60,8 @@ def run(tmp_path, monkeypatch):
         corners = "".join(f"vertex {x} {y} {z}\n" for x, y, z in TETRAHEDRON[[*face]])
         facets += f"facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n"
     (tmp_path / "rock.stl").write_text(f"solid rock\n{facets}endsolid rock\n")
-    turns = np.arange(2500) * 0.36
-    np.savetxt(tmp_path / "my_scan.csv", np.stack([turns % 360.0, np.full(2500, -30.0)], 1), delimiter=",")
+    turns = np.arange(3000) * 0.36
+    np.savetxt(tmp_path / "my_scan.csv", np.stack([turns % 360.0, np.full(3000, -30.0)], 1), delimiter=",")
 
     def execute(name: str) -> dict:
         names: dict = {}
