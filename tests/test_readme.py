@@ -76,6 +76,13 @@ def test_blocks_are_short():
         assert len(code.splitlines()) <= MAX_LINES, name
 
 
+def test_what_it_links_to_and_runs_exists():
+    text = README.read_text()
+    named = re.findall(r"\]\((?!http)([^)#]+)\)", text) + re.findall(r"python (\S+\.py)", text)
+    assert len(named) > 20
+    assert [path for path in named if not (README.parent / path).exists()] == []
+
+
 def test_numpy(run):
     names = run("numpy")
     ranges, shape, directions = names["ranges"], names["shape"], names["directions"][0]

@@ -17,7 +17,7 @@ from omniperception.lidar import Lidar, ScanPattern
 from omniperception.task.sensing import SensorConfig
 
 DURATIONS_S = (0.1, 0.5, 1.0)
-CAMERA, TARGET, FOCAL = (-4.3, -6.2, 5.0), (0.85, -0.3, 0.3), 1.38
+CAMERA, TARGET, FOCAL = (-4.3, -6.2, 5.0), (0.85, -0.35, 0.15), 1.34
 """The camera of the picture from outside: position and where it looks, metres, and focal length over half its width."""
 TO_LIGHT = (-0.45, -0.55, 0.70)
 PIXELS = (1200, 660)
@@ -166,7 +166,7 @@ def draw_scan(scan: Scan, demo: DemoScene, path: Path) -> None:
     """The points in the room from outside, as the sensor sees them, and from above."""
     figure = new_figure(14.0, 11.6)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.55, 1.0))
-    _draw_outside(upper.subplots(), scan, demo)
+    _draw_outside(upper.subplots(), scan, demo, _picture(demo))
     seen, above = lower.subplots(1, 2, width_ratios=(1.25, 1.0))
     _draw_ranges(seen, scan)
     _draw_from_above(above, scan)
@@ -181,19 +181,19 @@ def draw_comparison(scans: Sequence[Scan], demo: DemoScene, path: Path) -> None:
     """Several sensors' points in the room from outside, two beside each other."""
     rows = math.ceil(len(scans) / 2)
     figure = new_figure(14.0, 4.6 * rows)
-    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    panels, picture = figure.subplots(rows, 2, squeeze=False).ravel(), _picture(demo)
     for axis, scan in zip(panels, scans, strict=False):
-        _draw_outside(axis, scan, demo)
+        _draw_outside(axis, scan, demo, picture)
         axis.set_title(f"{scan.name}, {scan.seconds:g} s: {len(scan.ranges):,} of {scan.num_rays:,} rays hit")
     for axis in panels[len(scans) :]:
         axis.set_axis_off()
     figure.savefig(path, dpi=100)
 
 
-def _draw_outside(axis, scan: Scan, demo: DemoScene) -> None:
+def _draw_outside(axis, scan: Scan, demo: DemoScene, picture: np.ndarray) -> None:
     hidden = np.isin(scan.shape_id, demo.open_side)
     shown = ~hidden & _visible_from_camera(scan.points_w, demo)
-    axis.imshow(_picture(demo), interpolation="bilinear")
+    axis.imshow(picture, interpolation="bilinear")
     column, row = _project(scan.points_w)
     for kind in (kind for kind in DemoClass if (scan.class_id == kind).any()):
         of_kind = scan.class_id == kind

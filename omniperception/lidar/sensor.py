@@ -52,7 +52,7 @@ class LidarConfig:
         reference_range: Distance at which a white wall seen perpendicularly has intensity 1, metres.
         motion_segments: Pieces into which a frame is cut for motion distortion: each point is cast from the sensor's
             and the bodies' poses at its own time, interpolated between the ends of its piece. 0: every point is cast
-            from the poses at the frame's end.
+            from the poses at the frame's end. Vertices of deformables are in either case those at the frame's end.
         motion_jump: A body that moves farther than this within a piece was placed anew and does not sweep, metres.
     """
 

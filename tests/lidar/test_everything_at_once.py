@@ -21,7 +21,8 @@ from omniperception.lidar import (
 from omniperception.lidar import ShapeKind as K
 
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-FACES = np.array([[*map(int, face)] for face in "013 032 467 475 045 051 237 276 026 064 157 173".split()])
+CORNERS_OF_FACES = ("013", "032", "467", "475", "045", "051", "237", "276", "026", "064", "157", "173")
+FACES = np.array([[*map(int, corners)] for corners in CORNERS_OF_FACES])
 AXES = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 LOWER, UPPER, CARRIED = range(3)
 """Bodies: one with a sensor at the origin, one with a sensor 3 m above it, one that carries a mesh."""
