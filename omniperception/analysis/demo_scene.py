@@ -17,7 +17,6 @@ Vector = tuple[float, float, float]
 
 ROOM = ((-2.6, 4.4), (-2.7, 2.7), 2.6)
 """The room's extent along x and y and its height, metres; the robot stands at the origin and looks along x."""
-ROBOT_BODY = 0
 
 
 class DemoClass(IntEnum):

@@ -259,8 +259,9 @@ def _project(points_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _visible_from_camera(points_w: np.ndarray, demo: DemoScene) -> np.ndarray:
     eye, _ = _camera()
-    towards = torch.from_numpy(points_w - eye)
-    hits = demo.scene.cast(torch.from_numpy(eye).expand_as(towards)[None], towards[None], exclude_shapes=demo.open_side)
+    towards = torch.from_numpy(points_w - eye).float()
+    origins = torch.from_numpy(eye).float().expand_as(towards)
+    hits = demo.scene.cast(origins[None], towards[None], exclude_shapes=demo.open_side)
     return (hits.ranges[0] >= towards.norm(dim=1) - 0.02).numpy()
 
 
