@@ -30,6 +30,7 @@ def command(monkeypatch):
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["view_scan.py", *arguments])
         monkeypatch.setattr(view_scan, "PIXELS", (120, 66))
+        monkeypatch.setattr(view_scan, "DURATIONS_S", (0.02, 0.04, 0.06))
         runpy.run_path(str(SCRIPT), run_name="__main__")
 
     return run
