@@ -166,7 +166,7 @@ def draw_scan(scan: Scan, demo: DemoScene, path: Path) -> None:
     """The points in the room from outside, as the sensor sees them, and from above."""
     figure = new_figure(14.0, 11.6)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.55, 1.0))
-    _draw_outside(upper.subplots(), scan, demo, _picture(demo))
+    _draw_outside(upper.subplots(), scan, demo, _picture(demo), mark_area=60_000.0)
     seen, above = lower.subplots(1, 2, width_ratios=(1.25, 1.0))
     _draw_ranges(seen, scan)
     _draw_from_above(above, scan)
@@ -180,17 +180,17 @@ def draw_scan(scan: Scan, demo: DemoScene, path: Path) -> None:
 def draw_comparison(scans: Sequence[Scan], demo: DemoScene, path: Path) -> None:
     """Several sensors' points in the room from outside, two beside each other."""
     rows = math.ceil(len(scans) / 2)
-    figure = new_figure(14.0, 4.6 * rows)
+    figure = new_figure(14.0, 4.2 * rows)
     panels, picture = figure.subplots(rows, 2, squeeze=False).ravel(), _picture(demo)
     for axis, scan in zip(panels, scans, strict=False):
-        _draw_outside(axis, scan, demo, picture)
+        _draw_outside(axis, scan, demo, picture, mark_area=16_000.0)
         axis.set_title(f"{scan.name}, {scan.seconds:g} s: {len(scan.ranges):,} of {scan.num_rays:,} rays hit")
     for axis in panels[len(scans) :]:
         axis.set_axis_off()
     figure.savefig(path, dpi=100)
 
 
-def _draw_outside(axis, scan: Scan, demo: DemoScene, picture: np.ndarray) -> None:
+def _draw_outside(axis, scan: Scan, demo: DemoScene, picture: np.ndarray, mark_area: float) -> None:
     hidden = np.isin(scan.shape_id, demo.open_side)
     shown = ~hidden & _visible_from_camera(scan.points_w, demo)
     axis.imshow(picture, interpolation="bilinear")
@@ -199,7 +199,7 @@ def _draw_outside(axis, scan: Scan, demo: DemoScene, picture: np.ndarray) -> Non
         of_kind = scan.class_id == kind
         label = f"{kind.name.lower()}: {of_kind.sum():,}"
         drawn = of_kind & shown
-        axis.scatter(column[drawn], row[drawn], s=_dot(scan, 60_000.0), c=COLOURS[kind], linewidths=0, label=label)
+        axis.scatter(column[drawn], row[drawn], s=_dot(scan, mark_area), c=COLOURS[kind], linewidths=0, label=label)
     column, row = _project(scan.sensor_w[None])
     axis.plot(column, row, "*", color="red", markeredgecolor="white", markersize=11, linestyle="none", label="sensor")
     axis.set(xlim=(0, PIXELS[0]), ylim=(PIXELS[1], 0))
