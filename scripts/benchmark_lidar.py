@@ -28,6 +28,7 @@ import omniperception  # noqa: F401  before torch, whose threads it sets up
 
 # isort: split
 from omniperception import config
+from omniperception.analysis.figures import PlotsUnavailable
 from omniperception.analysis.lidar_benchmark.run import RUNS, ArgumentError, RunOptions, execute
 
 DEFAULTS = {
@@ -42,7 +43,7 @@ DEFAULTS = {
 
 
 def main() -> None:
-    with config.one_line_errors(ArgumentError):
+    with config.one_line_errors(ArgumentError, PlotsUnavailable):
         own, unknown = config.split_arguments(sys.argv[1:], DEFAULTS)
         if unknown:
             raise config.ConfigError(f"{' '.join(unknown)}: known arguments are {', '.join(DEFAULTS)}")

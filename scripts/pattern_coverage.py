@@ -4,7 +4,7 @@
                                        [strategies=true] [out=outputs/pattern_coverage.png]
 
 Any name of a preset of a LiDAR will do; only Livox scanners have tables (extra `tables`), which are left out where
-they are not installed. The picture (extra `dev`) shows each pattern after 0.1, 0.5 and 1 s.
+they are not installed. The picture (extra `plots`) shows each pattern after 0.1, 0.5 and 1 s.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 from omniperception import config
+from omniperception.analysis.figures import PlotsUnavailable, new_figure
 from omniperception.lidar import DEVICES, LIVOX, ScanPattern
 from omniperception.lidar.patterns.coverage import DURATIONS_S, angle_to_table, compare, strategy_coverage
 
@@ -58,14 +59,8 @@ def print_strategies(name: str, pattern: ScanPattern, num_rays: int, period_s: f
 
 def draw(patterns: dict[str, tuple[ScanPattern, ScanPattern | None]], path: Path) -> None:
     """Azimuth and elevation of each pattern's points after each duration."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(
-        len(patterns), len(DURATIONS_S), figsize=(5 * len(DURATIONS_S), 3.2 * len(patterns)), squeeze=False
-    )
+    figure = new_figure(5.0 * len(DURATIONS_S), 3.2 * len(patterns))
+    axes = figure.subplots(len(patterns), len(DURATIONS_S), squeeze=False)
     for (name, (model, table)), line in zip(patterns.items(), axes, strict=True):
         for seconds, axis in zip(DURATIONS_S, line, strict=True):
             for label, pattern, colour, size in (("table", table, "orange", 1.2), ("model", model, "navy", 0.15)):
@@ -77,14 +72,13 @@ def draw(patterns: dict[str, tuple[ScanPattern, ScanPattern | None]], path: Path
                     axis.scatter(azimuth, elevation, s=size, c=colour, linewidths=0, label=f"{label}, {count:,} points")
             axis.set(title=f"{name}, {seconds:g} s", xlabel="azimuth, deg", ylabel="elevation, deg")
             axis.legend(loc="lower right", fontsize=6, markerscale=8)
-    figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     print(f"picture: {path}")
 
 
 def main() -> None:
-    with config.one_line_errors(ValueError):
+    with config.one_line_errors(PlotsUnavailable, ValueError):
         own, unknown = config.split_arguments(sys.argv[1:], ARGUMENTS)
         names = list(DEVICES) if own["sensors"] == "all" else own["sensors"].split(",")
         for name in names:

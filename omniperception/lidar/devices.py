@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from .noise import AngularJitter, GaussianNoise, Noise
 from .patterns import (
     ScanPattern,
     airy,
@@ -66,6 +67,13 @@ class DeviceSpec:
     def vertical_fov_deg(self) -> float:
         """Height of the field of view."""
         return self.elevation_deg[1] - self.elevation_deg[0]
+
+    def noise(self) -> tuple[Noise, ...]:
+        """The maker's figures as noise models: normal ranges, and normal directions where a figure is given."""
+        models: list[Noise] = [GaussianNoise(self.range_sigma)]
+        if self.angle_sigma_deg is not None:
+            models.append(AngularJitter(self.angle_sigma_deg))
+        return tuple(models)
 
 
 _OUSTER = {

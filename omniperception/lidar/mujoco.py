@@ -87,6 +87,7 @@ class MujocoScene(RayScene):
     Attributes:
         geom_ids: The geom of each shape.
         body_ids: MuJoCo's id of each body of the scene.
+        body_names: Its name.
 
     Args:
         model: The compiled model.
@@ -108,6 +109,7 @@ class MujocoScene(RayScene):
     ) -> None:
         found = geom_shapes(model, class_of, geoms)
         self.geom_ids, self.body_ids = found.geom_ids, found.body_ids
+        self.body_names = tuple(model.body(k).name for k in found.body_ids)
         self._rows = torch.tensor(found.body_ids, dtype=torch.int64, device=device)
         super().__init__(found.shapes, num_envs, len(found.body_ids), device, num_threads, pose_dtype)
 

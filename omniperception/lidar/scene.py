@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal, get_args
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -13,6 +15,9 @@ from .kernels.place import GROUP_SIZE, bound_groups, place_kernel
 from .kernels.rays import rays_kernel
 from .launch import SplitLaunch, default_num_threads, wp_device
 from .shapes import Shape
+
+Array = torch.Tensor | np.ndarray
+QuatOrder = Literal["wxyz", "xyzw"]
 
 IDENTITY_QUAT = (1.0, 0.0, 0.0, 0.0)
 POSE_TYPES = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -241,6 +246,29 @@ class RayScene:
         """Indices of the shapes that a body carries; -1 for those fixed in the environment."""
         return tuple(k for k, shape in enumerate(self.shapes) if shape.body == body)
 
+    def set_poses(self, pos: Array, quat: Array, order: QuatOrder = "wxyz") -> None:
+        """Copies poses from another simulator's arrays, of any float type and on any device.
+
+        Args:
+            pos: Positions in the environment's frame, metres, (num_envs, num_bodies, 3), or (num_bodies, 3) for all
+                environments. Where the simulator has one world for all, subtract each environment's origin.
+            quat: Orientations, (num_envs, num_bodies, 4) or (num_bodies, 4).
+            order: Of a quaternion's numbers: "wxyz" (MuJoCo, Genesis, Isaac Lab 2) or "xyzw" (Isaac Gym, Isaac Lab 3,
+                Newton, PyBullet, ROS).
+        """
+        if order not in get_args(QuatOrder):
+            raise ValueError(f"order={order!r} must be one of {', '.join(get_args(QuatOrder))}")
+        pos, quat = torch.as_tensor(pos), torch.as_tensor(quat)
+        for name, given, own in (("pos", pos, self.body_pos), ("quat", quat, self.body_quat)):
+            if given.shape not in (own.shape, own.shape[1:]):
+                raise ValueError(f"{name} {tuple(given.shape)} must be {tuple(own.shape)} or {tuple(own.shape[1:])}")
+        self.body_pos.copy_(pos)
+        if order == "wxyz":
+            self.body_quat.copy_(quat)
+        else:
+            self.body_quat[..., 0].copy_(quat[..., 3])
+            self.body_quat[..., 1:].copy_(quat[..., :3])
+
     def broken_poses(self) -> torch.Tensor:
         """Which bodies have a pose that is not finite or a quaternion of norm 0, (num_envs, num_bodies) bool."""
         norm = torch.linalg.vector_norm(self.body_quat.double(), dim=-1)
@@ -304,8 +332,8 @@ class RayScene:
 
     def cast(
         self,
-        origins_w: torch.Tensor,
-        directions_w: torch.Tensor,
+        origins_w: Array,
+        directions_w: Array,
         max_range: float = float("inf"),
         exclude_shapes: Sequence[int] = (),
         normals: bool = False,
@@ -313,8 +341,9 @@ class RayScene:
         """Casts general rays, for cameras and checks.
 
         Args:
-            origins_w: Start of each ray in its environment's frame, metres, (num_envs, R, 3), float32 or float64.
-            directions_w: Direction of each ray, any length > 0, (num_envs, R, 3), float32 or float64.
+            origins_w: Start of each ray in its environment's frame, metres, (num_envs, R, 3), float32 or float64, a
+                tensor or a NumPy array.
+            directions_w: Direction of each ray, any length > 0, likewise.
             max_range: Rays end here, metres.
             exclude_shapes: Indices of shapes that these rays pass through.
             normals: Whether to compute the normals as well.
@@ -322,6 +351,7 @@ class RayScene:
         Returns:
             Freshly allocated hits.
         """
+        origins_w, directions_w = torch.as_tensor(origins_w), torch.as_tensor(directions_w)
         if origins_w.shape != directions_w.shape or origins_w.ndim != 3 or origins_w.shape[::2] != (self.num_envs, 3):
             raise ValueError(
                 f"origins_w {tuple(origins_w.shape)} and directions_w {tuple(directions_w.shape)} "

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import get_args
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -51,7 +52,7 @@ class LidarConfig:
         reference_range: Distance at which a white wall seen perpendicularly has intensity 1, metres.
         motion_segments: Pieces into which a frame is cut for motion distortion: each point is cast from the sensor's
             and the bodies' poses at its own time, interpolated between the ends of its piece. 0: every point is cast
-            from the poses at the frame's end.
+            from the poses at the frame's end. Vertices of deformables are in either case those at the frame's end.
         motion_jump: A body that moves farther than this within a piece was placed anew and does not sweep, metres.
     """
 
@@ -224,15 +225,18 @@ class Lidar:
         self._slots, self._pack = self._slots_of(num_viewed)
         self._cast = self._record_cast(seed, reflectivity or {}, num_viewed)
 
-    def cast(self, time_s: torch.Tensor) -> LidarFrame:
+    def cast(self, time_s: torch.Tensor | np.ndarray | float) -> LidarFrame:
         """Casts the frame that ends at ``time_s`` from the bodies' current poses or, with a ``track``, along it.
 
         Args:
-            time_s: Each environment's time, s, (num_envs,) float64.
+            time_s: Each environment's time, s, (num_envs,) float64, or one number for all of them.
 
         Returns:
             ``self.frame``, every element of it rewritten.
         """
+        if not isinstance(time_s, torch.Tensor):
+            time_s = torch.as_tensor(time_s, dtype=torch.float64, device=self.scene.device)
+            time_s = time_s.expand(self.scene.num_envs) if time_s.ndim == 0 else time_s
         if time_s.dtype != torch.float64 or time_s.shape != (self.scene.num_envs,):
             raise ValueError(
                 f"time_s must be float64 ({self.scene.num_envs},), got {time_s.dtype} {tuple(time_s.shape)}"

@@ -134,7 +134,7 @@ def test_a_missing_table_names_the_extra(monkeypatch):
 
     monkeypatch.setattr("omniperception.lidar.patterns.livox.files", absent)
     for make in LIVOX.values():
-        with pytest.raises(ModuleNotFoundError, match=r"pip install omniperception\[tables\]"):
+        with pytest.raises(ModuleNotFoundError, match=r"pip install 'omniperception\[tables\]'"):
             make("table")
         with pytest.raises(ValueError, match=r"lidar.pattern.source='tabel' must be 'model' or 'table'"):
             make("tabel")

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from omniperception.analysis.figures import new_figure
+
 from .compare import Options
 from .memory import buffer_sizes
 from .methods import Entry, build_all
@@ -120,13 +122,9 @@ def _measure(sweep: Sweep, value: int, peers: Sequence[Entry], options: Options)
 
 def plot_scaling(table: Table, chosen: Sequence[Sweep], file: Path, about: str) -> None:
     """Time per frame above and our memory below, one column per sweep."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     samples = f"median of n = {table.rows[0][-1]} rounds"
-    figure, axes = plt.subplots(2, len(chosen), figsize=(4.2 * len(chosen), 7.0), squeeze=False)
+    figure = new_figure(4.2 * len(chosen), 7.0)
+    axes = figure.subplots(2, len(chosen), squeeze=False)
     for sweep, (time_axis, memory_axis) in zip(chosen, axes.T, strict=True):
         for method in dict.fromkeys(row[2] for row in table.rows):
             rows = [row for row in table.rows if row[0] == sweep.name and row[2] == method]
@@ -144,9 +142,8 @@ def plot_scaling(table: Table, chosen: Sequence[Sweep], file: Path, about: str) 
             axis.grid(True, which="both", alpha=0.3)
             axis.legend(fontsize=7, title=title, title_fontsize=7)
     figure.text(0.01, 0.005, about, fontsize=6)
-    figure.tight_layout(rect=(0, 0.02, 1, 1))
+    figure.get_layout_engine().set(rect=(0.0, 0.02, 1.0, 0.98))
     figure.savefig(file, dpi=110)
-    plt.close(figure)
 
 
 def _cells(num_triangles: int) -> int:

@@ -144,7 +144,7 @@ def _read_table(name: str) -> np.ndarray:
             return np.load(file)
     except (ModuleNotFoundError, FileNotFoundError) as error:
         raise ModuleNotFoundError(
-            f"scan table {name!r} is not installed: pip install omniperception[tables], or use source='model'"
+            f"scan table {name!r} is not installed: pip install 'omniperception[tables]', or use source='model'"
         ) from error
 
 

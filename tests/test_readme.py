@@ -1,0 +1,179 @@
+"""The README's code runs as it stands, and its blocks stay short."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from omniperception.lidar import Lidar, vlp16
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+SECTION = "## The LiDAR by itself"
+MAX_LINES = 15
+
+ROBOT = """
+<mujoco>
+  <asset>
+    <mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1  1 0 1"/>
+    <hfield name="hills" nrow="3" ncol="4" size="1 2 0.5 0.1" elevation="0 1 0 2  1 0 3 0  0 1 2 0"/>
+  </asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <geom name="terrain" type="hfield" hfield="hills" pos="-4 0 0"/>
+    <geom name="rock" type="mesh" mesh="wedge" pos="4 0 0"/>
+    <geom name="post" type="cylinder" size="0.1 1" pos="0 3 1"/>
+    <geom name="ball" type="sphere" size="0.3" pos="2 2 0.5"/>
+    <body name="trunk" pos="0 0 0.6">
+      <freejoint/>
+      <geom name="hull" type="ellipsoid" size="0.3 0.2 0.1"/>
+      <geom name="pack" type="box" size="0.1 0.1 0.05" pos="0 0 0.1"/>
+      <body name="leg" pos="0.3 0 0">
+        <joint type="hinge"/>
+        <geom name="thigh" type="capsule" size="0.05 0.2" pos="0 0 -0.2"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+TETRAHEDRON = np.array([[-300.0, -300.0, 0.0], [300.0, -300.0, 0.0], [0.0, 400.0, 0.0], [0.0, 0.0, 500.0]])
+FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
+
+
+def blocks() -> dict[str, str]:
+    """The section's blocks of Python, by what is in and out of them."""
+    section = README.read_text().split(SECTION)[1].split("\n## ")[0]
+    found = re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)
+    return dict(zip(("numpy", "torch", "mujoco", "simulators", "mesh", "table"), found, strict=True))
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Executes a block where the files that it names are, and gives its names."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot.xml").write_text(ROBOT)
+    facets = ""
+    for face in FACES:
+        corners = "".join(f"vertex {x} {y} {z}\n" for x, y, z in TETRAHEDRON[[*face]])
+        facets += f"facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n"
+    (tmp_path / "rock.stl").write_text(f"solid rock\n{facets}endsolid rock\n")
+    turns = np.arange(3000) * 0.36
+    np.savetxt(tmp_path / "my_scan.csv", np.stack([turns % 360.0, np.full(3000, -30.0)], 1), delimiter=",")
+
+    def execute(name: str) -> dict:
+        names: dict = {}
+        exec(compile(blocks()[name], f"README.md, {name}", "exec"), names)
+        return names
+
+    return execute
+
+
+def test_blocks_are_short():
+    for name, code in blocks().items():
+        assert len(code.splitlines()) <= MAX_LINES, name
+
+
+def test_what_it_links_to_and_runs_exists():
+    text = README.read_text()
+    named = re.findall(r"\]\((?!http)([^)#]+)\)", text) + re.findall(r"python (\S+\.py)", text)
+    assert len(named) > 20
+    assert [path for path in named if not (README.parent / path).exists()] == []
+
+
+def test_numpy(run):
+    names = run("numpy")
+    ranges, shape, directions = names["ranges"], names["shape"], names["directions"][0]
+    towards = directions[180] / np.linalg.norm(directions[180])  # azimuth 0
+    across = towards @ np.array([3.0, 0.0, 0.0])
+    expected = across - np.sqrt(0.25 - (9.0 - across**2))
+    assert shape[0, 180] == 1 and shape[0, 0] == 0
+    np.testing.assert_allclose(ranges[0, 180], expected, rtol=1e-5)
+    np.testing.assert_allclose(ranges[0, 0], 0.5 * np.sqrt(1.01) / 0.1, rtol=1e-5)
+
+
+def test_torch(run):
+    names = run("torch")
+    cloud = names["cloud"]
+    assert cloud.points_w.shape == (64, 2000, 3)
+    floor, box = (cloud.points_w[cloud.class_id == k] for k in (0, 1))
+    assert len(box) > 1000 and floor[:, 2].abs().max() < 0.1  # five sigma of the noise
+    assert (box[:, :2].median(0).values - torch.tensor([2.0, 1.0])).abs().max() < 0.4
+
+
+def test_a_compiled_mujoco_model(run):
+    names = run("mujoco")
+    mujoco, model, data, scene = (names[key] for key in ("mujoco", "model", "data", "scene"))
+    assert {model.geom(k).name for k in scene.geom_ids} == set(re.findall(r'<geom name="(\w+)"', ROBOT))
+    housing = scene.shapes_of(names["trunk"])
+    assert {model.geom(scene.geom_ids[k]).name for k in housing} == {"hull", "pack"}
+    outputs = ("ranges", "directions_s")
+    frame = Lidar(names["config"], vlp16(), scene, names["trunk"], housing, outputs=outputs).cast(data.time)
+    assert torch.equal(frame.ranges, names["frame"].ranges)
+    trunk = data.body("trunk")
+    turn = trunk.xmat.reshape(3, 3)
+    origin, directions = trunk.xpos + turn @ [0.0, 0.0, 0.2], frame.directions_s[0].double().numpy() @ turn.T
+    geom, agreed = np.array([-1], np.int32), 0
+    for k in range(0, 4000, 10):
+        truth = mujoco.mj_ray(model, data, origin, directions[k], None, 1, trunk.id, geom)
+        expected = np.inf if geom[0] < 0 or not 0.1 <= truth <= 40.0 else truth
+        agreed += np.isclose(float(frame.ranges[0, k]), expected, rtol=2e-5, atol=2e-5)
+        shape = int(names["frame"].shape_id[0, k])
+        assert shape < 0 or expected == np.inf or scene.geom_ids[shape] == geom[0]
+    assert agreed >= 399
+
+
+def test_pose_tensors_of_a_simulator(run):
+    names = run("simulators")
+    time_s = torch.full((8,), 0.1, dtype=torch.float64)
+    names["link_pos_w"][..., 2] += 1.0
+    ranges = names["observe"](time_s)
+    assert ranges.data_ptr() == names["lidar"].frame.ranges.data_ptr()
+    height = names["link_pos_w"][:, 0, 2]
+    points = names["lidar"].frame.points_b
+    below = torch.nan_to_num(points[..., 2], nan=0.0).amin(1)
+    torch.testing.assert_close(below, -height, rtol=1e-5, atol=1e-5)
+
+
+def test_a_mesh_file(run):
+    pytest.importorskip("trimesh")
+    names = run("mesh")
+    hits = names["hits"]
+    corners = TETRAHEDRON * 1e-3 * 1.5
+    normal = np.cross(corners[2] - corners[1], corners[3] - corners[1])
+    height = corners[1][2] - (normal[0] * (0.1 - corners[1][0]) + normal[1] * (0.0 - corners[1][1])) / normal[2]
+    assert hits.shape_id.tolist() == [[1], [1]]
+    np.testing.assert_allclose(hits.ranges.numpy(), 5.0 - (2.0 + height), rtol=1e-5)
+
+
+def test_a_scan_table(run):
+    names = run("table")
+    first, second = names["first"][0], names["second"][0]
+    radius = 1.0 / np.tan(np.radians(30.0))
+    np.testing.assert_allclose(torch.linalg.vector_norm(first[:, :2], dim=1), radius, rtol=1e-4)
+    steps = torch.atan2(second[:, 1], second[:, 0]) - torch.atan2(first[:, 1], first[:, 0])
+    np.testing.assert_allclose(np.mod(steps.numpy() + 1e-3, 2 * np.pi), 1e-3, atol=1e-4)  # 1000 points are a turn
+
+
+BLOCKED = """
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {blocked}:
+            raise ImportError(f"blocked: {{name}}")
+
+sys.meta_path.insert(0, Blocked())
+"""
+
+
+def test_the_toolkit_imports_alone():
+    others = "{'hydra', 'omegaconf', 'mujoco', 'rsl_rl', 'tensordict', 'tensorboard', 'trimesh', 'matplotlib', 'yaml'}"
+    code = BLOCKED.format(blocked=others) + (
+        "import omniperception.lidar\n"
+        "print([m for m in sys.modules if m.startswith('omniperception') and not m.startswith('omniperception.lidar')])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "['omniperception']"
