@@ -278,7 +278,9 @@ class OmniEnv(VecEnv):
         for _ in range(self.config.sim.decimation):
             self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
             path.append(self.obstacles.pos_w.clone())
-        return torch.stack(path, 1)
+        path = torch.stack(path, 1)
+        self.obstacles.follow_ground(path)
+        return path
 
     def _read_state(self) -> None:
         self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)

@@ -69,9 +69,9 @@ class ObstacleField:
         self.velocity_w = torch.zeros(pos_w.shape[0], len(slots), 2, dtype=torch.float64, device=device)
         self.active = torch.zeros(pos_w.shape[0], len(slots), dtype=torch.bool, device=device)
         self.level = 1.0 if config.curriculum is None else 0.0
-        self._above_ground = torch.zeros(
-            pos_w.shape[:2] if ground is not None else 0, dtype=torch.float64, device=device
-        )
+        self._all_envs = torch.arange(pos_w.shape[0], device=device)
+        followers = pos_w.shape[:2] if ground is not None else (0,)
+        self._above_ground = torch.zeros(followers, dtype=torch.float64, device=device)
 
     def reset(
         self,
@@ -112,10 +112,10 @@ class ObstacleField:
             command = torch.zeros_like(robot) if command_w is None else command_w.double()
             self._start_approach(env_ids, self.approaches & active, robot, command)
         if self._ground is not None:
-            self._follow_ground(env_ids)
+            self.pos_w[env_ids, :, 2] = self._over_ground(self.pos_w[env_ids][..., :2], env_ids)
 
     def advance(self, dt: float, robot_xy_w: torch.Tensor) -> None:
-        """Moves every obstacle by `dt` (s); `robot_xy_w` (num_envs, 2) is the centre of a wrapping area."""
+        """Moves every obstacle level by `dt` (s); `robot_xy_w` (num_envs, 2) is the centre of a wrapping area."""
         if self._any_moves:
             self.pos_w[..., :2] += self.velocity_w * dt
         if self.config.boundary == "bounce":
@@ -123,8 +123,12 @@ class ObstacleField:
                 self._bounce()
         else:
             self._wrap(robot_xy_w)
+
+    def follow_ground(self, path: torch.Tensor) -> None:
+        """Lifts where the obstacles have been, (num_envs, num_steps, num_placed, 3), to the ground; the last is now."""
         if self._ground is not None:
-            self._follow_ground()
+            path[..., 2] = self._over_ground(path[..., :2], self._all_envs)
+            self.pos_w.copy_(path[:, -1])
 
     def bottom_above_ground(self) -> torch.Tensor:
         """(num_envs, num_placed) float64 height (m) of the lowest points above the ground below the centres."""
@@ -230,12 +234,11 @@ class ObstacleField:
 
     # ---- moving ------------------------------------------------------------------------------------------------------
 
-    def _follow_ground(self, env_ids: torch.Tensor | None = None) -> None:
-        """Lifts the obstacles of some environments, or of all, to the ground where they are."""
-        rows = slice(None) if env_ids is None else env_ids
-        pos, above = self.pos_w[rows], self._above_ground[rows]
-        z = above + self._ground.height(pos[..., :2], env_ids)
-        self.pos_w[rows, :, 2] = torch.where(self.active[rows], z, PARKED_HEIGHT)
+    def _over_ground(self, xy: torch.Tensor, env_ids: torch.Tensor) -> torch.Tensor:
+        """Heights (n, ..., num_placed) of the obstacles' centres where they are at (n, ..., num_placed, 2)."""
+        spread = (slice(None),) + (None,) * (xy.dim() - 3)
+        above, active = self._above_ground[env_ids][spread], self.active[env_ids][spread]
+        return torch.where(active, above + self._ground.height(xy, env_ids), PARKED_HEIGHT)
 
     def _bounce(self) -> None:
         xy, free = self.pos_w[..., :2], self.approaches[:, None]
