@@ -16,9 +16,7 @@ from omniperception.world.tiles import Rough, Slope, Stairs, Stones, TileGrid
 SMALL = ("terrain=mixed", "terrain.levels=3", "terrain.border=3.0", "terrain.curriculum=null")
 """A terrain of 30 x 86 m on which every episode starts anywhere."""
 FREE = (*SMALL, "obstacles=none")
-HEIGHTS = (
-    "+observations.groups.privileged.terms.heights={_target_:omniperception.task.observations.heights,_partial_:true}"
-)
+HEIGHTS = "{_target_:omniperception.task.observations.heights,_partial_:true}"
 ALL_KINDS = {
     "rough": Rough([0.02, 0.1]),
     "slope": Slope([5.0, 25.0]),
