@@ -23,6 +23,7 @@ class Ground:
     Attributes:
         level: (num_envs,) int64 row of each environment's tile, 0 the easiest.
         column: (num_envs,) int64 column of its tile; environments are spread evenly over them.
+        kinds: names of the kinds of tiles, by column.
     """
 
     def __init__(self, config: TiledTerrainConfig, model: mujoco.MjModel, pos_w: torch.Tensor) -> None:
@@ -32,7 +33,7 @@ class Ground:
             model: the compiled model.
             pos_w: (num_envs, 3) float64, the simulator's own position (m) of the ground's body; written here.
         """
-        self.config = config
+        self.config, self.kinds = config, config.column_kinds()
         geom = model.geom(GROUND)
         field = int(geom.dataid[0])
         self._rows, self._cols = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
@@ -49,11 +50,6 @@ class Ground:
         self._middle = torch.zeros(num_envs, 2, dtype=torch.int64, device=device)
         self._middle_height = torch.zeros(num_envs, device=device)
         self.move(torch.arange(num_envs, device=device), self.level.clone())
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Names of the kinds of tiles, by column."""
-        return self.config.column_kinds()
 
     def move(self, env_ids: torch.Tensor, level: torch.Tensor) -> None:
         """Puts environments (n,) on the tiles of levels (n,) in their columns."""
@@ -107,11 +103,12 @@ class Ground:
 
     def mean_level_by_kind(self) -> dict[str, float]:
         """Mean level of the environments in the columns of each kind that has any."""
-        level, column = self.level.tolist(), self.column.tolist()
-        by_kind: dict[str, list[int]] = {}
-        for k, row in zip(column, level, strict=True):
-            by_kind.setdefault(self.kinds[k], []).append(row)
-        return {kind: sum(levels) / len(levels) for kind, levels in by_kind.items()}
+        num_envs = self.column.bincount(minlength=len(self.kinds)).tolist()
+        levels = self.column.bincount(self.level.double(), len(self.kinds)).tolist()
+        sums = {kind: [0, 0.0] for kind in self.kinds}
+        for kind, count, level in zip(self.kinds, num_envs, levels, strict=True):
+            sums[kind] = [sums[kind][0] + count, sums[kind][1] + level]
+        return {kind: level / count for kind, (count, level) in sums.items() if count}
 
     def state_dict(self) -> dict:
         """What `load_state_dict` needs; the ground's position belongs to the simulator's state."""
