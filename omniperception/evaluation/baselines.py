@@ -96,7 +96,6 @@ class TrueSectors:
         device = env.device
         self._is_box = torch.tensor([slot.kind == "box" for slot in slots], device=device)
         self._half = torch.tensor([(*slot.size, 0.0)[:2] for slot in slots], device=device)
-        self._half_height = torch.tensor([slot.half_height for slot in slots], device=device)
         poses = [slot.pose or (0.0, 0.0, 0.0) for slot in slots]
         fixed = torch.tensor(poses, device=device).expand(env.num_envs, -1, -1)
         self._xy, self._yaw = fixed[..., :2].clone(), torch.deg2rad(fixed[..., 2])
@@ -129,7 +128,7 @@ class TrueSectors:
             return
         self._xy[:, self._placed] = field.pos_w[..., :2].float()
         self._yaw[:, self._placed] = 2 * torch.atan2(field.quat_w[..., 3], field.quat_w[..., 0]).float()
-        self._bottom[:, self._placed] = field.pos_w[..., 2].float() - self._half_height[self._placed]
+        self._bottom[:, self._placed] = field.bottom_above_ground().float()
 
     def _nearest_point(self, centre: torch.Tensor, turned: torch.Tensor) -> torch.Tensor:
         """(n, O, 2) the point of each outline that is nearest to the base, in the yaw-aligned frame."""

@@ -20,6 +20,8 @@ from omniperception.world.rays import HitClass
 FPS = 25
 BEHIND_M, ABOVE_M, AHEAD_M = 2.4, 1.45, 1.0
 """Where the camera is with respect to the robot, and how far ahead of the robot it looks."""
+OVER_GROUND_M = 0.4
+"""How far above the ground below it the camera stays at least, where the ground is not flat."""
 FOLLOW_S, TURN_S = 0.25, 0.9
 """Time constants with which the camera follows the robot's position and heading."""
 MIN_ARROW = 0.1
@@ -38,16 +40,16 @@ class FollowCamera:
         """Starts anew at the robot's next pose."""
         self._pos = None
 
-    def follow(self, pos_w: torch.Tensor, yaw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Eye and target (3,) (m) for a robot at `pos_w` (3,) (m) with heading `yaw` () (rad)."""
+    def follow(self, foot_w: torch.Tensor, yaw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Eye and target (3,) (m) for a robot with heading `yaw` () (rad) over a point `foot_w` (3,) of the ground."""
         heading = torch.stack((yaw.cos(), yaw.sin()))
         if self._pos is None:
-            self._pos, self._heading = pos_w[:2], heading
-        self._pos = self._keep_pos * self._pos + (1 - self._keep_pos) * pos_w[:2]
+            self._pos, self._heading = foot_w, heading
+        self._pos = self._keep_pos * self._pos + (1 - self._keep_pos) * foot_w
         self._heading = self._keep_heading * self._heading + (1 - self._keep_heading) * heading
         ahead = self._heading / self._heading.norm().clamp(min=1e-6)
-        eye = torch.cat((self._pos - BEHIND_M * ahead, pos_w.new_tensor([ABOVE_M])))
-        target = torch.cat((self._pos + AHEAD_M * ahead, pos_w.new_tensor([0.2])))
+        eye = self._pos + torch.cat((-BEHIND_M * ahead, ahead.new_tensor([ABOVE_M])))
+        target = self._pos + torch.cat((AHEAD_M * ahead, ahead.new_tensor([0.2])))
         return eye, target
 
 
@@ -127,7 +129,11 @@ class Recorder:
         env, state = self._env, self._env.kinematics
         pos, quat = env.sim.body_poses(self._shapes.bodies)
         base, yaw = state.base_pos_w[self._id], state.yaw[self._id]
-        eye, target = self._camera.follow(base, yaw)
+        below = torch.stack((base[0], base[1], base[2] - env.base_height[self._id]))
+        eye, target = self._camera.follow(below, yaw)
+        if env.ground is not None:
+            ground = env.ground.height(eye[None, :2], torch.tensor([self._id], device=env.device))[0]
+            eye[2] = torch.maximum(eye[2], ground + OVER_GROUND_M)
         points, proximal = self._points()
         arrows = []
         shown = (env.command.value[:, :2], 0.16, COMMAND), (state.base_lin_vel_yaw, 0.07, VELOCITY)

@@ -68,6 +68,8 @@ class Simulator(Protocol):
     """(num_envs, num_placed_obstacles, 3) float64: positions (m) of the kinematic bodies."""
     mocap_quat: torch.Tensor
     """(num_envs, num_placed_obstacles, 4) float64."""
+    ground_pos: torch.Tensor | None
+    """(num_envs, 3) float64: where a ground that is a height field lies (m, environment frame); None for a plane."""
     failed: torch.Tensor
     """(num_envs,) bool: simulations whose state became non-finite or raised an error since the last reset."""
 

@@ -39,8 +39,12 @@ class MujocoSimulator:
         self.batch = Batch(world.model, num_envs, config.num_threads)
         self.qpos = torch.from_numpy(self.batch.bind("qpos"))
         self.qvel = torch.from_numpy(self.batch.bind("qvel"))
-        self.mocap_pos = torch.from_numpy(self.batch.bind("mocap_pos"))
-        self.mocap_quat = torch.from_numpy(self.batch.bind("mocap_quat"))
+        self._kinematic = tuple(torch.from_numpy(self.batch.bind(name)) for name in ("mocap_pos", "mocap_quat"))
+        self.mocap_pos, self.mocap_quat = self._kinematic
+        self.ground_pos: torch.Tensor | None = None
+        if world.ground_mocap is not None:
+            self.ground_pos = self.mocap_pos[:, 0]
+            self.mocap_pos, self.mocap_quat = self.mocap_pos[:, 1:], self.mocap_quat[:, 1:]
         self.failed = torch.zeros(num_envs, dtype=torch.bool)
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
         self._record = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
@@ -75,6 +79,9 @@ class MujocoSimulator:
         """Steps with the kinematic bodies on their way, recording what somebody reads after every step."""
         if self._records and next(iter(self._records.values())).shape[1] != num_steps:
             self._records = self._allocate_records(num_steps)
+        if mocap_path is not None and self.ground_pos is not None:
+            ground = self.ground_pos[:, None, None].expand(-1, num_steps, -1, -1)
+            mocap_path = torch.cat((ground, mocap_path), 2)
         control = None if mocap_path is None else mocap_path.flatten(2).numpy()
         self.batch.rollout(
             num_steps, control=control, control_spec=_MOCAP_POS, record=self._record or ("time",), out=self._records
@@ -92,9 +99,10 @@ class MujocoSimulator:
         self.failed |= ~finite
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        mocap_pos, mocap_quat = self.mocap_pos[env_ids].clone(), self.mocap_quat[env_ids].clone()
+        kept = [poses[env_ids].clone() for poses in self._kinematic]
         self.batch.reset(env_ids.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        self.mocap_pos[env_ids], self.mocap_quat[env_ids] = mocap_pos, mocap_quat
+        for poses, before in zip(self._kinematic, kept, strict=True):
+            poses[env_ids] = before
         self.qpos[env_ids] = qpos.double()
         self.qvel[env_ids] = qvel.double()
         self.failed[env_ids] = False

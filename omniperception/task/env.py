@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from omniperception.random import EnvRandom
 from omniperception.sim import MujocoSimulator, SimConfig
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.task.heights import relative_heights
+from omniperception.task.heights import footprint_grid, height_grid, relative_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
@@ -21,9 +21,18 @@ from omniperception.task.rotations import rotate_yaw, yaw_quat
 from omniperception.task.sensing import LidarSensing, SensingNeeds, SensorConfig
 from omniperception.task.state import Kinematics
 from omniperception.task.terminations import TerminationsConfig
+from omniperception.task.terrain_levels import TerrainLevels
 from omniperception.task.timing import StageTimer
 from omniperception.task.true_risk import TrueVelocityRisk
-from omniperception.world import ObstacleField, ObstaclesConfig, RobotConfig, TerrainConfig, build_world
+from omniperception.world import (
+    Ground,
+    ObstacleField,
+    ObstaclesConfig,
+    RobotConfig,
+    TerrainConfig,
+    TiledTerrainConfig,
+    build_world,
+)
 from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 
 HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target", "avoidance_target"
@@ -33,6 +42,9 @@ avoidance velocity, and the risk of candidate velocities."""
 
 NEARNESS_RANGE = 4.0
 """Distance (m) from which on an obstacle counts as not near at all."""
+
+FOOTING = 0.35
+"""Nothing of the ground within this distance (m) of the base reaches above the feet when a robot starts."""
 
 MAX_ACTION = 100.0
 """Actions beyond this magnitude are clipped; a policy that gets here has diverged."""
@@ -57,7 +69,7 @@ class EnvConfig:
     num_envs: int
     seed: int
     robot: RobotConfig
-    terrain: TerrainConfig
+    terrain: TerrainConfig | TiledTerrainConfig
     obstacles: ObstaclesConfig
     commands: VelocityCommandConfig | GoalCommandConfig
     observations: ObservationsConfig
@@ -83,6 +95,11 @@ class EnvConfig:
             raise ValueError(
                 "perception.risk_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
                 " perception.risk_weight=0"
+            )
+        fixed = [name for name, group in self.obstacles.groups.items() if group.poses is not None]
+        if fixed and isinstance(self.terrain, TiledTerrainConfig):
+            raise ValueError(
+                f"obstacles: {', '.join(fixed)} with fixed poses stand on flat ground only; use terrain=flat"
             )
         if self.lidar is None:
             if self.sampler is not None:
@@ -122,6 +139,9 @@ class OmniEnv(VecEnv):
     contacts with obstacles are those of all physics steps of the control step.
 
     Attributes:
+        ground: the terrain's height field; None on flat ground.
+        base_height: (num_envs,) height (m) of the base's origin above the ground, the mean of what lies below it and
+            below the hips.
         avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from what was near at the newest frame when a
             term reads it, else 0.
         risk: (num_envs, K) true risk of each candidate velocity at the newest frame; None where V_avoid is the paper's.
@@ -144,9 +164,14 @@ class OmniEnv(VecEnv):
         self.random = EnvRandom(config.seed, config.num_envs, self.device)
         self.command = config.commands.build(config.num_envs, self.device, self.random)
         self.randomizer = Randomizer(config.randomization, self.sim, self.random)
+        self.ground: Ground | None = None
+        self.terrain_levels: TerrainLevels | None = None
+        if isinstance(config.terrain, TiledTerrainConfig):
+            self._build_ground(config.terrain)
         self.obstacles: ObstacleField | None = None
         if config.obstacles.placed_slots():
-            self.obstacles = ObstacleField(config.obstacles, self.sim.mocap_pos, self.sim.mocap_quat, self.random)
+            poses = self.sim.mocap_pos, self.sim.mocap_quat
+            self.obstacles = ObstacleField(config.obstacles, *poses, self.random, self.ground)
             if config.initial_obstacle_level is not None:
                 self.obstacles.level = config.initial_obstacle_level
         self.sensing = self._build_sensing(fields) if config.uses_lidar else None
@@ -180,6 +205,9 @@ class OmniEnv(VecEnv):
             self._read_state()
         if self.sensing is not None and self.sensing.due(self.step_count):
             self._sense()
+        if self.ground is not None:
+            with self.timer.stage("terrain"):
+                self.terrain_levels.record(self.kinematics, self.command.value)
         with self.timer.stage("rewards"):
             self._choose_avoidance()
             outcomes, done = self._terminate()
@@ -263,7 +291,9 @@ class OmniEnv(VecEnv):
         for _ in range(self.config.sim.decimation):
             self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
             path.append(self.obstacles.pos_w.clone())
-        return torch.stack(path, 1)
+        path = torch.stack(path, 1)
+        self.obstacles.follow_ground(path)
+        return path
 
     def _read_state(self) -> None:
         self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)
@@ -274,10 +304,19 @@ class OmniEnv(VecEnv):
             self.foot_force = self.sim.contact_sensor(FOOT_FORCE).unflatten(1, (-1, 3))
         if "link_force" in self._reads:
             self.link_force = self.sim.contact_sensor(LINK_FORCE).unflatten(1, (-1, 3))
+        self.base_height = self.kinematics.base_pos_w[:, 2]
+        if self.ground is not None:
+            self.base_height = self.base_height - self._ground_heights(self._footprint).mean(1)
         if "heights" in self._reads:
-            self.heights = relative_heights(self.kinematics.base_pos_w[:, 2], 0.0)
+            terrain = 0.0 if self.ground is None else self._ground_heights(self._height_grid)
+            self.heights = relative_heights(self.kinematics.base_pos_w[:, 2], terrain)
         if "obstacles" in self._reads:
             self._locate_obstacles()
+
+    def _ground_heights(self, grid: torch.Tensor) -> torch.Tensor:
+        """(num_envs, P) heights (m) of the ground at points (P, 2) of the yaw-aligned frame around the base."""
+        points = rotate_yaw(self.kinematics.yaw, grid.expand(self.num_envs, -1, -1))
+        return self.ground.height(points + self.kinematics.base_pos_w[:, None, :2])
 
     def _late_kinematics(self) -> Kinematics:
         """The state `delay` physics steps ago, by environment."""
@@ -332,11 +371,13 @@ class OmniEnv(VecEnv):
         reached = self.command.reached(self.kinematics)
         causes = {
             "diverged": diverged,
-            "fall": self.config.terminations.fallen(self.kinematics),
+            "fall": self.config.terminations.fallen(self.kinematics, self.base_height),
             "collision_end": collided,
             "goal": torch.zeros_like(diverged) if reached is None else reached,
             "time_out": self.episode_length_buf >= self.max_episode_length,
         }
+        if self.ground is not None:
+            causes["time_out"] |= self.ground.outside(self.kinematics.base_pos_w[:, :2])
         done = torch.zeros_like(diverged)
         outcomes = {}
         for name, happened in causes.items():
@@ -380,6 +421,9 @@ class OmniEnv(VecEnv):
         high = torch.tensor([spawn.x[1], spawn.y[1], torch.pi / 180 * spawn.yaw_deg[1]], device=self.device)
         pose = low + self.random.uniform(env_ids, (3,)) * (high - low)
         height = torch.full((len(env_ids), 1), self.robot.base_height, device=self.device)
+        if self.ground is not None:
+            self.terrain_levels.start(env_ids, pose[:, :2], self._completed(env_ids))
+            height = height + self.ground.highest(pose[:, :2], FOOTING, env_ids)[:, None]
         joints = self.default_joint_pos.expand(len(env_ids), -1)
         qpos = torch.cat((pose[:, :2], height, yaw_quat(pose[:, 2]), joints), 1)
         qvel = torch.zeros(len(env_ids), self.sim.qvel.shape[1], device=self.device)
@@ -401,6 +445,12 @@ class OmniEnv(VecEnv):
             self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
             if self.risk is not None:
                 self.risk = self.risk.index_fill(0, env_ids, 0.0)
+
+    def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
+        """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
+        if self.step_count == 0:
+            return None
+        return (self.outcomes["time_out"] | self.outcomes["goal"])[env_ids]
 
     def _observe(self) -> TensorDict:
         return self._collect({name: buffer.update(self, self._fresh) for name, buffer in self._groups.items()})
@@ -428,6 +478,8 @@ class OmniEnv(VecEnv):
         log = self.metrics.drain()
         if self.obstacles is not None:
             log["Metrics/obstacle_level"] = self.obstacles.level
+        if self.ground is not None:
+            log |= self.terrain_levels.report()
         seconds = self.timer.drain()
         steps = self.config.log_interval * self.num_envs
         for stage, spent in seconds.items():
@@ -439,6 +491,8 @@ class OmniEnv(VecEnv):
             "sim": self.sim,
             "command": self.command,
             "randomizer": self.randomizer,
+            "ground": self.ground,
+            "terrain_levels": self.terrain_levels,
             "obstacles": self.obstacles,
             "sensing": self.sensing,
             "metrics": self.metrics,
@@ -446,6 +500,11 @@ class OmniEnv(VecEnv):
         return {name: part for name, part in parts.items() if part is not None}
 
     # ---- construction ------------------------------------------------------------------------------------------------
+
+    def _build_ground(self, terrain: TiledTerrainConfig) -> None:
+        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos)
+        self.terrain_levels = TerrainLevels(self.ground, self.random, self.control_dt, self.max_episode_length)
+        self._height_grid, self._footprint = height_grid(self.device), footprint_grid(self.device)
 
     def _build_sensing(self, fields: frozenset[str]) -> LidarSensing:
         config = self.config

@@ -15,6 +15,11 @@ def height_grid(device: torch.device | str = "cpu") -> torch.Tensor:
     return torch.stack(torch.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
 
 
+def footprint_grid(device: torch.device | str = "cpu") -> torch.Tensor:
+    """(5, 2) points (m) in the yaw-aligned frame whose ground the base's height is measured from: origin and hips."""
+    return torch.tensor([[0.0, 0.0], [0.2, 0.1], [0.2, -0.1], [-0.2, 0.1], [-0.2, -0.1]], device=device)
+
+
 def relative_heights(base_height: torch.Tensor, terrain_height: torch.Tensor | float) -> torch.Tensor:
     """Base height minus terrain height, clipped to +-1 m.
 

@@ -141,7 +141,7 @@ def true_proprioception(env: OmniEnv, joint_vel_scale: float = 1.0, ang_vel_scal
 
 def base_height(env: OmniEnv) -> torch.Tensor:
     """Height (m) of the base origin above the ground, less the default pose's: privileged."""
-    return env.kinematics.base_pos_w[:, 2:3] - env.robot.base_height
+    return env.base_height[:, None] - env.robot.base_height
 
 
 @reads("heights")

@@ -16,7 +16,7 @@ class TerminationsConfig:
 
     Attributes:
         episode_length_s: time limit (s); reaching it is a time-out, not a failure.
-        min_base_height: a base origin lower than this (m) is a fall.
+        min_base_height: a base origin lower than this (m) above the ground is a fall.
         max_tilt_deg: a base inclined by more than this (deg) is a fall.
         on_collision: whether touching an obstacle ends the episode; the paper's collisions do not.
     """
@@ -34,8 +34,8 @@ class TerminationsConfig:
         if not 0 < self.max_tilt_deg <= 180:
             raise ValueError(f"terminations.max_tilt_deg={self.max_tilt_deg} must lie in (0, 180]")
 
-    def fallen(self, kinematics: Kinematics) -> torch.Tensor:
-        """(num_envs,) bool: the base lies too low or is inclined too far."""
+    def fallen(self, kinematics: Kinematics, base_height: torch.Tensor) -> torch.Tensor:
+        """(num_envs,) bool: the base lies too low, `base_height` (num_envs,) (m), or is inclined too far."""
         upright = -kinematics.projected_gravity_b[:, 2]
-        low = kinematics.base_pos_w[:, 2] < self.min_base_height
+        low = base_height < self.min_base_height
         return low | (upright < math.cos(math.radians(self.max_tilt_deg)))

@@ -9,7 +9,8 @@ import mujoco
 
 from omniperception.world.obstacles import ObstaclesConfig
 from omniperception.world.robot import RobotConfig
-from omniperception.world.terrain import TerrainConfig
+from omniperception.world.terrain import GROUND, TerrainConfig
+from omniperception.world.tiled_terrain import TiledTerrainConfig
 
 FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT = "foot_force", "link_force", "obstacle_contact"
 """Contact sensors that exist only when something reads them."""
@@ -32,13 +33,20 @@ class World:
 
     model: mujoco.MjModel
     robot: RobotConfig
-    terrain: TerrainConfig
+    terrain: TerrainConfig | TiledTerrainConfig
     obstacles: ObstaclesConfig
     sensors: frozenset[str]
 
     @property
     def base_body(self) -> int:
         return self.model.body(self.robot.base).id
+
+    @property
+    def ground_mocap(self) -> int | None:
+        """Index of the kinematic body that carries the ground, before all obstacles; None for a plane."""
+        body = int(self.model.geom(GROUND).bodyid[0])
+        mocap = int(self.model.body_mocapid[body])
+        return mocap if mocap >= 0 else None
 
     def sensor_slice(self, kind: str) -> slice:
         """Columns of MjData.sensordata that hold the sensors of one kind; empty when none were built."""
@@ -52,7 +60,7 @@ class World:
 
 def build_world(
     robot: RobotConfig,
-    terrain: TerrainConfig,
+    terrain: TerrainConfig | TiledTerrainConfig,
     obstacles: ObstaclesConfig,
     sensors: Collection[str] = (),
 ) -> World:

@@ -7,6 +7,7 @@ import math
 import torch
 
 from omniperception.random import EnvRandom
+from omniperception.world.ground import Ground
 from omniperception.world.obstacles import Obstacle, ObstaclesConfig
 
 PARKED_HEIGHT = -100.0
@@ -33,8 +34,16 @@ class ObstacleField:
         level: share of obstacles and of their speed that the curriculum lets in, 0 to 1.
     """
 
-    def __init__(self, config: ObstaclesConfig, pos_w: torch.Tensor, quat_w: torch.Tensor, random: EnvRandom) -> None:
-        self.config = config
+    def __init__(
+        self,
+        config: ObstaclesConfig,
+        pos_w: torch.Tensor,
+        quat_w: torch.Tensor,
+        random: EnvRandom,
+        ground: Ground | None = None,
+    ) -> None:
+        """`ground` is what they stand on and move over, at the height below their centres; None: a plane at 0."""
+        self.config, self._ground = config, ground
         self.pos_w, self.quat_w = pos_w, quat_w
         self._random = random
         slots, device = config.placed_slots(), pos_w.device
@@ -60,6 +69,9 @@ class ObstacleField:
         self.velocity_w = torch.zeros(pos_w.shape[0], len(slots), 2, dtype=torch.float64, device=device)
         self.active = torch.zeros(pos_w.shape[0], len(slots), dtype=torch.bool, device=device)
         self.level = 1.0 if config.curriculum is None else 0.0
+        self._all_envs = torch.arange(pos_w.shape[0], device=device)
+        followers = pos_w.shape[:2] if ground is not None else (0,)
+        self._above_ground = torch.zeros(followers, dtype=torch.float64, device=device)
 
     def reset(
         self,
@@ -92,14 +104,18 @@ class ObstacleField:
         self.velocity_w[env_ids] = _unit(heading) * (speed * active)[..., None]
         z = torch.where(active, bottom + self._half_height, PARKED_HEIGHT)
         self.pos_w[env_ids] = torch.cat((xy, z[..., None]), -1)
+        if self._ground is not None:
+            self._above_ground[env_ids] = bottom + self._half_height
         zero = torch.zeros_like(yaw)
         self.quat_w[env_ids] = torch.stack(((yaw / 2).cos(), zero, zero, (yaw / 2).sin()), -1)
         if self.any_approaches:
             command = torch.zeros_like(robot) if command_w is None else command_w.double()
             self._start_approach(env_ids, self.approaches & active, robot, command)
+        if self._ground is not None:
+            self.pos_w[env_ids, :, 2] = self._over_ground(self.pos_w[env_ids][..., :2], env_ids)
 
     def advance(self, dt: float, robot_xy_w: torch.Tensor) -> None:
-        """Moves every obstacle by `dt` (s); `robot_xy_w` (num_envs, 2) is the centre of a wrapping area."""
+        """Moves every obstacle level by `dt` (s); `robot_xy_w` (num_envs, 2) is the centre of a wrapping area."""
         if self._any_moves:
             self.pos_w[..., :2] += self.velocity_w * dt
         if self.config.boundary == "bounce":
@@ -107,6 +123,17 @@ class ObstacleField:
                 self._bounce()
         else:
             self._wrap(robot_xy_w)
+
+    def follow_ground(self, path: torch.Tensor) -> None:
+        """Lifts where the obstacles have been, (num_envs, num_steps, num_placed, 3), to the ground; the last is now."""
+        if self._ground is not None:
+            path[..., 2] = self._over_ground(path[..., :2], self._all_envs)
+            self.pos_w.copy_(path[:, -1])
+
+    def bottom_above_ground(self) -> torch.Tensor:
+        """(num_envs, num_placed) float64 height (m) of the lowest points above the ground below the centres."""
+        bottom = self.pos_w[..., 2] - self._half_height
+        return bottom if self._ground is None else bottom - self._ground.height(self.pos_w[..., :2])
 
     def start_anew(self, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
         """Lets approaching obstacles that have left the robot behind come again; see `reset` for the arguments."""
@@ -127,9 +154,12 @@ class ObstacleField:
 
     def state_dict(self) -> dict:
         """What `load_state_dict` needs to go on; positions belong to the simulator's state."""
-        return {"velocity_w": self.velocity_w.clone(), "active": self.active.clone(), "level": self.level}
+        state = {"velocity_w": self.velocity_w.clone(), "active": self.active.clone(), "level": self.level}
+        return state if self._ground is None else {**state, "above_ground": self._above_ground.clone()}
 
     def load_state_dict(self, state: dict) -> None:
+        if self._ground is not None:
+            self._above_ground.copy_(state["above_ground"])
         self.velocity_w.copy_(state["velocity_w"])
         self.active.copy_(state["active"])
         self.level = state["level"]
@@ -203,6 +233,12 @@ class ObstacleField:
         return self.velocity_w[env_ids].norm(dim=-1)
 
     # ---- moving ------------------------------------------------------------------------------------------------------
+
+    def _over_ground(self, xy: torch.Tensor, env_ids: torch.Tensor) -> torch.Tensor:
+        """Heights (n, ..., num_placed) of the obstacles' centres where they are at (n, ..., num_placed, 2)."""
+        spread = (slice(None),) + (None,) * (xy.dim() - 3)
+        above, active = self._above_ground[env_ids][spread], self.active[env_ids][spread]
+        return torch.where(active, above + self._ground.height(xy, env_ids), PARKED_HEIGHT)
 
     def _bounce(self) -> None:
         xy, free = self.pos_w[..., :2], self.approaches[:, None]

@@ -8,6 +8,7 @@ from enum import IntEnum
 from omniperception.lidar import Shape
 from omniperception.lidar.mujoco import geom_shapes
 from omniperception.world.build import World
+from omniperception.world.terrain import GROUND
 
 
 class HitClass(IntEnum):
@@ -50,7 +51,7 @@ def ray_shapes(world: World) -> RayShapes:
     def hit_class(name: str, shape: Shape) -> HitClass:
         if name in obstacles:
             return HitClass.OBSTACLE
-        return HitClass.ROBOT if shape.body >= 0 else HitClass.TERRAIN
+        return HitClass.ROBOT if shape.body >= 0 and name != GROUND else HitClass.TERRAIN
 
     shapes = (
         replace(shape, class_id=int(hit_class(name, shape))) for name, shape in zip(names, found.shapes, strict=True)

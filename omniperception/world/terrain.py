@@ -1,4 +1,4 @@
-"""The ground: a plane with friction and restitution."""
+"""The flat ground: a plane with friction and restitution."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import math
 from dataclasses import dataclass
 
 import mujoco
+
+GROUND = "ground"
+"""Name of the ground's geom, and of the body that carries it where it is a height field."""
 
 
 @dataclass(frozen=True)
@@ -24,25 +27,30 @@ class TerrainConfig:
 
     def __post_init__(self) -> None:
         if self.kind != "flat":
-            raise ValueError(f"terrain.kind={self.kind} is unknown; known: flat")
-        if self.friction < 0:
-            raise ValueError(f"terrain.friction={self.friction} must not be negative")
-        if not 0 <= self.restitution <= 1:
-            raise ValueError(f"terrain.restitution={self.restitution} must lie in [0, 1]")
+            raise ValueError(
+                f"terrain.kind={self.kind} is unknown; known: flat, or another preset such as terrain=mixed"
+            )
+        check_contact(self.friction, self.restitution)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Adds the ground geom, whose contact parameters take priority over the robot's."""
-        spec.worldbody.add_geom(
-            name="ground",
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=[0, 0, 1],
-            contype=1,
-            conaffinity=0,
-            condim=3,
-            priority=1,
-            friction=[self.friction, 0.005, 0.0001],
-            solref=list(contact_solref(self.restitution)),
-        )
+        geom = spec.worldbody.add_geom(name=GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+        set_contact(geom, self.friction, self.restitution)
+
+
+def check_contact(friction: float, restitution: float) -> None:
+    """Refuses parameters that no ground can have."""
+    if friction < 0:
+        raise ValueError(f"terrain.friction={friction} must not be negative")
+    if not 0 <= restitution <= 1:
+        raise ValueError(f"terrain.restitution={restitution} must lie in [0, 1]")
+
+
+def set_contact(geom: mujoco.MjsGeom, friction: float, restitution: float) -> None:
+    """Makes a geom the ground, whose contact parameters take priority over the robot's."""
+    geom.contype, geom.conaffinity, geom.condim, geom.priority = 1, 0, 3, 1
+    geom.friction = [friction, 0.005, 0.0001]
+    geom.solref[:2] = contact_solref(restitution)
 
 
 _CONTACT_FREQUENCY = 50.0

@@ -1,0 +1,122 @@
+"""The height field that physics and rays share, as the environments see it: heights, tiles, origins."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import torch
+
+from omniperception.world.terrain import GROUND
+from omniperception.world.tiled_terrain import TiledTerrainConfig
+
+EDGE = 1.0
+"""Distance (m) from the outer edge of the terrain at which an environment counts as outside."""
+
+
+class Ground:
+    """Which tile each environment starts on, and how high the ground is in that environment's frame.
+
+    The origin of an environment's frame is the middle of its tile, at the height of the ground there. The surface is
+    the one that MuJoCo collides and rays meet: two triangles to a cell, divided from (row, col) to (row + 1, col + 1).
+
+    Attributes:
+        level: (num_envs,) int64 row of each environment's tile, 0 the easiest.
+        column: (num_envs,) int64 column of its tile; environments are spread evenly over them.
+        kinds: names of the kinds of tiles, by column.
+    """
+
+    def __init__(self, config: TiledTerrainConfig, model: mujoco.MjModel, pos_w: torch.Tensor) -> None:
+        """
+        Args:
+            config: the terrain that is in the model.
+            model: the compiled model.
+            pos_w: (num_envs, 3) float64, the simulator's own position (m) of the ground's body; written here.
+        """
+        self.config, self.kinds = config, config.column_kinds()
+        geom = model.geom(GROUND)
+        field = int(geom.dataid[0])
+        self._rows, self._cols = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+        first, scale = int(model.hfield_adr[field]), float(model.hfield_size[field, 2])
+        data = torch.as_tensor(model.hfield_data[first : first + self._rows * self._cols]).double()
+        device = pos_w.device
+        self._heights = (data * scale + float(geom.pos[2])).float().to(device)
+        self._half = torch.tensor(model.hfield_size[field, :2], dtype=torch.float64, device=device)
+        self._last = torch.tensor([self._cols - 2, self._rows - 2], device=device)
+        self._pos_w = pos_w
+        num_envs = pos_w.shape[0]
+        self.level = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.column = torch.arange(num_envs, device=device) * config.columns // num_envs
+        self._middle = torch.zeros(num_envs, 2, dtype=torch.int64, device=device)
+        self._middle_height = torch.zeros(num_envs, device=device)
+        self.move(torch.arange(num_envs, device=device), self.level.clone())
+
+    def move(self, env_ids: torch.Tensor, level: torch.Tensor) -> None:
+        """Puts environments (n,) on the tiles of levels (n,) in their columns."""
+        self.level[env_ids] = level
+        grid, border = self.config.grid, self.config.border_cells
+        tile = torch.stack((level, self.column[env_ids]), -1)
+        middle = border + (2 * tile + 1) * grid.half
+        height = self._heights[middle[:, 1] * self._cols + middle[:, 0]]
+        self._middle[env_ids], self._middle_height[env_ids] = middle, height
+        self._pos_w[env_ids, :2] = self._half - middle * self.config.cell
+        self._pos_w[env_ids, 2] = -height.double()
+
+    def height(self, xy_w: torch.Tensor, env_ids: torch.Tensor | None = None) -> torch.Tensor:
+        """Heights (n, ...) in m of the ground below points (n, ..., 2) in the frames of environments (n,), or of all.
+
+        Beyond its edge the terrain goes on as high as at the edge.
+        """
+        spread = (slice(None),) + (None,) * (xy_w.dim() - 2)
+        middle, level = self._of(self._middle, env_ids), self._of(self._middle_height, env_ids)
+        middle = middle[spread]
+        cells = xy_w / self.config.cell
+        index = (cells.floor().long() + middle).clamp(min=0).minimum(self._last)
+        across = (cells - (index - middle)).clamp(0.0, 1.0)
+        u, v = across.unbind(-1)
+        low = index[..., 1] * self._cols + index[..., 0]
+        corner = low + torch.where(u >= v, 1, self._cols)
+        h_low, h_corner, h_high = (self._heights[k] for k in (low, corner, low + self._cols + 1))
+        surface = h_low + torch.maximum(u, v) * (h_corner - h_low) + torch.minimum(u, v) * (h_high - h_corner)
+        return surface - level[spread]
+
+    def highest(self, xy_w: torch.Tensor, radius: float, env_ids: torch.Tensor | None = None) -> torch.Tensor:
+        """Heights (n,) in m of the highest grid point within a square of 2 `radius` (m) and the cells around it.
+
+        Nothing of the surface within `radius` of the points (n, 2) is higher.
+        """
+        reach = math.ceil(radius / self.config.cell) + 1
+        step = torch.arange(-reach, reach + 1, device=xy_w.device)
+        window = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1).flatten(0, 1)
+        index = (xy_w / self.config.cell).round().long() + self._of(self._middle, env_ids)
+        index = (index[:, None] + window).clamp(min=0).minimum(self._last + 1)
+        highest = self._heights[index[..., 1] * self._cols + index[..., 0]].amax(1)
+        return highest - self._of(self._middle_height, env_ids)
+
+    def outside(self, xy_w: torch.Tensor) -> torch.Tensor:
+        """(num_envs,) bool: which points (num_envs, 2) lie within EDGE of the terrain's outer edge, or beyond."""
+        from_centre = (xy_w - self._pos_w[:, :2]).abs()
+        return (from_centre > self._half - EDGE).any(1)
+
+    def mean_level(self) -> float:
+        return float(self.level.float().mean())
+
+    def mean_level_by_kind(self) -> dict[str, float]:
+        """Mean level of the environments in the columns of each kind that has any."""
+        num_envs = self.column.bincount(minlength=len(self.kinds)).tolist()
+        levels = self.column.bincount(self.level.double(), len(self.kinds)).tolist()
+        sums = {kind: [0, 0.0] for kind in self.kinds}
+        for kind, count, level in zip(self.kinds, num_envs, levels, strict=True):
+            sums[kind] = [sums[kind][0] + count, sums[kind][1] + level]
+        return {kind: level / count for kind, (count, level) in sums.items() if count}
+
+    def state_dict(self) -> dict:
+        """What `load_state_dict` needs; the ground's position belongs to the simulator's state."""
+        return {"level": self.level.clone()}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.move(torch.arange(len(self.level), device=self.level.device), state["level"].to(self.level.device))
+
+    @staticmethod
+    def _of(values: torch.Tensor, env_ids: torch.Tensor | None) -> torch.Tensor:
+        return values if env_ids is None else values[env_ids]
