@@ -69,7 +69,7 @@ class SectorDistances:
             wp.from_torch(self.distances),
         ]
         threads = num_threads or default_num_threads()
-        self._launch = SplitLaunch(sector_minima, num_envs, (), args, true_ranges.device, threads, num_rays)
+        self._launch = SplitLaunch(sector_minima, num_envs, (), args, true_ranges.device, threads, 16 * num_rays)
 
     def __call__(self) -> torch.Tensor:
         """Measures the tensors' present contents; returns ``distances``."""
