@@ -15,5 +15,5 @@ def test_every_environment_is_in_one_chunk(num_envs, work, threads):
 def test_work_that_is_not_worth_a_thread_stays_together():
     assert len(split(100, MIN_CHUNK_WORK // 100, 8)) == 1
     assert len(split(100, MIN_CHUNK_WORK, 1)) == 1
-    assert len(split(100, MIN_CHUNK_WORK // 25, 8)) == 4
+    assert len(split(100, -(-MIN_CHUNK_WORK // 25), 8)) == 4
     assert len(split(100, MIN_CHUNK_WORK, 8)) == 8 * CHUNKS_PER_THREAD
