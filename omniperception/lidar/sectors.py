@@ -56,6 +56,7 @@ class SectorDistances:
                 f"body_quat must be ({num_envs}, bodies, 4) with bodies > base={base}, got {tuple(body_quat.shape)}"
             )
         self.distances = torch.full((num_envs, num_sectors), max_distance, device=true_ranges.device)
+        wp.init()  # from_torch does not, and no scene need have been built before
         args = [
             wp.from_torch(true_ranges),
             wp.from_torch(directions_s, dtype=wp.vec3),
