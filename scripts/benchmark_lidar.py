@@ -8,15 +8,16 @@ terrain   a terrain of 80,000 triangles against Embree
 scaling   cost against rays, environments, bodies and triangles, and memory per environment (CSV and PNG)
 paper     the paper's appendix case, and its rendering-time table; on a CPU the sizes that fit
 features  time and memory with and without each output, noise, motion distortion and moving bodies
-table     markdown for the README of what lies in `out`
+table     markdown of what lies in `out`
 
 Peers that are not installed are named and left out. To have them all:
 
     pip install embreex mujoco-lidar jax
     pip install --no-deps newton mujoco-warp etils taichi tibvh colorama
-    pip install open3d
+    pip install open3d                        (and the system's libusb-1.0)
 
-Everything is also written to `out` as JSON, CSV and markdown, with the date, the machine and all versions.
+Everything is also written to `out` as JSON, CSV and markdown, with the date, the machine and all versions. On a machine
+that does other work, trust the ratios by CPU time. What was measured stands in docs/lidar.md.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -319,23 +320,35 @@ class Leaks:
     escaped: int
 
 
+class Room(NamedTuple):
+    """A closed shape, rays in its frame from ``origins`` to ``targets`` (N, 3), and where its vertices have moved."""
+
+    shape: Shape
+    origins: np.ndarray
+    targets: np.ndarray
+    vertices: np.ndarray | None = None
+
+
 def leaks(num_rays: int, seed: int) -> list[Leaks]:
-    """Casts rays from inside closed meshes and from inside and above height fields, of 1 mm to 1 km, turned at will."""
+    """Casts rays from inside closed shapes and from above height fields, of 1 mm to 1 km, turned at will."""
+    rooms = {"mesh": _mesh_room, "deformable": _deformable_room, "hfield": _field_room, "box": _box_room}
     rng = np.random.default_rng(seed)
-    return [_leaks_of(name, room, num_rays, rng) for name, room in (("mesh", _mesh_room), ("hfield", _field_room))]
+    return [_leaks_of(name, room, num_rays, rng) for name, room in rooms.items()]
 
 
-def _leaks_of(name: str, room: Callable, num_rays: int, rng: np.random.Generator) -> Leaks:
+def _leaks_of(name: str, build: Callable[..., Room], num_rays: int, rng: np.random.Generator) -> Leaks:
     rays = escaped = 0
     while rays < num_rays:
         scale, quat, place = 10.0 ** rng.uniform(-3, 3), _unit(rng, 4), rng.uniform(-10, 10, 3)
-        shape, origins, targets = room(rng, scale)
+        room = build(rng, scale)
         turn = np.empty(9)
         mujoco.mju_quat2Mat(turn, quat)
         turn = turn.reshape(3, 3)
-        scene = RayScene([replace(shape, body=0)], 1, 1, pose_dtype=torch.float64)
+        scene = RayScene([replace(room.shape, body=0)], 1, 1, pose_dtype=torch.float64)
+        if room.vertices is not None:
+            scene.update_vertices(0, torch.from_numpy(room.vertices))
         scene.body_pos[:], scene.body_quat[:] = torch.from_numpy(place), torch.from_numpy(quat)
-        start, end = (torch.from_numpy(points @ turn.T + place)[None] for points in (origins, targets))
+        start, end = (torch.from_numpy(points @ turn.T + place)[None] for points in (room.origins, room.targets))
         ranges = scene.cast(start, end - start).ranges
         rays += ranges.numel()
         escaped += int(ranges.isinf().sum())
@@ -349,18 +362,40 @@ def _edge_points(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generat
     return np.concatenate([vertices, edges.mean(1), edges[:, 0] * along + edges[:, 1] * (1 - along)])
 
 
-def _mesh_room(rng: np.random.Generator, scale: float) -> tuple[Shape, np.ndarray, np.ndarray]:
-    """A bumpy room as it is in float32, rays from its middle and from anywhere near it."""
+def _rays_out(points: np.ndarray, scale: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from the middle of a room to points of it, and from anywhere near the middle to them and to anywhere."""
+    near = rng.uniform(-0.05, 0.05, points.shape) * scale
+    anywhere = rng.normal(size=points.shape) * scale
+    return np.concatenate([np.zeros_like(points), near, near]), np.concatenate([points, points, anywhere])
+
+
+def _mesh_room(rng: np.random.Generator, scale: float) -> Room:
+    """A bumpy room as it is in float32."""
     vertices, faces = random_mesh(rng)
     mesh = TriangleMesh(vertices * scale, faces)
     points = _edge_points(mesh.vertices.astype(np.float64), mesh.triangles, rng)
-    near = rng.uniform(-0.05, 0.05, points.shape) * scale
-    anywhere = rng.normal(size=points.shape) * scale
-    origins = np.concatenate([np.zeros_like(points), near, near])
-    return Shape(ShapeKind.MESH, asset=mesh), origins, np.concatenate([points, points, anywhere])
+    return Room(Shape(ShapeKind.MESH, asset=mesh), *_rays_out(points, scale, rng))
 
 
-def _field_room(rng: np.random.Generator, scale: float) -> tuple[Shape, np.ndarray, np.ndarray]:
+def _deformable_room(rng: np.random.Generator, scale: float) -> Room:
+    """A bumpy room that has taken on another one's form."""
+    before, faces = random_mesh(rng)
+    mesh = TriangleMesh(before * scale, faces)
+    vertices = (random_mesh(rng)[0] * scale).astype(np.float32)
+    points = _edge_points(vertices.astype(np.float64), mesh.triangles, rng)
+    return Room(Shape(ShapeKind.DEFORMABLE, asset=mesh), *_rays_out(points, scale, rng), vertices)
+
+
+def _box_room(rng: np.random.Generator, scale: float) -> Room:
+    """The exact shape from inside."""
+    half = rng.uniform(0.1, 1.0, 3) * scale
+    corners = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    along = rng.uniform(-1, 1, (500, 1)) * half
+    edges = [np.where(np.arange(3) == axis, along, corners[rng.integers(0, 8, 500)]) for axis in range(3)]
+    return Room(Shape(ShapeKind.BOX, tuple(half)), *_rays_out(np.concatenate([corners, *edges]), scale, rng))
+
+
+def _field_room(rng: np.random.Generator, scale: float) -> Room:
     """A field with a base: rays from inside to anywhere, and straight down on the grid's points and lines."""
     rows, cols = rng.integers(2, 60, 2)
     heights = rng.uniform(0.2, 1.0, (rows, cols)).astype(np.float32)
@@ -374,7 +409,7 @@ def _field_room(rng: np.random.Generator, scale: float) -> tuple[Shape, np.ndarr
     above = within * np.array([1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 3.0 * top])
     inside = np.broadcast_to([0.0, 0.0, 0.1 * top], points.shape)
     anywhere = rng.normal(size=points.shape) * scale
-    return shape, np.concatenate([above, inside, inside]), np.concatenate([within, points, anywhere])
+    return Room(shape, np.concatenate([above, inside, inside]), np.concatenate([within, points, anywhere]))
 
 
 def _far_point(case: Case) -> np.ndarray:

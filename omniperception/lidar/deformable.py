@@ -35,12 +35,12 @@ class Deformable:
         self._child = wp.array(tree.child, dtype=wp.int32, device=wp_device)
         gather = [vertices, self._corners, part.first_leaf, geometry.mesh_triangle]
         self._launches = [
-            SplitLaunch(gather_leaves, num_envs, (num_leaves,), gather, device, num_threads, 16 * num_leaves)
+            SplitLaunch(gather_leaves, num_envs, (num_leaves,), gather, device, num_threads, 64 * num_leaves)
         ]
         for first, count in reversed(tree.levels):
             refit = [first, self._child, geometry.mesh_triangle, part.first_leaf, num_leaves, part.first_node]
             args = [*refit, geometry.mesh_bounds]
-            self._launches.append(SplitLaunch(refit_nodes, num_envs, (count,), args, device, num_threads, 32 * count))
+            self._launches.append(SplitLaunch(refit_nodes, num_envs, (count,), args, device, num_threads, 64 * count))
 
     def refit(self) -> None:
         """Brings the trees of all environments up to date with ``vertices``."""

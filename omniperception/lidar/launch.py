@@ -13,7 +13,8 @@ import warp as wp
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no line per compiled kernel
 
 CHUNKS_PER_THREAD = 4
-MIN_CHUNK_WORK = 4096
+MIN_CHUNK_WORK = 65536
+"""Work that is worth another thread's waking up, in units of about half a nanosecond."""
 
 
 def default_num_threads() -> int:

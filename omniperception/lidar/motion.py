@@ -48,7 +48,7 @@ class PoseTrack:
         args = [scene.wp_body_pos, scene.wp_body_quat, wp.from_torch(self._newest), min(jump, 3.0e38)]
         args += [self.arrays.pos, self.arrays.quat, self.arrays.turn]
         kernel = record_kernel(POSE_TYPES[scene.body_pos.dtype])
-        self._record = scene.launch(kernel, (), args, work_per_env=20 * scene.num_bodies)
+        self._record = scene.launch(kernel, (), args, work_per_env=160 * scene.num_bodies)
         self._is_new = True
 
     def advance(self) -> None:
@@ -116,7 +116,7 @@ class SweptShapes:
             visible = wp.from_torch(self._visible)
         args = [track.arrays, scene.geometry.radius, visible, self._viewed, self._num_viewed]
         args += [viewpoint_of(view), view.max_range, self.bound, self.near, self.shape, self.count]
-        work = 40 * self._num_viewed * track.segments
+        work = 160 * self._num_viewed * track.segments
         return scene.launch(bound_swept_shapes, (), args, work_per_env=work)
 
 

@@ -135,7 +135,7 @@ class PlacedShapes:
             self.count,
         ]
         kernel = place_kernel(POSE_TYPES[scene.body_pos.dtype])
-        return scene.launch(kernel, (), args, work_per_env=30 * self._num_viewed)
+        return scene.launch(kernel, (), args, work_per_env=120 * self._num_viewed)
 
 
 class RayScene:

@@ -56,6 +56,7 @@ class SectorDistances:
                 f"body_quat must be ({num_envs}, bodies, 4) with bodies > base={base}, got {tuple(body_quat.shape)}"
             )
         self.distances = torch.full((num_envs, num_sectors), max_distance, device=true_ranges.device)
+        wp.init()  # from_torch does not, and no scene need have been built before
         args = [
             wp.from_torch(true_ranges),
             wp.from_torch(directions_s, dtype=wp.vec3),
@@ -69,7 +70,7 @@ class SectorDistances:
             wp.from_torch(self.distances),
         ]
         threads = num_threads or default_num_threads()
-        self._launch = SplitLaunch(sector_minima, num_envs, (), args, true_ranges.device, threads, num_rays)
+        self._launch = SplitLaunch(sector_minima, num_envs, (), args, true_ranges.device, threads, 16 * num_rays)
 
     def __call__(self) -> torch.Tensor:
         """Measures the tensors' present contents; returns ``distances``."""

@@ -9,7 +9,7 @@ import warp as wp
 
 from omniperception.lidar.launch import SplitLaunch, default_num_threads
 
-_WORK_PER_ENV = 1024
+_WORK_PER_ENV = 16384
 """Sampling one environment's cloud is worth a thread from a handful of environments on."""
 
 _VIEW_CACHE_SIZE = 64

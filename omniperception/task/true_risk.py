@@ -39,7 +39,6 @@ class TrueVelocityRisk:
         fixed = [slot for slot in slots if slot.pose is not None]
         outlines = torch.tensor([_outline(slot) for slot in (*placed, *fixed)], device=device).reshape(-1, 2)
         self._half_length, self._radius = outlines[:, 0].contiguous(), outlines[:, 1].contiguous()
-        self._half_height = torch.tensor([slot.half_height for slot in placed], device=device)
         poses = torch.tensor([slot.pose for slot in fixed], device=device).reshape(-1, 3)
         self._fixed_xy, self._fixed_yaw = poses[:, :2], torch.deg2rad(poses[:, 2])
         self._turn = torch.tensor([_lies_across(slot) for slot in placed], device=device) * (math.pi / 2)
@@ -81,8 +80,7 @@ class TrueVelocityRisk:
         if field is None:
             return fixed_xy, fixed_yaw, torch.zeros_like(fixed_xy), torch.ones_like(fixed_yaw, dtype=torch.bool)
         yaw = 2 * torch.atan2(field.quat_w[..., 3], field.quat_w[..., 0]).float() + self._turn
-        bottom = field.pos_w[..., 2].float() - self._half_height
-        counts = field.active & (bottom < HEADROOM)
+        counts = field.active & (field.bottom_above_ground() < HEADROOM)
         return (
             torch.cat((field.pos_w[..., :2].float(), fixed_xy), 1),
             torch.cat((yaw, fixed_yaw), 1),

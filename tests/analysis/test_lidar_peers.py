@@ -19,7 +19,7 @@ def methods_of(entry, scene, num_threads=2):
     if missing := entry.missing():
         pytest.skip(f"{', '.join(missing)} not installed")
     methods, skipped = build_all([entry], scene, num_threads, "cpu")
-    if "ImportError" in skipped.get(entry.name, ""):
+    if any(error in skipped.get(entry.name, "") for error in ("ImportError", "ModuleNotFoundError")):
         pytest.skip(skipped[entry.name])
     assert methods, skipped
     return methods

@@ -72,6 +72,7 @@ def _parts(item: object) -> list[object]:
         return [getattr(item, field.name) for field in dataclasses.fields(item)]
     if isinstance(item, wp.Mesh):
         return [item.points, item.indices, item.velocities]
-    if type(item).__name__ == "StructInstance" or type(item).__module__.startswith("omniperception."):
+    is_struct = any(base.__name__ == "StructInstance" for base in type(item).__mro__)
+    if is_struct or type(item).__module__.startswith("omniperception."):
         return list(getattr(item, "__dict__", {}).values())
     return []

@@ -13,7 +13,7 @@ from .compare import Options
 from .memory import buffer_sizes
 from .methods import Entry, build_all
 from .ours import OURS, OURS_NAME, long_scan, terrain_entries
-from .peers import BATCH_RAY, PEERS
+from .peers import BATCH_RAY, EMBREE, PEERS
 from .report import Table
 from .scenes import BenchmarkScene, obstacle_scene, terrain_scene
 from .timing import paired_timings
@@ -81,7 +81,7 @@ def sweeps(quick: bool = False) -> list[Sweep]:
     ]
 
 
-def measure_scaling(options: Options, chosen: Sequence[Sweep], rivals: Sequence[str] = (BATCH_RAY,)) -> Table:
+def measure_scaling(options: Options, chosen: Sequence[Sweep], rivals: Sequence[str] = (BATCH_RAY, EMBREE)) -> Table:
     """Ours, and the named peers where they can show the scene, at every value of every sweep."""
     table = Table("scaling", f"cost of a frame, {options.num_threads} threads", COLUMNS)
     peers = [peer for peer in PEERS if peer.name in rivals]
@@ -92,13 +92,13 @@ def measure_scaling(options: Options, chosen: Sequence[Sweep], rivals: Sequence[
     slope = growth(table, "bodies per environment", 100)
     if not math.isnan(slope):
         met = "MET" if slope < 1.0 else "NOT MET"
-        table.notes.append(f"bar: better than linear past 100 bodies: {met}, time grows as bodies^{slope:.2f}")
+        table.notes.append(f"bar: better than linear past 100 bodies: {met}, CPU time grows as bodies^{slope:.2f}")
     return table
 
 
 def growth(table: Table, sweep: str, start: int, method: str = OURS_NAME) -> float:
-    """Exponent with which the time of a frame grows from ``start`` to the last value of a sweep."""
-    times = {row[1]: row[3] for row in table.rows if row[0] == sweep and row[2] == method and row[1] >= start}
+    """Exponent with which the CPU time of a ray grows from ``start`` to the last value of a sweep."""
+    times = {row[1]: row[5] for row in table.rows if row[0] == sweep and row[2] == method and row[1] >= start}
     if start not in times or len(times) < 2:
         return math.nan
     last = max(times)
@@ -121,7 +121,7 @@ def _measure(sweep: Sweep, value: int, peers: Sequence[Entry], options: Options)
 
 
 def plot_scaling(table: Table, chosen: Sequence[Sweep], file: Path, about: str) -> None:
-    """Time per frame above and our memory below, one column per sweep."""
+    """CPU time per ray above, which other work on the machine disturbs least, and our memory below; by sweep."""
     samples = f"median of n = {table.rows[0][-1]} rounds"
     figure = new_figure(4.2 * len(chosen), 7.0)
     axes = figure.subplots(2, len(chosen), squeeze=False)
@@ -130,20 +130,21 @@ def plot_scaling(table: Table, chosen: Sequence[Sweep], file: Path, about: str) 
             rows = [row for row in table.rows if row[0] == sweep.name and row[2] == method]
             values = [max(row[1], 1) for row in rows]  # 0 has no place on a logarithmic axis
             if rows:
-                time_axis.plot(values, [row[3] for row in rows], marker="o", markersize=3, label=method)
+                time_axis.plot(values, [row[5] for row in rows], marker="o", markersize=3, label=method)
             if rows and rows[0][6] is not None:
                 (line,) = memory_axis.plot(values, [row[6] for row in rows], marker="o", markersize=3, label=method)
                 shared = [row[7] for row in rows]
                 memory_axis.plot(values, shared, "--", color=line.get_color(), label=f"{method}, shared by all")
-        time_axis.set(ylabel="time per frame, ms", title=sweep.fixed)
+        time_axis.set(ylabel="CPU time per ray, ns", title=sweep.fixed)
+        time_axis.title.set_fontsize(9)
         memory_axis.set_ylabel("memory per environment, bytes")
         for axis, title in ((time_axis, samples), (memory_axis, "n = 1, exact")):
             axis.set(xscale="log", yscale="log", xlabel=sweep.name)
-            axis.grid(True, which="both", alpha=0.3)
+            axis.grid(True, alpha=0.3)
             axis.legend(fontsize=7, title=title, title_fontsize=7)
     figure.text(0.01, 0.005, about, fontsize=6)
     figure.get_layout_engine().set(rect=(0.0, 0.02, 1.0, 0.98))
-    figure.savefig(file, dpi=110)
+    figure.savefig(file, dpi=80)
 
 
 def _cells(num_triangles: int) -> int:

@@ -1,7 +1,6 @@
 """Exact intersections of rays with shapes, compiled for the kinds of shapes that a scene has."""
 
 # ruff: noqa: SIM102, SIM109  (in a kernel, a branch on wp.static stands alone, and there is no 'in')
-# wp.static stands alone)
 
 import math
 from collections.abc import Iterable

@@ -101,6 +101,11 @@ class ScanOutputs:
     row: wp.array2d(dtype=wp.int32)
 
 
+@wp.func
+def turn_of(pose: wp.transformd):
+    return wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
+
+
 @cache
 def scan_kernel(variant: ScanVariant) -> wp.Kernel:
     """The kernel of one variant; a task casts ``Rays.block`` rays of one environment, one after the other."""
@@ -153,10 +158,10 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
                 p_carrier = wp.vec3d(body_pos[env, viewpoint.body])
                 q_carrier = to_quatd(wp.vec4d(body_quat[env, viewpoint.body]))
                 moment.view = wp.transformation(p_carrier, q_carrier) * viewpoint.pose
-        q_view = wp.quat(wp.transform_get_rotation(moment.view))
+        turn_view = turn_of(moment.view)
         if wp.static(in_base):
             p_mount = wp.vec3(wp.transform_get_translation(viewpoint.pose))
-            q_mount = wp.quat(wp.transform_get_rotation(viewpoint.pose))
+            turn_mount = turn_of(viewpoint.pose)
         if wp.static(selected):
             listed = int(rays.variant[env])
         if wp.static(shots):
@@ -181,7 +186,7 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
                 time = rays.lag[env] + float(row_in_frame) * rays.seconds_per_row
             if wp.static(moving):
                 moment = moment_at(track, env, viewpoint, time / rays.period)
-                q_view = wp.quat(wp.transform_get_rotation(moment.view))
+                turn_view = turn_of(moment.view)
             if wp.static(displaced):
                 moment.origin = rays.origins[at]
             if wp.static(noisy):
@@ -214,9 +219,9 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
             if wp.static(writes_points):
                 out.points_s[env, ray] = point
             if wp.static(in_base):
-                out.points_b[env, ray] = p_mount + wp.quat_rotate(q_mount, point)
+                out.points_b[env, ray] = p_mount + turn_mount * point
             if wp.static(in_world):
-                away = wp.vec3d(wp.quat_rotate(q_view, point))
+                away = wp.vec3d(turn_view * point)
                 out.points_w[env, ray] = wp.vec3(wp.transform_get_translation(moment.view) + away)
             shape = wp.int32(-1)
             if is_hit:
@@ -242,7 +247,7 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
                     normal = wp.transpose(met_at.axes) * normal_of(geometry, shape, env, met.face, at_shape)
                     cosine = wp.min(wp.abs(wp.dot(normal, cast_d)), 1.0)
                 if wp.static(writes_normals):
-                    out.normals_w[env, ray] = wp.quat_rotate(q_view, normal)
+                    out.normals_w[env, ray] = turn_view * normal
                 if wp.static(writes_incidence):
                     out.incidence[env, ray] = wp.where(is_hit, wp.acos(cosine), NAN)
                 if wp.static(writes_intensity):
