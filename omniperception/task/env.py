@@ -9,6 +9,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from omniperception.lidar import DEVICES, Noise
 from omniperception.random import EnvRandom
 from omniperception.sim import MujocoSimulator, SimConfig
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
@@ -101,6 +102,11 @@ class EnvConfig:
             raise ValueError(
                 f"obstacles: {', '.join(fixed)} with fixed poses stand on flat ground only; use terrain=flat"
             )
+        if self.randomization.lidar_device and self.lidar is not None and self.lidar.device is None:
+            raise ValueError(
+                "randomization.lidar_device needs a sensor whose maker states its noise, but lidar.device is null; name"
+                " the device, or use randomization=lidar"
+            )
         if self.lidar is None:
             if self.sampler is not None:
                 raise ValueError(
@@ -123,6 +129,12 @@ class EnvConfig:
         if self.obstacles.num_obstacles:
             fields |= {"obstacle_contact"}
         return fields
+
+    @property
+    def lidar_noise(self) -> tuple[Noise, ...]:
+        """The device's own noise, where asked for, and the randomization's."""
+        own = DEVICES[self.lidar.device].noise() if self.randomization.lidar_device else ()
+        return (*own, *self.randomization.noise)
 
     @property
     def uses_lidar(self) -> bool:
@@ -518,7 +530,7 @@ class OmniEnv(VecEnv):
             self.sim,
             self.control_dt,
             needs,
-            config.randomization.noise,
+            config.lidar_noise,
             config.seed,
             config.sim.num_threads or None,
             config.sampler() if config.sampler is not None else None,

@@ -20,6 +20,7 @@ class RandomizationConfig:
     """Ranges (low, high) drawn uniformly per environment at every reset; null leaves a row out altogether.
 
     Attributes:
+        lidar_device: whether ranges and directions have the noise that the maker of the LiDAR in use states.
         lidar_mask: points replaced by short distances.
         lidar_distance: multiplicative noise of the measured distances.
         lidar_gaussian: normal noise of the measured distances.
@@ -38,6 +39,7 @@ class RandomizationConfig:
         payload_position: where the payload sits in the base frame (m).
     """
 
+    lidar_device: bool = False
     lidar_mask: MaskNoise | None = None
     lidar_distance: DistanceNoise | None = None
     lidar_gaussian: GaussianNoise | None = None
@@ -72,9 +74,9 @@ class RandomizationConfig:
 
     @property
     def noise(self) -> tuple[Noise, ...]:
-        """The LiDAR noise models."""
+        """The LiDAR noise models, but for the device's own."""
         models = (getattr(self, item.name) for item in fields(self) if item.name.startswith("lidar_"))
-        return tuple(model for model in models if model is not None)
+        return tuple(model for model in models if not isinstance(model, bool | None))
 
 
 class Randomizer:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from omniperception.lidar import (
+    DEVICES,
     Lidar,
     LidarConfig,
     LidarFrame,
@@ -30,13 +31,20 @@ class SensorConfig:
         sensor: rays, rate, range limits and mount.
         pattern: makes the scan pattern.
         exclude_geoms: geoms of the robot that its rays pass through: the housing around the sensor.
+        device: name in `omniperception.lidar.DEVICES` of the sensor whose own noise `randomization.lidar_device` puts
+            on, or None.
         distal_below_deg: rays whose elevation in the sensor frame is below this count for `capped_ray_distance`.
     """
 
     sensor: LidarConfig
     pattern: Callable[[], ScanPattern]
     exclude_geoms: Sequence[str] = ()
+    device: str | None = None
     distal_below_deg: float = 20.0
+
+    def __post_init__(self) -> None:
+        if self.device is not None and self.device not in DEVICES:
+            raise ValueError(f"lidar.device={self.device} is unknown; known: {', '.join(DEVICES)}, or null")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from dataclasses import fields
 import pytest
 import torch
 
-from omniperception.lidar import DistanceNoise, MaskNoise
+from omniperception.lidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
 from omniperception.task.randomization import RandomizationConfig
 
 N = 300
@@ -260,6 +260,14 @@ def test_wrong_ranges_are_refused(make_config, row, message):
         make_config(f"+randomization.{row}")
 
 
-def test_the_devices_own_noise_reaches_the_lidar(make_env):
-    names = [type(model).__name__ for model in make_env("randomization=device").config.randomization.noise]
-    assert names == ["GaussianNoise", "AngularJitter", "Dropout", "MixedPixels"]
+@pytest.mark.parametrize(
+    ("lidar", "sigma", "angle"), [("mid360", 0.02, 0.15), ("avia", 0.02, 0.05), ("vlp16", 0.03, None)]
+)
+def test_the_devices_own_noise_reaches_the_lidar(make_config, lidar, sigma, angle):
+    models = make_config("randomization=device", f"lidar={lidar}").env.lidar_noise
+    assert models == (GaussianNoise(sigma), *([AngularJitter(angle)] if angle else []))
+
+
+def test_noise_of_a_sensor_without_a_maker_is_refused(make_config):
+    with pytest.raises(ValueError, match=r"randomization\.lidar_device needs a sensor whose maker states its noise"):
+        make_config("randomization=device", "lidar=custom")
