@@ -30,7 +30,7 @@ LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
 
 
 def test_no_preset_is_missed():
-    assert len(PRESETS) == 68
+    assert len(PRESETS) == 77
     groups = {preset.split("/")[0] for preset in PRESETS}
     assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()}
     assert set(COMPANIONS) <= set(PRESETS)
@@ -80,7 +80,7 @@ class TestPaper:
         assert (list(ppo.hidden_dims), ppo.activation) == ([1024, 512, 256, 128], "elu")
 
     def test_perception(self, run):
-        network = run.perception.network()
+        network = run.perception.build_network()
         assert run.perception.history == run.env.frame_history == 10
         assert run.env.targets == ("height_target",)
         widths = {name: part.hidden_size for name, part in network.named_children()}

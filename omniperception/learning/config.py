@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import nn
 
-from omniperception.perception import Sampler
+from omniperception.perception import PerceptionNetwork, Sampler
 from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, SECTOR_TARGET
 
 
@@ -18,7 +17,7 @@ class PerceptionConfig:
 
     Attributes:
         sampler: makes the sampler that reduces one frame to points.
-        network: makes the network that embeds a history of frames.
+        network: makes the network that embeds a history of frames, given the sampler's ``sizes`` and the ``history``.
         history: LiDAR frames that the network sees.
         height_weight: weight of the height supervision in the loss; 0 leaves it out.
         sector_weight: weight of the supervision with obstacle nearness by sector; 0, as in the paper, leaves it out.
@@ -30,7 +29,7 @@ class PerceptionConfig:
     """
 
     sampler: Callable[[], Sampler]
-    network: Callable[[], nn.Module]
+    network: Callable[..., PerceptionNetwork]
     history: int
     height_weight: float
     sector_weight: float
@@ -51,6 +50,14 @@ class PerceptionConfig:
                 f"perception.supervised_epochs={self.supervised_epochs} needs something to learn from; set"
                 " perception.avoidance_weight, sector_weight or height_weight, or supervised_epochs=0"
             )
+
+    def build_network(self) -> PerceptionNetwork:
+        """The network that fits the sampler's points and the history."""
+        sizes = self.sampler().sizes
+        try:
+            return self.network(**sizes, history=self.history)
+        except TypeError as error:
+            raise ValueError(f"perception.network does not fit the sampler, which gives {sizes}: {error}") from None
 
     @property
     def supervision(self) -> dict[str, float]:
@@ -158,7 +165,7 @@ def runner_config(
     supervision = None
     if perception is not None:
         actor["class_name"] = "omniperception.learning.models:PerceptionActor"
-        actor["perception"] = perception.network
+        actor["perception"] = perception.build_network
         actor["supervision"] = perception.supervision
         actor["end_to_end"] = perception.supervised_epochs == 0
         supervision = {"epochs": perception.supervised_epochs, "learning_rate": perception.learning_rate}

@@ -71,6 +71,7 @@ class PerceptivePpo(PPO):
             device,
             frames=perceptive,
             steps_per_frame=cfg.get("steps_per_frame", 1),
+            state_dim=actor.perception.feature_dim if perceptive and actor.perception.carried else 0,
         )
         alg = alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])
         if perceptive and not actor.end_to_end:
@@ -80,8 +81,9 @@ class PerceptivePpo(PPO):
 
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Sample actions; LiDAR frames are copied now because the environment may reuse their memory."""
-        self.storage.record_frames(obs)
-        return super().act(obs)
+        actions = super().act(obs)
+        self.storage.record_frames(obs, self._raw_actor.carried_state if self.storage.has_frames else None)
+        return actions
 
     def update(self) -> dict[str, float]:
         """One PPO update; mean losses, among them those of the supervised targets.
@@ -106,11 +108,13 @@ class PerceptivePpo(PPO):
         if not everyone.has_frames:
             return None
         with torch.no_grad():
-            return self._raw_actor.perception(everyone.frames, everyone.window_count)
+            return self._raw_actor.embed_windows(everyone)
 
     def save(self) -> dict:
-        """States of the networks and of the optimisers."""
+        """States of the networks, of the optimisers and of embeddings that are carried on."""
         state = super().save()
+        if isinstance(self._raw_actor, PerceptionActor):
+            state["carried"] = self._raw_actor.rollout.state_dict()
         if self.perception_trainer is not None:
             state["perception_optimizer_state_dict"] = self.perception_trainer.optimizer.state_dict()
         return state
@@ -119,6 +123,8 @@ class PerceptivePpo(PPO):
         """Load the parts that ``load_cfg`` names, all by default; whether the iteration is one of them."""
         if self.perception_trainer is not None and (load_cfg is None or load_cfg.get("optimizer")):
             self.perception_trainer.optimizer.load_state_dict(loaded_dict["perception_optimizer_state_dict"])
+        if isinstance(self._raw_actor, PerceptionActor) and (load_cfg is None or load_cfg.get("env")):
+            self._raw_actor.rollout.load_state_dict(loaded_dict.get("carried"))
         return super().load(loaded_dict, load_cfg, strict)
 
     def _check_gradients(self) -> None:

@@ -44,6 +44,7 @@ class Sampler(ABC):
         num_points: P, points written per environment.
         max_range: metres; points are divided by it.
         needs_attitude: whether it looks at the cloud from the levelled base.
+        sizes: P by the parts of a frame, named as the arguments of a network that reads them.
     """
 
     num_points: int
@@ -58,6 +59,10 @@ class Sampler(ABC):
         self.num_points = num_points
         self.max_range = float(max_range)
         self.num_threads = num_threads
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"num_points": self.num_points}
 
     def __call__(
         self,
@@ -110,6 +115,10 @@ class RawSampler(Sampler):
     def __init__(self, num_rays: int, *, max_range: float, num_threads: int | None = None) -> None:
         """Args: num_rays: R of every frame; max_range: metres."""
         super().__init__(num_rays, max_range, num_threads)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"num_rays": self.num_points}
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         inputs = [view(ranges, float32), view(directions_s, vec3), 1.0 / self.max_range, view(out, vec3)]
@@ -176,6 +185,10 @@ class PdSampler(Sampler):
         self._scratch: kernels.Scratch | None = None
         self._scratch_key: tuple | None = None
         self._tensors: dict[str, torch.Tensor] = {}
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"num_proximal": self.num_proximal, "num_distal": self.num_points - self.num_proximal}
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         n, r = ranges.shape
@@ -301,9 +314,10 @@ class ProximitySampler(PdSampler):
         if len(body) != 2 or min(body) < 0.0:
             raise ValueError(f"body={list(body)} must be [half length, half width] in metres")
         options = {"split_deg": split_deg, "ring_deg": ring_deg, "num_threads": num_threads}
-        super().__init__(num_proximal, 0, max_range=max_range, **options)
+        num_cells = num_sectors * (len(edges) - 1)
+        super().__init__(num_proximal, num_cells, max_range=max_range, **options)
+        self.num_distal = 0  # of the averages that PdSampler would write
         self.num_sectors = num_sectors
-        self.num_points = num_proximal + num_sectors * (len(edges) - 1)
         self.edges, self.decay, self.blind, self.body = torch.tensor(edges), decay, blind, tuple(body)
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
@@ -350,3 +364,7 @@ class FpsSampler(PdSampler):
             ring_deg=ring_deg,
             num_threads=num_threads,
         )
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"num_points": self.num_points}
