@@ -26,6 +26,8 @@ class PerceptionConfig:
         supervised_epochs: passes over each rollout in which the network is trained by supervision alone, while PPO
             takes the embedding as it is; 0, as in the paper: PPO's loss and the supervision together, end to end.
         learning_rate: of those passes.
+        memory_gb: memory (10^9 bytes) that the network may need in training, checked before anything is allocated; None
+            for all of the device's.
     """
 
     sampler: Callable[[], Sampler]
@@ -36,8 +38,11 @@ class PerceptionConfig:
     avoidance_weight: float = 0.0
     supervised_epochs: int = 0
     learning_rate: float = 1.0e-3
+    memory_gb: float | None = None
 
     def __post_init__(self) -> None:
+        if self.memory_gb is not None and self.memory_gb <= 0:
+            raise ValueError(f"perception.memory_gb={self.memory_gb} must be positive, or null for the device's memory")
         if self.history < 1:
             raise ValueError(f"perception.history={self.history} must be at least 1")
         for name in ("height_weight", "sector_weight", "avoidance_weight", "supervised_epochs"):

@@ -8,6 +8,7 @@ how many of a window's newest frames are valid.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 
 import torch
@@ -15,7 +16,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-
+aten = torch.ops.aten
 CARRIED_HISTORY = 2
 """Frames per window of a network that carries its state."""
 
@@ -79,7 +80,7 @@ class _UnrolledGru(torch.autograd.Function):
         saved = []
         for k in range(history):
             from_frame = projected[:, k : k + windows]
-            recurrent = functional.linear(state, weight, bias).to(state.dtype)
+            recurrent = functional.linear(state, weight, bias).to(state.dtype) if k else bias.expand_as(from_frame)
             gates = (from_frame[..., : 2 * hidden] + recurrent[..., : 2 * hidden]).sigmoid_()
             reset, update = gates.split(hidden, dim=-1)
             recurrent_new = recurrent[..., 2 * hidden :]
@@ -104,26 +105,33 @@ class _UnrolledGru(torch.autograd.Function):
         for k in reversed(range(history)):
             state, gates, new, recurrent_new = saved[4 * k : 4 * k + 4]
             reset, update = gates.split(hidden, dim=-1)
+            d_step = d_recurrent[k]
             d_state = gradient * valid[:, :, k]
-            d_update = d_state * (state - new)
-            d_new = (d_state - d_state * update).mul_(1.0 - new * new)
-            d_gates = torch.cat((d_new * recurrent_new, d_update), -1).mul_(gates).mul_(1.0 - gates)
-            d_recurrent[k, ..., : 2 * hidden] = d_gates
-            torch.mul(d_new, reset, out=d_recurrent[k, ..., 2 * hidden :])
+            through_new = torch.addcmul(d_state, d_state, update, value=-1.0)
+            d_new = aten.tanh_backward(through_new, new)
+            torch.mul(d_new, recurrent_new, out=d_step[..., :hidden])
+            torch.mul(d_state, state - new, out=d_step[..., hidden : 2 * hidden])
+            d_gates = d_step[..., : 2 * hidden]
+            aten.sigmoid_backward(d_gates, gates, grad_input=d_gates)
+            torch.mul(d_new, reset, out=d_step[..., 2 * hidden :])
             d_projected[:, k : k + windows, : 2 * hidden] += d_gates
             d_projected[:, k : k + windows, 2 * hidden :] += d_new
-            with ctx.autocast():
-                d_previous = (d_recurrent[k] @ weight).to(gradient.dtype)
-            gradient = gradient - d_state + d_state * update + d_previous
-        states = torch.stack(saved[0::4]).flatten(0, 2)
+            if k:
+                with ctx.autocast():
+                    d_previous = (d_step @ weight).to(gradient.dtype)
+                gradient = (gradient - through_new).add_(d_previous)
+        # The first step starts from zero: it adds to the bias's gradient alone.
+        states = torch.stack(saved[0::4]).flatten(0, 2)[batch * windows :]
         flat = d_recurrent.flatten(0, 2)
         with ctx.autocast():
-            d_weight = (flat.t() @ states).to(weight.dtype)
+            d_weight = (flat[batch * windows :].t() @ states).to(weight.dtype)
         return d_projected, None, d_weight, flat.sum(0)
 
 
-def _autocast_like_now(device_type: str) -> Callable[[], torch.autocast]:
+def _autocast_like_now(device_type: str) -> Callable[[], AbstractContextManager]:
     """Makes contexts with the present state of autocast, for a backward pass, which runs outside of it."""
+    if not torch.amp.is_autocast_available(device_type):  # torch's meta device, on which memory is counted
+        return nullcontext
     enabled, dtype = torch.is_autocast_enabled(device_type), torch.get_autocast_dtype(device_type)
     return partial(torch.autocast, device_type, dtype=dtype, enabled=enabled)
 
