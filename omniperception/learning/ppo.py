@@ -35,6 +35,11 @@ class PerceptivePpo(PPO):
         super().__init__(*args, **kwargs)
         self.num_updates = 0
         self.perception_trainer: PerceptionTrainer | None = None
+        if type(self.optimizer) is torch.optim.Adam:  # rsl_rl's choice, in one pass over the parameters
+            parameters = self.optimizer.param_groups[0]["params"]
+            self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)
+            # It does not mark them as changed, which embeddings that are kept go by.
+            self.optimizer.register_step_post_hook(lambda *_: torch.autograd.graph.increment_version(parameters))
         self.optimizer.register_step_pre_hook(lambda *_: self._check_gradients())
 
     @staticmethod

@@ -18,6 +18,9 @@ from omniperception.perception.launch import launch_over_envs, view
 _FPS_LANES = 128
 """CUDA threads that share one environment's farthest point sampling."""
 
+BUCKETS_FROM = 512
+"""Points from which on farthest point sampling by buckets is faster on a CPU than looking at every point."""
+
 vec4 = kernels.wp.vec4
 vec3, float32, int32 = kernels.wp.vec3, kernels.wp.float32, kernels.wp.int32
 
@@ -155,6 +158,7 @@ class PdSampler(Sampler):
         split_deg: float,
         ring_deg: float = 2.0,
         reduce: str = "average",
+        max_candidates: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Configure the two halves.
@@ -166,6 +170,8 @@ class PdSampler(Sampler):
             split_deg: elevation in the sensor frame that separates the halves, degrees.
             ring_deg: height of a theta ring for sorting, degrees.
             reduce: "average" takes a bin's mean, "pick" its middle point.
+            max_candidates: most proximal hits that farthest point sampling looks at, evenly spaced in ray order; 0, the
+                default, is all of them: exact.
             num_threads: CPU threads; all cores by default.
         """
         if num_proximal < 0 or num_distal < 0:
@@ -177,6 +183,10 @@ class PdSampler(Sampler):
             raise ValueError(f"reduce must be 'average' or 'pick', got '{reduce}'")
         if math.isnan(split_deg):
             raise ValueError("split_deg must be a number of degrees, got nan")
+        if max_candidates and max_candidates < num_proximal:
+            raise ValueError(f"max_candidates={max_candidates} must be 0 or at least num_proximal={num_proximal}")
+        self.max_candidates = max_candidates
+        self.buckets_from = BUCKETS_FROM
         self.num_proximal = num_proximal
         self.num_distal = num_distal
         self.split = math.radians(split_deg)
@@ -209,10 +219,12 @@ class PdSampler(Sampler):
                 theta,
                 self.split,
                 scale,
+                self.max_candidates,
                 scratch,
                 block_dim=32,
             )
-            launch(kernels.pick_farthest, self.num_proximal, lanes, scratch, inner=lanes, block_dim=lanes)
+            picks = (self.num_proximal, lanes, self.buckets_from, scratch)
+            launch(kernels.pick_farthest, *picks, inner=lanes, block_dim=lanes)
             launch(
                 kernels.write_proximal,
                 theta,
@@ -245,6 +257,8 @@ class PdSampler(Sampler):
         """Work memory for N environments of R rays, allocated when the shape or device is new."""
         if self._scratch_key == (n, r, device):
             return self._scratch
+        by_bucket = device.type == "cpu" and self.num_proximal and r >= self.buckets_from
+        num_buckets = -(-r // kernels.BUCKET_SIZE) if by_bucket else 0
         sizes = {
             "picked": (n, max(self.num_proximal, 1)),
             "num_proximal": (n,),
@@ -252,13 +266,17 @@ class PdSampler(Sampler):
             "items": (2, n, r),
             "histogram": (n, kernels.RADIX_SIZE),
             "ray": (n, r),
-            "distance": (n, r),
+            "distance": (n, num_buckets * kernels.BUCKET_SIZE or r),
+            "position": (n, num_buckets * kernels.BUCKET_SIZE),
+            "bucket_distance": (n, num_buckets),
         }
+        real = {name: (n, r) for name in "xyz"}
+        real |= {"bucketed": (n, 3, num_buckets * kernels.BUCKET_SIZE), "boxes": (n, 6, num_buckets)}
         self._tensors = {name: torch.empty(size, dtype=torch.int32, device=device) for name, size in sizes.items()}
-        self._tensors |= {name: torch.empty(n, r, device=device) for name in "xyz"}
+        self._tensors |= {name: torch.empty(size, device=device) for name, size in real.items()}
         scratch = kernels.Scratch()
         for name, tensor in self._tensors.items():
-            setattr(scratch, name, view(tensor, float32 if name in "xyz" else int32))
+            setattr(scratch, name, view(tensor, float32 if name in real else int32))
         self._scratch, self._scratch_key = scratch, (n, r, device)
         return scratch
 
@@ -288,6 +306,7 @@ class ProximitySampler(PdSampler):
         blind: float,
         body: Sequence[float],
         ring_deg: float = 2.0,
+        max_candidates: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Configure both halves.
@@ -302,6 +321,7 @@ class ProximitySampler(PdSampler):
             blind: nearest range that counts, metres.
             body: half length and half width of the robot's own body around the base's origin, metres.
             ring_deg: height of a theta ring for sorting the proximal half, degrees.
+            max_candidates: as in :class:`PdSampler`.
             num_threads: CPU threads; all cores by default.
         """
         edges = [float(edge) for edge in band_edges]
@@ -314,6 +334,7 @@ class ProximitySampler(PdSampler):
         if len(body) != 2 or min(body) < 0.0:
             raise ValueError(f"body={list(body)} must be [half length, half width] in metres")
         options = {"split_deg": split_deg, "ring_deg": ring_deg, "num_threads": num_threads}
+        options["max_candidates"] = max_candidates
         num_cells = num_sectors * (len(edges) - 1)
         super().__init__(num_proximal, num_cells, max_range=max_range, **options)
         self.num_distal = 0  # of the averages that PdSampler would write
@@ -352,16 +373,23 @@ class FpsSampler(PdSampler):
     """
 
     def __init__(
-        self, num_points: int, *, max_range: float, ring_deg: float = 2.0, num_threads: int | None = None
+        self,
+        num_points: int,
+        *,
+        max_range: float,
+        ring_deg: float = 2.0,
+        max_candidates: int = 0,
+        num_threads: int | None = None,
     ) -> None:
-        """Args: num_points: slots; max_range: metres; ring_deg: height of a theta ring for sorting,
-        degrees."""
+        """Args: num_points: slots; max_range: metres; ring_deg: height of a theta ring for sorting, degrees;
+        max_candidates: as in :class:`PdSampler`."""
         super().__init__(
             num_points,
             0,
             max_range=max_range,
             split_deg=-math.inf,
             ring_deg=ring_deg,
+            max_candidates=max_candidates,
             num_threads=num_threads,
         )
 
