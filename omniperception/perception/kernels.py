@@ -191,6 +191,65 @@ def farthest_points_by_bucket(
 ): ...
 
 
+MAX_GRID = 32
+"""Most cells along an axis in :func:`first_of_each_cell`."""
+
+_FIRST_OF_EACH_CELL = r"""
+    const int n = num_proximal.data[env];
+    if (n <= num_picks) return;
+    float* xyz[3] = {
+        (float*)((char*)x.data + (size_t)env * x.strides[0]),
+        (float*)((char*)y.data + (size_t)env * y.strides[0]),
+        (float*)((char*)z.data + (size_t)env * z.strides[0])};
+    int* R = (int*)((char*)ray.data + (size_t)env * ray.strides[0]);
+    int* C = (int*)((char*)distance.data + (size_t)env * distance.strides[0]);
+    for (int i = 0; i < n; ++i) C[i] = 0;
+    for (int a = 2; a >= 0; --a) {
+        const float* __restrict__ X = xyz[a];
+        float lo = X[0], hi = X[0];
+        for (int i = 1; i < n; ++i) {
+            lo = X[i] < lo ? X[i] : lo;
+            hi = X[i] > hi ? X[i] : hi;
+        }
+        const float scale = hi > lo ? (float)grid / (hi - lo) : 0.0f;
+        for (int i = 0; i < n; ++i) {
+            const int cell = (int)((X[i] - lo) * scale);
+            C[i] = C[i] * grid + (cell > grid - 1 ? grid - 1 : cell);
+        }
+    }
+    unsigned int seen[1024];
+    for (int w = 0; w < (grid * grid * grid + 31) / 32; ++w) seen[w] = 0u;
+    int cells = 0;
+    for (int i = 0; i < n; ++i) {
+        const unsigned int bit = 1u << (C[i] & 31);
+        if (seen[C[i] >> 5] & bit) C[i] = -1;
+        else { seen[C[i] >> 5] |= bit; ++cells; }
+    }
+    if (cells < num_picks) return;
+    int kept = 0;
+    for (int i = 0; i < n; ++i) {
+        if (C[i] < 0) continue;
+        for (int a = 0; a < 3; ++a) xyz[a][kept] = xyz[a][i];
+        R[kept++] = R[i];
+    }
+    num_proximal.data[env] = kept;
+"""
+
+
+@wp.func_native(_FIRST_OF_EACH_CELL)
+def first_of_each_cell(
+    x: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+    z: wp.array2d(dtype=wp.float32),
+    ray: wp.array2d(dtype=wp.int32),
+    distance: wp.array2d(dtype=wp.int32),
+    num_proximal: wp.array(dtype=wp.int32),
+    grid: int,
+    num_picks: int,
+    env: int,
+): ...
+
+
 _FARTHEST_POINTS = r"""
     const int n = num_proximal.data[env];
     const int k = n < num_picks ? n : num_picks;
@@ -349,29 +408,13 @@ def gather_proximal(
     elevation: wp.array2d(dtype=wp.float32),
     split: float,
     scale: float,
-    max_candidates: int,
     scratch: Scratch,
 ):
-    """Collect the hits with theta above the split, in ray order; evenly spaced ones where there are more than
-    ``max_candidates``, unless that is 0."""
+    """Collect the hits with theta above the split, in ray order."""
     env = env_offset + wp.tid()
-    total = wp.int32(0)
-    if max_candidates > 0:
-        for ray in range(ranges.shape[1]):
-            if is_hit(ranges[env, ray]) and elevation[env, ray] > split:
-                total += 1
-    thinned = max_candidates > 0 and total > max_candidates
     n = wp.int32(0)
-    phase = wp.int32(0)  # hit number i stays when i * max_candidates modulo the total is below max_candidates
     for ray in range(ranges.shape[1]):
         if is_hit(ranges[env, ray]) and elevation[env, ray] > split:
-            if thinned:
-                stays = phase < max_candidates
-                phase += max_candidates
-                if phase >= total:
-                    phase -= total
-                if not stays:
-                    continue
             point = (ranges[env, ray] * scale) * directions[env, ray]
             scratch.x[env, n] = point[0]
             scratch.y[env, n] = point[1]
@@ -379,6 +422,22 @@ def gather_proximal(
             scratch.ray[env, n] = ray
             n += 1
     scratch.num_proximal[env] = n
+
+
+@wp.kernel
+def thin_proximal(env_offset: int, grid: int, num_picks: int, scratch: Scratch):
+    """Keep the first hit in each cell of a grid over the cloud's box, if there are enough of them."""
+    first_of_each_cell(
+        scratch.x,
+        scratch.y,
+        scratch.z,
+        scratch.ray,
+        scratch.distance,
+        scratch.num_proximal,
+        grid,
+        num_picks,
+        env_offset + wp.tid(),
+    )
 
 
 @wp.kernel

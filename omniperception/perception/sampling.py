@@ -158,7 +158,7 @@ class PdSampler(Sampler):
         split_deg: float,
         ring_deg: float = 2.0,
         reduce: str = "average",
-        max_candidates: int = 0,
+        grid: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Configure the two halves.
@@ -170,8 +170,8 @@ class PdSampler(Sampler):
             split_deg: elevation in the sensor frame that separates the halves, degrees.
             ring_deg: height of a theta ring for sorting, degrees.
             reduce: "average" takes a bin's mean, "pick" its middle point.
-            max_candidates: most proximal hits that farthest point sampling looks at, evenly spaced in ray order; 0, the
-                default, is all of them: exact.
+            grid: cells along each axis of the proximal cloud's box; farthest point sampling then looks only at each
+                cell's first hit in ray order, if there are enough; 0, the default, looks at all hits: exact.
             num_threads: CPU threads; all cores by default.
         """
         if num_proximal < 0 or num_distal < 0:
@@ -183,9 +183,9 @@ class PdSampler(Sampler):
             raise ValueError(f"reduce must be 'average' or 'pick', got '{reduce}'")
         if math.isnan(split_deg):
             raise ValueError("split_deg must be a number of degrees, got nan")
-        if max_candidates and max_candidates < num_proximal:
-            raise ValueError(f"max_candidates={max_candidates} must be 0 or at least num_proximal={num_proximal}")
-        self.max_candidates = max_candidates
+        if not 0 <= grid <= kernels.MAX_GRID:
+            raise ValueError(f"grid={grid} must lie in 0..{kernels.MAX_GRID}; 0 samples exactly")
+        self.grid = grid
         self.buckets_from = BUCKETS_FROM
         self.num_proximal = num_proximal
         self.num_distal = num_distal
@@ -219,10 +219,11 @@ class PdSampler(Sampler):
                 theta,
                 self.split,
                 scale,
-                self.max_candidates,
                 scratch,
                 block_dim=32,
             )
+            if self.grid:
+                launch(kernels.thin_proximal, self.grid, self.num_proximal, scratch, block_dim=32)
             picks = (self.num_proximal, lanes, self.buckets_from, scratch)
             launch(kernels.pick_farthest, *picks, inner=lanes, block_dim=lanes)
             launch(
@@ -306,7 +307,7 @@ class ProximitySampler(PdSampler):
         blind: float,
         body: Sequence[float],
         ring_deg: float = 2.0,
-        max_candidates: int = 0,
+        grid: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Configure both halves.
@@ -321,7 +322,7 @@ class ProximitySampler(PdSampler):
             blind: nearest range that counts, metres.
             body: half length and half width of the robot's own body around the base's origin, metres.
             ring_deg: height of a theta ring for sorting the proximal half, degrees.
-            max_candidates: as in :class:`PdSampler`.
+            grid: as in :class:`PdSampler`.
             num_threads: CPU threads; all cores by default.
         """
         edges = [float(edge) for edge in band_edges]
@@ -333,8 +334,7 @@ class ProximitySampler(PdSampler):
             raise ValueError(f"blind={blind} must lie in [0, max_range={max_range})")
         if len(body) != 2 or min(body) < 0.0:
             raise ValueError(f"body={list(body)} must be [half length, half width] in metres")
-        options = {"split_deg": split_deg, "ring_deg": ring_deg, "num_threads": num_threads}
-        options["max_candidates"] = max_candidates
+        options = {"split_deg": split_deg, "ring_deg": ring_deg, "grid": grid, "num_threads": num_threads}
         num_cells = num_sectors * (len(edges) - 1)
         super().__init__(num_proximal, num_cells, max_range=max_range, **options)
         self.num_distal = 0  # of the averages that PdSampler would write
@@ -378,18 +378,18 @@ class FpsSampler(PdSampler):
         *,
         max_range: float,
         ring_deg: float = 2.0,
-        max_candidates: int = 0,
+        grid: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Args: num_points: slots; max_range: metres; ring_deg: height of a theta ring for sorting, degrees;
-        max_candidates: as in :class:`PdSampler`."""
+        grid: as in :class:`PdSampler`."""
         super().__init__(
             num_points,
             0,
             max_range=max_range,
             split_deg=-math.inf,
             ring_deg=ring_deg,
-            max_candidates=max_candidates,
+            grid=grid,
             num_threads=num_threads,
         )
 

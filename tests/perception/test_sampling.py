@@ -90,17 +90,22 @@ class TestFarthestPoints:
         for _ in range(5):
             assert torch.equal(sample(sampler, rays), expected)
 
-    def test_fewer_candidates_are_evenly_spaced_hits(self):
+    def test_grid_leaves_the_first_hit_of_each_cell(self):
         rays = random_rays(3, 400, seed=8)
-        got = sample(FpsSampler(20, max_range=MAX_RANGE, max_candidates=70), rays)
-        for env in range(3):
-            hits = torch.isfinite(rays[0][env]).nonzero().flatten().numpy()
-            chosen = [hit for i, hit in enumerate(hits) if i * 70 % len(hits) < 70]
-            assert len(chosen) == 70 and max(np.diff(np.searchsorted(hits, chosen))) <= -(-len(hits) // 70)
-            cloud = (rays[0][env, chosen, None] * rays[1][env, chosen] / MAX_RANGE).double().numpy()
-            assert as_set(got[env]) == as_set(cloud[brute_force_fps(cloud, 20)].astype(np.float32))
-        with pytest.raises(ValueError, match="max_candidates=5 must be 0 or at least num_proximal=20"):
-            FpsSampler(20, max_range=1.0, max_candidates=5)
+        for grid, k in ((4, 20), (9, 200)):
+            got = sample(FpsSampler(k, max_range=MAX_RANGE, grid=grid), rays)
+            for env in range(3):
+                hits = torch.isfinite(rays[0][env])
+                scale = torch.tensor(1.0 / MAX_RANGE)
+                cloud = ((rays[0][env, hits] * scale)[:, None] * rays[1][env, hits]).numpy()
+                low, high = cloud.min(0), cloud.max(0)
+                cells = ((cloud - low) * (np.float32(grid) / (high - low))).astype(int).clip(max=grid - 1)
+                first = sorted(np.unique(cells, axis=0, return_index=True)[1])
+                assert k < len(first) < len(cloud) or k == 200
+                candidates = cloud[first] if len(first) >= k else cloud
+                assert as_set(got[env]) == as_set(candidates[brute_force_fps(candidates, k)])
+        with pytest.raises(ValueError, match=r"grid=33 must lie in 0\.\.32"):
+            FpsSampler(20, max_range=1.0, grid=33)
 
     def test_duplicates_are_picked_once_each(self):
         points = np.tile([[1.0, 2.0, 2.0]], (10, 1))
