@@ -162,6 +162,7 @@ def test_the_program_tells_what_is_wrong_in_one_line(tmp_path, overrides, named)
         ("lidar.sensor.period_s=0.03", "lidar.sensor.period_s=0.03 must be a multiple"),
         ("lidar.exclude_geoms=[nose]", "lidar.exclude_geoms"),
         ("robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),
+        ("perception.memory_gb=0.001", "but there are 0.0 GB"),
     ],
 )
 def test_what_only_the_compiled_world_can_judge_is_a_config_error_too(override, named):

@@ -86,12 +86,14 @@ def measure(frame: LidarFrame, num_points: int, max_range: float, repeats: int, 
 
 
 def pareto(rows: list[Row]) -> set[str]:
-    """Names of the rows of which no other is both faster and covers better."""
+    """Names of the rows of which no other is faster and covers as well, to two digits of the ratio."""
     return {
         row.name
         for row in rows
         if not any(
-            other.milliseconds <= row.milliseconds and other.radius_ratio <= row.radius_ratio and other is not row
+            other.milliseconds <= row.milliseconds
+            and round(other.radius_ratio, 2) <= round(row.radius_ratio, 2)
+            and other is not row
             for other in rows
         )
     }

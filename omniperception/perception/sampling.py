@@ -18,7 +18,7 @@ from omniperception.perception.launch import launch_over_envs, view
 _FPS_LANES = 128
 """CUDA threads that share one environment's farthest point sampling."""
 
-BUCKETS_FROM = 512
+BUCKETS_FROM = 1024
 """Points from which on farthest point sampling by buckets is faster on a CPU than looking at every point."""
 
 vec4 = kernels.wp.vec4
