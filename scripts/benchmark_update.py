@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import statistics
 import sys
+from collections.abc import Callable
 
 import omniperception  # noqa: F401  before torch, whose threads it sets up
 
@@ -18,7 +19,16 @@ import omniperception  # noqa: F401  before torch, whose threads it sets up
 import torch
 
 from omniperception import config
-from omniperception.analysis.update_benchmark import UpdateCase, build, differences, rollout_bytes, seconds
+from omniperception.analysis.update_benchmark import (
+    UpdateCase,
+    UpdatePair,
+    build,
+    differences,
+    embedding_seconds,
+    rollout_bytes,
+    seconds,
+)
+from omniperception.learning import PerceptivePpo
 
 POLICIES = {"small": (256, 128, 64), "paper": (1024, 512, 256, 128)}
 OWN = {"num_envs": "64", "num_steps": "24", "num_epochs": "5", "repeats": "5", "policy": "small"}
@@ -38,15 +48,21 @@ def main() -> None:
     pair = build(case)
     features, gradients = differences(pair)
     print(f"relative difference: features {features:.1e}, gradients {gradients:.1e}")
-    seconds(pair.shared), seconds(pair.stepwise)
-    pairs = [(seconds(pair.shared), seconds(pair.stepwise)) for _ in range(repeats)]
+    sizes = [f"rollout {rollout_bytes(algorithm) / 1e6:8.1f} MB" for algorithm in (pair.shared, pair.stepwise)]
+    print(f"shared frames: {sizes[0]}; window per step: {sizes[1]}")
+    report("update", seconds, pair, repeats)
+    report("perception network, one mini-batch", embedding_seconds, pair, repeats)
+
+
+def report(name: str, timed: Callable[[PerceptivePpo], float], pair: UpdatePair, repeats: int) -> None:
+    """Times both formulations in turn and prints the medians."""
+    timed(pair.shared), timed(pair.stepwise)
+    pairs = [(timed(pair.shared), timed(pair.stepwise)) for _ in range(repeats)]
     ratios = sorted(theirs / ours for ours, theirs in pairs)
-    for name, algorithm, k in (("shared frames", pair.shared, 0), ("window per step", pair.stepwise, 1)):
-        time = statistics.median(p[k] for p in pairs)
-        print(f"{name:<16} {1e3 * time:9.1f} ms per update, rollout {rollout_bytes(algorithm) / 1e6:8.1f} MB")
+    ours, theirs = (1e3 * statistics.median(p[k] for p in pairs) for k in (0, 1))
     print(
-        f"ratio            {statistics.median(ratios):9.2f} (median of {repeats} pairs, {ratios[0]:.2f} to"
-        f" {ratios[-1]:.2f})"
+        f"{name}: shared frames {ours:.1f} ms, window per step {theirs:.1f} ms, ratio {statistics.median(ratios):.2f}"
+        f" (median of {repeats} pairs, {ratios[0]:.2f} to {ratios[-1]:.2f})"
     )
 
 

@@ -150,6 +150,15 @@ def seconds(algorithm: PerceptivePpo) -> float:
     return time.perf_counter() - start
 
 
+def embedding_seconds(algorithm: PerceptivePpo) -> float:
+    """Wall time of the perception network alone, forward and backward, on one mini-batch."""
+    storage = algorithm.storage
+    observations = storage.observations_of(torch.arange(storage.num_envs // algorithm.num_mini_batches))
+    start = time.perf_counter()
+    algorithm.actor.embed(observations).sum().backward()
+    return time.perf_counter() - start
+
+
 def rollout_bytes(algorithm: PerceptivePpo) -> int:
     """Bytes of point clouds that the storage keeps for an update."""
     storage = algorithm.storage
