@@ -13,6 +13,7 @@ import torch
 from omniperception.config import ConfigError, RunConfig
 from omniperception.learning import Runner, latest_checkpoint
 from omniperception.learning.config import runner_config
+from omniperception.learning.memory import check_fits
 from omniperception.task.env import OmniEnv
 
 if TYPE_CHECKING:
@@ -30,6 +31,9 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
     """
     seed_everything(run.env.seed)
     try:
+        if run.perception is not None:
+            device = getattr(run.env.sim, "device", "cpu")
+            check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), device)
         env = OmniEnv(run.env)
         return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
     except ValueError as error:
@@ -63,16 +67,21 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
     return TrainedPolicy(runner.env, runner.get_inference_policy(str(runner.env.device)), checkpoint)
 
 
+def steps_per_frame(run: RunConfig) -> int:
+    """Control steps between two LiDAR frames."""
+    return max(1, round(run.env.lidar.sensor.period_s / run.env.sim.control_dt))
+
+
 def learning_settings(run: RunConfig, env: OmniEnv) -> dict:
     """rsl_rl's configuration for a run."""
     observations = run.env.observations
-    steps_per_frame = env.sensing.period_steps if env.sensing is not None else 1
+    period = env.sensing.period_steps if env.sensing is not None else 1
     return runner_config(
         run.ppo,
         run.perception,
         observations.actor,
         observations.critic,
-        steps_per_frame,
+        period,
         run.env.rewards.avoidance.risk,
     )
 

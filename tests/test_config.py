@@ -30,7 +30,7 @@ LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
 
 
 def test_no_preset_is_missed():
-    assert len(PRESETS) == 76
+    assert len(PRESETS) == 85
     groups = {preset.split("/")[0] for preset in PRESETS}
     assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()}
     assert set(COMPANIONS) <= set(PRESETS)
@@ -80,7 +80,7 @@ class TestPaper:
         assert (list(ppo.hidden_dims), ppo.activation) == ([1024, 512, 256, 128], "elu")
 
     def test_perception(self, run):
-        network = run.perception.network()
+        network = run.perception.build_network()
         assert run.perception.history == run.env.frame_history == 10
         assert run.env.targets == ("height_target",)
         widths = {name: part.hidden_size for name, part in network.named_children()}
@@ -162,6 +162,7 @@ def test_the_program_tells_what_is_wrong_in_one_line(tmp_path, overrides, named)
         ("lidar.sensor.period_s=0.03", "lidar.sensor.period_s=0.03 must be a multiple"),
         ("lidar.exclude_geoms=[nose]", "lidar.exclude_geoms"),
         ("robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),
+        ("perception.memory_gb=0.001", "but there are 0.0 GB"),
     ],
 )
 def test_what_only_the_compiled_world_can_judge_is_a_config_error_too(override, named):

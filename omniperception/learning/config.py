@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import nn
 
-from omniperception.perception import Sampler
+from omniperception.perception import PerceptionNetwork, Sampler
 from omniperception.perception.velocity_risk import VelocityRisk
 from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, RISK_TARGET, SECTOR_TARGET
 
@@ -19,7 +18,7 @@ class PerceptionConfig:
 
     Attributes:
         sampler: makes the sampler that reduces one frame to points.
-        network: makes the network that embeds a history of frames.
+        network: makes the network that embeds a history of frames, given the sampler's ``sizes`` and the ``history``.
         history: LiDAR frames that the network sees.
         height_weight: weight of the height supervision in the loss; 0 leaves it out.
         sector_weight: weight of the supervision with obstacle nearness by sector; 0, as in the paper, leaves it out.
@@ -30,10 +29,12 @@ class PerceptionConfig:
         supervised_epochs: passes over each rollout in which the network is trained by supervision alone, while PPO
             takes the embedding as it is; 0, as in the paper: PPO's loss and the supervision together, end to end.
         learning_rate: of those passes.
+        memory_gb: memory (10^9 bytes) that the network may need in training, checked before anything is allocated; None
+            for all of the device's.
     """
 
     sampler: Callable[[], Sampler]
-    network: Callable[[], nn.Module]
+    network: Callable[..., PerceptionNetwork]
     history: int
     height_weight: float
     sector_weight: float
@@ -41,8 +42,11 @@ class PerceptionConfig:
     risk_weight: float = 0.0
     supervised_epochs: int = 0
     learning_rate: float = 1.0e-3
+    memory_gb: float | None = None
 
     def __post_init__(self) -> None:
+        if self.memory_gb is not None and self.memory_gb <= 0:
+            raise ValueError(f"perception.memory_gb={self.memory_gb} must be positive, or null for the device's memory")
         if self.history < 1:
             raise ValueError(f"perception.history={self.history} must be at least 1")
         for name in ("height_weight", "sector_weight", "avoidance_weight", "risk_weight", "supervised_epochs"):
@@ -60,6 +64,14 @@ class PerceptionConfig:
                 f"perception.supervised_epochs={self.supervised_epochs} needs something to learn from; set"
                 " perception.avoidance_weight, risk_weight, sector_weight or height_weight, or supervised_epochs=0"
             )
+
+    def build_network(self) -> PerceptionNetwork:
+        """The network that fits the sampler's points and the history."""
+        sizes = self.sampler().sizes
+        try:
+            return self.network(**sizes, history=self.history)
+        except TypeError as error:
+            raise ValueError(f"perception.network does not fit the sampler, which gives {sizes}: {error}") from None
 
     @property
     def supervision(self) -> dict[str, float]:
@@ -170,7 +182,7 @@ def runner_config(
     supervision = None
     if perception is not None:
         actor["class_name"] = "omniperception.learning.models:PerceptionActor"
-        actor["perception"] = perception.network
+        actor["perception"] = perception.build_network
         actor["supervision"] = perception.supervision
         actor["velocity_risk"] = velocity_risk
         actor["end_to_end"] = perception.supervised_epochs == 0

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 
+from omniperception.learning.embedding import RolloutEmbedding
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
 from omniperception.perception.velocity_risk import VelocityRisk
@@ -42,9 +43,9 @@ class PerceptionActor(MLPModel):
     """An MLP on one-dimensional observation groups and the embedding of the LiDAR history.
 
     While experience is collected (no gradients) the embedding is computed once per LiDAR tick and reused
-    until the next tick or parameter change. In updates each distinct window of a
-    :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the
-    network's embedding of an empty history.
+    until the next tick or parameter change (:class:`RolloutEmbedding`, which also carries the state of a network that
+    has one). In updates each distinct window of a :class:`WindowedObservations` is embedded once. An environment
+    without a frame since its reset gets the network's embedding of an empty history.
 
     With ``supervision`` and ``end_to_end`` the mean squared error between the part of the embedding that the network
     sets aside for a target (``perception.supervised``) and the observation group of that name, over the steps that
@@ -105,10 +106,13 @@ class PerceptionActor(MLPModel):
             self.register_buffer("_candidates", velocity_risk.candidates(), persistent=False)
         for target in supervision:
             self._check_target(target, obs)
-        self._cache_key: tuple | None = None
-        self._cached = torch.empty(0)
-        self._cached_empty = torch.empty(0)
+        self.rollout = RolloutEmbedding(network)
         self._losses: dict[str, list[torch.Tensor]] = {target: [] for target in supervision}
+
+    @property
+    def carried_state(self) -> torch.Tensor | None:
+        """(N, D) embedding before the newest frame acted on, of a network that carries its state."""
+        return self.rollout.before
 
     @property
     def extra_groups(self) -> list[str]:
@@ -129,7 +133,7 @@ class PerceptionActor(MLPModel):
                     features = _AddLoss.apply(features, self.supervised_loss(features, obs))
                 obs = obs.groups
             else:
-                features, has_frame = self._rollout_features(obs), obs["frame_count"].squeeze(-1) > 0
+                features, has_frame = self.rollout(obs), obs["frame_count"].squeeze(-1) > 0
             if self.read_out is not None:
                 obs = self._avoiding(obs, features, has_frame)
         return torch.cat([super().get_latent(obs, masks, hidden_state), features], dim=-1)
@@ -150,12 +154,14 @@ class PerceptionActor(MLPModel):
     def embed(self, obs: WindowedObservations) -> torch.Tensor:
         """(B, D) embeddings of the steps of an update; each window is embedded once."""
         if not obs.has_frames:  # the sensor sleeps: there is nothing to embed
-            return self._empty_features(obs.frames).expand(obs.batch_size[0], -1)
-        windows = obs.window_features
-        if windows is None:
-            windows = self.perception(obs.frames, obs.window_count)
-        table = torch.cat([windows.flatten(0, 1), self._empty_features(obs.frames)])
+            return self.perception.empty(obs.frames).expand(obs.batch_size[0], -1)
+        windows = self.embed_windows(obs) if obs.window_features is None else obs.window_features
+        table = torch.cat([windows.flatten(0, 1), self.perception.empty(obs.frames)])
         return table[torch.where(obs.step_count > 0, obs.step_window, table.shape[0] - 1)]
+
+    def embed_windows(self, obs: WindowedObservations) -> torch.Tensor:
+        """(E, W, D) embeddings of an update's windows."""
+        return self.perception(obs.frames, obs.window_count, obs.state)
 
     def supervised_loss(self, features: torch.Tensor, obs: WindowedObservations) -> torch.Tensor:
         """Weighted sum of the mean squared errors of all targets, over the steps that have a frame."""
@@ -181,42 +187,6 @@ class PerceptionActor(MLPModel):
 
     def _get_latent_dim(self) -> int:
         return self.obs_dim + self._feature_dim
-
-    def _empty_features(self, frames: torch.Tensor) -> torch.Tensor:
-        """(1, D) embedding of a history without a valid frame."""
-        shape = (1, self.perception.history, *frames.shape[2:])
-        return self.perception(frames.new_zeros(shape), torch.zeros(1, 1, dtype=torch.long, device=frames.device))[0]
-
-    def _rollout_features(self, obs: TensorDict) -> torch.Tensor:
-        """(N, D) embeddings of the current histories, from the cache if nothing they depend on has
-        changed."""
-        frames, count = obs["frames"], obs["frame_count"]
-        if torch.is_grad_enabled():
-            features, empty = self.perception(frames, count)[:, 0], self._empty_features(frames)
-        else:
-            key = self._state_key(obs)
-            if key != self._cache_key:
-                self._cached = self.perception(frames, count)[:, 0]
-                self._cached_empty = self._empty_features(frames)
-                self._cache_key = key
-            features, empty = self._cached, self._cached_empty
-        return torch.where(count > 0, features, empty)
-
-    def _state_key(self, obs: TensorDict) -> tuple:
-        """What the embeddings depend on; a few points of the newest frame tell one environment from
-        another."""
-        frames = obs["frames"]
-        probe = frames[:, -1, :2].sum(dtype=torch.float64)
-        tick, value = torch.stack([obs["frame_tick"].flatten()[0].double(), probe]).tolist()
-        versions = tuple((id(p), p._version) for p in self.perception.parameters())
-        return (
-            int(tick),
-            value,
-            tuple(frames.shape),
-            frames.device,
-            torch.is_inference_mode_enabled(),
-            versions,
-        )
 
     def _build_read_out(self, obs: TensorDict) -> nn.Module:
         if self.command_group not in self.obs_groups or obs[self.command_group].shape[-1] < 2:

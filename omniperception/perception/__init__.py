@@ -1,12 +1,13 @@
 """Point-cloud sampling (FPS, averaging, sorting) and the networks that read sampled LiDAR histories."""
 
 from omniperception.perception.networks import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
-from omniperception.perception.pd_risknet import PdRiskNet
+from omniperception.perception.pd_risknet import CarriedPdRiskNet, PdRiskNet
 from omniperception.perception.sampling import Attitude, FpsSampler, PdSampler, ProximitySampler, RawSampler, Sampler
 from omniperception.perception.velocity_risk import VelocityRisk
 
 __all__ = [
     "Attitude",
+    "CarriedPdRiskNet",
     "DirectMlp",
     "FpsGru",
     "FpsMlp",

@@ -30,6 +30,224 @@ class Scratch:
     keys: wp.array3d(dtype=wp.int32)  # (2, N, R) sort keys, read from one half and written to the other
     items: wp.array3d(dtype=wp.int32)  # (2, N, R) what is sorted by them
     histogram: wp.array2d(dtype=wp.int32)  # (N, RADIX_SIZE)
+    bucketed: wp.array3d(dtype=wp.float32)  # (N, 3, R rounded up to whole buckets) x, y, z in order of place
+    position: wp.array2d(dtype=wp.int32)  # (N, the same) their positions in x, y, z
+    boxes: wp.array3d(dtype=wp.float32)  # (N, 6, buckets) least x, y, z and greatest x, y, z of each bucket
+    bucket_distance: wp.array2d(dtype=wp.int32)  # (N, buckets) greatest distance bits in each bucket
+
+
+BUCKET_SIZE = 32
+"""Points per bucket of :func:`farthest_points_by_bucket`."""
+
+_FARTHEST_POINTS_BY_BUCKET = r"""
+#if !defined(__CUDA_ARCH__)
+    const int SIZE = 32, CELLS = 16;
+    const int n = num_proximal.data[env];
+    const int buckets = (n + SIZE - 1) / SIZE, padded = buckets * SIZE;
+    const float* in[3] = {
+        (const float*)((const char*)x.data + (size_t)env * x.strides[0]),
+        (const float*)((const char*)y.data + (size_t)env * y.strides[0]),
+        (const float*)((const char*)z.data + (size_t)env * z.strides[0])};
+    float* sorted[3];
+    float* low[3];
+    float* high[3];
+    for (int a = 0; a < 3; ++a) {
+        sorted[a] = (float*)((char*)bucketed.data + (size_t)env * bucketed.strides[0] + a * bucketed.strides[1]);
+        low[a] = (float*)((char*)boxes.data + (size_t)env * boxes.strides[0] + a * boxes.strides[1]);
+        high[a] = (float*)((char*)boxes.data + (size_t)env * boxes.strides[0] + (a + 3) * boxes.strides[1]);
+    }
+    const float* __restrict__ X = sorted[0];
+    const float* __restrict__ Y = sorted[1];
+    const float* __restrict__ Z = sorted[2];
+    int* __restrict__ I = (int*)((char*)position.data + (size_t)env * position.strides[0]);
+    int* __restrict__ D = (int*)((char*)distance.data + (size_t)env * distance.strides[0]);
+    int* __restrict__ M = (int*)((char*)bucket_distance.data + (size_t)env * bucket_distance.strides[0]);
+    int* __restrict__ P = (int*)((char*)picked.data + (size_t)env * picked.strides[0]);
+
+    // Order by cell of a grid over the cloud, along a Z-curve, so that consecutive points are near each other.
+    float least[3], scale[3];
+    for (int a = 0; a < 3; ++a) {
+        float lo = in[a][0], hi = in[a][0];
+        for (int i = 1; i < n; ++i) {
+            lo = in[a][i] < lo ? in[a][i] : lo;
+            hi = in[a][i] > hi ? in[a][i] : hi;
+        }
+        least[a] = lo;
+        scale[a] = hi > lo ? (float)CELLS / (hi - lo) : 0.0f;
+    }
+    static const unsigned short SPREAD[16] = {
+        0, 1, 8, 9, 64, 65, 72, 73, 512, 513, 520, 521, 576, 577, 584, 585};
+    int starts[4097];
+    for (int c = 0; c <= 4096; ++c) starts[c] = 0;
+    for (int i = 0; i < n; ++i) {
+        int key = 0;
+        for (int a = 0; a < 3; ++a) {
+            int cell = (int)((in[a][i] - least[a]) * scale[a]);
+            cell = cell < 0 ? 0 : (cell > CELLS - 1 ? CELLS - 1 : cell);
+            key |= SPREAD[cell] << a;
+        }
+        D[i] = key;
+        ++starts[key + 1];
+    }
+    for (int c = 0; c < 4096; ++c) starts[c + 1] += starts[c];
+    int current = 0;
+    for (int i = 0; i < n; ++i) {
+        const int slot = starts[D[i]]++;
+        if (i == 0) current = slot;
+        I[slot] = i;
+        for (int a = 0; a < 3; ++a) sorted[a][slot] = in[a][i];
+    }
+    for (int i = n; i < padded; ++i) {
+        I[i] = 0x7fffffff;
+        for (int a = 0; a < 3; ++a) sorted[a][i] = sorted[a][n - 1];
+    }
+    for (int i = 0; i < padded; ++i) D[i] = i < n ? 0x7f7fffff : -1;
+    for (int b = 0; b < buckets; ++b) {
+        M[b] = 0x7f7fffff;
+        for (int a = 0; a < 3; ++a) {
+            float lo = sorted[a][b * SIZE], hi = lo;
+            for (int i = b * SIZE + 1; i < (b + 1) * SIZE; ++i) {
+                lo = sorted[a][i] < lo ? sorted[a][i] : lo;
+                hi = sorted[a][i] > hi ? sorted[a][i] : hi;
+            }
+            low[a][b] = lo;
+            high[a][b] = hi;
+        }
+    }
+    const float* __restrict__ LX = low[0];
+    const float* __restrict__ LY = low[1];
+    const float* __restrict__ LZ = low[2];
+    const float* __restrict__ HX = high[0];
+    const float* __restrict__ HY = high[1];
+    const float* __restrict__ HZ = high[2];
+    for (int s = 0; s < num_picks; ++s) {
+        P[s] = I[current];
+        if (s == num_picks - 1) return;
+        D[current] = -1;
+        const int own = current / SIZE;
+        const float cx = X[current], cy = Y[current], cz = Z[current];
+        // A block of buckets at a time: those whose box is nearer than their farthest point must look at their points.
+        for (int first = 0; first < buckets; first += 16) {
+            const int last = first + 16 < buckets ? first + 16 : buckets;
+            int looks[16];
+            int any = 0;
+            for (int b = first; b < last; ++b) {
+                float dx = LX[b] - cx > cx - HX[b] ? LX[b] - cx : cx - HX[b];
+                float dy = LY[b] - cy > cy - HY[b] ? LY[b] - cy : cy - HY[b];
+                float dz = LZ[b] - cz > cz - HZ[b] ? LZ[b] - cz : cz - HZ[b];
+                dx = dx > 0.0f ? dx : 0.0f;
+                dy = dy > 0.0f ? dy : 0.0f;
+                dz = dz > 0.0f ? dz : 0.0f;
+                const float squared = dx * dx + dy * dy + dz * dz;
+                int bits;
+                memcpy(&bits, &squared, sizeof(bits));
+                looks[b - first] = bits < M[b] || b == own;
+                any |= looks[b - first];
+            }
+            if (!any) continue;
+            for (int b = first; b < last; ++b) {
+                if (!looks[b - first]) continue;
+                int farthest = -1;
+                for (int i = b * SIZE; i < (b + 1) * SIZE; ++i) {
+                    const float dx = X[i] - cx, dy = Y[i] - cy, dz = Z[i] - cz;
+                    const float squared = dx * dx + dy * dy + dz * dz;
+                    int bits;
+                    memcpy(&bits, &squared, sizeof(bits));
+                    const int d = D[i] < bits ? D[i] : bits;
+                    D[i] = d;
+                    farthest = farthest > d ? farthest : d;
+                }
+                M[b] = farthest;
+            }
+        }
+        int farthest = -1;
+        for (int b = 0; b < buckets; ++b) farthest = farthest > M[b] ? farthest : M[b];
+        int winner = 0x7fffffff;
+        for (int b = 0; b < buckets; ++b) {
+            if (M[b] != farthest) continue;
+            for (int i = b * SIZE; i < (b + 1) * SIZE; ++i) {
+                if (D[i] == farthest && I[i] < winner) { winner = I[i]; current = i; }
+            }
+        }
+    }
+#endif
+"""
+
+
+@wp.func_native(_FARTHEST_POINTS_BY_BUCKET)
+def farthest_points_by_bucket(
+    x: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+    z: wp.array2d(dtype=wp.float32),
+    distance: wp.array2d(dtype=wp.int32),
+    picked: wp.array2d(dtype=wp.int32),
+    num_proximal: wp.array(dtype=wp.int32),
+    bucketed: wp.array3d(dtype=wp.float32),
+    position: wp.array2d(dtype=wp.int32),
+    boxes: wp.array3d(dtype=wp.float32),
+    bucket_distance: wp.array2d(dtype=wp.int32),
+    num_picks: int,
+    env: int,
+): ...
+
+
+MAX_GRID = 32
+"""Most cells along an axis in :func:`first_of_each_cell`."""
+
+_FIRST_OF_EACH_CELL = r"""
+    const int n = num_proximal.data[env];
+    if (n <= num_picks) return;
+    float* xyz[3] = {
+        (float*)((char*)x.data + (size_t)env * x.strides[0]),
+        (float*)((char*)y.data + (size_t)env * y.strides[0]),
+        (float*)((char*)z.data + (size_t)env * z.strides[0])};
+    int* R = (int*)((char*)ray.data + (size_t)env * ray.strides[0]);
+    int* C = (int*)((char*)distance.data + (size_t)env * distance.strides[0]);
+    for (int i = 0; i < n; ++i) C[i] = 0;
+    for (int a = 2; a >= 0; --a) {
+        const float* __restrict__ X = xyz[a];
+        float lo = X[0], hi = X[0];
+        for (int i = 1; i < n; ++i) {
+            lo = X[i] < lo ? X[i] : lo;
+            hi = X[i] > hi ? X[i] : hi;
+        }
+        const float scale = hi > lo ? (float)grid / (hi - lo) : 0.0f;
+        for (int i = 0; i < n; ++i) {
+            const int cell = (int)((X[i] - lo) * scale);
+            C[i] = C[i] * grid + (cell > grid - 1 ? grid - 1 : cell);
+        }
+    }
+    unsigned int seen[1024];
+    for (int w = 0; w < (grid * grid * grid + 31) / 32; ++w) seen[w] = 0u;
+    int cells = 0;
+    for (int i = 0; i < n; ++i) {
+        const unsigned int bit = 1u << (C[i] & 31);
+        if (seen[C[i] >> 5] & bit) C[i] = -1;
+        else { seen[C[i] >> 5] |= bit; ++cells; }
+    }
+    if (cells < num_picks) return;
+    int kept = 0;
+    for (int i = 0; i < n; ++i) {
+        if (C[i] < 0) continue;
+        for (int a = 0; a < 3; ++a) xyz[a][kept] = xyz[a][i];
+        R[kept++] = R[i];
+    }
+    num_proximal.data[env] = kept;
+"""
+
+
+@wp.func_native(_FIRST_OF_EACH_CELL)
+def first_of_each_cell(
+    x: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+    z: wp.array2d(dtype=wp.float32),
+    ray: wp.array2d(dtype=wp.int32),
+    distance: wp.array2d(dtype=wp.int32),
+    num_proximal: wp.array(dtype=wp.int32),
+    grid: int,
+    num_picks: int,
+    env: int,
+): ...
 
 
 _FARTHEST_POINTS = r"""
@@ -44,7 +262,7 @@ _FARTHEST_POINTS = r"""
     const float* __restrict__ X = x.data + row;
     const float* __restrict__ Y = y.data + row;
     const float* __restrict__ Z = z.data + row;
-    int* __restrict__ D = distance.data + row;
+    int* __restrict__ D = distance.data + (size_t)env * (distance.strides[0] / sizeof(int));
     for (int i = lane; i < n; i += num_lanes) D[i] = 0x7f7fffff;
     int current = 0;
 #if defined(__CUDA_ARCH__)
@@ -207,9 +425,45 @@ def gather_proximal(
 
 
 @wp.kernel
-def pick_farthest(env_offset: int, num_picks: int, num_lanes: int, scratch: Scratch):
-    """Exact farthest point sampling from the first hit in ray order; no point is picked twice."""
+def thin_proximal(env_offset: int, grid: int, num_picks: int, scratch: Scratch):
+    """Keep the first hit in each cell of a grid over the cloud's box, if there are enough of them."""
+    first_of_each_cell(
+        scratch.x,
+        scratch.y,
+        scratch.z,
+        scratch.ray,
+        scratch.distance,
+        scratch.num_proximal,
+        grid,
+        num_picks,
+        env_offset + wp.tid(),
+    )
+
+
+@wp.kernel
+def pick_farthest(env_offset: int, num_picks: int, num_lanes: int, bucket_from: int, scratch: Scratch):
+    """Exact farthest point sampling from the first hit in ray order; no point is picked twice.
+
+    A single lane sorts ``bucket_from`` points and more into buckets, of which far ones need not be looked at.
+    """
     thread, lane = wp.tid()
+    num_points = scratch.num_proximal[env_offset + thread]
+    if num_lanes == 1 and num_points >= bucket_from and num_points > num_picks:
+        farthest_points_by_bucket(
+            scratch.x,
+            scratch.y,
+            scratch.z,
+            scratch.distance,
+            scratch.picked,
+            scratch.num_proximal,
+            scratch.bucketed,
+            scratch.position,
+            scratch.boxes,
+            scratch.bucket_distance,
+            num_picks,
+            env_offset + thread,
+        )
+        return
     farthest_points(
         scratch.x,
         scratch.y,

@@ -14,6 +14,8 @@ _WORK_PER_ENV = 16384
 
 _VIEW_CACHE_SIZE = 64
 _views: OrderedDict[tuple, wp.array] = OrderedDict()
+_LAUNCH_CACHE_SIZE = 64
+_launches: OrderedDict[tuple, tuple[SplitLaunch, list]] = OrderedDict()
 
 
 def view(tensor: torch.Tensor, dtype: type) -> wp.array:
@@ -60,6 +62,9 @@ def launch_over_envs(
 ) -> None:
     """Launch ``kernel(env_offset, *inputs)`` for all environments and, on the CPU, wait for it.
 
+    A launch with the memory and numbers of an earlier one is replayed, because recording it takes longer than sampling
+    a few environments.
+
     Args:
         kernel: first argument ``env_offset: int``, to be added to its first thread index.
         num_envs: size of the first launch dimension.
@@ -69,6 +74,22 @@ def launch_over_envs(
         block_dim: CUDA threads per block.
         num_threads: CPU threads; all the process may use by default.
     """
-    shape = (inner,) if inner else ()
     threads = num_threads or default_num_threads()
-    SplitLaunch(kernel, num_envs, shape, inputs, device, threads, _WORK_PER_ENV, block_dim)()
+    key = (kernel, num_envs, inner, block_dim, threads, device, *map(_identity, inputs))
+    known = _launches.get(key)
+    if known is None:
+        shape = (inner,) if inner else ()
+        launch = SplitLaunch(kernel, num_envs, shape, inputs, device, threads, _WORK_PER_ENV, block_dim)
+        known = _launches[key] = launch, inputs  # which are thereby kept, so that an id is not given away again
+        while len(_launches) > _LAUNCH_CACHE_SIZE:
+            _launches.popitem(last=False)
+    else:
+        _launches.move_to_end(key)
+    known[0]()
+
+
+def _identity(argument: object) -> object:
+    """What tells one argument of a launch from another: an array or struct by itself, numbers by value."""
+    if isinstance(argument, int | float):
+        return argument
+    return tuple(argument) if wp.types.type_is_vector(type(argument)) else id(argument)

@@ -18,6 +18,9 @@ from omniperception.perception.launch import launch_over_envs, view
 _FPS_LANES = 128
 """CUDA threads that share one environment's farthest point sampling."""
 
+BUCKETS_FROM = 1024
+"""Points from which on farthest point sampling by buckets is faster on a CPU than looking at every point."""
+
 vec4 = kernels.wp.vec4
 vec3, float32, int32 = kernels.wp.vec3, kernels.wp.float32, kernels.wp.int32
 
@@ -44,6 +47,7 @@ class Sampler(ABC):
         num_points: P, points written per environment.
         max_range: metres; points are divided by it.
         needs_attitude: whether it looks at the cloud from the levelled base.
+        sizes: P by the parts of a frame, named as the arguments of a network that reads them.
     """
 
     num_points: int
@@ -58,6 +62,10 @@ class Sampler(ABC):
         self.num_points = num_points
         self.max_range = float(max_range)
         self.num_threads = num_threads
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"num_points": self.num_points}
 
     def __call__(
         self,
@@ -111,6 +119,10 @@ class RawSampler(Sampler):
         """Args: num_rays: R of every frame; max_range: metres."""
         super().__init__(num_rays, max_range, num_threads)
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"num_rays": self.num_points}
+
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         inputs = [view(ranges, float32), view(directions_s, vec3), 1.0 / self.max_range, view(out, vec3)]
         launch_over_envs(
@@ -146,6 +158,7 @@ class PdSampler(Sampler):
         split_deg: float,
         ring_deg: float = 2.0,
         reduce: str = "average",
+        grid: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Configure the two halves.
@@ -157,6 +170,8 @@ class PdSampler(Sampler):
             split_deg: elevation in the sensor frame that separates the halves, degrees.
             ring_deg: height of a theta ring for sorting, degrees.
             reduce: "average" takes a bin's mean, "pick" its middle point.
+            grid: cells along each axis of the proximal cloud's box; farthest point sampling then looks only at each
+                cell's first hit in ray order, if there are enough; 0, the default, looks at all hits: exact.
             num_threads: CPU threads; all cores by default.
         """
         if num_proximal < 0 or num_distal < 0:
@@ -168,6 +183,10 @@ class PdSampler(Sampler):
             raise ValueError(f"reduce must be 'average' or 'pick', got '{reduce}'")
         if math.isnan(split_deg):
             raise ValueError("split_deg must be a number of degrees, got nan")
+        if not 0 <= grid <= kernels.MAX_GRID:
+            raise ValueError(f"grid={grid} must lie in 0..{kernels.MAX_GRID}; 0 samples exactly")
+        self.grid = grid
+        self.buckets_from = BUCKETS_FROM
         self.num_proximal = num_proximal
         self.num_distal = num_distal
         self.split = math.radians(split_deg)
@@ -176,6 +195,10 @@ class PdSampler(Sampler):
         self._scratch: kernels.Scratch | None = None
         self._scratch_key: tuple | None = None
         self._tensors: dict[str, torch.Tensor] = {}
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"num_proximal": self.num_proximal, "num_distal": self.num_points - self.num_proximal}
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         n, r = ranges.shape
@@ -199,7 +222,10 @@ class PdSampler(Sampler):
                 scratch,
                 block_dim=32,
             )
-            launch(kernels.pick_farthest, self.num_proximal, lanes, scratch, inner=lanes, block_dim=lanes)
+            if self.grid:
+                launch(kernels.thin_proximal, self.grid, self.num_proximal, scratch, block_dim=32)
+            picks = (self.num_proximal, lanes, self.buckets_from, scratch)
+            launch(kernels.pick_farthest, *picks, inner=lanes, block_dim=lanes)
             launch(
                 kernels.write_proximal,
                 theta,
@@ -232,6 +258,8 @@ class PdSampler(Sampler):
         """Work memory for N environments of R rays, allocated when the shape or device is new."""
         if self._scratch_key == (n, r, device):
             return self._scratch
+        by_bucket = device.type == "cpu" and self.num_proximal and r >= self.buckets_from
+        num_buckets = -(-r // kernels.BUCKET_SIZE) if by_bucket else 0
         sizes = {
             "picked": (n, max(self.num_proximal, 1)),
             "num_proximal": (n,),
@@ -239,13 +267,17 @@ class PdSampler(Sampler):
             "items": (2, n, r),
             "histogram": (n, kernels.RADIX_SIZE),
             "ray": (n, r),
-            "distance": (n, r),
+            "distance": (n, num_buckets * kernels.BUCKET_SIZE or r),
+            "position": (n, num_buckets * kernels.BUCKET_SIZE),
+            "bucket_distance": (n, num_buckets),
         }
+        real = {name: (n, r) for name in "xyz"}
+        real |= {"bucketed": (n, 3, num_buckets * kernels.BUCKET_SIZE), "boxes": (n, 6, num_buckets)}
         self._tensors = {name: torch.empty(size, dtype=torch.int32, device=device) for name, size in sizes.items()}
-        self._tensors |= {name: torch.empty(n, r, device=device) for name in "xyz"}
+        self._tensors |= {name: torch.empty(size, device=device) for name, size in real.items()}
         scratch = kernels.Scratch()
         for name, tensor in self._tensors.items():
-            setattr(scratch, name, view(tensor, float32 if name in "xyz" else int32))
+            setattr(scratch, name, view(tensor, float32 if name in real else int32))
         self._scratch, self._scratch_key = scratch, (n, r, device)
         return scratch
 
@@ -275,6 +307,7 @@ class ProximitySampler(PdSampler):
         blind: float,
         body: Sequence[float],
         ring_deg: float = 2.0,
+        grid: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Configure both halves.
@@ -289,6 +322,7 @@ class ProximitySampler(PdSampler):
             blind: nearest range that counts, metres.
             body: half length and half width of the robot's own body around the base's origin, metres.
             ring_deg: height of a theta ring for sorting the proximal half, degrees.
+            grid: as in :class:`PdSampler`.
             num_threads: CPU threads; all cores by default.
         """
         edges = [float(edge) for edge in band_edges]
@@ -300,10 +334,11 @@ class ProximitySampler(PdSampler):
             raise ValueError(f"blind={blind} must lie in [0, max_range={max_range})")
         if len(body) != 2 or min(body) < 0.0:
             raise ValueError(f"body={list(body)} must be [half length, half width] in metres")
-        options = {"split_deg": split_deg, "ring_deg": ring_deg, "num_threads": num_threads}
-        super().__init__(num_proximal, 0, max_range=max_range, **options)
+        options = {"split_deg": split_deg, "ring_deg": ring_deg, "grid": grid, "num_threads": num_threads}
+        num_cells = num_sectors * (len(edges) - 1)
+        super().__init__(num_proximal, num_cells, max_range=max_range, **options)
+        self.num_distal = 0  # of the averages that PdSampler would write
         self.num_sectors = num_sectors
-        self.num_points = num_proximal + num_sectors * (len(edges) - 1)
         self.edges, self.decay, self.blind, self.body = torch.tensor(edges), decay, blind, tuple(body)
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
@@ -338,15 +373,26 @@ class FpsSampler(PdSampler):
     """
 
     def __init__(
-        self, num_points: int, *, max_range: float, ring_deg: float = 2.0, num_threads: int | None = None
+        self,
+        num_points: int,
+        *,
+        max_range: float,
+        ring_deg: float = 2.0,
+        grid: int = 0,
+        num_threads: int | None = None,
     ) -> None:
-        """Args: num_points: slots; max_range: metres; ring_deg: height of a theta ring for sorting,
-        degrees."""
+        """Args: num_points: slots; max_range: metres; ring_deg: height of a theta ring for sorting, degrees;
+        grid: as in :class:`PdSampler`."""
         super().__init__(
             num_points,
             0,
             max_range=max_range,
             split_deg=-math.inf,
             ring_deg=ring_deg,
+            grid=grid,
             num_threads=num_threads,
         )
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"num_points": self.num_points}

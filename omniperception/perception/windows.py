@@ -1,4 +1,5 @@
-"""Layers over sliding windows of frames: each frame enters a layer once, however many windows contain it.
+"""Layers over sliding windows of frames: each frame enters a layer once, however many windows contain it; and a GRU
+whose state is carried on from frame to frame.
 
 Window w of a (B, F, ...) sequence covers frames w .. w + H - 1, so W = F - H + 1 windows; count (B, W) says
 how many of a window's newest frames are valid.
@@ -7,12 +8,17 @@ how many of a window's newest frames are valid.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
+
+aten = torch.ops.aten
+CARRIED_HISTORY = 2
+"""Frames per window of a network that carries its state."""
 
 
 def window_count(frames: torch.Tensor, count: torch.Tensor, history: int) -> int:
@@ -67,7 +73,7 @@ def _last_states(
     state = projected.new_zeros(batch, windows, hidden)
     for k in range(history):
         from_frame = projected[:, k : k + windows]
-        recurrent = functional.linear(state, weight, bias).to(state.dtype)
+        recurrent = functional.linear(state, weight, bias).to(state.dtype) if k else bias.expand_as(from_frame)
         gates = (from_frame[..., : 2 * hidden] + recurrent[..., : 2 * hidden]).sigmoid_()
         reset, update = gates.split(hidden, dim=-1)
         recurrent_new = recurrent[..., 2 * hidden :]
@@ -111,28 +117,71 @@ class _UnrolledGru(torch.autograd.Function):
         for k in reversed(range(history)):
             state, gates, new, recurrent_new = saved[4 * k : 4 * k + 4]
             reset, update = gates.split(hidden, dim=-1)
+            d_step = d_recurrent[k]
             d_state = gradient * valid[:, :, k]
-            d_update = d_state * (state - new)
-            d_new = (d_state - d_state * update).mul_(1.0 - new * new)
-            d_gates = torch.cat((d_new * recurrent_new, d_update), -1).mul_(gates).mul_(1.0 - gates)
-            d_recurrent[k, ..., : 2 * hidden] = d_gates
-            torch.mul(d_new, reset, out=d_recurrent[k, ..., 2 * hidden :])
+            through_new = torch.addcmul(d_state, d_state, update, value=-1.0)
+            d_new = aten.tanh_backward(through_new, new)
+            torch.mul(d_new, recurrent_new, out=d_step[..., :hidden])
+            torch.mul(d_state, state - new, out=d_step[..., hidden : 2 * hidden])
+            d_gates = d_step[..., : 2 * hidden]
+            aten.sigmoid_backward(d_gates, gates, grad_input=d_gates)
+            torch.mul(d_new, reset, out=d_step[..., 2 * hidden :])
             d_projected[:, k : k + windows, : 2 * hidden] += d_gates
             d_projected[:, k : k + windows, 2 * hidden :] += d_new
-            with ctx.autocast():
-                d_previous = (d_recurrent[k] @ weight).to(gradient.dtype)
-            gradient = gradient - d_state + d_state * update + d_previous
-        states = torch.stack(saved[0::4]).flatten(0, 2)
+            if k:
+                with ctx.autocast():
+                    d_previous = (d_step @ weight).to(gradient.dtype)
+                gradient = (gradient - through_new).add_(d_previous)
+        # The first step starts from zero: it adds to the bias's gradient alone.
+        states = torch.stack(saved[0::4]).flatten(0, 2)[batch * windows :]
         flat = d_recurrent.flatten(0, 2)
         with ctx.autocast():
-            d_weight = (flat.t() @ states).to(weight.dtype)
+            d_weight = (flat[batch * windows :].t() @ states).to(weight.dtype)
         return d_projected, None, d_weight, flat.sum(0)
 
 
-def _autocast_like_now(device_type: str) -> Callable[[], torch.autocast]:
+def _autocast_like_now(device_type: str) -> Callable[[], AbstractContextManager]:
     """Makes contexts with the present state of autocast, for a backward pass, which runs outside of it."""
+    if not torch.amp.is_autocast_available(device_type):  # torch's meta device, on which memory is counted
+        return nullcontext
     enabled, dtype = torch.is_autocast_enabled(device_type), torch.get_autocast_dtype(device_type)
     return partial(torch.autocast, device_type, dtype=dtype, enabled=enabled)
+
+
+class CarriedGru(nn.GRU):
+    """A GRU that runs over all frames since an environment's reset; parameters are those of ``nn.GRU`` with one layer.
+
+    Windows are two frames long (:data:`CARRIED_HISTORY`) only so that a window's count tells the first frame since a
+    reset (1), which starts from zero, from a later one (2), which goes on from the state before. Without a frame (0)
+    the state is zero.
+    """
+
+    def __init__(self, input_size: int, hidden_size: int) -> None:
+        """Args: input_size: numbers per frame; hidden_size: size of the state, which is the embedding."""
+        super().__init__(input_size, hidden_size, batch_first=True)
+
+    def forward(self, frames: torch.Tensor, count: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor:
+        """Frames (B, W + 1, input_size), count (B, W) in 0..2, state (B, hidden_size) before the first window's newest
+        frame, zero by default -> states after each window's newest frame (B, W, hidden_size)."""
+        num_windows = window_count(frames, count, CARRIED_HISTORY)
+        projected = functional.linear(frames[:, 1:], self.weight_ih_l0, self.bias_ih_l0).to(self.weight_hh_l0.dtype)
+        if state is None:
+            state = projected.new_zeros(frames.shape[0], self.hidden_size)
+        states = []
+        for w in range(num_windows):
+            before = torch.where(count[:, w, None] > 1, state, 0.0)
+            state = torch.where(count[:, w, None] > 0, self._step(projected[:, w], before), 0.0)
+            states.append(state)
+        return torch.stack(states, 1)
+
+    def _step(self, projected: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """The state after a frame; gate order is PyTorch's: reset, update, new."""
+        recurrent = functional.linear(state, self.weight_hh_l0, self.bias_hh_l0).to(state.dtype)
+        from_frame, from_state = projected.chunk(3, dim=-1), recurrent.chunk(3, dim=-1)
+        reset = torch.sigmoid(from_frame[0] + from_state[0])
+        update = torch.sigmoid(from_frame[1] + from_state[1])
+        new = torch.tanh(from_frame[2] + reset * from_state[2])
+        return torch.lerp(new, state, update)
 
 
 class WindowedLinear(nn.Module):

@@ -90,6 +90,19 @@ def test_cache_tells_environments_apart():
     assert torch.allclose(actor(b.get_observations()), cached)
 
 
+def test_a_reset_alone_embeds_nothing_anew():
+    env = ToyEnv(4)
+    advance(env, 10)
+    actor = actor_for(env)
+    counter = Counter(actor.perception)
+    with torch.inference_mode():
+        actor(env.get_observations())
+        first = counter.calls
+        env.frame_count[2], env.frames[2] = 0, 0.0
+        actor(env.get_observations())
+    assert counter.calls == first
+
+
 @pytest.mark.parametrize("network", ["pd", "mlp"])
 def test_reset_between_frames_gives_the_empty_embedding(network):
     env = ToyEnv(4)

@@ -9,7 +9,7 @@ from rsl_rl.env import VecEnv
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from omniperception.perception import PdRiskNet
+from omniperception.perception import CarriedPdRiskNet, PdRiskNet
 
 HISTORY, POINTS, PERIOD = 4, 3, 5
 
@@ -21,7 +21,7 @@ class ToyEnv(VecEnv):
     copying sees later frames.
     """
 
-    def __init__(self, num_envs=6, frames=True, episode=17, period=PERIOD, seed=0):
+    def __init__(self, num_envs=6, frames=True, episode=17, period=PERIOD, seed=0, history=HISTORY):
         self.num_envs, self.num_actions, self.device, self.cfg = num_envs, 2, "cpu", {}
         self.max_episode_length = episode
         self.has_frames, self.period = frames, period
@@ -30,7 +30,7 @@ class ToyEnv(VecEnv):
         self.tick = 0
         self.position = torch.tensor(self.rng.normal(size=(num_envs, 2)), dtype=torch.float32)
         self.episode_length_buf = torch.arange(num_envs) * 3 % episode
-        self.frames = torch.zeros(num_envs, HISTORY, POINTS, 3)
+        self.frames = torch.zeros(num_envs, history, POINTS, 3)
         self.frame_count = torch.zeros(num_envs, 1, dtype=torch.long)
 
     def get_observations(self):
@@ -63,7 +63,7 @@ class ToyEnv(VecEnv):
         self.frames[:, :-1] = self.frames[:, 1:].clone()
         noise = torch.randn(self.num_envs, POINTS, 1) * 0.01  # torch's global generator
         self.frames[:, -1] = torch.cat([self.position, torch.ones(self.num_envs, 1)], -1).unsqueeze(1) * 0.1 + noise
-        self.frame_count = (self.frame_count + 1).clamp(max=HISTORY)
+        self.frame_count = (self.frame_count + 1).clamp(max=self.frames.shape[1])
 
     def _reset(self, ids):
         self.position[ids] = torch.tensor(self.rng.normal(size=(len(ids), 2)), dtype=torch.float32)
@@ -89,15 +89,17 @@ SUPERVISED = {"epochs": 2, "learning_rate": 1e-2}
 """Of a perception network that PPO does not train."""
 
 
-def config(frames=True, supervision=None, **overrides):
-    """Runner configuration; keyword arguments replace top-level entries."""
+def config(frames=True, supervision=None, carried=False, **overrides):
+    """Runner configuration; keyword arguments replace top-level entries. A carried state needs ToyEnv(history=2)."""
+    sizes = {"num_proximal": 2, "num_distal": 1, "proximal_dim": 5, "distal_dim": 3}
+    network = functools.partial(CarriedPdRiskNet if carried else PdRiskNet, history=2 if carried else HISTORY, **sizes)
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5}
     mlp = {"hidden_dims": [16], "activation": "elu", "obs_normalization": True}
     actor = {"class_name": "rsl_rl.models:MLPModel", "distribution_cfg": gaussian, **mlp}
     if frames:
         actor |= {
             "class_name": "omniperception.learning.models:PerceptionActor",
-            "perception": functools.partial(PdRiskNet, 2, 1, HISTORY, proximal_dim=5, distal_dim=3),
+            "perception": network,
             "supervision": {"height_target": 1.0},
             "end_to_end": supervision is None,
         }

@@ -66,6 +66,47 @@ class TestFarthestPoints:
         for env in range(4):
             assert (order(theta[env], phi[env]) == np.arange(64)).all()
 
+    @pytest.mark.parametrize(("num_rays", "k"), [(40, 7), (300, 64), (1000, 256), (1000, 999)])
+    def test_buckets_do_not_change_a_pick(self, num_rays, k):
+        """Neither on random clouds nor with ties, duplicates and a flat cloud."""
+        rng = np.random.default_rng(k)
+        lattice = rng.integers(1, 6, (num_rays, 3)).astype(np.float32)  # many ties and duplicates
+        flat = np.concatenate([rng.uniform(-1, 1, (num_rays, 2)), np.ones((num_rays, 1))], 1).astype(np.float32)
+        _, _, theta, phi = rays_from_points(lattice)
+        clouds = [torch.tensor(points)[None] for points in (lattice, flat)]
+        cases = [(torch.ones(1, num_rays), cloud, theta, phi) for cloud in clouds]
+        for rays in (*cases, random_rays(3, num_rays, seed=k)):
+            plain, buckets = FpsSampler(k, max_range=1.0), FpsSampler(k, max_range=1.0)
+            plain.buckets_from, buckets.buckets_from = 10**9, 1
+            assert torch.equal(sample(plain, rays), sample(buckets, rays))
+
+    def test_clouds_with_and_without_buckets_do_not_meet(self):
+        """Environments are sampled at once, some by buckets and some not, each in its own work memory."""
+        rays = random_rays(64, 1001, seed=3)
+        rays[0][::3, 300:] = math.inf
+        sampler, plain = FpsSampler(50, max_range=MAX_RANGE, num_threads=4), FpsSampler(50, max_range=MAX_RANGE)
+        sampler.buckets_from, plain.buckets_from = 500, 10**9
+        expected = sample(plain, rays)
+        for _ in range(5):
+            assert torch.equal(sample(sampler, rays), expected)
+
+    def test_grid_leaves_the_first_hit_of_each_cell(self):
+        rays = random_rays(3, 400, seed=8)
+        for grid, k in ((4, 20), (9, 200)):
+            got = sample(FpsSampler(k, max_range=MAX_RANGE, grid=grid), rays)
+            for env in range(3):
+                hits = torch.isfinite(rays[0][env])
+                scale = torch.tensor(1.0 / MAX_RANGE)
+                cloud = ((rays[0][env, hits] * scale)[:, None] * rays[1][env, hits]).numpy()
+                low, high = cloud.min(0), cloud.max(0)
+                cells = ((cloud - low) * (np.float32(grid) / (high - low))).astype(int).clip(max=grid - 1)
+                first = sorted(np.unique(cells, axis=0, return_index=True)[1])
+                assert k < len(first) < len(cloud) or k == 200
+                candidates = cloud[first] if len(first) >= k else cloud
+                assert as_set(got[env]) == as_set(candidates[brute_force_fps(candidates, k)])
+        with pytest.raises(ValueError, match=r"grid=33 must lie in 0\.\.32"):
+            FpsSampler(20, max_range=1.0, grid=33)
+
     def test_duplicates_are_picked_once_each(self):
         points = np.tile([[1.0, 2.0, 2.0]], (10, 1))
         got = sample(FpsSampler(4, max_range=3.0), rays_from_points(points))[0]

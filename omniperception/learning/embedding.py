@@ -1,0 +1,85 @@
+"""The embeddings that a policy acts on: computed once per LiDAR frame, and carried on where the network has a state."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from omniperception.perception import PerceptionNetwork
+
+
+class RolloutEmbedding:
+    """Embeddings of the current LiDAR histories of one set of environments.
+
+    Without gradients they are computed at a new tick or after a change of the parameters only. A network that carries
+    its state goes on from the embedding before the newest frame, once per tick and environment; which environments
+    start anew is told by their count of frames, so nobody has to report resets.
+
+    Attributes:
+        before: (N, D) embedding before the newest frame, of a network that carries its state, else None.
+    """
+
+    def __init__(self, network: PerceptionNetwork) -> None:
+        self._network = network
+        self.before: torch.Tensor | None = None
+        self._after: torch.Tensor | None = None
+        self._empty: torch.Tensor | None = None
+        self._tick: int | None = None
+        self._made_with: tuple | None = None
+        self._seen: tuple[torch.Tensor, torch.Tensor] | None = None
+
+    def __call__(self, obs: TensorDict) -> torch.Tensor:
+        """(N, D) embeddings of the histories in the observations; the empty one without a frame since the reset."""
+        frames, count = obs["frames"], obs["frame_count"]
+        with torch.no_grad():
+            self._follow(obs)
+        if torch.is_grad_enabled():
+            state = None if self.before is None else self.before.clone()  # it may come from inference mode
+            features, empty = self._network(frames, count, state)[:, 0], self._network.empty(frames)
+        else:
+            features, empty = self._after, self._empty
+        return torch.where(count > 0, features, empty)
+
+    def state_dict(self) -> dict | None:
+        """What a resumed run goes on from; None for a network without a carried state."""
+        if self.before is None:
+            return None
+        return {"tick": self._tick, "before": self.before, "after": self._after}
+
+    def load_state_dict(self, state: dict | None) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self._made_with = self._seen = None
+        if state is not None:
+            self._tick, self.before, self._after = state["tick"], state["before"].clone(), state["after"].clone()
+
+    def _follow(self, obs: TensorDict) -> None:
+        """Brings the embeddings up to the observations."""
+        frames, count = obs["frames"], obs["frame_count"]
+        probe = frames[:, -1, :2].sum((-2, -1), dtype=torch.float64)  # tells one set of environments from another
+        tick, changed = self._tick_and_change(obs["frame_tick"], probe, count.squeeze(-1))
+        made_with = (
+            tuple(frames.shape),
+            frames.device,
+            torch.is_inference_mode_enabled(),
+            tuple((id(p), p._version) for p in self._network.parameters()),
+        )
+        if tick == self._tick and not changed and made_with == self._made_with:
+            return
+        if self._network.carried and (tick != self._tick or self.before is None):
+            known = self._after is not None and len(self._after) == len(frames)
+            self.before = self._after if known else frames.new_zeros(len(frames), self._network.feature_dim)
+        self._after = self._network(frames, count, self.before)[:, 0]
+        self._empty = self._network.empty(frames)
+        self._tick, self._made_with, self._seen = tick, made_with, (probe, count.squeeze(-1).clone())
+
+    def _tick_and_change(self, ticks: torch.Tensor, probe: torch.Tensor, count: torch.Tensor) -> tuple[int, bool]:
+        """The newest tick, and whether an environment that has a frame has another one than before.
+
+        A reset takes frames away and adds none, so that the others' embeddings stay; one read-back for both.
+        """
+        if self._seen is None or len(self._seen[0]) != len(probe):
+            return int(ticks.flatten()[0]), True
+        before, count_before = self._seen
+        other = (count > 0) & ((probe != before) | (count != count_before))
+        tick, changed = torch.stack([ticks.flatten()[0], other.any().to(ticks.dtype)]).tolist()
+        return tick, bool(changed)

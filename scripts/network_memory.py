@@ -1,0 +1,63 @@
+"""What training each perception network needs: parameters, optimiser, rollout, and whether it fits.
+
+    python scripts/network_memory.py [budget_gb=24] [overrides, e.g. experiment=paper lidar.sensor.num_rays=20000]
+
+Nothing is allocated: networks run on torch's meta device. Policy, critic, physics and rays are not counted. Of the raw
+cloud there is a second row, as a storage without shared frames would have it: every control step's whole window kept.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import omniperception  # noqa: F401  before torch, whose threads it sets up
+from omniperception import config
+from omniperception.assembly import steps_per_frame
+from omniperception.learning.memory import GB, Footprint, footprint, largest_cloud
+
+COLUMNS = ("parameters", "weights, Adam", "sensor", "rollout", "mini-batch", "total", "verdict")
+
+
+def row(name: str, needs: Footprint, budget: float) -> str:
+    sizes = (
+        needs.weights + needs.gradients + needs.optimizer,
+        needs.sensor,
+        needs.rollout,
+        needs.mini_batch,
+        needs.total,
+    )
+    cells = [f"{needs.parameters / 1e6:.2f} M", *(f"{size / GB:.3f}" for size in sizes)]
+    verdict = "fits" if needs.total <= budget else "OUT OF MEMORY"
+    return f"| {name} | {' | '.join(cells)} | {verdict} |"
+
+
+def presets() -> list[str]:
+    names = (path.stem for path in (config.CONFIG_DIR / "perception").glob("*.yaml"))
+    return sorted(name for name in names if name != "none")
+
+
+def main() -> None:
+    with config.one_line_errors():
+        own, overrides = config.split_arguments(sys.argv[1:], {"budget_gb": "24"})
+        budget = config.positive("budget_gb", own["budget_gb"], float) * GB
+        overrides = overrides or ["experiment=paper"]
+        lines, largest = [], []
+        for name in presets():
+            run = config.assemble(config.compose([*overrides, f"perception={name}"]))
+            sizes = (run.perception, run.ppo, run.env.num_envs, steps_per_frame(run))
+            lines.append(row(name, footprint(*sizes), budget))
+            if name == "direct_mlp":
+                lines.append(row(f"{name}, window per step", footprint(*sizes, window_per_step=True), budget))
+                largest = [largest_cloud(*sizes, budget), largest_cloud(*sizes, budget, window_per_step=True)]
+    print(
+        f"{' '.join(overrides)}: {sizes[2]} environments x {run.ppo.num_steps_per_env} steps, a frame every {sizes[3]},"
+        f" {run.ppo.num_mini_batches} mini-batches, {run.env.lidar.sensor.num_rays} rays; GB (10^9 bytes), limit"
+        f" {budget / GB:g}\n"
+    )
+    print(f"| perception | {' | '.join(COLUMNS)} |\n|{'---|' * (1 + len(COLUMNS))}")
+    print("\n".join(lines))
+    print(f"\ndirect_mlp fits up to {largest[0]:,} rays per frame; with a window per step up to {largest[1]:,}")
+
+
+if __name__ == "__main__":
+    main()

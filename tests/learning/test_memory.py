@@ -1,0 +1,101 @@
+"""Memory counted before anything is allocated, against the tensors of a run."""
+
+import functools
+
+import pytest
+import torch
+from test_ppo import collect
+from toy_env import ToyEnv, config
+
+from omniperception.learning import PerceptivePpo
+from omniperception.learning.config import PerceptionConfig, PPOConfig
+from omniperception.learning.memory import _kept_for_backward, check_fits, footprint, largest_cloud
+from omniperception.perception import CarriedPdRiskNet, DirectMlp, FpsGru, PdRiskNet, PdSampler, RawSampler
+
+RAYS, HISTORY = 40, 4
+
+
+def ppo_config(**changes):
+    values = {name: 1 for name in PPOConfig.__dataclass_fields__}
+    values |= {"num_steps_per_env": 8, "num_mini_batches": 2, "max_minutes": None, "schedule": "fixed"}
+    return PPOConfig(**{**values, **changes})
+
+
+def perception(network=DirectMlp, sampler=None, history=HISTORY, **changes):
+    sampler = sampler or functools.partial(RawSampler, num_rays=RAYS, max_range=5.0)
+    network = functools.partial(network)
+    return PerceptionConfig(sampler, network, history, height_weight=0.0, sector_weight=0.0, **changes)
+
+
+def halves(num_proximal=5, num_distal=7):
+    return functools.partial(PdSampler, num_proximal, num_distal, max_range=5.0, split_deg=10.0)
+
+
+@pytest.mark.parametrize("carried", [False, True])
+def test_predicted_bytes_are_those_of_a_run(carried):
+    env = ToyEnv(6, history=2 if carried else HISTORY)
+    cfg = config(carried=carried, multi_gpu=None)
+    alg = PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
+    collect(alg, env, 8)
+    storage = alg.storage
+    kept = [storage.frames] + ([storage.initial_state] if carried else [])
+    rollout = sum(t.untyped_storage().nbytes() for t in kept)
+    alg.update()
+    network = alg.actor.perception
+    adam = [alg.optimizer.state[p][name] for p in network.parameters() for name in ("exp_avg", "exp_avg_sq")]
+
+    made = functools.partial(CarriedPdRiskNet if carried else PdRiskNet, proximal_dim=5, distal_dim=3)
+    needs = footprint(perception(made, halves(2, 1), 2 if carried else HISTORY), ppo_config(), 6, 5)
+    assert needs.rollout == rollout
+    assert needs.optimizer == sum(t.untyped_storage().nbytes() for t in adam)
+    assert needs.weights == sum(p.untyped_storage().nbytes() for p in network.parameters())
+    assert needs.gradients == sum(p.grad.untyped_storage().nbytes() for p in network.parameters())
+
+
+def test_direct_mlp_by_hand():
+    """P = 40 points, H = 4, 256 hidden, 251 out; 10 environments, 8 steps, a frame every 5: W = 3 windows, F = 6."""
+    needs = footprint(perception(), ppo_config(), 10, 5)
+    assert needs.parameters == 4 * 120 * 256 + 256 + 256 * 251 + 251
+    assert needs.rollout == 10 * 6 * 40 * 12
+    assert needs.sensor == 10 * 9 * 40 * 12
+    frames, hidden, out = 5 * 6 * 120, 5 * 3 * 256, 5 * 3 * 251
+    assert needs.mini_batch >= 4 * (frames + hidden + out)
+    windows = footprint(perception(), ppo_config(), 10, 5, window_per_step=True)
+    assert windows.rollout == 10 * 8 * 4 * 40 * 12
+    assert needs.total < windows.total
+
+
+@pytest.mark.parametrize(
+    "network", [DirectMlp(8, 4), FpsGru(8, 4, 9), PdRiskNet(5, 3, 4, 6, 5)], ids=lambda n: type(n).__name__
+)
+def test_meta_tensors_are_as_large_as_real_ones(network):
+    real = _kept_for_backward(network, 6, 3)
+    assert real == _kept_for_backward(network.to("meta"), 6, 3) > 6 * 6 * 8 * 12
+
+
+def test_the_papers_verdict():
+    """24 GB, 4096 environments, whole Mid-360 frames (20,000 points), 10 frames: out of memory, shared or not."""
+    whole = perception(sampler=functools.partial(RawSampler, num_rays=20_000, max_range=5.0), history=10)
+    ppo = ppo_config(num_steps_per_env=24, num_mini_batches=4)
+    shared, windows = footprint(whole, ppo, 4096, 5), footprint(whole, ppo, 4096, 5, window_per_step=True)
+    assert shared.rollout == 4096 * 15 * 20_000 * 12 and windows.rollout == 4096 * 240 * 20_000 * 12
+    assert windows.total > shared.total > 24e9
+    risknet = functools.partial(PdRiskNet)
+    assert footprint(perception(risknet, halves(256, 128), 10), ppo, 4096, 5).total < 24e9
+    fits = largest_cloud(whole, ppo, 4096, 5, 24e9)
+    at_most = perception(sampler=functools.partial(RawSampler, num_rays=fits, max_range=5.0), history=10)
+    assert 0.99 * 24e9 < footprint(at_most, ppo, 4096, 5).total <= 24e9
+
+
+def test_what_cannot_fit_is_refused_in_one_line():
+    check_fits(perception(), ppo_config(), 10, 5, "cpu")
+    with pytest.raises(
+        ValueError, match=r"DirectMlp needs 0\.0 GB with num_envs=10 .*raise .*perception\.memory_gb"
+    ) as error:
+        check_fits(perception(memory_gb=1e-6), ppo_config(), 10, 5, "cpu")
+    assert "\n" not in str(error.value)
+    huge = perception(sampler=functools.partial(RawSampler, num_rays=10**7, max_range=5.0))
+    with pytest.raises(ValueError, match="but there are"):
+        check_fits(huge, ppo_config(), 10**6, 5, torch.device("cpu"))
+    with pytest.raises(ValueError, match=r"memory_gb=-1 must be positive"):
+        perception(memory_gb=-1)
