@@ -25,7 +25,7 @@ HALF_PI = wp.constant(wp.float32(0.5 * math.pi))
 
 
 @wp.func
-def _settled(v: wp.vec3):
+def settled(v: wp.vec3):
     """``v`` without parts so small that products of two would be denormal, on which a CPU is a hundred times slower."""
     return wp.vec3(
         wp.where(wp.abs(v[0]) < NOTHING, 0.0, v[0]),
@@ -268,11 +268,11 @@ def place_kernel(pose_type: type) -> wp.Kernel:
             pose = to_view * pose
             if there:
                 kind = shape_kind[shape]
-                c = _settled(wp.vec3(wp.transform_get_translation(pose)))
+                c = settled(wp.vec3(wp.transform_get_translation(pose)))
                 turn = wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
-                x_axis = _settled(wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0]))
-                y_axis = _settled(wp.vec3(turn[0, 1], turn[1, 1], turn[2, 1]))
-                up = _settled(wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]))
+                x_axis = settled(wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0]))
+                y_axis = settled(wp.vec3(turn[0, 1], turn[1, 1], turn[2, 1]))
+                up = settled(wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]))
                 axes = wp.matrix_from_rows(x_axis, y_axis, up)
                 radius = shape_radius[shape]
                 distance = wp.length(c)

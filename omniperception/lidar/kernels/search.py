@@ -9,7 +9,7 @@ import warp as wp
 
 from .geometry import INF, SLACK, Geometry, Hit, shape_functions, uncertain
 from .motion import Moment, Track, shape_at
-from .place import _settled
+from .place import settled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -136,11 +136,11 @@ def locate_functions(moving: bool, displaced: bool) -> tuple[wp.Function, wp.Fun
         if wp.static(moving):
             pose = pose_of(slots, track, moment, env, slot)
             turn = wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
-            located.c = _settled(wp.vec3(wp.transform_get_translation(pose)))
+            located.c = settled(wp.vec3(wp.transform_get_translation(pose)))
             located.axes = wp.matrix_from_rows(
-                _settled(wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0])),
-                _settled(wp.vec3(turn[0, 1], turn[1, 1], turn[2, 1])),
-                _settled(wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])),
+                settled(wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0])),
+                settled(wp.vec3(turn[0, 1], turn[1, 1], turn[2, 1])),
+                settled(wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])),
             )
         else:
             bound = slots.bound[env, slot]
