@@ -2,8 +2,8 @@
 
 They act in this order, whatever the order in which they are given: angular jitter turns the ray before it is cast;
 mixed pixels, Gaussian and distance noise change the distance of a hit, which then ends at the maximum range and is no
-point below the minimum range; the mask replaces it; dropout loses it. No model turns a miss into a hit; a ray that jitter
-turns may meet what the nominal one would have missed.
+point below the minimum range; the mask replaces it; dropout loses it. No model turns a miss into a hit; a ray that
+jitter turns may meet what the nominal one would have missed.
 """
 
 import math
