@@ -32,10 +32,9 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
     seed_everything(run.env.seed)
     try:
         if run.perception is not None:
-            device = getattr(run.env.sim, "device", "cpu")
-            check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), device)
+            check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), "cpu")
         env = OmniEnv(run.env)
-        return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
+        return Runner(env, learning_settings(run), str(log_dir) if log_dir else None, str(env.device))
     except ValueError as error:
         raise ConfigError(str(error)) from error
 
@@ -72,16 +71,15 @@ def steps_per_frame(run: RunConfig) -> int:
     return max(1, round(run.env.lidar.sensor.period_s / run.env.sim.control_dt))
 
 
-def learning_settings(run: RunConfig, env: OmniEnv) -> dict:
+def learning_settings(run: RunConfig) -> dict:
     """rsl_rl's configuration for a run."""
     observations = run.env.observations
-    period = env.sensing.period_steps if env.sensing is not None else 1
     return runner_config(
         run.ppo,
         run.perception,
         observations.actor,
         observations.critic,
-        period,
+        steps_per_frame(run) if run.perception is not None else 1,
         run.env.rewards.avoidance.risk,
     )
 

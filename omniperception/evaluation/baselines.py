@@ -127,7 +127,7 @@ class TrueSectors:
         if field is None:
             return
         self._xy[:, self._placed] = field.pos_w[..., :2].float()
-        self._yaw[:, self._placed] = 2 * torch.atan2(field.quat_w[..., 3], field.quat_w[..., 0]).float()
+        self._yaw[:, self._placed] = field.yaw.float()
         self._bottom[:, self._placed] = field.bottom_above_ground().float()
 
     def _nearest_point(self, centre: torch.Tensor, turned: torch.Tensor) -> torch.Tensor:

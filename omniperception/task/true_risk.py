@@ -16,6 +16,8 @@ from omniperception.world.obstacles import Obstacle
 
 HEADROOM = 0.45
 """What hangs at least this high (m) above the ground lets the robot pass."""
+_FAR = wp.constant(5.0)
+"""Gaps beyond this many decays (a risk below 0.7 %) do not count."""
 _CORNERS = 1.2
 """A box is taken for a capsule along its longer side with the shorter half extent times this as radius."""
 
@@ -40,11 +42,9 @@ class TrueVelocityRisk:
         outlines = torch.tensor([_outline(slot) for slot in (*placed, *fixed)], device=device).reshape(-1, 2)
         self._half_length, self._radius = outlines[:, 0].contiguous(), outlines[:, 1].contiguous()
         poses = torch.tensor([slot.pose for slot in fixed], device=device).reshape(-1, 3)
-        self._fixed_xy, self._fixed_yaw = poses[:, :2], torch.deg2rad(poses[:, 2])
-        self._turn = torch.tensor([_lies_across(slot) for slot in placed], device=device) * (math.pi / 2)
-        self._fixed_yaw = self._fixed_yaw + torch.tensor([_lies_across(s) for s in fixed], device=device) * (
-            math.pi / 2
-        )
+        turn = (math.pi / 2) * torch.tensor([_lies_across(slot) for slot in (*placed, *fixed)], device=device)
+        self._turn = turn[: len(placed)]
+        self._fixed_xy, self._fixed_yaw = poses[:, :2], torch.deg2rad(poses[:, 2]) + turn[len(placed) :]
         times = torch.tensor(config.times, device=device)
         self._times, self._discounts = times, (-times / config.time_constant).exp()
 
@@ -79,7 +79,7 @@ class TrueVelocityRisk:
         fixed_xy, fixed_yaw = self._fixed_xy.expand(n, -1, -1), self._fixed_yaw.expand(n, -1)
         if field is None:
             return fixed_xy, fixed_yaw, torch.zeros_like(fixed_xy), torch.ones_like(fixed_yaw, dtype=torch.bool)
-        yaw = 2 * torch.atan2(field.quat_w[..., 3], field.quat_w[..., 0]).float() + self._turn
+        yaw = field.yaw.float() + self._turn
         counts = field.active & (field.bottom_above_ground() < HEADROOM)
         return (
             torch.cat((field.pos_w[..., :2].float(), fixed_xy), 1),
@@ -131,7 +131,7 @@ def velocity_risks(
             half = axis[env, o]
             w = velocity[env, o]
             edge = radius[o] + robot_radius
-            reach = (top_speed + wp.length(w)) * horizon + wp.length(half) + edge + 5.0 * decay
+            reach = (top_speed + wp.length(w)) * horizon + wp.length(half) + edge + _FAR * decay
             if wp.length(p) < reach:
                 squared = wp.max(wp.dot(half, half), 1.0e-9)
                 for k in range(candidates.shape[0]):
@@ -141,6 +141,6 @@ def velocity_risks(
                         q = p + times[t] * approach
                         along = wp.clamp(-wp.dot(q, half) / squared, -1.0, 1.0)
                         gap = wp.length(q + along * half) - edge
-                        if gap < 5.0 * decay:
+                        if gap < _FAR * decay:
                             worst = wp.max(worst, discounts[t] * wp.exp(-wp.max(gap, 0.0) / decay))
                     risk_out[env, k] = worst

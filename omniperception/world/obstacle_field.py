@@ -130,6 +130,11 @@ class ObstacleField:
             path[..., 2] = self._over_ground(path[..., :2], self._all_envs)
             self.pos_w.copy_(path[:, -1])
 
+    @property
+    def yaw(self) -> torch.Tensor:
+        """(num_envs, num_placed) float64 orientation (rad) about the vertical; obstacles turn about no other axis."""
+        return 2 * torch.atan2(self.quat_w[..., 3], self.quat_w[..., 0])
+
     def bottom_above_ground(self) -> torch.Tensor:
         """(num_envs, num_placed) float64 height (m) of the lowest points above the ground below the centres."""
         bottom = self.pos_w[..., 2] - self._half_height
