@@ -32,10 +32,10 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
     seed_everything(run.env.seed)
     try:
         if run.perception is not None:
-            check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), "cpu")
+            check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), run.env.sim.torch_device)
         env = OmniEnv(run.env)
         return Runner(env, learning_settings(run), str(log_dir) if log_dir else None, str(env.device))
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         raise ConfigError(str(error)) from error
 
 

@@ -53,30 +53,44 @@ class SimConfig:
         """Control step (s)."""
         return self.timestep * self.decimation
 
+    @property
+    def torch_device(self) -> torch.device:
+        """Where the simulations and everything that they feed live."""
+        return torch.device("cpu")
+
+    def build(self, world: World, num_envs: int, record_states: bool = False) -> Simulator:
+        """`num_envs` simulations of a world; with `record_states` their states after each physics step are kept."""
+        from omniperception.sim.mujoco import MujocoSimulator
+
+        return MujocoSimulator(world, self, num_envs, record_states)
+
 
 class Simulator(Protocol):
-    """Many copies of one world, stepped together. Tensors are live; all are (num_envs, ...)."""
+    """Many copies of one world, stepped together. Tensors are live; all are (num_envs, ...).
+
+    States have the engine's own precision, float64 or float32.
+    """
 
     world: World
     num_envs: int
     device: torch.device
     qpos: torch.Tensor
-    """(num_envs, 7 + num_joints) float64: base position (m, environment frame), quaternion (wxyz), joints (rad)."""
+    """(num_envs, 7 + num_joints): base position (m, environment frame), quaternion (wxyz), joints (rad)."""
     qvel: torch.Tensor
-    """(num_envs, 6 + num_joints) float64: base linear velocity (m/s, world), angular velocity (rad/s, base), joints."""
+    """(num_envs, 6 + num_joints): base linear velocity (m/s, world), angular velocity (rad/s, base), joints."""
     mocap_pos: torch.Tensor
-    """(num_envs, num_placed_obstacles, 3) float64: positions (m) of the kinematic bodies."""
+    """(num_envs, num_placed_obstacles, 3): positions (m) of the kinematic bodies."""
     mocap_quat: torch.Tensor
-    """(num_envs, num_placed_obstacles, 4) float64."""
+    """(num_envs, num_placed_obstacles, 4): their quaternions."""
     ground_pos: torch.Tensor | None
-    """(num_envs, 3) float64: where a ground that is a height field lies (m, environment frame); None for a plane."""
+    """(num_envs, 3): where a ground that is a height field lies (m, environment frame); None for a plane."""
     failed: torch.Tensor
     """(num_envs,) bool: simulations whose state became non-finite or raised an error since the last reset."""
 
     qpos_steps: torch.Tensor
-    """(num_envs, num_steps, nq) float64: qpos after each physics step of the last call, if they are recorded."""
+    """(num_envs, num_steps, nq): qpos after each physics step of the last call, if they are recorded."""
     qvel_steps: torch.Tensor
-    """(num_envs, num_steps, nv) float64."""
+    """(num_envs, num_steps, nv): likewise qvel."""
 
     def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
         """Physics steps with (num_envs, num_joints) joint position targets (rad).
@@ -84,7 +98,7 @@ class Simulator(Protocol):
         Args:
             joint_target: held through all steps.
             num_steps: physics steps.
-            mocap_path: (num_envs, num_steps, num_placed_obstacles, 3) float64, m: where the kinematic bodies are during
+            mocap_path: (num_envs, num_steps, num_placed_obstacles, 3), m: where the kinematic bodies are during
                 each step; None leaves them where they are.
         """
 
@@ -114,6 +128,9 @@ class Simulator(Protocol):
 
     def model_field(self, name: str) -> torch.Tensor:
         """(num_envs, ...) per-environment values of a model field, made per-environment on the first call."""
+
+    def anomalies(self) -> dict[str, float]:
+        """By name, how many environments met a limit of the engine since the last call."""
 
     def state_dict(self) -> dict:
         """Everything that the physics needs to go on exactly."""

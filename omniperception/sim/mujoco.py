@@ -149,6 +149,9 @@ class MujocoSimulator:
     def update_model(self, env_ids: torch.Tensor) -> None:
         self.batch.set_const(env_ids.numpy())
 
+    def anomalies(self) -> dict[str, float]:
+        return {}
+
     def state_dict(self) -> dict:
         """State rows of all simulations and the model fields that differ between them."""
         return {

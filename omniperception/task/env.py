@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from omniperception.lidar import DEVICES, Noise
 from omniperception.random import EnvRandom
-from omniperception.sim import MujocoSimulator, SimConfig
+from omniperception.sim import SimConfig, Simulator
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.task.heights import footprint_grid, height_grid, relative_heights
 from omniperception.task.metrics import EpisodeMetrics
@@ -171,7 +171,7 @@ class OmniEnv(VecEnv):
         sensors = {FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT} & fields
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
         late = config.randomization.latency_s is not None
-        self.sim = MujocoSimulator(self.world, config.sim, config.num_envs, record_states=late)
+        self.sim: Simulator = config.sim.build(self.world, config.num_envs, record_states=late)
         self.device = self.sim.device
         self.random = EnvRandom(config.seed, config.num_envs, self.device)
         self.command = config.commands.build(config.num_envs, self.device, self.random)
@@ -443,7 +443,7 @@ class OmniEnv(VecEnv):
         self.randomizer.reset(env_ids)
         if self._past is not None:
             for past, now in zip(self._past, (qpos, qvel), strict=True):
-                past[env_ids] = now.double()[:, None]
+                past[env_ids] = now.to(past.dtype)[:, None]
         self.command.reset(env_ids, Kinematics.of(self.sim.qpos, self.sim.qvel))
         if self.obstacles is not None:
             commanded = rotate_yaw(pose[:, 2], self.command.value[env_ids, :2])
@@ -487,7 +487,7 @@ class OmniEnv(VecEnv):
         if self.obstacles is not None and self.config.initial_obstacle_level is None:
             seconds = self.config.log_interval * self.control_dt
             self.obstacles.raise_level(self.metrics.free_velocity_error(), seconds)
-        log = self.metrics.drain()
+        log = self.metrics.drain() | {f"Anomalies/{name}": count for name, count in self.sim.anomalies().items()}
         if self.obstacles is not None:
             log["Metrics/obstacle_level"] = self.obstacles.level
         if self.ground is not None:

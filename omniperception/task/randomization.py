@@ -10,9 +10,11 @@ import torch
 from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.random import EnvRandom
 from omniperception.sim import Simulator
-from omniperception.world.terrain import contact_solref
+from omniperception.world.terrain import contact_solrefs
 
 Range = Sequence[float] | None
+_SCALED = ("actuator_gainprm", "actuator_biasprm", "body_ipos")
+"""Model fields that are changed relative to their nominal values."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,9 @@ class Randomizer:
         self._base = sim.world.base_body
         self._ground = model.geom("ground").id
         self._mass = any(getattr(config, n) for n in ("added_mass", "payload_mass", "com_x", "com_y", "com_z"))
+        nominal = {"opt.gravity": model.opt.gravity} | {name: getattr(model, name) for name in _SCALED}
+        self._nominal = {name: torch.tensor(value, device=sim.device) for name, value in nominal.items()}
+        self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
         self.joint_offset: torch.Tensor | None = None
         """(num_envs, num_joints) rad added to the joint targets; None when not randomized."""
         self.delay: torch.Tensor | None = None
@@ -106,15 +111,15 @@ class Randomizer:
         """Draws new parameters for some environments."""
         config = self.config
         if config.ground_friction:
-            self._sim.model_field("geom_friction")[env_ids, self._ground, 0] = self._draw(env_ids, "ground_friction")
+            self._write("geom_friction", (env_ids, self._ground, 0), self._draw(env_ids, "ground_friction"))
         if config.ground_restitution:
-            solref = [contact_solref(float(e)) for e in self._draw(env_ids, "ground_restitution")]
-            self._sim.model_field("geom_solref")[env_ids, self._ground] = torch.tensor(solref, dtype=torch.float64)
+            solref = contact_solrefs(self._draw(env_ids, "ground_restitution"))
+            self._write("geom_solref", (env_ids, self._ground), solref)
         if config.motor_strength:
             self._scale_motors(env_ids)
         if config.gravity_offset:
-            nominal = torch.as_tensor(self._model.opt.gravity)
-            self._sim.model_field("opt.gravity")[env_ids] = nominal + self._draw(env_ids, "gravity_offset", (3,))
+            offset = self._draw(env_ids, "gravity_offset", (3,))
+            self._write("opt.gravity", env_ids, self._nominal["opt.gravity"] + offset)
         if self.joint_offset is not None:
             self.joint_offset[env_ids] = self._draw(env_ids, "joint_offset", self.joint_offset.shape[1:]).float()
         if self.delay is not None:
@@ -132,6 +137,11 @@ class Randomizer:
             if mine is not None:
                 mine.copy_(saved)
 
+    def _write(self, field: str, index: object, values: torch.Tensor) -> None:
+        """Writes float64 values into a model field in the engine's precision."""
+        target = self._sim.model_field(field)
+        target[index] = values.to(target.dtype)
+
     def _draw(self, env_ids: torch.Tensor, name: str, shape: Sequence[int] = ()) -> torch.Tensor:
         low, high = getattr(self.config, name)
         return self._random.range(env_ids, low, high, tuple(shape)).double()
@@ -143,12 +153,8 @@ class Randomizer:
 
     def _scale_motors(self, env_ids: torch.Tensor) -> None:
         scale = self._draw(env_ids, "motor_strength", (self._model.nu, 1))
-        gain, bias = (
-            torch.as_tensor(self._model.actuator_gainprm),
-            torch.as_tensor(self._model.actuator_biasprm),
-        )
-        self._sim.model_field("actuator_gainprm")[env_ids] = gain * scale
-        self._sim.model_field("actuator_biasprm")[env_ids] = bias * scale
+        for name in ("actuator_gainprm", "actuator_biasprm"):
+            self._write(name, env_ids, self._nominal[name] * scale)
 
     def _set_masses(self, env_ids: torch.Tensor) -> None:
         """Mass and centre of mass of base, added mass and payload together; the base's inertia stays nominal."""
@@ -156,10 +162,9 @@ class Randomizer:
         body = base_mass + self._draw_or_zero(env_ids, "added_mass")
         payload = self._draw_or_zero(env_ids, "payload_mass")
         offset = torch.stack([self._draw_or_zero(env_ids, name) for name in ("com_x", "com_y", "com_z")], 1)
-        centre = torch.as_tensor(self._model.body_ipos[self._base]) + offset
-        position = torch.tensor(self.config.payload_position, dtype=torch.float64, device=env_ids.device)
+        centre = self._nominal["body_ipos"][self._base] + offset
         total = body + payload
-        self._sim.model_field("body_mass")[env_ids, self._base] = total
-        combined = (body[:, None] * centre + payload[:, None] * position) / total[:, None]
-        self._sim.model_field("body_ipos")[env_ids, self._base] = combined
+        self._write("body_mass", (env_ids, self._base), total)
+        combined = (body[:, None] * centre + payload[:, None] * self._payload_position) / total[:, None]
+        self._write("body_ipos", (env_ids, self._base), combined)
         self._sim.update_model(env_ids)

@@ -31,7 +31,7 @@ class Ground:
         Args:
             config: the terrain that is in the model.
             model: the compiled model.
-            pos_w: (num_envs, 3) float64, the simulator's own position (m) of the ground's body; written here.
+            pos_w: (num_envs, 3), the simulator's own position (m) of the ground's body; written here.
         """
         self.config, self.kinds = config, config.column_kinds()
         geom = model.geom(GROUND)
@@ -41,7 +41,7 @@ class Ground:
         data = torch.as_tensor(model.hfield_data[first : first + self._rows * self._cols]).double()
         device = pos_w.device
         self._heights = (data * scale + float(geom.pos[2])).float().to(device)
-        self._half = torch.tensor(model.hfield_size[field, :2], dtype=torch.float64, device=device)
+        self._half = torch.tensor(model.hfield_size[field, :2], dtype=pos_w.dtype, device=device)
         self._last = torch.tensor([self._cols - 2, self._rows - 2], device=device)
         self._pos_w = pos_w
         num_envs = pos_w.shape[0]
@@ -60,7 +60,7 @@ class Ground:
         height = self._heights[middle[:, 1] * self._cols + middle[:, 0]]
         self._middle[env_ids], self._middle_height[env_ids] = middle, height
         self._pos_w[env_ids, :2] = self._half - middle * self.config.cell
-        self._pos_w[env_ids, 2] = -height.double()
+        self._pos_w[env_ids, 2] = -height.to(self._pos_w.dtype)
 
     def height(self, xy_w: torch.Tensor, env_ids: torch.Tensor | None = None) -> torch.Tensor:
         """Heights (n, ...) in m of the ground below points (n, ..., 2) in the frames of environments (n,), or of all.

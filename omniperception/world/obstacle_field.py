@@ -24,11 +24,12 @@ class ObstacleField:
     """Places and moves the kinematic obstacles of all environments.
 
     Attributes:
-        pos_w: (num_envs, num_placed, 3) float64, m, environment frame; the simulator's own kinematic positions.
-        quat_w: (num_envs, num_placed, 4) float64; the simulator's own kinematic orientations.
-        velocity_w: (num_envs, num_placed, 2) float64, m/s.
+        pos_w: (num_envs, num_placed, 3) m, environment frame; the simulator's own kinematic positions, whose precision
+            everything here has.
+        quat_w: (num_envs, num_placed, 4); the simulator's own kinematic orientations.
+        velocity_w: (num_envs, num_placed, 2) m/s.
         active: (num_envs, num_placed) bool: whether an obstacle takes part in the current episode.
-        radius: (num_placed,) float64, m, of the circle around the footprint.
+        radius: (num_placed,) m, of the circle around the footprint.
         approaches: (num_placed,) bool: which obstacles come at the robot.
         any_approaches: whether some do, and `start_anew` has to be called.
         level: share of obstacles and of their speed that the curriculum lets in, 0 to 1.
@@ -47,9 +48,10 @@ class ObstacleField:
         self.pos_w, self.quat_w = pos_w, quat_w
         self._random = random
         slots, device = config.placed_slots(), pos_w.device
+        self._dtype = pos_w.dtype
 
         def column(*values: float | tuple[float, ...]) -> torch.Tensor:
-            return torch.tensor(values, dtype=torch.float64, device=device)
+            return torch.tensor(values, dtype=self._dtype, device=device)
 
         groups = [slot.group for slot in slots]
         self.radius = column(*(slot.radius for slot in slots))
@@ -66,12 +68,12 @@ class ObstacleField:
         self.any_approaches = bool(self.approaches.any())
         self._any_moves = any(_moves(slot) for slot in slots)
         self._stands = torch.tensor([not _moves(slot) for slot in slots], device=device)
-        self.velocity_w = torch.zeros(pos_w.shape[0], len(slots), 2, dtype=torch.float64, device=device)
+        self.velocity_w = torch.zeros(pos_w.shape[0], len(slots), 2, dtype=self._dtype, device=device)
         self.active = torch.zeros(pos_w.shape[0], len(slots), dtype=torch.bool, device=device)
         self.level = 1.0 if config.curriculum is None else 0.0
         self._all_envs = torch.arange(pos_w.shape[0], device=device)
         followers = pos_w.shape[:2] if ground is not None else (0,)
-        self._above_ground = torch.zeros(followers, dtype=torch.float64, device=device)
+        self._above_ground = torch.zeros(followers, dtype=self._dtype, device=device)
 
     def reset(
         self,
@@ -88,8 +90,8 @@ class ObstacleField:
             command_w: (n, 2) the velocity (m/s) that it is commanded; None for none.
             goal_w: (n, 2) where it is to go, m; only a free path needs it.
         """
-        robot = robot_xy_w.double()
-        u = self._random.uniform(env_ids, (7, self.pos_w.shape[1])).double()
+        robot = robot_xy_w.to(self._dtype)
+        u = self._random.uniform(env_ids, (7, self.pos_w.shape[1])).to(self._dtype)
         bottom, yaw, heading = (
             _within(bounds, u[:, row]) for row, bounds in ((6, self._bottom), (2, self._yaw), (4, self._heading))
         )
@@ -109,7 +111,7 @@ class ObstacleField:
         zero = torch.zeros_like(yaw)
         self.quat_w[env_ids] = torch.stack(((yaw / 2).cos(), zero, zero, (yaw / 2).sin()), -1)
         if self.any_approaches:
-            command = torch.zeros_like(robot) if command_w is None else command_w.double()
+            command = torch.zeros_like(robot) if command_w is None else command_w.to(self._dtype)
             self._start_approach(env_ids, self.approaches & active, robot, command)
         if self._ground is not None:
             self.pos_w[env_ids, :, 2] = self._over_ground(self.pos_w[env_ids][..., :2], env_ids)
@@ -132,21 +134,22 @@ class ObstacleField:
 
     @property
     def yaw(self) -> torch.Tensor:
-        """(num_envs, num_placed) float64 orientation (rad) about the vertical; obstacles turn about no other axis."""
+        """(num_envs, num_placed) orientation (rad) about the vertical; obstacles turn about no other axis."""
         return 2 * torch.atan2(self.quat_w[..., 3], self.quat_w[..., 0])
 
     def bottom_above_ground(self) -> torch.Tensor:
-        """(num_envs, num_placed) float64 height (m) of the lowest points above the ground below the centres."""
+        """(num_envs, num_placed) height (m) of the lowest points above the ground below the centres."""
         bottom = self.pos_w[..., 2] - self._half_height
         return bottom if self._ground is None else bottom - self._ground.height(self.pos_w[..., :2])
 
     def start_anew(self, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
         """Lets approaching obstacles that have left the robot behind come again; see `reset` for the arguments."""
-        distance = (self.pos_w[..., :2] - robot_xy_w.double()[:, None]).norm(dim=-1)
+        distance = (self.pos_w[..., :2] - robot_xy_w.to(self._dtype)[:, None]).norm(dim=-1)
         gone = self.approaches & self.active & (distance > self._start[:, 1] + LOSE_SIGHT)
         env_ids = gone.any(1).nonzero().flatten()
         if len(env_ids):
-            self._start_approach(env_ids, gone[env_ids], robot_xy_w[env_ids].double(), command_w[env_ids].double())
+            robot, command = (xy[env_ids].to(self._dtype) for xy in (robot_xy_w, command_w))
+            self._start_approach(env_ids, gone[env_ids], robot, command)
 
     def raise_level(self, velocity_error: float, seconds: float) -> None:
         """Raises the curriculum's level while the robot walks well (`velocity_error` in m/s)."""
@@ -199,13 +202,13 @@ class ObstacleField:
         Obstacles choose in turn. Every environment draws equally many random numbers, whatever fits.
         """
         config, count = self.config, self.pos_w.shape[1]
-        u = self._random.uniform(env_ids, (_CANDIDATES * 2, count)).double()
+        u = self._random.uniform(env_ids, (_CANDIDATES * 2, count)).to(self._dtype)
         places = torch.stack([self._in_area(pair, robot) for pair in u.split(2, 1)], 2)  # (n, num_placed, C, 2)
         in_the_way = self._stands & (bottom < config.headroom)
         fits = (places - robot[:, None, None]).norm(dim=-1) - self.radius[:, None] >= config.clearance
         if config.free_path is not None:
-            bends = config.free_path.bend * (2 * self._random.uniform(env_ids, (2,)).double() - 1)
-            off_path = distance_to_path(places, bent_path(robot, goal.double(), bends)) - self.radius[:, None]
+            bends = config.free_path.bend * (2 * self._random.uniform(env_ids, (2,)).to(self._dtype) - 1)
+            off_path = distance_to_path(places, bent_path(robot, goal.to(self._dtype), bends)) - self.radius[:, None]
             fits &= (off_path >= config.free_path.width / 2) | ~in_the_way[..., None]
         xy, found = places[:, :, 0].clone(), self.approaches.repeat(len(robot), 1)
         for k in range(count):
@@ -214,7 +217,7 @@ class ObstacleField:
             counts = (in_the_way[:, :k] & found[:, :k])[:, None] & in_the_way[:, k, None, None]
             free = fits[:, k] & ((gap >= 0) | ~counts).all(-1) if config.spacing else fits[:, k]
             first = free.int().argmax(1)
-            xy[:, k] = places[torch.arange(len(robot)), k, first]
+            xy[:, k] = places[torch.arange(len(robot), device=robot.device), k, first]
             found[:, k] |= free.any(1)
         return xy, found
 
@@ -222,7 +225,7 @@ class ObstacleField:
         self, env_ids: torch.Tensor, which: torch.Tensor, robot: torch.Tensor, command: torch.Tensor
     ) -> None:
         """Puts obstacles `which` (n, num_placed) around the robots (n, 2) on courses that lead past them."""
-        u = self._random.uniform(env_ids, (3, self.pos_w.shape[1])).double()
+        u = self._random.uniform(env_ids, (3, self.pos_w.shape[1])).to(self._dtype)
         bearing = _unit(2 * math.pi * u[:, 0])
         distance = _within(self._start, u[:, 1])
         miss = (2 * u[:, 2] - 1) * self._within
@@ -253,7 +256,7 @@ class ObstacleField:
         xy.copy_(torch.where(below, 2 * self._low - xy, torch.where(above, 2 * self._high - xy, xy)))
 
     def _wrap(self, robot_xy_w: torch.Tensor) -> None:
-        low = self._low + robot_xy_w.double()[:, None]
+        low = self._low + robot_xy_w.to(self._dtype)[:, None]
         xy = self.pos_w[..., :2]
         wrapped = low + torch.remainder(xy - low, self._high - self._low)
         xy.copy_(torch.where(self.approaches[:, None], xy, wrapped))

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import mujoco
+import torch
 
 GROUND = "ground"
 """Name of the ground's geom, and of the body that carries it where it is a height field."""
@@ -63,16 +64,21 @@ def contact_solref(restitution: float) -> tuple[float, float]:
     The stiffness is the same for every restitution: in MuJoCo's other format, (time constant, damping ratio),
     it grows as the damping ratio falls, and a lively contact then gains energy at usual step sizes.
     """
-    return -(_CONTACT_FREQUENCY**2), -2.0 * damping_ratio(restitution) * _CONTACT_FREQUENCY
+    return tuple(contact_solrefs(torch.tensor(restitution, dtype=torch.float64)).tolist())
 
 
-def damping_ratio(restitution: float) -> float:
+def contact_solrefs(restitution: torch.Tensor) -> torch.Tensor:
+    """(..., 2) `contact_solref` of coefficients (...)."""
+    damping = -2.0 * damping_ratio(restitution) * _CONTACT_FREQUENCY
+    return torch.stack((torch.full_like(damping, -(_CONTACT_FREQUENCY**2)), damping), -1)
+
+
+def damping_ratio(restitution: torch.Tensor) -> torch.Tensor:
     """Damping ratio of a contact whose rebound speed is `restitution` times the impact speed.
 
     A linear spring-damper with ratio z rebounds with e = exp(-pi z / sqrt(1 - z^2)), so
     z = -ln(e) / sqrt(pi^2 + ln(e)^2); e = 0 is critical damping.
     """
-    if restitution <= 0:
-        return 1.0
-    log_e = math.log(restitution)
-    return -log_e / math.hypot(math.pi, log_e)
+    log_e = restitution.log()
+    ratio = -log_e / torch.hypot(log_e, torch.full_like(log_e, math.pi))
+    return torch.where(restitution <= 0, 1.0, ratio)

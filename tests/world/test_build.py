@@ -111,7 +111,7 @@ def test_actuators_are_a_pd_law_with_torque_limits(mixed):
 
 @pytest.mark.parametrize(("restitution", "ratio"), [(0.0, 1.0), (1.0, 0.0), (math.exp(-math.pi), 0.7071068)])
 def test_damping_ratio(restitution, ratio):
-    assert damping_ratio(restitution) == pytest.approx(ratio, abs=1e-6)
+    assert damping_ratio(torch.tensor(restitution)).item() == pytest.approx(ratio, abs=1e-6)
 
 
 def rebound(restitution, timestep, speed=1.0, gap=1e-4):

@@ -1,0 +1,374 @@
+"""MuJoCo Warp on a GPU (or, slowly, on a CPU): thousands of worlds in one launch behind the Simulator protocol."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+
+import mujoco
+import torch
+import warp as wp
+
+from omniperception.lidar.launch import wp_device
+from omniperception.sim.base import SimConfig
+from omniperception.sim.mujoco import apply_options
+from omniperception.world import World
+
+_MAX_SPEED = 1e3
+"""A generalised velocity (m/s or rad/s) beyond this is a diverged simulation."""
+_DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
+"""Model fields that the engine derives from masses and inertias."""
+_MASSES = ("body_mass", "body_ipos", "body_inertia")
+_GROUND_CONTACTS = {mujoco.mjtGeom.mjGEOM_SPHERE: 1, mujoco.mjtGeom.mjGEOM_CAPSULE: 2}
+"""Most contacts of a geom with a plane; every other kind has up to _MANY."""
+_MANY = 4
+_OBSTACLES_AT_ONCE = 4
+"""Obstacles that a robot can be pressed against at the same time before capacities have to be raised ..."""
+_PAIRS_PER_OBSTACLE = 8
+"""... and links with which each of them is then in contact."""
+_ROWS_PER_CONTACT = {"pyramidal": 4, "elliptic": 3}
+
+
+@dataclass(frozen=True)
+class MujocoWarpConfig(SimConfig):
+    """Physics settings of `sim=mujoco_warp`.
+
+    Attributes:
+        device: 'auto' (a GPU where there is one), 'cpu', 'cuda' or 'cuda:<index>'. `num_threads` is for LiDAR rays on a
+            CPU; the physics has one thread there.
+        contacts_per_env: contacts for which there is room, on average over all environments; 0: from the scene.
+        rows_per_env: constraint rows for which every environment has room; 0: from the scene.
+        deterministic: the same bits in every run on a GPU, at a cost; a CPU always gives them.
+    """
+
+    device: str = "auto"
+    contacts_per_env: int = 0
+    rows_per_env: int = 0
+    deterministic: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("contacts_per_env", "rows_per_env"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"sim.{name}={getattr(self, name)} must be 0 (from the scene) or a positive number")
+        kind, _, index = self.device.partition(":")
+        if kind not in ("auto", "cpu", "cuda") or (index and not (kind == "cuda" and index.isdigit())):
+            raise ValueError(f"sim.device={self.device} is unknown; use auto, cpu, cuda or cuda:<index>")
+        if kind == "cuda" and not torch.cuda.is_available():
+            raise ValueError(f"sim.device={self.device} needs a GPU that PyTorch can use; use sim.device=cpu")
+
+    @property
+    def torch_device(self) -> torch.device:
+        if self.device == "auto":
+            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device(self.device)
+
+    def build(self, world: World, num_envs: int, record_states: bool = False) -> MujocoWarpSimulator:
+        return MujocoWarpSimulator(world, self, num_envs, record_states)
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Room for what a scene can need at once.
+
+    Attributes:
+        contacts: contacts and pairs of near geoms per environment; all environments share the sum.
+        convex: pairs per environment that only the general convex search can tell apart; shared likewise.
+        rows: constraint rows of each environment.
+    """
+
+    contacts: int
+    convex: int
+    rows: int
+
+    @classmethod
+    def of(cls, world: World, config: MujocoWarpConfig) -> Capacity:
+        """What is configured, else for a robot that lies on all of its geoms, pressed against a few obstacles."""
+        model = world.model
+        robot = [k for k in range(model.ngeom) if model.geom_conaffinity[k]]
+        tiled = world.ground_mocap is not None
+        ground = sum(_MANY if tiled else _GROUND_CONTACTS.get(int(model.geom_type[k]), _MANY) for k in robot)
+        pairs = _PAIRS_PER_OBSTACLE * min(len(world.obstacles.placed_slots()), _OBSTACLES_AT_ONCE)
+        contacts = config.contacts_per_env or ground + _MANY * pairs
+        limits = int(model.jnt_limited.sum()) + int((model.dof_frictionloss > 0).sum())
+        rows = config.rows_per_env or limits + _ROWS_PER_CONTACT[config.cone] * contacts
+        convex = max((len(robot) if tiled else 0) + pairs, 1)
+        return cls(contacts, min(convex, contacts), rows)
+
+
+class MujocoWarpSimulator:
+    """`num_envs` worlds on one device; every tensor is a view of the engine's own float32 memory.
+
+    A call of `step` is one CUDA graph on a GPU: the obstacles' way, the physics steps and the recording of what
+    somebody reads after each of them. Nothing here waits for the device but `anomalies`, `state_dict` and
+    `load_state_dict`.
+
+    Attributes:
+        capacity: the room that was made for contacts and constraints; `anomalies` tells when it was too small.
+        overflow: (num_envs,) int32: bits of what did not fit since the last call of `anomalies`.
+    """
+
+    def __init__(self, world: World, config: MujocoWarpConfig, num_envs: int, record_states: bool = False) -> None:
+        self._engine = engine = _load_engine()
+        self.world, self.config, self.num_envs = world, config, num_envs
+        self.device = config.torch_device
+        self._wp_device = wp_device(self.device)
+        apply_options(world.model, config)
+        model = _supported(world.model)
+        self.capacity = room = Capacity.of(world, config)
+        with wp.ScopedDevice(self._wp_device):
+            self.model = engine.put_model(model)
+            self.data = engine.make_data(
+                model,
+                num_envs,
+                nconmax=room.contacts,
+                nccdmax=room.convex,
+                njmax=room.rows,
+            )
+        self.model.opt.warn_overflow = 0  # reported by `anomalies` instead of printed by every thread
+        if config.deterministic:
+            self.model.opt.deterministic = int(engine.DeterminismType.ALL)
+        data = self.data
+        self.qpos, self.qvel, self._ctrl = (wp.to_torch(array) for array in (data.qpos, data.qvel, data.ctrl))
+        self.mocap_pos, self.mocap_quat = wp.to_torch(data.mocap_pos), wp.to_torch(data.mocap_quat)
+        self.ground_pos: torch.Tensor | None = None
+        if world.ground_mocap is not None:
+            self.ground_pos = self.mocap_pos[:, 0]
+            self.mocap_pos, self.mocap_quat = self.mocap_pos[:, 1:], self.mocap_quat[:, 1:]
+        self.failed = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
+        self.overflow = wp.to_torch(data.overflow)
+        self._torque = wp.to_torch(data.actuator_force)
+        self._forgotten = (wp.to_torch(data.qacc_warmstart), self._ctrl, self._torque)
+        self._pos, self._quat = wp.to_torch(data.xpos), wp.to_torch(data.xquat)
+        self._geom_pos, self._geom_mat = wp.to_torch(data.geom_xpos), wp.to_torch(data.geom_xmat)
+        recorded = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
+        self._recorded: tuple[str, ...] = recorded
+        self._fields: dict[str, torch.Tensor] = {}
+        self._indices: dict[tuple[int, ...], torch.Tensor] = {}
+        self._graphs: dict[str, wp.Graph | None] = {}
+        self._allocate_steps(1)
+
+    @property
+    def qpos_steps(self) -> torch.Tensor:
+        return self._records["qpos"]
+
+    @property
+    def qvel_steps(self) -> torch.Tensor:
+        return self._records["qvel"]
+
+    def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
+        if num_steps != self._num_steps:
+            self._allocate_steps(num_steps)
+        self._ctrl.copy_(joint_target)
+        if mocap_path is None:
+            self._launch("steps", self._steps)
+        else:
+            self._path.copy_(mocap_path)
+            self._launch("steps along the path", self._steps_along_path)
+
+    def detect_failures(self) -> None:
+        """Marks simulations whose state is no longer finite or faster than anything physical."""
+        speed = self.qvel.abs().amax(dim=1)
+        finite = (speed < _MAX_SPEED) & torch.isfinite(self.qpos.sum(dim=1))
+        self.failed |= ~finite
+
+    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        self.qpos[env_ids] = qpos.float()
+        self.qvel[env_ids] = qvel.float()
+        self.failed[env_ids] = False
+        for values in (*self._forgotten, *self._records.values()):
+            values[env_ids] = 0.0
+
+    def joint_torque(self) -> torch.Tensor:
+        return self._torque.clone()
+
+    def contact_sensor(self, kind: str) -> torch.Tensor:
+        return self._records["sensordata"][:, -1, self.world.sensor_slice(kind)].clone()
+
+    def touched(self, kind: str) -> torch.Tensor:
+        return (self._records["sensordata"][:, :, self.world.sensor_slice(kind)] > 0).flatten(1).any(1)
+
+    def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        self._launch("kinematics", self._kinematics)
+        index = self._index(bodies)
+        return self._pos[:, index], self._quat[:, index]
+
+    def geom_poses(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        self._launch("kinematics", self._kinematics)
+        index = self._index(geoms)
+        return self._geom_pos[:, index], self._geom_mat[:, index]
+
+    def model_field(self, name: str) -> torch.Tensor:
+        if name not in self._fields:
+            self._expand(name)
+            if name in _MASSES:
+                for derived in _DERIVED:
+                    self._expand(derived)
+                self.update_model(torch.arange(self.num_envs, device=self.device))
+        return self._fields[name]
+
+    def update_model(self, env_ids: torch.Tensor) -> None:
+        """Derives anew for all worlds, whose other constants come out as they were, in one launch for all."""
+        self._launch("constants", self._constants)
+
+    def anomalies(self) -> dict[str, float]:
+        """Environments for whose contacts or constraints there was no room since the last call; waits for the device.
+
+        A warning names the override that makes room, once.
+        """
+        kinds = self._engine.OverflowType
+        rows = int(kinds.NEFC | kinds.NJMAX_NNZ)
+        contacts = int(kinds.BROADPHASE | kinds.NARROWPHASE | kinds.CCD | kinds.HFIELD | kinds.CONTACT_MATCH)
+        bits = ((self.overflow & rows) != 0, (self.overflow & contacts) != 0)
+        row_count, contact_count = torch.stack(bits).sum(1).tolist()
+        self.overflow.zero_()
+        if row_count:
+            self._warn(f"{row_count} environments had no room for all constraints", "rows_per_env", self.capacity.rows)
+        if contact_count:
+            self._warn(f"{contact_count} environments had no room", "contacts_per_env", self.capacity.contacts)
+        return {"constraint_overflow": row_count, "contact_overflow": contact_count}
+
+    def state_dict(self) -> dict:
+        """What the next step depends on, and the model fields that differ between the worlds."""
+        return {
+            "state": {name: wp.to_torch(getattr(self.data, name)).clone() for name in _STATE},
+            "fields": {name: value.clone() for name, value in self._fields.items()},
+            "failed": self.failed.clone(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        for name, value in state["state"].items():
+            wp.to_torch(getattr(self.data, name)).copy_(value)
+        self.failed.copy_(state["failed"])
+        for name, value in state["fields"].items():
+            self._expand(name)
+            self._fields[name].copy_(value)
+
+    # ---- what runs on the device -------------------------------------------------------------------------------------
+
+    def _steps(self) -> None:
+        for step in range(self._num_steps):
+            self._engine.step(self.model, self.data)
+            self._record(step)
+
+    def _steps_along_path(self) -> None:
+        first = 0 if self.ground_pos is None else 1
+        for step in range(self._num_steps):
+            wp.launch(
+                _move_kinematic,
+                dim=(self.num_envs, self._path.shape[2]),
+                inputs=[step, first, self._wp_path],
+                outputs=[self.data.mocap_pos],
+            )
+            self._engine.step(self.model, self.data)
+            self._record(step)
+
+    def _record(self, step: int) -> None:
+        for name, out in self._wp_records.items():
+            wp.launch(_record, dim=(out.shape[0], out.shape[2]), inputs=[step, getattr(self.data, name)], outputs=[out])
+
+    def _kinematics(self) -> None:
+        self._engine.kinematics(self.model, self.data)
+
+    def _constants(self) -> None:
+        groups = self._engine.SetConstGroup
+        self._engine.set_const(self.model, self.data, groups.FIXED | groups.INERT0, restore=False)
+
+    def _launch(self, name: str, work: Callable[[], None]) -> None:
+        """Runs device work on PyTorch's stream: the first time as it is, which compiles kernels, then as a graph."""
+        if self.device.type != "cuda":
+            with wp.ScopedDevice(self._wp_device):
+                work()
+            return
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
+        if name not in self._graphs:
+            with wp.ScopedStream(stream, sync_enter=False):
+                work()
+            self._graphs[name] = None
+            return
+        if self._graphs[name] is None:
+            self._graphs[name] = self._captured(work)
+        wp.capture_launch(self._graphs[name], stream=stream)
+
+    def _captured(self, work: Callable[[], None]) -> wp.Graph:
+        """A graph of the work, captured on a stream of its own, since PyTorch's default stream cannot be captured."""
+        with (
+            wp.ScopedStream(wp.Stream(self._wp_device), sync_enter=False),
+            wp.ScopedCapture(device=self._wp_device, force_module_load=False) as capture,
+        ):
+            work()
+        return capture.graph
+
+    # ---- memory ------------------------------------------------------------------------------------------------------
+
+    def _allocate_steps(self, num_steps: int) -> None:
+        """Buffers for what goes in and comes out with every physics step of a call."""
+        self._num_steps = num_steps
+        model, kind = self.world.model, {"dtype": torch.float32, "device": self.device}
+        widths = {"sensordata": model.nsensordata, "qpos": model.nq, "qvel": model.nv}
+        self._records = {n: torch.zeros(self.num_envs, num_steps, widths[n], **kind) for n in self._recorded}
+        self._wp_records = {name: wp.from_torch(values) for name, values in self._records.items()}
+        self._path = torch.zeros(self.num_envs, num_steps, self.mocap_pos.shape[1], 3, **kind)
+        self._wp_path = wp.from_torch(self._path, dtype=wp.vec3)
+        self._graphs.clear()
+
+    def _expand(self, name: str) -> None:
+        """Gives every world values of its own of a model field."""
+        if name in self._fields:
+            return
+        *path, last = name.split(".")
+        owner = getattr(self.model, path[0]) if path else self.model
+        shared = getattr(owner, last)
+        values = wp.to_torch(shared)
+        self._fields[name] = values.expand(self.num_envs, *values.shape[1:]).clone()
+        own = wp.from_torch(self._fields[name], dtype=shared.dtype)
+        own._is_batched = True  # as the engine marks its own
+        setattr(owner, last, own)
+        self._graphs.clear()  # they hold the old address
+
+    def _index(self, ids: tuple[int, ...]) -> torch.Tensor:
+        if ids not in self._indices:
+            self._indices[ids] = torch.tensor(ids, device=self.device)
+        return self._indices[ids]
+
+    def _warn(self, what: str, override: str, capacity: int) -> None:
+        message = f"{what}, which are missing in the physics; raise sim.{override} (now {capacity})"
+        warnings.warn(message, RuntimeWarning, stacklevel=3)
+
+
+_STATE = ("qpos", "qvel", "qacc_warmstart", "time", "ctrl", "mocap_pos", "mocap_quat", "actuator_force")
+"""Arrays of the engine's data that the next step, or a reader before it, depends on."""
+
+
+@wp.kernel(enable_backward=False)
+def _move_kinematic(step: int, first: int, path: wp.array3d[wp.vec3], mocap_pos_out: wp.array2d[wp.vec3]):
+    env, body = wp.tid()
+    mocap_pos_out[env, first + body] = path[env, step, body]
+
+
+@wp.kernel(enable_backward=False)
+def _record(step: int, values: wp.array2d[float], out: wp.array3d[float]):
+    env, k = wp.tid()
+    out[env, step, k] = values[env, k]
+
+
+def _load_engine() -> ModuleType:
+    """mujoco_warp, which only this simulator needs."""
+    try:
+        import mujoco_warp
+    except ImportError as error:
+        raise ImportError(
+            f"sim=mujoco_warp needs mujoco-warp ({error.name} is missing): pip install 'omniperception[gpu]', or use"
+            " sim=mujoco"
+        ) from error
+    return mujoco_warp
+
+
+def _supported(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model without the flag that the engine does not know: it never resets a world by itself."""
+    model = copy.copy(model)
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return model
