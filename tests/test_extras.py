@@ -45,7 +45,7 @@ def test_a_missing_library_names_its_extra(monkeypatch, modules, use, extra):
 def test_every_extra_that_is_named_exists():
     texts = [path.read_text() for path in (*CODE, ROOT / "README.md")]
     named = {extra for text in texts for extra in re.findall(r"omniperception\[(\w+)\]", text)}
-    assert {"meshes", "tables", "plots"} <= named <= set(PROJECT["optional-dependencies"])
+    assert {"meshes", "tables", "plots", "gpu"} <= named <= set(PROJECT["optional-dependencies"])
 
 
 def test_only_dependencies_are_imported_before_they_are_used():

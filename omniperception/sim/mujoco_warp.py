@@ -19,16 +19,20 @@ from omniperception.world import World
 
 _MAX_SPEED = 1e3
 """A generalised velocity (m/s or rad/s) beyond this is a diverged simulation."""
+_MAX_DISTANCE = 1e4
+"""So is a generalised position (m or rad) beyond this, where float32 resolves 1 mm."""
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 """Model fields that the engine derives from masses and inertias."""
 _MASSES = ("body_mass", "body_ipos", "body_inertia")
 _GROUND_CONTACTS = {mujoco.mjtGeom.mjGEOM_SPHERE: 1, mujoco.mjtGeom.mjGEOM_CAPSULE: 2}
 """Most contacts of a geom with a plane; every other kind has up to _MANY."""
 _MANY = 4
-_OBSTACLES_AT_ONCE = 4
-"""Obstacles that a robot can be pressed against at the same time before capacities have to be raised ..."""
-_PAIRS_PER_OBSTACLE = 8
-"""... and links with which each of them is then in contact."""
+_OBSTACLES_AT_ONCE = 3
+"""Obstacles that a robot can be pressed against at the same time before capacities have to be raised, ..."""
+_PAIRS_PER_OBSTACLE = 6
+"""... links with which each of them is then in contact, ..."""
+_CONTACTS_PER_PAIR = 2
+"""... and contacts of each of those, on average."""
 _ROWS_PER_CONTACT = {"pyramidal": 4, "elliptic": 3}
 
 
@@ -92,7 +96,7 @@ class Capacity:
         tiled = world.ground_mocap is not None
         ground = sum(_MANY if tiled else _GROUND_CONTACTS.get(int(model.geom_type[k]), _MANY) for k in robot)
         pairs = _PAIRS_PER_OBSTACLE * min(len(world.obstacles.placed_slots()), _OBSTACLES_AT_ONCE)
-        contacts = config.contacts_per_env or ground + _MANY * pairs
+        contacts = config.contacts_per_env or ground + _CONTACTS_PER_PAIR * pairs
         limits = int(model.jnt_limited.sum()) + int((model.dof_frictionloss > 0).sum())
         rows = config.rows_per_env or limits + _ROWS_PER_CONTACT[config.cone] * contacts
         convex = max((len(robot) if tiled else 0) + pairs, 1)
@@ -170,10 +174,9 @@ class MujocoWarpSimulator:
             self._launch("steps along the path", self._steps_along_path)
 
     def detect_failures(self) -> None:
-        """Marks simulations whose state is no longer finite or faster than anything physical."""
-        speed = self.qvel.abs().amax(dim=1)
-        finite = (speed < _MAX_SPEED) & torch.isfinite(self.qpos.sum(dim=1))
-        self.failed |= ~finite
+        """Marks simulations whose state is no longer finite, faster or farther away than anything physical."""
+        speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
+        self.failed |= ~((speed < _MAX_SPEED) & (distance < _MAX_DISTANCE))  # false for what is not a number, too
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self.qpos[env_ids] = qpos.float()

@@ -5,6 +5,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from omniperception.sim import SimConfig
 from omniperception.sim.mujoco import apply_options

@@ -1,0 +1,132 @@
+"""MuJoCo Warp against `mj_step`, its capacities, failures and model fields; on a CPU at small size."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("mujoco_warp")
+
+from omniperception.analysis.step_errors import step_errors
+from omniperception.sim.mujoco_warp import Capacity, MujocoWarpConfig
+from omniperception.world import build_world
+
+
+@pytest.fixture(scope="module")
+def run(make_config):
+    return make_config("obstacles=static")
+
+
+def simulator(run, num_envs=4, sensors=("foot_force", "obstacle_contact"), **settings):
+    world = build_world(run.env.robot, run.env.terrain, run.env.obstacles, sensors)
+    return MujocoWarpConfig(device="cpu", **settings).build(world, num_envs)
+
+
+def stand(sim):
+    joints = torch.tensor(list(sim.world.robot.default_joint_pos.values()))
+    qpos = torch.cat((torch.tensor([0.0, 0.0, 0.33, 1.0, 0.0, 0.0, 0.0]), joints)).repeat(sim.num_envs, 1)
+    sim.mocap_pos[:] = torch.tensor([0.0, 0.0, -100.0])
+    sim.reset(torch.arange(sim.num_envs), qpos, torch.zeros(sim.num_envs, 18))
+    return joints.expand(sim.num_envs, -1)
+
+
+def test_one_step_is_that_of_mj_step(run):
+    """Robots that stand, stumble and lie; measured: 1e-5 rad/s and 1e-7 rad at most, in float32."""
+    errors = step_errors(simulator(run, 24))
+    assert (errors.contacts > 0).mean() > 0.7 and errors.contacts.max() >= 4
+    assert np.median(errors.velocity) < 2e-5
+    assert errors.velocity.max() < 1e-3 and errors.position.max() < 5e-6
+
+
+def test_state_is_the_memory_of_the_engine(run):
+    sim = simulator(run)
+    sim.qpos[2, 7] = 0.25
+    sim.mocap_pos[1, 0, 2] = -3.0
+    assert sim.data.qpos.numpy()[2, 7] == np.float32(0.25) and sim.data.mocap_pos.numpy()[1, 0, 2] == -3.0
+    assert sim.qpos.data_ptr() == sim.data.qpos.ptr
+
+
+@pytest.mark.parametrize("field", ["qpos", "qvel"])
+@pytest.mark.parametrize("value", [float("nan"), 1e12])
+def test_a_broken_state_is_detected_and_stays_alone(run, field, value):
+    healthy, broken = simulator(run), simulator(run)
+    for sim in (healthy, broken):
+        target = stand(sim)
+    getattr(broken, field)[1, 7] = value
+    for sim in (healthy, broken):
+        sim.step(target, 3)
+        sim.detect_failures()
+    assert not healthy.failed.any()
+    assert broken.failed.tolist() == [False, True, False, False]
+    others = [0, 2, 3]
+    assert torch.equal(healthy.qpos[others], broken.qpos[others])
+    for sim in (healthy, broken):
+        stand(sim)
+        assert not sim.failed.any()
+        sim.step(target)
+    assert torch.equal(healthy.qpos, broken.qpos)
+
+
+def test_fields_are_per_world_only_when_asked_for(run):
+    sim = simulator(run)
+    assert sim.model.geom_friction.shape[0] == 1
+    sim.model_field("geom_friction")[1] *= 2
+    assert sim.model.geom_friction.shape[0] == 4 and sim.model.geom_solref.shape[0] == 1
+    first, second = sim.model.geom_friction.numpy()[:2]
+    assert np.array_equal(2 * first, second)
+    np.testing.assert_allclose(first, sim.world.model.geom_friction, rtol=1e-6)
+
+
+def test_masses_bring_what_the_engine_derives_from_them(run):
+    """Inverse weights of one heavier world against `mj_setConst`; those of the others stay."""
+    import mujoco
+
+    sim = simulator(run)
+    base = sim.world.base_body
+    sim.model_field("body_mass")[2, base] += 5.0
+    before = sim.model.body_invweight0.numpy()[[0, 1, 3]]
+    sim.update_model(torch.tensor([2]))
+    model = sim.world.model
+    model.body_mass[base] += 5.0
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    np.testing.assert_allclose(sim.model.body_invweight0.numpy()[2], model.body_invweight0, rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(sim.model.body_subtreemass.numpy()[2, base], model.body_subtreemass[base], rtol=1e-6)
+    assert np.array_equal(sim.model.body_invweight0.numpy()[[0, 1, 3]], before)
+
+
+def test_an_overflow_is_reported_and_names_the_override(run):
+    sim = simulator(run, rows_per_env=10)
+    target = stand(sim)
+    sim.qpos[1:, 2] = 3.0  # only one robot stands
+    sim.step(target, 20)
+    with pytest.warns(RuntimeWarning, match=r"raise sim\.rows_per_env \(now 10\)"):
+        assert sim.anomalies() == {"constraint_overflow": 1, "contact_overflow": 0}
+    assert sim.anomalies() == {"constraint_overflow": 0, "contact_overflow": 0}
+
+
+def test_room_for_a_robot_on_all_of_its_geoms(run):
+    """By hand: 5 spheres x 1, 8 capsules x 2, 5 cylinders and a box x 4; 3 obstacles x 6 links x 2; 12 joint limits."""
+    room = Capacity.of(build_world(run.env.robot, run.env.terrain, run.env.obstacles), MujocoWarpConfig(device="cpu"))
+    assert room.contacts == 5 + 16 + 24 + 36
+    assert room.rows == 12 + 4 * room.contacts
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"device": "tpu"}, r"sim\.device=tpu"),
+        ({"device": "cpu:1"}, r"sim\.device=cpu:1"),
+        ({"rows_per_env": -1}, r"sim\.rows_per_env=-1"),
+        ({"timestep": 0.0}, r"sim\.timestep=0\.0"),
+    ],
+)
+def test_wrong_settings_are_refused(settings, key):
+    with pytest.raises(ValueError, match=key):
+        MujocoWarpConfig(**settings)
+
+
+def test_a_missing_engine_names_its_extra(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
+    with pytest.raises(ImportError, match=r"pip install 'omniperception\[gpu\]'.*sim=mujoco"):
+        simulator(run)

@@ -1,0 +1,151 @@
+"""What both simulators owe the task: the same tests for `sim=mujoco` and `sim=mujoco_warp`."""
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from omniperception.sim import SimConfig
+from omniperception.sim.mujoco_warp import MujocoWarpConfig
+from omniperception.world import build_world
+
+SENSORS = ("foot_force", "obstacle_contact")
+
+
+@pytest.fixture(scope="module", params=["mujoco", "mujoco_warp"])
+def engine(request):
+    if request.param == "mujoco":
+        return SimConfig()
+    pytest.importorskip("mujoco_warp")
+    return MujocoWarpConfig(device="cpu")
+
+
+@pytest.fixture(scope="module")
+def run(make_config):
+    return make_config("obstacles=static")
+
+
+@pytest.fixture
+def sim(run, engine):
+    sim = simulator(run, engine)
+    stand(sim)
+    return sim
+
+
+def simulator(run, engine, num_envs=4):
+    return engine.build(build_world(run.env.robot, run.env.terrain, run.env.obstacles, SENSORS), num_envs)
+
+
+def stand(sim):
+    """Puts every robot into its default pose, obstacles out of reach."""
+    qpos = torch.zeros(sim.num_envs, 19, dtype=torch.float64)
+    qpos[:, 2], qpos[:, 3] = 0.33, 1.0
+    qpos[:, 7:] = default_joints(sim)
+    sim.mocap_pos[:] = torch.tensor([0.0, 0.0, -100.0])
+    sim.mocap_quat[:] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    sim.reset(torch.arange(sim.num_envs), qpos, torch.zeros(sim.num_envs, 18))
+
+
+def default_joints(sim):
+    return torch.tensor(list(sim.world.robot.default_joint_pos.values()), dtype=torch.float64)
+
+
+def targets(sim, seed, steps):
+    generator = torch.Generator().manual_seed(seed)
+    noise = 0.3 * torch.randn(steps, sim.num_envs, 12, generator=generator, dtype=torch.float64)
+    return default_joints(sim) + noise
+
+
+def test_body_poses_are_those_of_the_current_state(sim):
+    sim.step(targets(sim, 1, 1)[0])
+    sim.qpos[1, 0] = 3.0
+    sim.mocap_pos[1, 0] = torch.tensor([1.0, 2.0, 3.0])
+    base, obstacle = sim.world.base_body, sim.world.model.body("obstacle_pillar_0").id
+    calf = sim.world.model.body("RR_calf").id
+    pos, quat = sim.body_poses((base, calf, obstacle))
+    data = mujoco.MjData(sim.world.model)
+    data.qpos[:], data.mocap_pos[:] = sim.qpos[1].double().numpy(), sim.mocap_pos[1].double().numpy()
+    mujoco.mj_kinematics(sim.world.model, data)
+    np.testing.assert_allclose(pos[1].numpy(), data.xpos[[base, calf, obstacle]], atol=1e-6)
+    np.testing.assert_allclose(quat[1].numpy(), data.xquat[[base, calf, obstacle]], atol=1e-6)
+
+
+def test_standing_feet_carry_the_weight(sim):
+    """The reading is what a foot does to the ground: downwards."""
+    target = default_joints(sim).expand(4, -1)
+    total = torch.zeros(4)
+    for step in range(240):
+        sim.step(target)
+        if step >= 200:
+            total += sim.contact_sensor("foot_force").unflatten(1, (4, 3))[..., 2].sum(1) / 40
+    weight = sim.world.model.body_subtreemass[sim.world.base_body] * 9.81
+    assert 140 < weight < 160
+    torch.testing.assert_close(-total, torch.full((4,), weight, dtype=torch.float32), rtol=0.03, atol=0)
+
+
+def test_an_obstacle_in_the_trunk_is_felt_in_its_own_environment_only(sim):
+    sim.mocap_pos[2, 1] = torch.tensor([0.1, 0.0, 0.3])
+    sim.step(default_joints(sim).expand(4, -1))
+    felt = sim.contact_sensor("obstacle_contact") > 0
+    assert felt.nonzero().tolist() == [[2, 1]]
+
+
+def test_reset_of_one_leaves_the_others_bit_identical(run, engine):
+    kept, disturbed = simulator(run, engine), simulator(run, engine)
+    for sim in (kept, disturbed):
+        stand(sim)
+    for step, target in enumerate(targets(kept, 2, 60)):
+        if step == 30:
+            qpos = kept.qpos[1:2] * 0 + kept.qpos[3:4]
+            disturbed.reset(torch.tensor([1]), qpos, torch.ones(1, 18))
+            assert torch.equal(disturbed.qvel[1].double(), torch.ones(18).double())
+            assert (disturbed.contact_sensor("foot_force")[1] == 0).all()
+        kept.step(target)
+        disturbed.step(target)
+    others = [0, 2, 3]
+    assert torch.equal(kept.qpos[others], disturbed.qpos[others])
+    assert torch.equal(kept.qvel[others], disturbed.qvel[others])
+    assert not torch.equal(kept.qpos[1], disturbed.qpos[1])
+
+
+def test_a_reset_forgets_the_past(run, engine):
+    """The same pose and targets give the same motion, whatever happened before (no warm start left over)."""
+    fresh, used = simulator(run, engine), simulator(run, engine)
+    for target in targets(used, 3, 50):
+        used.step(target)
+    for sim in (fresh, used):
+        stand(sim)
+        for target in targets(sim, 4, 30):
+            sim.step(target)
+    assert torch.equal(fresh.qpos, used.qpos)
+
+
+def test_gravity_of_one_environment(sim):
+    """Free fall for one step: v = g dt, and only where gravity was changed."""
+    sim.qpos[:, 2] = 5.0
+    sim.model_field("opt.gravity")[3] = torch.tensor([1.0, 0.0, -8.81], dtype=sim.qpos.dtype)
+    sim.step(default_joints(sim).expand(4, -1))
+    assert sim.qvel[3, :3].tolist() == pytest.approx([0.005, 0.0, -8.81 * 0.005], abs=1e-6)
+    assert sim.qvel[0, :3].tolist() == pytest.approx([0.0, 0.0, -9.81 * 0.005], abs=1e-6)
+
+
+def test_saved_state_goes_on_bit_for_bit(run, engine):
+    whole, resumed = simulator(run, engine), simulator(run, engine)
+    stand(whole)
+    whole.mocap_pos[0, 0] = torch.tensor([0.3, 0.0, 0.2])
+    whole.model_field("body_mass")[1, whole.world.base_body] += 2.0
+    whole.update_model(torch.arange(4))
+    steps = targets(whole, 6, 80)
+    for target in steps[:40]:
+        whole.step(target)
+    state = copy.deepcopy(whole.state_dict())
+    for target in steps[40:]:
+        whole.step(target)
+    resumed.load_state_dict(state)
+    for target in steps[40:]:
+        resumed.step(target)
+    for field in ("qpos", "qvel", "mocap_pos", "mocap_quat"):
+        assert torch.equal(getattr(whole, field), getattr(resumed, field)), field
+    assert torch.equal(whole.contact_sensor("foot_force"), resumed.contact_sensor("foot_force"))
