@@ -153,7 +153,7 @@ class MujocoWarpSimulator:
         self._fields: dict[str, torch.Tensor] = {}
         self._indices: dict[tuple[int, ...], torch.Tensor] = {}
         self._graphs: dict[str, wp.Graph | None] = {}
-        self._allocate_steps(1)
+        self._allocate_steps(config.decimation)
 
     @property
     def qpos_steps(self) -> torch.Tensor:
@@ -307,6 +307,7 @@ class MujocoWarpSimulator:
 
     # ---- memory ------------------------------------------------------------------------------------------------------
 
+    @torch.inference_mode(False)  # what is allocated within a rollout is written outside of one, too
     def _allocate_steps(self, num_steps: int) -> None:
         """Buffers for what goes in and comes out with every physics step of a call."""
         self._num_steps = num_steps
@@ -318,6 +319,7 @@ class MujocoWarpSimulator:
         self._wp_path = wp.from_torch(self._path, dtype=wp.vec3)
         self._graphs.clear()
 
+    @torch.inference_mode(False)
     def _expand(self, name: str) -> None:
         """Gives every world values of its own of a model field."""
         if name in self._fields:

@@ -64,7 +64,7 @@ def contact_solref(restitution: float) -> tuple[float, float]:
     The stiffness is the same for every restitution: in MuJoCo's other format, (time constant, damping ratio),
     it grows as the damping ratio falls, and a lively contact then gains energy at usual step sizes.
     """
-    return tuple(contact_solrefs(torch.tensor(restitution, dtype=torch.float64)).tolist())
+    return tuple(contact_solrefs(torch.tensor(restitution, dtype=torch.float64, device="cpu")).tolist())
 
 
 def contact_solrefs(restitution: torch.Tensor) -> torch.Tensor:
