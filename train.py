@@ -13,28 +13,42 @@ from omegaconf import DictConfig
 
 from omniperception import config
 from omniperception.assembly import build_runner
-from omniperception.learning import CheckpointError, TrainingDiverged, latest_checkpoint, list_checkpoints
+from omniperception.learning import (
+    CheckpointError,
+    TrainingDiverged,
+    distributed,
+    latest_checkpoint,
+    list_checkpoints,
+)
 
 
 def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
-    """Trains a run to its end in `run_dir`."""
+    """Trains a run to its end in `run_dir`; of several processes the first one tells how it goes."""
     runner = build_runner(run, run_dir)
     if resume:
         runner.load(str(latest_checkpoint(run_dir)))
-        print(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
+        tell(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
     else:
-        print(f"run directory: {run_dir}")
+        tell(f"run directory: {run_dir}")
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
-    print(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
+    tell(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
+    distributed.disconnect()
+
+
+def tell(text: str) -> None:
+    if distributed.rank() == 0:
+        print(text)
 
 
 @hydra.main(config_path="conf", config_name="config", version_base="1.3")
 def train(composed: DictConfig) -> None:
     with config.one_line_errors(CheckpointError, TrainingDiverged):
-        run_dir = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
         run = config.assemble(composed)
-        begun = config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir))
-        config.save(run.composed, run_dir)
+        distributed.connect(run.env.sim.torch_device)
+        run_dir = distributed.of_first(Path(os.path.relpath(HydraConfig.get().runtime.output_dir)))
+        begun = distributed.of_first(config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir)))
+        if distributed.rank() == 0:
+            config.save(run.composed, run_dir)
         learn(run, run_dir, resume=begun)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from omniperception.config import ConfigError, RunConfig
-from omniperception.learning import Runner, latest_checkpoint
+from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import runner_config
 from omniperception.learning.memory import check_fits
 from omniperception.task.env import OmniEnv
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
-    """The environment and everything that learns in it, seeded.
+    """The environment and everything that learns in it, seeded; each process of several with a seed of its own.
 
     A setting that only the compiled world can judge, such as a geom's name, is a ConfigError here.
 
@@ -29,6 +29,7 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
         run: the assembled configuration.
         log_dir: where TensorBoard files and checkpoints go; None writes nothing.
     """
+    run = replace(run, env=replace(run.env, seed=run.env.seed + distributed.SEED_STRIDE * distributed.rank()))
     seed_everything(run.env.seed)
     try:
         if run.perception is not None:

@@ -12,6 +12,7 @@ from rsl_rl.extensions import resolve_rnd_config, resolve_symmetry_config
 from rsl_rl.utils import resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 
+from omniperception.learning.distributed import average_gradients
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.storage import PerceptiveStorage
 from omniperception.learning.supervision import PerceptionTrainer
@@ -81,6 +82,8 @@ class PerceptivePpo(PPO):
         alg = alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])
         if perceptive and not actor.end_to_end:
             alg.perception_trainer = PerceptionTrainer(actor, max_grad_norm=alg.max_grad_norm, **cfg["supervision"])
+            parameters = list(actor.perception_parameters())
+            alg.perception_trainer.optimizer.register_step_pre_hook(lambda *_: average_gradients(parameters))
         alg.compile(cfg.get("torch_compile_mode"))
         return alg
 

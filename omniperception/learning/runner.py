@@ -15,6 +15,7 @@ from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
+from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
     CheckpointError,
     checkpoint_path,
@@ -40,6 +41,9 @@ _EVERYTHING = {
 
 class Runner(OnPolicyRunner):
     """rsl_rl's runner with atomic checkpoints, exact resume, a wall-time budget and a compact log.
+
+    Started by torchrun, every process trains in environments of its own and all have the same weights and curriculum.
+    The first one logs and saves; a checkpoint goes on with any number of processes, exactly with the one that saved it.
 
     A resumed run continues exactly (on the CPU bit for bit) if the environment has ``state_dict`` and
     ``load_state_dict`` that cover everything a step depends on, and if ``get_observations`` repeats the
@@ -112,8 +116,9 @@ class Runner(OnPolicyRunner):
             with self._interrupts_noted():
                 for it in range(first, first + num_learning_iterations):
                     obs = self._iterate(it, first, first + num_learning_iterations, obs)
-                    if self._interrupted or self._out_of_time():
-                        self.stop_reason = "interrupted" if self._interrupted else "time budget"
+                    reason = "interrupted" if self._interrupted else "time budget" if self._out_of_time() else ""
+                    if reason := distributed.of_first(reason):
+                        self.stop_reason = reason
                         break
                     if self.current_learning_iteration % self.cfg["save_interval"] == 0:
                         self._save_checkpoint()
@@ -174,7 +179,7 @@ class Runner(OnPolicyRunner):
             self._last_saved = Path(path)
         if parts.get("env") and state["env"] is not None and hasattr(self.env, "load_state_dict"):
             self.env.load_state_dict(state["env"])
-        if parts.get("rng"):
+        if parts.get("rng") and distributed.rank() == 0:  # the others keep exploring in ways of their own
             set_rng_state(state["rng"])
         return state["infos"]
 
@@ -184,9 +189,12 @@ class Runner(OnPolicyRunner):
         with torch.inference_mode():
             for _ in range(self.cfg["num_steps_per_env"]):
                 obs = self._step(obs)
+            self._share_curriculum()
             collected = time.perf_counter()
             self.alg.compute_returns(obs)
         losses = self.alg.update()
+        if self.is_distributed:
+            self.alg.broadcast_parameters()  # running statistics of observations are the first process's
         end = time.perf_counter()
         self.total_time += end - start
         self.current_learning_iteration = it + 1
@@ -202,6 +210,23 @@ class Runner(OnPolicyRunner):
             rnd_weight=self.alg.rnd.weight if self.alg.rnd else None,
         )
         return obs
+
+    def _share_curriculum(self) -> None:
+        """Obstacles come in all processes at once, so that all see LiDAR frames in the same steps."""
+        if self.is_distributed and hasattr(self.env, "curriculum_level"):
+            self.env.curriculum_level = distributed.mean(self.env.curriculum_level, self.device)
+
+    def _configure_multi_gpu(self) -> None:
+        """rsl_rl's, for CPUs, too."""
+        distributed.connect(self.device)
+        self.gpu_world_size, self.is_distributed = distributed.world_size(), distributed.world_size() > 1
+        self.gpu_global_rank, self.gpu_local_rank = distributed.rank(), distributed.local_rank()
+        ranks = {
+            "global_rank": self.gpu_global_rank,
+            "local_rank": self.gpu_local_rank,
+            "world_size": self.gpu_world_size,
+        }
+        self.cfg["multi_gpu"] = ranks if self.is_distributed else None
 
     def _step(self, obs: TensorDict) -> TensorDict:
         """Act, step the environments, store the transition."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,8 +42,8 @@ class MujocoWarpConfig(SimConfig):
     """Physics settings of `sim=mujoco_warp`.
 
     Attributes:
-        device: 'auto' (a GPU where there is one), 'cpu', 'cuda' or 'cuda:<index>'. `num_threads` is for LiDAR rays on a
-            CPU; the physics has one thread there.
+        device: 'auto' (a GPU where there is one), 'cpu', 'cuda' (the GPU of this process's rank) or 'cuda:<index>'.
+            `num_threads` is for LiDAR rays on a CPU; the physics has one thread there.
         contacts_per_env: contacts for which there is room, on average over all environments; 0: from the scene.
         rows_per_env: constraint rows for which every environment has room; 0: from the scene.
         deterministic: the same bits in every run on a GPU, at a cost; a CPU always gives them.
@@ -66,9 +67,12 @@ class MujocoWarpConfig(SimConfig):
 
     @property
     def torch_device(self) -> torch.device:
-        if self.device == "auto":
-            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        return torch.device(self.device)
+        kind = self.device
+        if kind == "auto":
+            kind = "cuda" if torch.cuda.is_available() else "cpu"
+        if kind == "cuda":
+            return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+        return torch.device(kind)
 
     def build(self, world: World, num_envs: int, record_states: bool = False) -> MujocoWarpSimulator:
         return MujocoWarpSimulator(world, self, num_envs, record_states)

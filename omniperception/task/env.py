@@ -241,6 +241,16 @@ class OmniEnv(VecEnv):
             extras["log"] = self._report()
         return self.observations, rewards, done.long(), extras
 
+    @property
+    def curriculum_level(self) -> float:
+        """Share of the obstacles that the curriculum lets in, 0 to 1; 1 where there is none."""
+        return 1.0 if self.obstacles is None else self.obstacles.level
+
+    @curriculum_level.setter
+    def curriculum_level(self, level: float) -> None:
+        if self.obstacles is not None:
+            self.obstacles.level = level
+
     def state_dict(self) -> dict:
         """Everything that a resumed run needs to go on exactly."""
         parts = {name: part.state_dict() for name, part in self._parts().items()}
