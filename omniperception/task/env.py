@@ -10,6 +10,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from omniperception.lidar import DEVICES, Noise
+from omniperception.perception.sector_motion import NEARNESS_RANGE, encode, nothing_near
 from omniperception.random import EnvRandom
 from omniperception.sim import MujocoSimulator, SimConfig
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
@@ -24,7 +25,7 @@ from omniperception.task.state import Kinematics
 from omniperception.task.terminations import TerminationsConfig
 from omniperception.task.terrain_levels import TerrainLevels
 from omniperception.task.timing import StageTimer
-from omniperception.task.true_risk import TrueVelocityRisk
+from omniperception.task.true_sectors import TrueSectors
 from omniperception.world import (
     Ground,
     ObstacleField,
@@ -37,12 +38,9 @@ from omniperception.world import (
 from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 
 HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target", "avoidance_target"
-RISK_TARGET = "risk_target"
-"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector, the
-avoidance velocity, and the risk of candidate velocities."""
-
-NEARNESS_RANGE = 4.0
-"""Distance (m) from which on an obstacle counts as not near at all."""
+MOTION_TARGET = "motion_target"
+"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector of what
+the LiDAR hits, the avoidance velocity, and nearness and velocity of the true obstacles by sector."""
 
 FOOTING = 0.35
 """Nothing of the ground within this distance (m) of the base reaches above the feet when a robot starts."""
@@ -62,6 +60,7 @@ class EnvConfig:
         lidar: the sensor, or None.
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
+        base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with; those named *_TARGET here.
         log_interval: control steps between two reports of the metrics.
         initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
@@ -81,6 +80,7 @@ class EnvConfig:
     lidar: SensorConfig | None = None
     sampler: Callable | None = None
     frame_history: int = 0
+    base_motion: bool = False
     targets: Sequence[str] = ()
     log_interval: int = 24
     initial_obstacle_level: float | None = None
@@ -92,10 +92,10 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
             raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
-        if RISK_TARGET in self.targets and self.rewards.avoidance.risk is None:
+        if MOTION_TARGET in self.targets and self.rewards.avoidance.risk is None:
             raise ValueError(
-                "perception.risk_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
-                " perception.risk_weight=0"
+                "perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
+                " perception.motion_weight=0"
             )
         fixed = [name for name, group in self.obstacles.groups.items() if group.poses is not None]
         if fixed and isinstance(self.terrain, TiledTerrainConfig):
@@ -124,11 +124,16 @@ class EnvConfig:
         fields = self.rewards.fields_read() | self.observations.fields_read()
         if HEIGHT_TARGET in self.targets:
             fields |= {"heights"}
-        if {SECTOR_TARGET, AVOIDANCE_TARGET, RISK_TARGET} & set(self.targets):
+        if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
             fields |= {"sectors"}
         if self.obstacles.num_obstacles:
             fields |= {"obstacle_contact"}
         return fields
+
+    @property
+    def remembered_frames(self) -> int:
+        """LiDAR frames for which an obstacle that was seen counts in the velocity risk: those that the network sees."""
+        return max(self.frame_history, 1)
 
     @property
     def lidar_noise(self) -> tuple[Noise, ...]:
@@ -156,7 +161,9 @@ class OmniEnv(VecEnv):
             below the hips.
         avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from what was near at the newest frame when a
             term reads it, else 0.
-        risk: (num_envs, K) true risk of each candidate velocity at the newest frame; None where V_avoid is the paper's.
+        motion: (num_envs, S, 3) distance (m) and velocity (m/s, yaw-aligned) of the nearest obstacle by sector at the
+            newest frame; None where V_avoid is the paper's.
+        risk: (num_envs, K) true risk of each candidate velocity that follows from it; None when nobody reads it.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -186,8 +193,8 @@ class OmniEnv(VecEnv):
             self.obstacles = ObstacleField(config.obstacles, *poses, self.random, self.ground)
             if config.initial_obstacle_level is not None:
                 self.obstacles.level = config.initial_obstacle_level
+        self.true_sectors = self._build_true_sectors(fields) if config.uses_lidar else None
         self.sensing = self._build_sensing(fields) if config.uses_lidar else None
-        self.true_risk = self._build_true_risk(fields)
         self._allocate()
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self.probes: list[Callable[[], None]] = []  # called in each step before finished environments are reset
@@ -215,8 +222,10 @@ class OmniEnv(VecEnv):
         self._advance_physics(actions)
         with self.timer.stage("state"):
             self._read_state()
-        if self.sensing is not None and self.sensing.due(self.step_count):
-            self._sense()
+        if self.sensing is not None:
+            self.sensing.follow(self.sensed)
+            if self.sensing.due(self.step_count):
+                self._sense()
         if self.ground is not None:
             with self.timer.stage("terrain"):
                 self.terrain_levels.record(self.kinematics, self.command.value)
@@ -252,6 +261,7 @@ class OmniEnv(VecEnv):
             "actions": list(self.actions),
             "past": list(self._past or ()),
             "risk": self.risk,
+            "obstacle_motion": self.motion,
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -270,7 +280,7 @@ class OmniEnv(VecEnv):
             self._groups[name].buffer = buffer
         self._read_state()
         if self.sensing is not None:
-            self.risk = state["risk"]
+            self.risk, self.motion = state["risk"], state["obstacle_motion"]
             self._read_avoidance()
             self._choose_avoidance()
         self.observations = self._collect(dict(state["observations"]))
@@ -361,20 +371,24 @@ class OmniEnv(VecEnv):
         with self.timer.stage("sectors"):
             self.sensing.measure_sectors()
             self._read_avoidance()
-        if self.true_risk is not None:
+        if self.true_sectors is not None:
             with self.timer.stage("risk"):
-                self.risk = self.true_risk.measure(self.kinematics)
+                unseen = self.sensing.unseen
+                known = None if unseen is None else unseen < self.config.remembered_frames
+                self.motion = self.true_sectors.measure(self.kinematics, known)
+                if self.risk is not None:
+                    self.risk = self.config.rewards.avoidance.risk.risk(self.motion, self._candidates)
 
     def _read_avoidance(self) -> None:
         """V_avoid of the paper, which holds from one frame to the next."""
-        if "sectors" in self._reads and self.true_risk is None:
+        if "sectors" in self._reads and self.true_sectors is None:
             self.avoidance_velocity = avoidance_velocity(self.sensing.sector_distance, self.config.rewards.avoidance)
 
     def _choose_avoidance(self) -> None:
         """V_avoid from the risk of velocities, which depends on the command of the moment."""
-        if self.true_risk is not None:
+        if self.risk is not None:
             law, command = self.config.rewards.avoidance.risk, self.command.value[:, :2]
-            self.avoidance_velocity = law.avoidance(self.risk, command, self.true_risk.candidates)
+            self.avoidance_velocity = law.avoidance(self.risk, command, self._candidates)
 
     def _terminate(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Why environments end, each environment for one reason, and whether they do."""
@@ -457,6 +471,8 @@ class OmniEnv(VecEnv):
             self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
             if self.risk is not None:
                 self.risk = self.risk.index_fill(0, env_ids, 0.0)
+            if self.motion is not None:
+                self.motion[env_ids] = nothing_near(1, self.motion.shape[1], self.device)
 
     def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
@@ -479,8 +495,8 @@ class OmniEnv(VecEnv):
             groups[SECTOR_TARGET] = (1.0 - self.sensing.sector_distance / NEARNESS_RANGE).clamp(min=0.0)
         if AVOIDANCE_TARGET in self.config.targets:
             groups[AVOIDANCE_TARGET] = self.avoidance_velocity
-        if RISK_TARGET in self.config.targets:
-            groups[RISK_TARGET] = self.risk
+        if MOTION_TARGET in self.config.targets:
+            groups[MOTION_TARGET] = encode(self.motion).flatten(1)
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:
@@ -524,6 +540,7 @@ class OmniEnv(VecEnv):
             sectors=config.rewards.avoidance.num_sectors if "sectors" in fields else 0,
             sector_max=config.lidar.sensor.max_range,
             rays="rays" in fields,
+            obstacles=self.true_sectors.names if self.true_sectors is not None else (),
         )
         return LidarSensing(
             config.lidar,
@@ -535,13 +552,14 @@ class OmniEnv(VecEnv):
             config.sim.num_threads or None,
             config.sampler() if config.sampler is not None else None,
             config.frame_history,
+            config.base_motion,
         )
 
-    def _build_true_risk(self, fields: frozenset[str]) -> TrueVelocityRisk | None:
-        config, law = self.config, self.config.rewards.avoidance.risk
-        if self.sensing is None or law is None or "sectors" not in fields:
+    def _build_true_sectors(self, fields: frozenset[str]) -> TrueSectors | None:
+        config, avoidance = self.config, self.config.rewards.avoidance
+        if avoidance.risk is None or not ("sectors" in fields or MOTION_TARGET in config.targets):
             return None
-        return TrueVelocityRisk(law, config.obstacles, self.obstacles, self.num_envs, self.device)
+        return TrueSectors(avoidance.num_sectors, config.obstacles, self.obstacles, self.num_envs, self.device)
 
     def _allocate(self) -> None:
         robot, model = self.robot, self.world.model
@@ -555,8 +573,13 @@ class OmniEnv(VecEnv):
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
         self.risk: torch.Tensor | None = None
-        if self.true_risk is not None:
-            self.risk = torch.zeros(self.num_envs, len(self.true_risk.candidates), device=self.device)
+        self.motion: torch.Tensor | None = None
+        if self.true_sectors is not None:
+            law, num_sectors = self.config.rewards.avoidance.risk, self.true_sectors.num_sectors
+            self.motion = nothing_near(self.num_envs, num_sectors, self.device)
+            if "sectors" in self._reads:
+                self._candidates = law.candidates(self.device)
+                self.risk = torch.zeros(self.num_envs, law.num_candidates, device=self.device)
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._past: tuple[torch.Tensor, torch.Tensor] | None = None
         if self.randomizer.delay is not None:
