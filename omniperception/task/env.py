@@ -13,7 +13,7 @@ from omniperception.lidar import DEVICES, Noise
 from omniperception.random import EnvRandom
 from omniperception.sim import MujocoSimulator, SimConfig
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.task.heights import footprint_grid, height_grid, relative_heights
+from omniperception.task.heights import HeightLookup, flat_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
@@ -296,16 +296,11 @@ class OmniEnv(VecEnv):
 
     def _obstacle_path(self) -> torch.Tensor:
         """Moves the obstacles through the control step; where they are during each of its physics steps."""
-        path = []
         if self.obstacles.any_approaches:
             commanded = rotate_yaw(self.kinematics.yaw, self.command.value[:, :2])
             self.obstacles.start_anew(self.sim.qpos[:, :2], commanded)
-        for _ in range(self.config.sim.decimation):
-            self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
-            path.append(self.obstacles.pos_w.clone())
-        path = torch.stack(path, 1)
-        self.obstacles.follow_ground(path)
-        return path
+        sim = self.config.sim
+        return self.obstacles.travel(sim.timestep, sim.decimation, self.sim.qpos[:, :2])
 
     def _read_state(self) -> None:
         self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)
@@ -318,17 +313,16 @@ class OmniEnv(VecEnv):
             self.link_force = self.sim.contact_sensor(LINK_FORCE).unflatten(1, (-1, 3))
         self.base_height = self.kinematics.base_pos_w[:, 2]
         if self.ground is not None:
-            self.base_height = self.base_height - self._ground_heights(self._footprint).mean(1)
+            self._height_lookup.place(self.kinematics)
+            self.base_height = self._height_lookup.base_height()
         if "heights" in self._reads:
-            terrain = 0.0 if self.ground is None else self._ground_heights(self._height_grid)
-            self.heights = relative_heights(self.kinematics.base_pos_w[:, 2], terrain)
+            self._read_heights()
         if "obstacles" in self._reads:
             self._locate_obstacles()
 
-    def _ground_heights(self, grid: torch.Tensor) -> torch.Tensor:
-        """(num_envs, P) heights (m) of the ground at points (P, 2) of the yaw-aligned frame around the base."""
-        points = rotate_yaw(self.kinematics.yaw, grid.expand(self.num_envs, -1, -1))
-        return self.ground.height(points + self.kinematics.base_pos_w[:, None, :2])
+    def _read_heights(self) -> None:
+        flat = self.ground is None
+        self.heights = flat_heights(self.base_height) if flat else self._height_lookup.around()
 
     def _late_kinematics(self) -> Kinematics:
         """The state `delay` physics steps ago, by environment."""
@@ -514,9 +508,10 @@ class OmniEnv(VecEnv):
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _build_ground(self, terrain: TiledTerrainConfig) -> None:
-        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos)
+        threads = self.config.sim.num_threads or None
+        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos, threads)
         self.terrain_levels = TerrainLevels(self.ground, self.random, self.control_dt, self.max_episode_length)
-        self._height_grid, self._footprint = height_grid(self.device), footprint_grid(self.device)
+        self._height_lookup = HeightLookup(self.ground, self.num_envs, self.device)
 
     def _build_sensing(self, fields: frozenset[str]) -> LidarSensing:
         config = self.config
