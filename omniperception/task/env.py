@@ -156,6 +156,8 @@ class OmniEnv(VecEnv):
             below the hips.
         avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from what was near at the newest frame when a
             term reads it, else 0.
+        heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; at the
+            newest frame when a network is supervised with them, and of this moment when a term reads them.
         risk: (num_envs, K) true risk of each candidate velocity at the newest frame; None where V_avoid is the paper's.
     """
 
@@ -168,6 +170,8 @@ class OmniEnv(VecEnv):
         self.timer = StageTimer()
         fields = config.fields_read()
         self._reads = fields
+        observed = "heights" in config.rewards.fields_read() | config.observations.fields_read()
+        self._heights_every_step = observed or ("heights" in fields and not config.uses_lidar)
         sensors = {FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT} & fields
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
         late = config.randomization.latency_s is not None
@@ -195,6 +199,8 @@ class OmniEnv(VecEnv):
         self._all_envs = torch.arange(self.num_envs, device=self.device)
         self._reset(self._all_envs)
         self._read_state()
+        if "heights" in fields:
+            self._read_heights()
         self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
         self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self._sense()
@@ -252,6 +258,7 @@ class OmniEnv(VecEnv):
             "actions": list(self.actions),
             "past": list(self._past or ()),
             "risk": self.risk,
+            "heights": self.heights if "heights" in self._reads else None,
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -273,6 +280,8 @@ class OmniEnv(VecEnv):
             self.risk = state["risk"]
             self._read_avoidance()
             self._choose_avoidance()
+        if "heights" in self._reads and state.get("heights") is not None:
+            self.heights = state["heights"]
         self.observations = self._collect(dict(state["observations"]))
 
     # ---- the parts of a step -----------------------------------------------------------------------------------------
@@ -315,12 +324,13 @@ class OmniEnv(VecEnv):
         if self.ground is not None:
             self._height_lookup.place(self.kinematics)
             self.base_height = self._height_lookup.base_height()
-        if "heights" in self._reads:
+        if self._heights_every_step:
             self._read_heights()
         if "obstacles" in self._reads:
             self._locate_obstacles()
 
     def _read_heights(self) -> None:
+        """Heights of the base above the ground around it, at the latest state that `_read_state` has seen."""
         flat = self.ground is None
         self.heights = flat_heights(self.base_height) if flat else self._height_lookup.around()
 
@@ -355,6 +365,9 @@ class OmniEnv(VecEnv):
         with self.timer.stage("sectors"):
             self.sensing.measure_sectors()
             self._read_avoidance()
+        if "heights" in self._reads and not self._heights_every_step:
+            with self.timer.stage("heights"):
+                self._read_heights()
         if self.true_risk is not None:
             with self.timer.stage("risk"):
                 self.risk = self.true_risk.measure(self.kinematics)

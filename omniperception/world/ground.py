@@ -79,13 +79,14 @@ class Ground:
 
         Beyond its edge the terrain goes on as high as at the edge.
         """
+        if not xy_w.numel():
+            return xy_w.new_zeros(xy_w.shape[:-1])
         points = xy_w.reshape(len(xy_w), -1, 2)
         heights = points.new_empty(points.shape[:2])
-        if len(points):
-            real, vec2 = _REAL[xy_w.dtype]
-            ids = self._all_envs if env_ids is None else env_ids.contiguous()
-            arrays = [view(ids, wp.int64), view(points, vec2), view(heights, real)]
-            self.launch(kernels.heights_kernel(real), arrays, *points.shape[:2])
+        real, vec2 = _REAL[xy_w.dtype]
+        ids = self._all_envs if env_ids is None else env_ids.contiguous()
+        arrays = [view(ids, wp.int64), view(points, vec2), view(heights, real)]
+        self.launch(kernels.heights_kernel(real), arrays, *points.shape[:2])
         return heights.reshape(xy_w.shape[:-1])
 
     def launch(self, kernel: wp.Kernel, inputs: list, num_envs: int, lookups: int) -> None:
