@@ -26,6 +26,7 @@ from mujoco.batch import Batch
 from omniperception import config
 from omniperception.assembly import build_runner, seed_everything
 from omniperception.task.env import OmniEnv
+from omniperception.task.timing import StageTimer
 
 BLOCK = 25
 """Control steps per timed block: a multiple of the LiDAR's period."""
@@ -48,16 +49,16 @@ def bare_physics(env: OmniEnv) -> Callable[[], float]:
     return block
 
 
-def environment_steps(env: OmniEnv) -> Callable[[], float]:
-    """Seconds for a block of `env.step` with random actions."""
+def environment_steps(env: OmniEnv, clock: Callable[[], float] = time.perf_counter) -> Callable[[], float]:
+    """Seconds of a clock for a block of `env.step` with random actions."""
 
     def block() -> float:
         actions = [0.4 * torch.randn(env.num_envs, env.num_actions) for _ in range(BLOCK)]
-        start = time.perf_counter()
+        start = clock()
         with torch.inference_mode():
             for action in actions:
                 env.step(action)
-        return time.perf_counter() - start
+        return clock() - start
 
     return block
 
@@ -90,13 +91,14 @@ def benchmark_step(run: config.RunConfig, repeats: int) -> None:
         print(f"  {stage:<17} {1e6 * seconds / total:8.2f} us per env step")
 
 
-def benchmark_against(runs: list[config.RunConfig], repeats: int) -> None:
+def benchmark_against(runs: list[config.RunConfig], repeats: int, clock: Callable[[], float]) -> None:
     """Time by stage of two tasks, the second the baseline, in alternating blocks."""
     tasks = []
     for run in runs:
         seed_everything(run.env.seed)
         env = OmniEnv(replace(run.env, log_interval=10**9, initial_obstacle_level=1.0))
-        tasks.append((env, environment_steps(env)))
+        env.timer = StageTimer(clock)
+        tasks.append((env, environment_steps(env, clock)))
     for env, steps in tasks:
         steps()
         env.timer.drain()
@@ -140,14 +142,13 @@ def main() -> None:
         run, repeats = config.assemble(config.compose(overrides)), int(own["repeats"])
         if own["what"] not in ("step", "iteration"):
             raise config.ConfigError(f"what={own['what']} must be step or iteration")
-        if own["clock"] not in ("wall", "cpu"):
+        clocks = {"wall": time.perf_counter, "cpu": time.process_time}
+        if own["clock"] not in clocks:
             raise config.ConfigError(f"clock={own['clock']} must be wall or cpu")
         print(f"{run.env.num_envs} environments, {torch.get_num_threads()} torch threads, {' '.join(overrides)}")
-        if own["clock"] == "cpu":
-            time.perf_counter = time.process_time
         if own["against"]:
             baseline = config.assemble(config.compose([*overrides, *own["against"].split(",")]))
-            benchmark_against([run, baseline], repeats)
+            benchmark_against([run, baseline], repeats, clocks[own["clock"]])
         else:
             {"step": benchmark_step, "iteration": benchmark_iteration}[own["what"]](run, repeats)
 
