@@ -14,7 +14,7 @@ from omniperception.perception.sector_motion import NEARNESS_RANGE, encode, noth
 from omniperception.random import EnvRandom
 from omniperception.sim import MujocoSimulator, SimConfig
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.task.heights import footprint_grid, height_grid, relative_heights
+from omniperception.task.heights import HeightLookup, flat_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
@@ -164,6 +164,8 @@ class OmniEnv(VecEnv):
         motion: (num_envs, S, 3) distance (m) and velocity (m/s, yaw-aligned) of the nearest obstacle by sector at the
             newest frame; None where V_avoid is the paper's.
         risk: (num_envs, K) true risk of each candidate velocity that follows from it; None when nobody reads it.
+        heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; at the
+            newest frame when a network is supervised with them, and of this moment when a term reads them.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -175,6 +177,8 @@ class OmniEnv(VecEnv):
         self.timer = StageTimer()
         fields = config.fields_read()
         self._reads = fields
+        observed = "heights" in config.rewards.fields_read() | config.observations.fields_read()
+        self._heights_every_step = observed or ("heights" in fields and not config.uses_lidar)
         sensors = {FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT} & fields
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
         late = config.randomization.latency_s is not None
@@ -202,6 +206,8 @@ class OmniEnv(VecEnv):
         self._all_envs = torch.arange(self.num_envs, device=self.device)
         self._reset(self._all_envs)
         self._read_state()
+        if "heights" in fields:
+            self._read_heights()
         self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
         self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self._sense()
@@ -262,6 +268,7 @@ class OmniEnv(VecEnv):
             "past": list(self._past or ()),
             "risk": self.risk,
             "obstacle_motion": self.motion,
+            "heights": self.heights if "heights" in self._reads else None,
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -283,6 +290,8 @@ class OmniEnv(VecEnv):
             self.risk, self.motion = state["risk"], state["obstacle_motion"]
             self._read_avoidance()
             self._choose_avoidance()
+        if "heights" in self._reads and state.get("heights") is not None:
+            self.heights = state["heights"]
         self.observations = self._collect(dict(state["observations"]))
 
     # ---- the parts of a step -----------------------------------------------------------------------------------------
@@ -306,16 +315,11 @@ class OmniEnv(VecEnv):
 
     def _obstacle_path(self) -> torch.Tensor:
         """Moves the obstacles through the control step; where they are during each of its physics steps."""
-        path = []
         if self.obstacles.any_approaches:
             commanded = rotate_yaw(self.kinematics.yaw, self.command.value[:, :2])
             self.obstacles.start_anew(self.sim.qpos[:, :2], commanded)
-        for _ in range(self.config.sim.decimation):
-            self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
-            path.append(self.obstacles.pos_w.clone())
-        path = torch.stack(path, 1)
-        self.obstacles.follow_ground(path)
-        return path
+        sim = self.config.sim
+        return self.obstacles.travel(sim.timestep, sim.decimation, self.sim.qpos[:, :2])
 
     def _read_state(self) -> None:
         self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)
@@ -328,17 +332,17 @@ class OmniEnv(VecEnv):
             self.link_force = self.sim.contact_sensor(LINK_FORCE).unflatten(1, (-1, 3))
         self.base_height = self.kinematics.base_pos_w[:, 2]
         if self.ground is not None:
-            self.base_height = self.base_height - self._ground_heights(self._footprint).mean(1)
-        if "heights" in self._reads:
-            terrain = 0.0 if self.ground is None else self._ground_heights(self._height_grid)
-            self.heights = relative_heights(self.kinematics.base_pos_w[:, 2], terrain)
+            self._height_lookup.place(self.kinematics)
+            self.base_height = self._height_lookup.base_height()
+        if self._heights_every_step:
+            self._read_heights()
         if "obstacles" in self._reads:
             self._locate_obstacles()
 
-    def _ground_heights(self, grid: torch.Tensor) -> torch.Tensor:
-        """(num_envs, P) heights (m) of the ground at points (P, 2) of the yaw-aligned frame around the base."""
-        points = rotate_yaw(self.kinematics.yaw, grid.expand(self.num_envs, -1, -1))
-        return self.ground.height(points + self.kinematics.base_pos_w[:, None, :2])
+    def _read_heights(self) -> None:
+        """Heights of the base above the ground around it, at the latest state that `_read_state` has seen."""
+        flat = self.ground is None
+        self.heights = flat_heights(self.base_height) if flat else self._height_lookup.around()
 
     def _late_kinematics(self) -> Kinematics:
         """The state `delay` physics steps ago, by environment."""
@@ -371,6 +375,9 @@ class OmniEnv(VecEnv):
         with self.timer.stage("sectors"):
             self.sensing.measure_sectors()
             self._read_avoidance()
+        if "heights" in self._reads and not self._heights_every_step:
+            with self.timer.stage("heights"):
+                self._read_heights()
         if self.true_sectors is not None:
             with self.timer.stage("risk"):
                 unseen = self.sensing.unseen
@@ -530,9 +537,10 @@ class OmniEnv(VecEnv):
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _build_ground(self, terrain: TiledTerrainConfig) -> None:
-        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos)
+        threads = self.config.sim.num_threads or None
+        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos, threads)
         self.terrain_levels = TerrainLevels(self.ground, self.random, self.control_dt, self.max_episode_length)
-        self._height_grid, self._footprint = height_grid(self.device), footprint_grid(self.device)
+        self._height_lookup = HeightLookup(self.ground, self.num_envs, self.device)
 
     def _build_sensing(self, fields: frozenset[str]) -> LidarSensing:
         config = self.config

@@ -1,8 +1,5 @@
 """The blind and the scripted policy: what they see and what they are told."""
 
-import math
-from types import SimpleNamespace
-
 import pytest
 import torch
 
@@ -10,9 +7,7 @@ from omniperception import config
 from omniperception.assembly import build_runner
 from omniperception.evaluation.baselines import covered, steered
 from omniperception.perception import Attitude
-from omniperception.random import EnvRandom
 from omniperception.task.rewards import AvoidanceConfig
-from omniperception.world import ObstacleField, ObstacleGroup, ObstaclesConfig
 
 BLIND = ("experiment=walk", "rewards=walk")
 SEEING = ("experiment=quickstart", "scenario=static", "num_envs=3", "randomization=none")
