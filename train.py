@@ -29,6 +29,8 @@ def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
         runner.load(str(latest_checkpoint(run_dir)))
         tell(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
     else:
+        if run.init is not None:
+            runner.start_from(config.find_run(run.init))
         tell(f"run directory: {run_dir}")
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
     tell(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")

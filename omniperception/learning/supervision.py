@@ -12,6 +12,8 @@ from omniperception.learning.storage import PerceptiveStorage
 class PerceptionTrainer:
     """A few epochs of regression on the rollout's frames, with an optimiser of its own.
 
+    Each frame is compared with the targets of the first control step that sees it, when they were measured.
+
     PPO then sees the embedding as a fixed observation. A supervised network learns with far larger steps than the
     trust region of a policy allows, and PPO's epochs need not pass through it.
 
@@ -30,7 +32,7 @@ class PerceptionTrainer:
         device = torch.device(storage.device)
         for _ in range(self._epochs):
             for env_ids in storage.shuffled_envs(num_mini_batches):
-                observations = storage.observations_of(env_ids)
+                observations = storage.observations_of(env_ids).at_steps(storage.first_steps)
                 if not observations.has_frames:
                     continue
                 with torch.autocast(device.type, dtype=torch.bfloat16, enabled=mixed_precision):

@@ -2,6 +2,7 @@
 
 from omniperception.perception.networks import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
 from omniperception.perception.pd_risknet import CarriedPdRiskNet, PdRiskNet
+from omniperception.perception.rings import RingPath
 from omniperception.perception.sampling import Attitude, FpsSampler, PdSampler, ProximitySampler, RawSampler, Sampler
 from omniperception.perception.velocity_risk import VelocityRisk
 
@@ -17,6 +18,7 @@ __all__ = [
     "PerceptionNetwork",
     "ProximitySampler",
     "RawSampler",
+    "RingPath",
     "Sampler",
     "VelocityRisk",
 ]

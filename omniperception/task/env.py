@@ -10,10 +10,11 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from omniperception.lidar import DEVICES, Noise
+from omniperception.perception.sector_motion import NEARNESS_RANGE, encode, nothing_near
 from omniperception.random import EnvRandom
 from omniperception.sim import SimConfig, Simulator
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.task.heights import footprint_grid, height_grid, relative_heights
+from omniperception.task.heights import HeightLookup, flat_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
@@ -24,7 +25,7 @@ from omniperception.task.state import Kinematics
 from omniperception.task.terminations import TerminationsConfig
 from omniperception.task.terrain_levels import TerrainLevels
 from omniperception.task.timing import StageTimer
-from omniperception.task.true_risk import TrueVelocityRisk
+from omniperception.task.true_sectors import TrueSectors
 from omniperception.world import (
     Ground,
     ObstacleField,
@@ -37,12 +38,9 @@ from omniperception.world import (
 from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 
 HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target", "avoidance_target"
-RISK_TARGET = "risk_target"
-"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector, the
-avoidance velocity, and the risk of candidate velocities."""
-
-NEARNESS_RANGE = 4.0
-"""Distance (m) from which on an obstacle counts as not near at all."""
+MOTION_TARGET = "motion_target"
+"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector of what
+the LiDAR hits, the avoidance velocity, and nearness and velocity of the true obstacles by sector."""
 
 FOOTING = 0.35
 """Nothing of the ground within this distance (m) of the base reaches above the feet when a robot starts."""
@@ -62,6 +60,7 @@ class EnvConfig:
         lidar: the sensor, or None.
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
+        base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with; those named *_TARGET here.
         log_interval: control steps between two reports of the metrics.
         initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
@@ -81,6 +80,7 @@ class EnvConfig:
     lidar: SensorConfig | None = None
     sampler: Callable | None = None
     frame_history: int = 0
+    base_motion: bool = False
     targets: Sequence[str] = ()
     log_interval: int = 24
     initial_obstacle_level: float | None = None
@@ -92,10 +92,10 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
             raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
-        if RISK_TARGET in self.targets and self.rewards.avoidance.risk is None:
+        if MOTION_TARGET in self.targets and self.rewards.avoidance.risk is None:
             raise ValueError(
-                "perception.risk_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
-                " perception.risk_weight=0"
+                "perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
+                " perception.motion_weight=0"
             )
         fixed = [name for name, group in self.obstacles.groups.items() if group.poses is not None]
         if fixed and isinstance(self.terrain, TiledTerrainConfig):
@@ -124,11 +124,16 @@ class EnvConfig:
         fields = self.rewards.fields_read() | self.observations.fields_read()
         if HEIGHT_TARGET in self.targets:
             fields |= {"heights"}
-        if {SECTOR_TARGET, AVOIDANCE_TARGET, RISK_TARGET} & set(self.targets):
+        if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
             fields |= {"sectors"}
         if self.obstacles.num_obstacles:
             fields |= {"obstacle_contact"}
         return fields
+
+    @property
+    def remembered_frames(self) -> int:
+        """LiDAR frames for which an obstacle that was seen counts in the velocity risk: those that the network sees."""
+        return max(self.frame_history, 1)
 
     @property
     def lidar_noise(self) -> tuple[Noise, ...]:
@@ -156,7 +161,11 @@ class OmniEnv(VecEnv):
             below the hips.
         avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from what was near at the newest frame when a
             term reads it, else 0.
-        risk: (num_envs, K) true risk of each candidate velocity at the newest frame; None where V_avoid is the paper's.
+        motion: (num_envs, S, 3) distance (m) and velocity (m/s, yaw-aligned) of the nearest obstacle by sector at the
+            newest frame; None where V_avoid is the paper's.
+        risk: (num_envs, K) true risk of each candidate velocity that follows from it; None when nobody reads it.
+        heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; at the
+            newest frame when a network is supervised with them, and of this moment when a term reads them.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -168,6 +177,8 @@ class OmniEnv(VecEnv):
         self.timer = StageTimer()
         fields = config.fields_read()
         self._reads = fields
+        observed = "heights" in config.rewards.fields_read() | config.observations.fields_read()
+        self._heights_every_step = observed or ("heights" in fields and not config.uses_lidar)
         sensors = {FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT} & fields
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
         late = config.randomization.latency_s is not None
@@ -186,8 +197,8 @@ class OmniEnv(VecEnv):
             self.obstacles = ObstacleField(config.obstacles, *poses, self.random, self.ground)
             if config.initial_obstacle_level is not None:
                 self.obstacles.level = config.initial_obstacle_level
+        self.true_sectors = self._build_true_sectors(fields) if config.uses_lidar else None
         self.sensing = self._build_sensing(fields) if config.uses_lidar else None
-        self.true_risk = self._build_true_risk(fields)
         self._allocate()
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self.probes: list[Callable[[], None]] = []  # called in each step before finished environments are reset
@@ -195,6 +206,8 @@ class OmniEnv(VecEnv):
         self._all_envs = torch.arange(self.num_envs, device=self.device)
         self._reset(self._all_envs)
         self._read_state()
+        if "heights" in fields:
+            self._read_heights()
         self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
         self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self._sense()
@@ -215,8 +228,10 @@ class OmniEnv(VecEnv):
         self._advance_physics(actions)
         with self.timer.stage("state"):
             self._read_state()
-        if self.sensing is not None and self.sensing.due(self.step_count):
-            self._sense()
+        if self.sensing is not None:
+            self.sensing.follow(self.sensed)
+            if self.sensing.due(self.step_count):
+                self._sense()
         if self.ground is not None:
             with self.timer.stage("terrain"):
                 self.terrain_levels.record(self.kinematics, self.command.value)
@@ -262,6 +277,8 @@ class OmniEnv(VecEnv):
             "actions": list(self.actions),
             "past": list(self._past or ()),
             "risk": self.risk,
+            "obstacle_motion": self.motion,
+            "heights": self.heights if "heights" in self._reads else None,
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -280,9 +297,11 @@ class OmniEnv(VecEnv):
             self._groups[name].buffer = buffer
         self._read_state()
         if self.sensing is not None:
-            self.risk = state["risk"]
+            self.risk, self.motion = state["risk"], state["obstacle_motion"]
             self._read_avoidance()
             self._choose_avoidance()
+        if "heights" in self._reads and state.get("heights") is not None:
+            self.heights = state["heights"]
         self.observations = self._collect(dict(state["observations"]))
 
     # ---- the parts of a step -----------------------------------------------------------------------------------------
@@ -306,16 +325,11 @@ class OmniEnv(VecEnv):
 
     def _obstacle_path(self) -> torch.Tensor:
         """Moves the obstacles through the control step; where they are during each of its physics steps."""
-        path = []
         if self.obstacles.any_approaches:
             commanded = rotate_yaw(self.kinematics.yaw, self.command.value[:, :2])
             self.obstacles.start_anew(self.sim.qpos[:, :2], commanded)
-        for _ in range(self.config.sim.decimation):
-            self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
-            path.append(self.obstacles.pos_w.clone())
-        path = torch.stack(path, 1)
-        self.obstacles.follow_ground(path)
-        return path
+        sim = self.config.sim
+        return self.obstacles.travel(sim.timestep, sim.decimation, self.sim.qpos[:, :2])
 
     def _read_state(self) -> None:
         self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)
@@ -328,17 +342,17 @@ class OmniEnv(VecEnv):
             self.link_force = self.sim.contact_sensor(LINK_FORCE).unflatten(1, (-1, 3))
         self.base_height = self.kinematics.base_pos_w[:, 2]
         if self.ground is not None:
-            self.base_height = self.base_height - self._ground_heights(self._footprint).mean(1)
-        if "heights" in self._reads:
-            terrain = 0.0 if self.ground is None else self._ground_heights(self._height_grid)
-            self.heights = relative_heights(self.kinematics.base_pos_w[:, 2], terrain)
+            self._height_lookup.place(self.kinematics)
+            self.base_height = self._height_lookup.base_height()
+        if self._heights_every_step:
+            self._read_heights()
         if "obstacles" in self._reads:
             self._locate_obstacles()
 
-    def _ground_heights(self, grid: torch.Tensor) -> torch.Tensor:
-        """(num_envs, P) heights (m) of the ground at points (P, 2) of the yaw-aligned frame around the base."""
-        points = rotate_yaw(self.kinematics.yaw, grid.expand(self.num_envs, -1, -1))
-        return self.ground.height(points + self.kinematics.base_pos_w[:, None, :2])
+    def _read_heights(self) -> None:
+        """Heights of the base above the ground around it, at the latest state that `_read_state` has seen."""
+        flat = self.ground is None
+        self.heights = flat_heights(self.base_height) if flat else self._height_lookup.around()
 
     def _late_kinematics(self) -> Kinematics:
         """The state `delay` physics steps ago, by environment."""
@@ -371,20 +385,27 @@ class OmniEnv(VecEnv):
         with self.timer.stage("sectors"):
             self.sensing.measure_sectors()
             self._read_avoidance()
-        if self.true_risk is not None:
+        if "heights" in self._reads and not self._heights_every_step:
+            with self.timer.stage("heights"):
+                self._read_heights()
+        if self.true_sectors is not None:
             with self.timer.stage("risk"):
-                self.risk = self.true_risk.measure(self.kinematics)
+                unseen = self.sensing.unseen
+                known = None if unseen is None else unseen < self.config.remembered_frames
+                self.motion = self.true_sectors.measure(self.kinematics, known)
+                if self.risk is not None:
+                    self.risk = self.config.rewards.avoidance.risk.risk(self.motion, self._candidates)
 
     def _read_avoidance(self) -> None:
         """V_avoid of the paper, which holds from one frame to the next."""
-        if "sectors" in self._reads and self.true_risk is None:
+        if "sectors" in self._reads and self.true_sectors is None:
             self.avoidance_velocity = avoidance_velocity(self.sensing.sector_distance, self.config.rewards.avoidance)
 
     def _choose_avoidance(self) -> None:
         """V_avoid from the risk of velocities, which depends on the command of the moment."""
-        if self.true_risk is not None:
+        if self.risk is not None:
             law, command = self.config.rewards.avoidance.risk, self.command.value[:, :2]
-            self.avoidance_velocity = law.avoidance(self.risk, command, self.true_risk.candidates)
+            self.avoidance_velocity = law.avoidance(self.risk, command, self._candidates)
 
     def _terminate(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Why environments end, each environment for one reason, and whether they do."""
@@ -467,6 +488,8 @@ class OmniEnv(VecEnv):
             self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
             if self.risk is not None:
                 self.risk = self.risk.index_fill(0, env_ids, 0.0)
+            if self.motion is not None:
+                self.motion[env_ids] = nothing_near(1, self.motion.shape[1], self.device)
 
     def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
@@ -489,8 +512,8 @@ class OmniEnv(VecEnv):
             groups[SECTOR_TARGET] = (1.0 - self.sensing.sector_distance / NEARNESS_RANGE).clamp(min=0.0)
         if AVOIDANCE_TARGET in self.config.targets:
             groups[AVOIDANCE_TARGET] = self.avoidance_velocity
-        if RISK_TARGET in self.config.targets:
-            groups[RISK_TARGET] = self.risk
+        if MOTION_TARGET in self.config.targets:
+            groups[MOTION_TARGET] = encode(self.motion).flatten(1)
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:
@@ -524,9 +547,10 @@ class OmniEnv(VecEnv):
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _build_ground(self, terrain: TiledTerrainConfig) -> None:
-        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos)
+        threads = self.config.sim.num_threads or None
+        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos, threads)
         self.terrain_levels = TerrainLevels(self.ground, self.random, self.control_dt, self.max_episode_length)
-        self._height_grid, self._footprint = height_grid(self.device), footprint_grid(self.device)
+        self._height_lookup = HeightLookup(self.ground, self.num_envs, self.device)
 
     def _build_sensing(self, fields: frozenset[str]) -> LidarSensing:
         config = self.config
@@ -534,6 +558,7 @@ class OmniEnv(VecEnv):
             sectors=config.rewards.avoidance.num_sectors if "sectors" in fields else 0,
             sector_max=config.lidar.sensor.max_range,
             rays="rays" in fields,
+            obstacles=self.true_sectors.names if self.true_sectors is not None else (),
         )
         return LidarSensing(
             config.lidar,
@@ -545,13 +570,14 @@ class OmniEnv(VecEnv):
             config.sim.num_threads or None,
             config.sampler() if config.sampler is not None else None,
             config.frame_history,
+            config.base_motion,
         )
 
-    def _build_true_risk(self, fields: frozenset[str]) -> TrueVelocityRisk | None:
-        config, law = self.config, self.config.rewards.avoidance.risk
-        if self.sensing is None or law is None or "sectors" not in fields:
+    def _build_true_sectors(self, fields: frozenset[str]) -> TrueSectors | None:
+        config, avoidance = self.config, self.config.rewards.avoidance
+        if avoidance.risk is None or not ("sectors" in fields or MOTION_TARGET in config.targets):
             return None
-        return TrueVelocityRisk(law, config.obstacles, self.obstacles, self.num_envs, self.device)
+        return TrueSectors(avoidance.num_sectors, config.obstacles, self.obstacles, self.num_envs, self.device)
 
     def _allocate(self) -> None:
         robot, model = self.robot, self.world.model
@@ -565,8 +591,13 @@ class OmniEnv(VecEnv):
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
         self.risk: torch.Tensor | None = None
-        if self.true_risk is not None:
-            self.risk = torch.zeros(self.num_envs, len(self.true_risk.candidates), device=self.device)
+        self.motion: torch.Tensor | None = None
+        if self.true_sectors is not None:
+            law, num_sectors = self.config.rewards.avoidance.risk, self.true_sectors.num_sectors
+            self.motion = nothing_near(self.num_envs, num_sectors, self.device)
+            if "sectors" in self._reads:
+                self._candidates = law.candidates(self.device)
+                self.risk = torch.zeros(self.num_envs, law.num_candidates, device=self.device)
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._past: tuple[torch.Tensor, torch.Tensor] | None = None
         if self.randomizer.delay is not None:

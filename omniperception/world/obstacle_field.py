@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 
 import torch
+import warp as wp
 
+from omniperception.perception.launch import view
 from omniperception.random import EnvRandom
 from omniperception.world.ground import Ground
+from omniperception.world.ground_kernels import lift_kernel
 from omniperception.world.obstacles import Obstacle, ObstaclesConfig
 
 PARKED_HEIGHT = -100.0
@@ -16,6 +19,7 @@ LOSE_SIGHT = 1.0
 """How far (m) beyond its farthest start an approaching obstacle gets before it starts anew."""
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PUSH_OFF_TURNS = 16
+_REAL = {torch.float32: (wp.float32, wp.vec3), torch.float64: (wp.float64, wp.vec3d)}
 _CANDIDATES = 48
 """Places drawn for an obstacle that has to keep clear of something; the first that does is taken."""
 
@@ -71,9 +75,9 @@ class ObstacleField:
         self.velocity_w = torch.zeros(pos_w.shape[0], len(slots), 2, dtype=self._dtype, device=device)
         self.active = torch.zeros(pos_w.shape[0], len(slots), dtype=torch.bool, device=device)
         self.level = 1.0 if config.curriculum is None else 0.0
-        self._all_envs = torch.arange(pos_w.shape[0], device=device)
         followers = pos_w.shape[:2] if ground is not None else (0,)
         self._above_ground = torch.zeros(followers, dtype=self._dtype, device=device)
+        self._path = torch.zeros(pos_w.shape[0], 0, len(slots), 3, dtype=self._dtype, device=device)
 
     def reset(
         self,
@@ -126,11 +130,25 @@ class ObstacleField:
         else:
             self._wrap(robot_xy_w)
 
-    def follow_ground(self, path: torch.Tensor) -> None:
-        """Lifts where the obstacles have been, (num_envs, num_steps, num_placed, 3), to the ground; the last is now."""
-        if self._ground is not None:
-            path[..., 2] = self._over_ground(path[..., :2], self._all_envs)
-            self.pos_w.copy_(path[:, -1])
+    def travel(self, dt: float, num_steps: int, robot_xy_w: torch.Tensor) -> torch.Tensor:
+        """Moves every obstacle by `num_steps` steps of `dt` (s); see `advance`.
+
+        Returns:
+            (num_envs, num_steps, num_placed, 3) m, where they are after each step, on the ground; the same memory in
+            every call.
+        """
+        if self._path.shape[1] != num_steps:
+            with torch.inference_mode(False):  # it is written in and out of rollouts
+                self._path = self._path.new_zeros(len(self.pos_w), num_steps, *self.pos_w.shape[1:])
+        for step in range(num_steps):
+            self.advance(dt, robot_xy_w)
+            self._path[:, step] = self.pos_w
+        if self._ground is not None and self._path.numel():
+            real, vec3 = _REAL[self._dtype]
+            arrays = [view(self._above_ground, real), view(self.active, wp.bool), PARKED_HEIGHT, view(self._path, vec3)]
+            self._ground.launch(lift_kernel(real), arrays, len(self.pos_w), num_steps * self.pos_w.shape[1])
+            self.pos_w.copy_(self._path[:, -1])
+        return self._path
 
     @property
     def yaw(self) -> torch.Tensor:
@@ -243,10 +261,9 @@ class ObstacleField:
     # ---- moving ------------------------------------------------------------------------------------------------------
 
     def _over_ground(self, xy: torch.Tensor, env_ids: torch.Tensor) -> torch.Tensor:
-        """Heights (n, ..., num_placed) of the obstacles' centres where they are at (n, ..., num_placed, 2)."""
-        spread = (slice(None),) + (None,) * (xy.dim() - 3)
-        above, active = self._above_ground[env_ids][spread], self.active[env_ids][spread]
-        return torch.where(active, above + self._ground.height(xy, env_ids), PARKED_HEIGHT)
+        """Heights (n, num_placed) of the obstacles' centres where they are at (n, num_placed, 2)."""
+        above = self._above_ground[env_ids] + self._ground.height(xy, env_ids)
+        return torch.where(self.active[env_ids], above, PARKED_HEIGHT)
 
     def _bounce(self) -> None:
         xy, free = self.pos_w[..., :2], self.approaches[:, None]
