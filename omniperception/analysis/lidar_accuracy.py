@@ -110,22 +110,23 @@ def cases() -> list[Case]:
     return [*single, *far, *small, *large, *close, *crowds, *scans]
 
 
-def compare(case: Case, num_rays: int, seed: int, rays_per_scene: int = 10_000) -> Tally:
-    """Casts rays through random scenes of a case with both and counts where they differ."""
+def compare(case: Case, num_rays: int, seed: int, rays_per_scene: int = 10_000, device: str = "cpu") -> Tally:
+    """Casts rays through random scenes of a case with both, ours on `device`, and counts where they differ."""
     rng = np.random.default_rng(seed)
     tally = Tally()
     while tally.rays < num_rays:
         model = random_model(case, rng)
         data = random_state(case, model, rng)
         origins, directions = random_rays(case, model, data, min(rays_per_scene, num_rays - tally.rays), rng)
-        scene = MujocoScene(model)
+        scene = MujocoScene(model, device=device)
         scene.copy_data(data)
         if case.scanned:
             origins[:] = origins[0]
             ranges, shape, directions = scan(scene, origins[0], directions)
         else:
-            hits = scene.cast(torch.from_numpy(origins)[None], torch.from_numpy(directions)[None])
-            ranges, shape = hits.ranges[0].double().numpy(), hits.shape_id[0].numpy()
+            starts, along = (torch.from_numpy(vectors)[None].to(device) for vectors in (origins, directions))
+            hits = scene.cast(starts, along)
+            ranges, shape = hits.ranges[0].cpu().double().numpy(), hits.shape_id[0].cpu().numpy()
         geom = np.where(shape >= 0, np.array([*scene.geom_ids, -1])[shape], -1)
         _count(model, data, origins, directions, ranges, geom, max(TOUCHING_M, TOUCHING * case.scale), tally)
     return tally
@@ -137,10 +138,10 @@ def scan(scene: RayScene, origin: np.ndarray, directions: np.ndarray) -> tuple[n
     pattern = ScanPattern(table, torch.zeros(len(table)), torch.zeros(len(table)), float(len(table)))
     config = LidarConfig(len(table), period_s=1.0, min_range=0.0, max_range=1e6, mount_pos=tuple(origin))
     lidar = Lidar(config, pattern, scene, mount_body=-1, outputs=("ranges", "shape_id", "directions_s"))
-    frame = lidar.cast(torch.zeros(1, dtype=torch.float64))
-    cast = frame.directions_s[0].double().numpy()
+    frame = lidar.cast(torch.zeros(1, dtype=torch.float64, device=scene.device))
+    cast = frame.directions_s[0].cpu().double().numpy()
     lengths = np.linalg.norm(cast, axis=1, keepdims=True)
-    return frame.ranges[0].double().numpy(), frame.shape_id[0].numpy(), cast / lengths
+    return frame.ranges[0].cpu().double().numpy(), frame.shape_id[0].cpu().numpy(), cast / lengths
 
 
 def random_model(case: Case, rng: np.random.Generator) -> mujoco.MjModel:
