@@ -249,6 +249,8 @@ class OmniEnv(VecEnv):
             if len(ids):
                 self._reset(ids)
                 self._read_state()
+                if "heights" in self._reads and not self._heights_every_step:  # the last frame's may not be finite
+                    self.heights = self.heights.index_fill(0, ids, self.robot.base_height)
         with self.timer.stage("observations"):
             self.observations = self._observe()
         extras: dict = {"time_outs": outcomes["time_out"].float()}

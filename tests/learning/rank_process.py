@@ -1,0 +1,35 @@
+"""Run by a test under torchrun: every process learns the toy run in an environment of its own and saves what it has."""
+
+import sys
+
+import numpy as np
+import torch
+from toy_env import SUPERVISED, ToyEnv, config
+
+from omniperception.learning import Runner, distributed, latest_checkpoint, list_checkpoints
+
+if __name__ == "__main__":
+    run_dir, iterations, out, synchronized = sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4]
+    rank = distributed.rank()
+    torch.set_num_threads(1)
+    torch.manual_seed(rank)
+    np.random.seed(rank)
+    env = ToyEnv(seed=rank)
+    env.curriculum_level = 0.25 + 0.5 * rank
+    runner = Runner(env, config(True, SUPERVISED), run_dir)
+    if list_checkpoints(run_dir):
+        runner.load(str(latest_checkpoint(run_dir)))
+    elif synchronized == "once":  # from then on only gradients are exchanged
+        runner.alg.broadcast_parameters()
+        runner.alg.broadcast_parameters = lambda: None
+    runner.learn(iterations)
+    models = {"actor": runner.alg.actor, "critic": runner.alg.critic}
+    ended = {
+        "parameters": {n: dict(m.named_parameters()) for n, m in models.items()},
+        "buffers": {n: dict(m.named_buffers()) for n, m in models.items()},
+        "position": env.position,
+        "level": env.curriculum_level,
+        "iteration": runner.current_learning_iteration,
+    }
+    torch.save(ended, f"{out}/{rank}.pt")
+    distributed.disconnect()
