@@ -286,28 +286,26 @@ class MujocoWarpSimulator:
 
     def _launch(self, name: str, work: Callable[[], None]) -> None:
         """Runs device work on PyTorch's stream: the first time as it is, which compiles kernels, then as a graph."""
-        if self.device.type != "cuda":
-            with wp.ScopedDevice(self._wp_device):
+        with wp.ScopedDevice(self._wp_device):
+            if self.device.type != "cuda":
                 work()
-            return
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        if name not in self._graphs:
-            with wp.ScopedStream(stream, sync_enter=False):
-                work()
-            self._graphs[name] = None
-            return
-        if self._graphs[name] is None:
-            self._graphs[name] = self._captured(work)
-        wp.capture_launch(self._graphs[name], stream=stream)
+                return
+            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
+            if name not in self._graphs:
+                with wp.ScopedStream(stream, sync_enter=False):
+                    work()
+                self._graphs[name] = None
+                return
+            if self._graphs[name] is None:
+                self._graphs[name] = self._captured(work)
+            wp.capture_launch(self._graphs[name], stream=stream)
 
     def _captured(self, work: Callable[[], None]) -> wp.Graph:
         """A graph of the work, captured on a stream of its own, since PyTorch's default stream cannot be captured."""
-        with (
-            wp.ScopedStream(wp.Stream(self._wp_device), sync_enter=False),
-            wp.ScopedCapture(device=self._wp_device, force_module_load=False) as capture,
-        ):
-            work()
-        return capture.graph
+        with wp.ScopedStream(wp.Stream(self._wp_device), sync_enter=False):
+            with wp.ScopedCapture(device=self._wp_device, force_module_load=False) as capture:
+                work()
+            return capture.graph
 
     # ---- memory ------------------------------------------------------------------------------------------------------
 

@@ -70,6 +70,10 @@ def test_body_poses_are_those_of_the_current_state(sim):
     mujoco.mj_kinematics(sim.world.model, data)
     np.testing.assert_allclose(pos[1].numpy(), data.xpos[[base, calf, obstacle]], atol=1e-6)
     np.testing.assert_allclose(quat[1].numpy(), data.xquat[[base, calf, obstacle]], atol=1e-6)
+    foot = sim.world.model.geom("RR_foot").id
+    pos, mat = sim.geom_poses((foot,))
+    np.testing.assert_allclose(pos[1, 0].numpy(), data.geom_xpos[foot], atol=1e-6)
+    np.testing.assert_allclose(mat[1, 0].numpy().ravel(), data.geom_xmat[foot], atol=1e-6)
 
 
 def test_standing_feet_carry_the_weight(sim):
