@@ -25,6 +25,7 @@ from mujoco.batch import Batch
 
 from omniperception import config
 from omniperception.assembly import build_runner, seed_everything
+from omniperception.sim import SimConfig
 from omniperception.task.env import OmniEnv
 from omniperception.task.timing import StageTimer
 
@@ -142,6 +143,8 @@ def main() -> None:
         run, repeats = config.assemble(config.compose(overrides)), int(own["repeats"])
         if own["what"] not in ("step", "iteration"):
             raise config.ConfigError(f"what={own['what']} must be step or iteration")
+        if type(run.env.sim) is not SimConfig:
+            raise config.ConfigError("Batch.step is that of sim=mujoco; another is timed by gpu_check.py only=env")
         clocks = {"wall": time.perf_counter, "cpu": time.process_time}
         if own["clock"] not in clocks:
             raise config.ConfigError(f"clock={own['clock']} must be wall or cpu")
