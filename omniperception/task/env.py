@@ -210,6 +210,8 @@ class OmniEnv(VecEnv):
             self._read_heights()
         self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
         self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if self.sensing is not None:
+            self.sensing.start(self._all_envs, self.sensed)
         self._sense()
         self.observations = self._observe()
 
@@ -249,6 +251,8 @@ class OmniEnv(VecEnv):
             if len(ids):
                 self._reset(ids)
                 self._read_state()
+                if self.sensing is not None:
+                    self.sensing.start(ids, self.sensed)
         with self.timer.stage("observations"):
             self.observations = self._observe()
         extras: dict = {"time_outs": outcomes["time_out"].float()}
