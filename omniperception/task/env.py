@@ -13,7 +13,7 @@ from omniperception.lidar import DEVICES, Noise
 from omniperception.random import EnvRandom
 from omniperception.sim import MujocoSimulator, SimConfig
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.task.heights import HeightLookup, flat_heights
+from omniperception.task.heights import NUM_HEIGHTS, HeightLookup, flat_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
@@ -156,8 +156,8 @@ class OmniEnv(VecEnv):
             below the hips.
         avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from what was near at the newest frame when a
             term reads it, else 0.
-        heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; at the
-            newest frame when a network is supervised with them, and of this moment when a term reads them.
+        heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; of this
+            moment when a term reads them, else, for supervision, at the newest frame, and 0 before the first.
         risk: (num_envs, K) true risk of each candidate velocity at the newest frame; None where V_avoid is the paper's.
     """
 
@@ -199,8 +199,6 @@ class OmniEnv(VecEnv):
         self._all_envs = torch.arange(self.num_envs, device=self.device)
         self._reset(self._all_envs)
         self._read_state()
-        if "heights" in fields:
-            self._read_heights()
         self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
         self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self._sense()
@@ -258,7 +256,7 @@ class OmniEnv(VecEnv):
             "actions": list(self.actions),
             "past": list(self._past or ()),
             "risk": self.risk,
-            "heights": self.heights if "heights" in self._reads else None,
+            "heights": self.heights,
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -280,8 +278,7 @@ class OmniEnv(VecEnv):
             self.risk = state["risk"]
             self._read_avoidance()
             self._choose_avoidance()
-        if "heights" in self._reads and state.get("heights") is not None:
-            self.heights = state["heights"]
+        self.heights = state.get("heights", self.heights)  # older checkpoints have none
         self.observations = self._collect(dict(state["observations"]))
 
     # ---- the parts of a step -----------------------------------------------------------------------------------------
@@ -464,6 +461,8 @@ class OmniEnv(VecEnv):
             self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
             if self.risk is not None:
                 self.risk = self.risk.index_fill(0, env_ids, 0.0)
+            if not self._heights_every_step:
+                self.heights = self.heights.index_fill(0, env_ids, 0.0)
 
     def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
@@ -562,6 +561,7 @@ class OmniEnv(VecEnv):
         self.last_joint_vel = zero
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
+        self.heights = torch.zeros(self.num_envs, NUM_HEIGHTS if "heights" in self._reads else 0, device=self.device)
         self.risk: torch.Tensor | None = None
         if self.true_risk is not None:
             self.risk = torch.zeros(self.num_envs, len(self.true_risk.candidates), device=self.device)
