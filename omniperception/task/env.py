@@ -479,13 +479,10 @@ class OmniEnv(VecEnv):
             self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
             if self.risk is not None:
                 self.risk = self.risk.index_fill(0, env_ids, 0.0)
-<<<<<<< HEAD
             if self.motion is not None:
                 self.motion[env_ids] = nothing_near(1, self.motion.shape[1], self.device)
-=======
             if not self._heights_every_step:
                 self.heights = self.heights.index_fill(0, env_ids, 0.0)
->>>>>>> ground
 
     def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
