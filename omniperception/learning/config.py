@@ -29,6 +29,7 @@ class PerceptionConfig:
         supervised_epochs: passes over each rollout in which the network is trained by supervision alone, while PPO
             takes the embedding as it is; 0, as in the paper: PPO's loss and the supervision together, end to end.
         learning_rate: of those passes.
+        final_learning_rate: what it falls to, linearly, until ppo.max_iterations; None keeps it.
         base_motion: whether a frame's last row says how the base moved since the frame before (x, y, yaw), from the
             state estimator.
         memory_gb: memory (10^9 bytes) that the network may need in training, checked before anything is allocated; None
@@ -44,6 +45,7 @@ class PerceptionConfig:
     motion_weight: float = 0.0
     supervised_epochs: int = 0
     learning_rate: float = 1.0e-3
+    final_learning_rate: float | None = None
     base_motion: bool = False
     memory_gb: float | None = None
 
@@ -62,6 +64,11 @@ class PerceptionConfig:
             )
         if self.learning_rate <= 0:
             raise ValueError(f"perception.learning_rate={self.learning_rate} must be positive")
+        if self.final_learning_rate is not None and not 0 < self.final_learning_rate <= self.learning_rate:
+            raise ValueError(
+                f"perception.final_learning_rate={self.final_learning_rate} must lie in (0, {self.learning_rate}], or"
+                " be null"
+            )
         if self.motion_weight and not self.supervised_epochs:
             raise ValueError(
                 f"perception.motion_weight={self.motion_weight} is learned beside PPO; set"
@@ -198,7 +205,12 @@ def runner_config(
         actor["supervision"] = perception.supervision
         actor["velocity_risk"] = velocity_risk
         actor["end_to_end"] = perception.supervised_epochs == 0
-        supervision = {"epochs": perception.supervised_epochs, "learning_rate": perception.learning_rate}
+        first, last = perception.learning_rate, perception.final_learning_rate
+        supervision = {
+            "epochs": perception.supervised_epochs,
+            "learning_rates": (first, first if last is None else last),
+            "num_updates": ppo.max_iterations,
+        }
     return {
         "num_steps_per_env": ppo.num_steps_per_env,
         "save_interval": ppo.save_interval,

@@ -124,7 +124,9 @@ class PerceptivePpo(PPO):
         """
         if self.perception_trainer is not None:
             acted_on = self._embed_rollout() if self.learns_policy else None
-            self.perception_trainer.train(self.storage, self.num_mini_batches, self.use_mixed_precision)
+            self.perception_trainer.train(
+                self.storage, self.num_updates, self.num_mini_batches, self.use_mixed_precision
+            )
             self.storage.window_features = acted_on
         losses = super().update() if self.learns_policy else self.storage.clear() or {}
         self.num_updates += 1

@@ -77,10 +77,10 @@ def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, 
     places, hit = places.unflatten(2, (-1, shape.num_sectors)), hit.unflatten(2, (-1, shape.num_sectors))
     origin, yaw = _poses(moved)
     fixed = _turned(yaw[:, :, None, None], places) + origin[:, :, None, None]
-    windows = fixed.unfold(1, shape.history, 1).movedim(-1, 2)  # (B, W, H, bands, S, 2)
+    windows = _windows(fixed, shape.history)  # (B, W, H, bands, S, 2)
     newest = slice(shape.history - 1, None)
     here = _turned(-yaw[:, newest, None, None, None], windows - origin[:, newest, None, None, None])
-    hit = hit.unfold(1, shape.history, 1).movedim(-1, 2) & valid_frames(count, shape.history)[..., None, None]
+    hit = _windows(hit, shape.history) & valid_frames(count, shape.history)[..., None, None]
     x, y = here.unbind(-1)
     distance = torch.where(hit, (x * x + y * y).sqrt(), _NOTHING)
     turned = (torch.atan2(y, x) + math.pi) * (shape.num_sectors / (2 * math.pi))
@@ -91,6 +91,12 @@ def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, 
     lateral = torch.zeros_like(distance).scatter_reduce(-1, sector, torch.where(is_nearest, within, 0.0), "sum")
     proximities = [torch.exp(-nearest / decay) for decay in shape.decays]
     return torch.stack((*proximities, _LATERAL * lateral * proximities[-1]), -2).flatten(2, 4)
+
+
+def _windows(frames: torch.Tensor, history: int) -> torch.Tensor:
+    """(B, F, ...) -> (B, F - H + 1, H, ...)."""
+    count = frames.shape[1] - history + 1
+    return torch.stack([frames[:, k : k + count] for k in range(history)], 2)
 
 
 def _poses(moved: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

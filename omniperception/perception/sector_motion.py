@@ -18,7 +18,8 @@ VELOCITY_WEIGHT = 0.3
 
 def sector_bearings(num_sectors: int, device: torch.device | str = "cpu") -> torch.Tensor:
     """Unit vectors (num_sectors, 2) to the sectors' centres in the yaw-aligned frame; sector 0 starts at -pi."""
-    angle = -math.pi + (torch.arange(num_sectors, device=device) + 0.5) * (2 * math.pi / num_sectors)
+    middle = torch.arange(num_sectors, dtype=torch.float32, device=device) + 0.5  # of a type that an exporter keeps
+    angle = -math.pi + middle * (2 * math.pi / num_sectors)
     return torch.stack((angle.cos(), angle.sin()), -1)
 
 

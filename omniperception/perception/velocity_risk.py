@@ -136,17 +136,16 @@ class VelocityRisk:
         least = sector = when = None
         for time in self.times:  # the squared distance is |p|^2 - 2 p.c t + |c t|^2, the middle term a matrix product
             point, goal = place + time * velocity, time * candidates
-            squared, nearest = torch.baddbmm(
-                point.square().sum(-1, keepdim=True), point, (-2.0 * goal.T).expand(len(point), -1, -1)
-            ).min(1)
+            squared, nearest = (point.square().sum(-1, keepdim=True) - 2.0 * point @ goal.T).min(1)
             distance = (squared + goal.square().sum(-1)).clamp(min=0.0).sqrt()
-            exponent = self._exponent(distance, torch.as_tensor(time))
+            now = 0.0 * distance + time  # not full_like, which an exporter takes for a constant
+            exponent = self._exponent(distance, now)
             if least is None:
-                least, sector, when = exponent, nearest, torch.full_like(exponent, time)
+                least, sector, when = exponent, nearest, now
                 continue
             worse = exponent < least
             least, sector = torch.where(worse, exponent, least), torch.where(worse, nearest, sector)
-            when = torch.where(worse, time, when)
+            when = torch.where(worse, now, when)
         return sector, when
 
     def _exponent(self, distance: torch.Tensor, time: torch.Tensor) -> torch.Tensor:

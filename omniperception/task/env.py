@@ -14,7 +14,7 @@ from omniperception.perception.sector_motion import NEARNESS_RANGE, encode, noth
 from omniperception.random import EnvRandom
 from omniperception.sim import SimConfig, Simulator
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.task.heights import HeightLookup, flat_heights
+from omniperception.task.heights import NUM_HEIGHTS, HeightLookup, flat_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
@@ -164,8 +164,8 @@ class OmniEnv(VecEnv):
         motion: (num_envs, S, 3) distance (m) and velocity (m/s, yaw-aligned) of the nearest obstacle by sector at the
             newest frame; None where V_avoid is the paper's.
         risk: (num_envs, K) true risk of each candidate velocity that follows from it; None when nobody reads it.
-        heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; at the
-            newest frame when a network is supervised with them, and of this moment when a term reads them.
+        heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; of this
+            moment when a term reads them, else, for supervision, at the newest frame, and 0 before the first.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -206,10 +206,10 @@ class OmniEnv(VecEnv):
         self._all_envs = torch.arange(self.num_envs, device=self.device)
         self._reset(self._all_envs)
         self._read_state()
-        if "heights" in fields:
-            self._read_heights()
         self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
         self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if self.sensing is not None:
+            self.sensing.start(self._all_envs, self.sensed)
         self._sense()
         self.observations = self._observe()
 
@@ -249,8 +249,8 @@ class OmniEnv(VecEnv):
             if len(ids):
                 self._reset(ids)
                 self._read_state()
-                if "heights" in self._reads and not self._heights_every_step:  # the last frame's may not be finite
-                    self.heights = self.heights.index_fill(0, ids, self.robot.base_height)
+                if self.sensing is not None:
+                    self.sensing.start(ids, self.sensed)
         with self.timer.stage("observations"):
             self.observations = self._observe()
         extras: dict = {"time_outs": outcomes["time_out"].float()}
@@ -280,7 +280,7 @@ class OmniEnv(VecEnv):
             "past": list(self._past or ()),
             "risk": self.risk,
             "obstacle_motion": self.motion,
-            "heights": self.heights if "heights" in self._reads else None,
+            "heights": self.heights,
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -302,8 +302,7 @@ class OmniEnv(VecEnv):
             self.risk, self.motion = state["risk"], state["obstacle_motion"]
             self._read_avoidance()
             self._choose_avoidance()
-        if "heights" in self._reads and state.get("heights") is not None:
-            self.heights = state["heights"]
+        self.heights = state.get("heights", self.heights)  # older checkpoints have none
         self.observations = self._collect(dict(state["observations"]))
 
     # ---- the parts of a step -----------------------------------------------------------------------------------------
@@ -492,6 +491,8 @@ class OmniEnv(VecEnv):
                 self.risk = self.risk.index_fill(0, env_ids, 0.0)
             if self.motion is not None:
                 self.motion[env_ids] = nothing_near(1, self.motion.shape[1], self.device)
+            if not self._heights_every_step:
+                self.heights = self.heights.index_fill(0, env_ids, 0.0)
 
     def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
@@ -592,6 +593,7 @@ class OmniEnv(VecEnv):
         self.last_joint_vel = zero
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
+        self.heights = torch.zeros(self.num_envs, NUM_HEIGHTS if "heights" in self._reads else 0, device=self.device)
         self.risk: torch.Tensor | None = None
         self.motion: torch.Tensor | None = None
         if self.true_sectors is not None:

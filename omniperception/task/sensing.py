@@ -151,6 +151,11 @@ class LidarSensing:
             )  # row 0 is a miss; all other shapes are one more obstacle, which is left out
             self.unseen = torch.full((sim.num_envs, len(needs.obstacles)), NEVER, device=sim.device)
 
+    def start(self, env_ids: torch.Tensor, sensed: Kinematics) -> None:
+        """Notes where the base of some environments starts; call after their reset."""
+        if self.odometry is not None:
+            self.odometry.start(env_ids, sensed)
+
     def follow(self, sensed: Kinematics) -> None:
         """Notes how the base moves; call at every control step."""
         if self.odometry is not None:
@@ -247,8 +252,6 @@ class LidarSensing:
         """Forgets what some environments have seen, and how their bodies moved."""
         self._placed_anew[env_ids] = True
         self.frame_count[env_ids] = 0
-        if self.odometry is not None:
-            self.odometry.reset(env_ids)
         if self.frames is not None:
             self.frames[env_ids] = 0.0
         if self.sector_distance is not None:
