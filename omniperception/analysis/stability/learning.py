@@ -134,9 +134,9 @@ def precision(seed: int = 0, num_envs: int = 16) -> list[Row]:
 def carried_state(steps: int = 10**6, seed: int = 0) -> list[Row]:
     """A carried GRU state after many frames without a reset: bounds, and float32 against float64."""
     generator = torch.Generator().manual_seed(seed)
-    network = CarriedPdRiskNet(num_proximal=4, num_distal=4, proximal_dim=16, distal_dim=36).requires_grad_(False)
+    network = CarriedPdRiskNet(num_proximal=0, num_distal=8, proximal_dim=0, distal_dim=64).requires_grad_(False)
     exact = copy.deepcopy(network).double()
-    state, true = torch.zeros(1, 52), torch.zeros(1, 52, dtype=torch.float64)
+    state, true = torch.zeros(1, 64), torch.zeros(1, 64, dtype=torch.float64)
     rows, done, chunk = [], 0, 1000
     marks = {10**k for k in range(3, 7)} | {steps}
     while done < steps:
