@@ -12,15 +12,15 @@ from collections.abc import Mapping, Sequence
 import torch
 from rsl_rl.utils.logger import Logger
 
-METRICS = "Metrics/"
-"""Keys of ``extras["log"]`` that begin so are shown on the console."""
+METRICS, ANOMALIES = "Metrics/", "Anomalies/"
+"""Keys of ``extras["log"]`` that begin so are shown on the console; anomalies only if there are any."""
 
 
 class CompactLogger(Logger):
     """rsl_rl's logger with TensorBoard only and a single line per iteration.
 
     ``cfg["console_metrics"]`` (names without the prefix "Metrics/") selects and orders what the line shows;
-    all by default.
+    all by default. Anomalies that happened are always shown.
     """
 
     def init_logging_writer(self, first_iteration: int = 0) -> None:
@@ -75,7 +75,10 @@ class CompactLogger(Logger):
         chosen: Sequence[str] | None = self.cfg.get("console_metrics")
         if chosen is not None:
             names = [METRICS + name for name in chosen if METRICS + name in names]
-        return {name.removeprefix(METRICS): _mean(self.ep_extras, name) for name in names}
+        means = {name.removeprefix(METRICS): _mean(self.ep_extras, name) for name in names}
+        keys = dict.fromkeys(key for info in self.ep_extras for key in info if key.startswith(ANOMALIES))
+        anomalies = {key.removeprefix(ANOMALIES): _mean(self.ep_extras, key) for key in keys}
+        return means | {name: count for name, count in anomalies.items() if count > 0}
 
     def _line(self, done: int, total: int, collect: float, learn: float, losses: dict, metrics: dict) -> str:
         steps = self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size

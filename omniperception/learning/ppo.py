@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -36,6 +37,7 @@ class PerceptivePpo(PPO):
         super().__init__(*args, **kwargs)
         self.num_updates = 0
         self.learns_policy = self.num_learning_epochs > 0
+        self._has_gradient: dict[str, bool] = {}
         self.perception_trainer: PerceptionTrainer | None = None
         if type(self.optimizer) is torch.optim.Adam:  # rsl_rl's choice, in one pass over the parameters
             parameters = self.optimizer.param_groups[0]["params"]
@@ -43,6 +45,16 @@ class PerceptivePpo(PPO):
             # It does not mark them as changed, which embeddings that are kept go by.
             self.optimizer.register_step_post_hook(lambda *_: torch.autograd.graph.increment_version(parameters))
         self.optimizer.register_step_pre_hook(lambda *_: self._check_gradients())
+
+    def set_perception_trainer(self, trainer: PerceptionTrainer) -> None:
+        """Lets supervision alone train the perception network, with the same check of its gradients."""
+        self.perception_trainer = trainer
+        network = list(self._raw_actor.perception_parameters())
+
+        def check(*_: object) -> None:
+            self._check_finite("perception network", network)
+
+        trainer.optimizer.register_step_pre_hook(check)
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PerceptivePpo:
@@ -65,6 +77,7 @@ class PerceptivePpo(PPO):
         alg_cfg = resolve_rnd_config(alg_cfg, obs, cfg["obs_groups"], env)
         alg_cfg = resolve_symmetry_config(alg_cfg, env)
 
+        _check_batches(env.num_envs, cfg["num_steps_per_env"], alg_cfg.get("num_mini_batches", 4), perceptive)
         actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
         critic = critic_class(obs, cfg["obs_groups"], "critic", 1, **critic_cfg).to(device)
         groups = {group for names in cfg["obs_groups"].values() for group in names}
@@ -82,9 +95,10 @@ class PerceptivePpo(PPO):
         )
         alg = alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])
         if perceptive and not actor.end_to_end:
-            alg.perception_trainer = PerceptionTrainer(actor, max_grad_norm=alg.max_grad_norm, **cfg["supervision"])
+            trainer = PerceptionTrainer(actor, max_grad_norm=alg.max_grad_norm, **cfg["supervision"])
             parameters = list(actor.perception_parameters())
-            alg.perception_trainer.optimizer.register_step_pre_hook(lambda *_: average_gradients(parameters))
+            trainer.optimizer.register_step_pre_hook(lambda *_: average_gradients(parameters))
+            alg.set_perception_trainer(trainer)
         alg.compile(cfg.get("torch_compile_mode"))
         return alg
 
@@ -128,8 +142,10 @@ class PerceptivePpo(PPO):
                 self.storage, self.num_updates, self.num_mini_batches, self.use_mixed_precision
             )
             self.storage.window_features = acted_on
+        self._has_gradient.clear()
         losses = super().update() if self.learns_policy else self.storage.clear() or {}
         self.num_updates += 1
+        self._check_learning(losses)
         if isinstance(self._raw_actor, PerceptionActor):
             losses |= self._raw_actor.pop_supervised_losses()
         self._check_parameters()
@@ -161,17 +177,41 @@ class PerceptivePpo(PPO):
         return super().load(loaded_dict, load_cfg, strict)
 
     def _check_gradients(self) -> None:
-        for name, model in (("actor", self._raw_actor), ("critic", self._raw_critic)):
-            if not _all_finite([p.grad for p in model.parameters() if p.grad is not None]):
-                raise TrainingDiverged(
-                    f"update {self.num_updates}: the gradient of the {name} is not finite"
-                    f" ({self._diagnosis()}); the weights are those of the last good step"
-                )
+        models = {"actor": self._raw_actor, "critic": self._raw_critic}
+        for name, model in models.items():
+            moved = self._check_finite(name, list(model.parameters())) > 0.0
+            self._has_gradient[name] = self._has_gradient.get(name, False) or moved
+
+    def _check_learning(self, losses: dict[str, float]) -> None:
+        """Stops if no step had a gradient: one whose norm overflows is made 0 where it is clipped.
+
+        In the first step nothing is clipped by PPO, so that the actor has one unless all advantages are 0.
+        """
+        idle = [name for name, moved in self._has_gradient.items() if not moved]
+        if "actor" in idle and not bool(self.storage.advantages.any()):
+            idle.remove("actor")
+        if idle:
+            raise TrainingDiverged(
+                f"update {self.num_updates}: the gradient of the {' and '.join(idle)} overflowed in every step, so that"
+                f" nothing was learnt (value loss {losses['value']:.3g}, rewards up to"
+                f" {float(self.storage.rewards.abs().max()):.3g}); scale the rewards down"
+            )
+
+    def _check_finite(self, name: str, parameters: list[torch.nn.Parameter]) -> float:
+        """The largest norm of a parameter's gradient; one that is not finite stops the training."""
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        finite, largest = _finite_and_largest(gradients)
+        if not finite:
+            raise TrainingDiverged(
+                f"update {self.num_updates}: the gradient of the {name} is not finite"
+                f" ({self._diagnosis()}); the weights are those of the last good step"
+            )
+        return largest
 
     def _check_parameters(self) -> None:
         for name, model in (("actor", self._raw_actor), ("critic", self._raw_critic)):
             tensors = [t for t in (*model.parameters(), *model.buffers()) if t.is_floating_point()]
-            if not _all_finite(tensors):
+            if not _finite_and_largest(tensors)[0]:
                 bad = next(n for n, t in model.state_dict().items() if not torch.isfinite(t).all())
                 raise TrainingDiverged(
                     f"update {self.num_updates}: {name} parameter '{bad}' is not finite ({self._diagnosis()})"
@@ -188,14 +228,56 @@ class PerceptivePpo(PPO):
             finite = torch.isfinite(tensor)
             if not finite.all():
                 return f"{int((~finite).sum())} non-finite numbers in the rollout's {name}"
+        ratio = self._largest_log_ratio()
+        if ratio > _MAX_LOG_RATIO:
+            return (
+                f"rollout finite, an action became exp({ratio:.3g}) times as likely, smallest standard deviation"
+                f" {float(self._raw_actor.output_std.min()):.1e}: lower the learning rate or keep more noise"
+            )
+        name, value = max(((n, float(t.abs().max())) for n, t in stored.items()), key=lambda item: item[1])
+        if value > _HUGE:
+            return f"the rollout's {name} reach {value:.2g}, whose square overflows"
         return f"rollout finite, learning rate {self.learning_rate:.2e}: lower it, or max_grad_norm"
 
+    def _largest_log_ratio(self) -> float:
+        """Largest logarithm of an action's likelihood now over that in the rollout."""
+        largest = -math.inf
+        if self.storage.step == 0:  # the update is over
+            return largest
+        with torch.no_grad():
+            for batch in self.storage.mini_batch_generator(self.num_mini_batches, 1):
+                self._raw_actor(batch.observations, stochastic_output=True)
+                now = self._raw_actor.get_output_log_prob(batch.actions)
+                largest = max(largest, float((now - batch.old_actions_log_prob.squeeze(-1)).max()))
+        return largest
 
-def _all_finite(tensors: list[torch.Tensor]) -> bool:
-    """Whether every element is finite, with one read-back if so.
+
+_MAX_LOG_RATIO = math.log(torch.finfo(torch.float32).max)
+_HUGE = math.sqrt(torch.finfo(torch.float32).max)
+
+
+def _finite_and_largest(tensors: list[torch.Tensor]) -> tuple[bool, float]:
+    """Whether every element is finite, and the largest norm of a tensor, with one read-back.
 
     Euclidean norms take a twentieth of the time of maximum norms; they may overflow, so a bad one is looked into.
     """
-    if not tensors or bool(torch.isfinite(torch.stack(torch._foreach_norm(tensors))).all()):
-        return True
-    return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)
+    if not tensors:
+        return True, 0.0
+    largest = float(torch.stack(torch._foreach_norm(tensors)).detach().amax())
+    return math.isfinite(largest) or all(bool(torch.isfinite(tensor).all()) for tensor in tensors), largest
+
+
+def _check_batches(num_envs: int, num_steps: int, num_mini_batches: int, whole_envs: bool) -> None:
+    """Refuses mini-batches without content; those with frames are of whole environments."""
+    available = num_envs if whole_envs else num_envs * num_steps
+    if available < num_mini_batches:
+        what = "environments" if whole_envs else f"steps ({num_envs} environments x {num_steps})"
+        raise ValueError(
+            f"ppo.num_mini_batches={num_mini_batches} must not exceed the {available} {what} of a rollout; lower it or"
+            " raise num_envs"
+        )
+    if num_envs * num_steps < 2:
+        raise ValueError(
+            f"num_envs={num_envs} and ppo.num_steps_per_env={num_steps} make rollouts of one step, whose advantages"
+            " have no spread to be divided by; raise one of them"
+        )

@@ -254,9 +254,11 @@ class Runner(OnPolicyRunner):
             finite = torch.isfinite(tensor)
             if not finite.all():
                 env = int((~finite).flatten(1).any(1).nonzero()[0]) if tensor.dim() > 1 else int((~finite).nonzero()[0])
+                terms = self.env.terms_not_finite(name, env) if hasattr(self.env, "terms_not_finite") else []
+                blamed = f" ({', '.join(terms)})" if terms else ""
                 raise TrainingDiverged(
                     f"iteration {self.current_learning_iteration}: the environment returned"
-                    f" non-finite {name}, first in environment {env}"
+                    f" non-finite {name}{blamed}, first in environment {env}"
                 )
 
     def _out_of_time(self) -> bool:

@@ -1,6 +1,6 @@
 """Physics back ends behind one protocol."""
 
-from omniperception.sim.base import SimConfig, Simulator
+from omniperception.sim.base import Failure, SimConfig, Simulator
 from omniperception.sim.mujoco import MujocoSimulator
 
-__all__ = ["MujocoSimulator", "SimConfig", "Simulator"]
+__all__ = ["Failure", "MujocoSimulator", "SimConfig", "Simulator"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Protocol
 
 import torch
@@ -11,6 +12,26 @@ from omniperception.world import World
 
 _INTEGRATORS = ("euler", "implicitfast", "implicit", "rk4")
 _CONES = ("pyramidal", "elliptic")
+MAX_SPEED = 1e3
+"""A generalised velocity (m/s or rad/s) beyond this is a diverged simulation."""
+MAX_DISTANCE = 1e4
+"""So is a generalised position (m or rad) beyond this, where float32 resolves 1 mm."""
+
+
+class Failure(IntEnum):
+    """Why a simulation cannot go on; 0 while it can."""
+
+    NONE = 0
+    ACTION = 1
+    """It was given a joint target that is not finite."""
+    NOT_FINITE = 2
+    """Its state is not finite."""
+    TOO_FAST = 3
+    """It moves faster than anything physical."""
+    TOO_FAR = 4
+    """It is so far away that single precision no longer resolves a millimetre."""
+    ENGINE = 5
+    """The engine warned or gave up: a singular inertia, full contact buffers, an acceleration out of bounds."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +105,12 @@ class Simulator(Protocol):
     """(num_envs, num_placed_obstacles, 4): their quaternions."""
     ground_pos: torch.Tensor | None
     """(num_envs, 3): where a ground that is a height field lies (m, environment frame); None for a plane."""
-    failed: torch.Tensor
-    """(num_envs,) bool: simulations whose state became non-finite or raised an error since the last reset."""
+    failure: torch.Tensor
+    """(num_envs,) int64: the first `Failure` of each simulation since its last reset."""
+
+    @property
+    def failed(self) -> torch.Tensor:
+        """(num_envs,) bool: simulations with a failure since their last reset."""
 
     qpos_steps: torch.Tensor
     """(num_envs, num_steps, nq): qpos after each physics step of the last call, if they are recorded."""
@@ -96,7 +121,7 @@ class Simulator(Protocol):
         """Physics steps with (num_envs, num_joints) joint position targets (rad).
 
         Args:
-            joint_target: held through all steps.
+            joint_target: held through all steps; one that is not finite is a failure, and the last one goes on.
             num_steps: physics steps.
             mocap_path: (num_envs, num_steps, num_placed_obstacles, 3), m: where the kinematic bodies are during
                 each step; None leaves them where they are.
@@ -138,8 +163,11 @@ class Simulator(Protocol):
     def load_state_dict(self, state: dict) -> None:
         """Goes on from a `state_dict` of the same world and number of environments."""
 
+    def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
+        """Marks simulations `which` (num_envs,) bool as failed; the first cause stays."""
+
     def detect_failures(self) -> None:
-        """Marks simulations whose state has become non-finite in `failed`."""
+        """Marks simulations whose state is no longer one that a robot can be in."""
 
     def update_model(self, env_ids: torch.Tensor) -> None:
         """Recomputes what the engine derives from model fields that were written for some environments."""

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from mujoco.batch import Batch, SimulationError
 
-from omniperception.sim.base import SimConfig
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, SimConfig
 from omniperception.world import World
 
 _INTEGRATORS = {
@@ -19,8 +19,6 @@ _INTEGRATORS = {
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 _MOCAP_POS = int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 _STAGE_POS = mujoco.mjtStage.mjSTAGE_POS.value
-_MAX_SPEED = 1e3
-"""A generalised velocity (m/s or rad/s) beyond this is a diverged simulation."""
 
 
 class MujocoSimulator:
@@ -45,7 +43,7 @@ class MujocoSimulator:
         if world.ground_mocap is not None:
             self.ground_pos = self.mocap_pos[:, 0]
             self.mocap_pos, self.mocap_quat = self.mocap_pos[:, 1:], self.mocap_quat[:, 1:]
-        self.failed = torch.zeros(num_envs, dtype=torch.bool)
+        self.failure = torch.zeros(num_envs, dtype=torch.int64)
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
         self._record = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
         self._records: dict[str, np.ndarray] = self._allocate_records(1)
@@ -56,6 +54,10 @@ class MujocoSimulator:
         self._geom_poses: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
+    def failed(self) -> torch.Tensor:
+        return self.failure > Failure.NONE
+
+    @property
     def qpos_steps(self) -> torch.Tensor:
         return torch.from_numpy(self._records["qpos"])
 
@@ -64,6 +66,8 @@ class MujocoSimulator:
         return torch.from_numpy(self._records["qvel"])
 
     def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
+        if not bool(torch.isfinite(joint_target).all()):
+            joint_target = self._finite_targets(joint_target)
         self._ctrl.copy_(joint_target)
         try:
             if mocap_path is None and not self._record:
@@ -71,9 +75,17 @@ class MujocoSimulator:
             else:
                 self._roll_out(num_steps, mocap_path)
         except SimulationError as error:
-            self.failed[torch.from_numpy(np.asarray(error.ids))] = True
+            raised = torch.zeros(self.num_envs, dtype=torch.bool)
+            raised[torch.from_numpy(np.asarray(error.ids))] = True
+            self.mark_failed(raised, Failure.ENGINE)
         if self._torque is not None:  # any later call, such as `forward` for poses, overwrites the engine's array
             self._torque.numpy()[:] = self._actuator_force
+
+    def _finite_targets(self, joint_target: torch.Tensor) -> torch.Tensor:
+        """Marks simulations whose targets are not finite; for them the last ones hold, which the engine can take."""
+        finite = torch.isfinite(joint_target).all(1)
+        self.mark_failed(~finite, Failure.ACTION)
+        return torch.where(finite[:, None], joint_target.double(), self._ctrl)
 
     def _roll_out(self, num_steps: int, mocap_path: torch.Tensor | None) -> None:
         """Steps with the kinematic bodies on their way, recording what somebody reads after every step."""
@@ -92,11 +104,18 @@ class MujocoSimulator:
         widths = {"sensordata": model.nsensordata, "qpos": model.nq, "qvel": model.nv}
         return {name: np.zeros((self.num_envs, num_steps, widths[name])) for name in self._record}
 
+    def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
+        self.failure = torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure)
+
     def detect_failures(self) -> None:
-        """Marks simulations whose state is no longer finite or faster than anything physical."""
-        speed = self.qvel.abs().amax(dim=1)
-        finite = (speed < _MAX_SPEED) & torch.isfinite(self.qpos.sum(dim=1))
-        self.failed |= ~finite
+        """Looks at speed, position and the engine's warnings, at which a simulation stops until the call's end."""
+        speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
+        warned = torch.from_numpy(self.batch.warning[..., 1].any(1))
+        if not bool(((speed < MAX_SPEED) & (distance < MAX_DISTANCE) & ~warned).all()):
+            self.mark_failed(~torch.isfinite(speed + distance), Failure.NOT_FINITE)
+            self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
+            self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
+            self.mark_failed(warned, Failure.ENGINE)
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         kept = [poses[env_ids].clone() for poses in self._kinematic]
@@ -105,7 +124,7 @@ class MujocoSimulator:
             poses[env_ids] = before
         self.qpos[env_ids] = qpos.double()
         self.qvel[env_ids] = qvel.double()
-        self.failed[env_ids] = False
+        self.failure[env_ids] = Failure.NONE
         for values in self._records.values():
             values[env_ids.numpy()] = 0.0
         if self._torque is not None:
@@ -157,12 +176,11 @@ class MujocoSimulator:
         return {
             "state": torch.from_numpy(self.batch.state.copy()),
             "fields": {name: value.clone() for name, value in self._fields.items()},
-            "failed": self.failed.clone(),
         }
 
     def load_state_dict(self, state: dict) -> None:
         self.batch.state[:] = state["state"].numpy()
-        self.failed.copy_(state["failed"])
+        self.failure.zero_()
         for name, value in state["fields"].items():
             self.model_field(name).copy_(value)
         if "body_mass" in state["fields"]:

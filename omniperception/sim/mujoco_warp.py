@@ -14,14 +14,10 @@ import torch
 import warp as wp
 
 from omniperception.lidar.launch import wp_device
-from omniperception.sim.base import SimConfig
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, SimConfig
 from omniperception.sim.mujoco import apply_options
 from omniperception.world import World
 
-_MAX_SPEED = 1e3
-"""A generalised velocity (m/s or rad/s) beyond this is a diverged simulation."""
-_MAX_DISTANCE = 1e4
-"""So is a generalised position (m or rad) beyond this, where float32 resolves 1 mm."""
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 """Model fields that the engine derives from masses and inertias."""
 _MASSES = ("body_mass", "body_ipos", "body_inertia")
@@ -146,7 +142,7 @@ class MujocoWarpSimulator:
         if world.ground_mocap is not None:
             self.ground_pos = self.mocap_pos[:, 0]
             self.mocap_pos, self.mocap_quat = self.mocap_pos[:, 1:], self.mocap_quat[:, 1:]
-        self.failed = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
+        self.failure = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.overflow = wp.to_torch(data.overflow)
         self._torque = wp.to_torch(data.actuator_force)
         self._forgotten = (wp.to_torch(data.qacc_warmstart), self._ctrl, self._torque)
@@ -160,6 +156,10 @@ class MujocoWarpSimulator:
         self._allocate_steps(config.decimation)
 
     @property
+    def failed(self) -> torch.Tensor:
+        return self.failure > Failure.NONE
+
+    @property
     def qpos_steps(self) -> torch.Tensor:
         return self._records["qpos"]
 
@@ -170,22 +170,29 @@ class MujocoWarpSimulator:
     def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
         if num_steps != self._num_steps:
             self._allocate_steps(num_steps)
-        self._ctrl.copy_(joint_target)
+        finite = torch.isfinite(joint_target).all(1)
+        self.mark_failed(~finite, Failure.ACTION)
+        self._ctrl.copy_(torch.where(finite[:, None], joint_target.float(), self._ctrl))
         if mocap_path is None:
             self._launch("steps", self._steps)
         else:
             self._path.copy_(mocap_path)
             self._launch("steps along the path", self._steps_along_path)
 
+    def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
+        self.failure.copy_(torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure))
+
     def detect_failures(self) -> None:
-        """Marks simulations whose state is no longer finite, faster or farther away than anything physical."""
+        """Looks at speed and position; the engine itself has no warnings."""
         speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
-        self.failed |= ~((speed < _MAX_SPEED) & (distance < _MAX_DISTANCE))  # false for what is not a number, too
+        self.mark_failed(~torch.isfinite(speed + distance), Failure.NOT_FINITE)
+        self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
+        self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self.qpos[env_ids] = qpos.float()
         self.qvel[env_ids] = qvel.float()
-        self.failed[env_ids] = False
+        self.failure[env_ids] = int(Failure.NONE)
         for values in (*self._forgotten, *self._records.values()):
             values[env_ids] = 0.0
 
@@ -243,13 +250,12 @@ class MujocoWarpSimulator:
         return {
             "state": {name: wp.to_torch(getattr(self.data, name)).clone() for name in _STATE},
             "fields": {name: value.clone() for name, value in self._fields.items()},
-            "failed": self.failed.clone(),
         }
 
     def load_state_dict(self, state: dict) -> None:
         for name, value in state["state"].items():
             wp.to_torch(getattr(self.data, name)).copy_(value)
-        self.failed.copy_(state["failed"])
+        self.failure.zero_()
         for name, value in state["fields"].items():
             self._expand(name)
             self._fields[name].copy_(value)

@@ -46,7 +46,7 @@ FOOTING = 0.35
 """Nothing of the ground within this distance (m) of the base reaches above the feet when a robot starts."""
 
 MAX_ACTION = 100.0
-"""Actions beyond this magnitude are clipped; a policy that gets here has diverged."""
+"""Actions beyond this magnitude are clipped and counted; a policy that gets here has diverged."""
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,7 @@ class OmniEnv(VecEnv):
         risk: (num_envs, K) true risk of each candidate velocity that follows from it; None when nobody reads it.
         heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; of this
             moment when a term reads them, else, for supervision, at the newest frame, and 0 before the first.
+        weighted_rewards: (num_envs,) of each term in the last step, times its weight and the control step.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -201,6 +202,7 @@ class OmniEnv(VecEnv):
         self.sensing = self._build_sensing(fields) if config.uses_lidar else None
         self._allocate()
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
+        self.weighted_rewards: dict[str, torch.Tensor] = {}
         self.probes: list[Callable[[], None]] = []  # called in each step before finished environments are reset
         self.step_count = 0
         self._all_envs = torch.arange(self.num_envs, device=self.device)
@@ -220,7 +222,8 @@ class OmniEnv(VecEnv):
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """One control step with actions (num_envs, num_actions); see rsl_rl.env.VecEnv."""
-        actions = actions.clamp(-MAX_ACTION, MAX_ACTION)
+        self.metrics.record_clipped(actions.abs().amax(1) > MAX_ACTION)
+        actions = torch.where(actions.isinf(), torch.nan, actions).clamp(-MAX_ACTION, MAX_ACTION)
         self.actions = (actions, self.actions[0], self.actions[1])
         self.last_joint_vel = self.kinematics.joint_vel
         self.step_count += 1
@@ -234,7 +237,7 @@ class OmniEnv(VecEnv):
                 self._sense()
         if self.ground is not None:
             with self.timer.stage("terrain"):
-                self.terrain_levels.record(self.kinematics, self.command.value)
+                self.terrain_levels.record(self.kinematics, self.command.value, ~self.sim.failed)
         with self.timer.stage("rewards"):
             self._choose_avoidance()
             outcomes, done = self._terminate()
@@ -267,6 +270,16 @@ class OmniEnv(VecEnv):
     def curriculum_level(self, level: float) -> None:
         if self.obstacles is not None:
             self.obstacles.level = level
+
+    def terms_not_finite(self, name: str, env_id: int) -> list[str]:
+        """Which terms of "rewards", or of an observation group, are not finite for an environment."""
+        if name == "rewards":
+            return [term for term, value in self.weighted_rewards.items() if not torch.isfinite(value[env_id])]
+        if name not in self._groups:
+            return []
+        group = self._groups[name]
+        rows = self.observations[name][env_id].view(-1, group.width)
+        return [term for term, part in group.slices.items() if not torch.isfinite(rows[:, part]).all()]
 
     def state_dict(self) -> dict:
         """Everything that a resumed run needs to go on exactly."""
@@ -434,9 +447,10 @@ class OmniEnv(VecEnv):
         """Weighted sum times the control step; a diverged environment's step counts nothing."""
         healthy = ~self.sim.failed
         total = torch.zeros(self.num_envs, device=self.device)
-        for index, term in enumerate(self.config.rewards.terms.values()):
+        for index, (name, term) in enumerate(self.config.rewards.terms.items()):
             weighted = torch.where(healthy, term.func(self), 0.0) * (term.weight * self.control_dt)
             self.metrics.record_rewards(index, weighted)
+            self.weighted_rewards[name] = weighted
             total += weighted
         return total
 
@@ -447,9 +461,9 @@ class OmniEnv(VecEnv):
         lin_error, yaw_error = torch.where(healthy, lin_error, 0.0), torch.where(healthy, yaw_error, 0.0)
         self.velocity_error, self.yaw_rate_error = lin_error, yaw_error
         self.contacts, self.free = self.touching.clone(), self.no_obstacle_near()
-        self.metrics.record_tracking(lin_error, yaw_error, self.free)
+        self.metrics.record_tracking(lin_error, yaw_error, healthy, self.free)
         self.metrics.record_contacts(self.touching)
-        self.metrics.record_ends(done, outcomes)
+        self.metrics.record_ends(done, outcomes, self.sim.failure)
 
     def no_obstacle_near(self) -> torch.Tensor | None:
         """(num_envs,) bool: no obstacle within the avoidance threshold in any sector; None without obstacles."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from omniperception.sim import Failure
+
 OUTCOMES = ("time_out", "fall", "goal", "collision_end", "diverged")
 """How an episode can end."""
 
@@ -19,6 +21,8 @@ class EpisodeMetrics:
         self._names = reward_terms
         self._rewards = torch.zeros(len(reward_terms), device=device)
         self._errors = torch.zeros(5, device=device)
+        self._healthy_steps, self._clipped = torch.zeros(2, device=device).unbind(0)
+        self._failures = torch.zeros(len(Failure), dtype=torch.int64, device=device)
         self._outcomes = torch.zeros(len(OUTCOMES) + 2, device=device)
         self._steps = 0
         self.collided = torch.zeros(num_envs, dtype=torch.bool, device=device)
@@ -26,40 +30,50 @@ class EpisodeMetrics:
     def record_rewards(self, index: int, weighted: torch.Tensor) -> None:
         self._rewards[index] += weighted.mean()
 
-    def record_tracking(self, lin_error: torch.Tensor, yaw_error: torch.Tensor, free: torch.Tensor | None) -> None:
-        """Absolute errors (m/s, rad/s); `free` marks environments with no obstacle near, None means all."""
+    def record_tracking(
+        self, lin_error: torch.Tensor, yaw_error: torch.Tensor, healthy: torch.Tensor, free: torch.Tensor | None
+    ) -> None:
+        """Absolute errors (m/s, rad/s) where `healthy`; `free` marks environments with no obstacle near, None: all."""
+        free = healthy if free is None else free & healthy
         self._errors[0] += lin_error.mean()
         self._errors[1] += yaw_error.mean()
-        if free is None:
-            self._errors[2] += lin_error.mean()
-            self._errors[3] += 1.0
-        else:
-            self._errors[2] += (lin_error * free).mean()
-            self._errors[3] += free.float().mean()
+        self._errors[2] += (lin_error * free).mean()
+        self._errors[3] += free.float().mean()
+        self._healthy_steps += healthy.float().mean()
         self._steps += 1
+
+    def record_clipped(self, clipped: torch.Tensor) -> None:
+        """Environments (num_envs,) bool whose action was out of bounds."""
+        self._clipped += clipped.sum()
 
     def record_contacts(self, touching: torch.Tensor) -> None:
         self.collided |= touching
         self._errors[4] += touching.float().mean()
 
-    def record_ends(self, done: torch.Tensor, outcomes: dict[str, torch.Tensor]) -> None:
+    def record_ends(self, done: torch.Tensor, outcomes: dict[str, torch.Tensor], failure: torch.Tensor) -> None:
         self._outcomes += torch.stack(
             [outcomes[name].sum() for name in OUTCOMES] + [(done & self.collided).sum(), done.sum()]
         )
+        self._failures += torch.bincount(failure, minlength=len(Failure))
         self.collided &= ~done
 
     def free_velocity_error(self) -> float:
-        """Mean linear velocity error (m/s) away from obstacles since the last drain."""
-        return float(self._errors[2] / self._errors[3].clamp(min=1e-6)) if self._steps else float("inf")
+        """Mean linear velocity error (m/s) away from obstacles since the last drain; inf if nobody was."""
+        return float(self._errors[2] / self._errors[3]) if self._errors[3] > 0 else float("inf")
 
     def state_dict(self) -> dict:
         sums = {"rewards": self._rewards, "errors": self._errors, "outcomes": self._outcomes}
-        return {**sums, "steps": self._steps, "collided": self.collided}
+        health = {"failures": self._failures, "clipped": self._clipped, "healthy_steps": self._healthy_steps}
+        return {**sums, "health": health, "steps": self._steps, "collided": self.collided}
 
     def load_state_dict(self, state: dict) -> None:
         self._rewards.copy_(state["rewards"])
         self._errors.copy_(state["errors"])
         self._outcomes.copy_(state["outcomes"])
+        if "health" in state:  # checkpoints of earlier versions lack it
+            self._failures.copy_(state["health"]["failures"])
+            self._clipped.copy_(state["health"]["clipped"])
+            self._healthy_steps.copy_(state["health"]["healthy_steps"])
         self.collided.copy_(state["collided"])
         self._steps = state["steps"]
 
@@ -67,9 +81,10 @@ class EpisodeMetrics:
         """Means since the last call, and clears them."""
         steps = max(self._steps, 1)
         rewards, errors, outcomes = (x.tolist() for x in (self._rewards / steps, self._errors, self._outcomes))
+        healthy_steps = max(float(self._healthy_steps), 1e-6)
         log = {f"Reward/{name}": value for name, value in zip(self._names, rewards, strict=True)}
-        log["Metrics/velocity_error"] = errors[0] / steps
-        log["Metrics/yaw_rate_error"] = errors[1] / steps
+        log["Metrics/velocity_error"] = errors[0] / healthy_steps
+        log["Metrics/yaw_rate_error"] = errors[1] / healthy_steps
         log["Metrics/free_velocity_error"] = errors[2] / max(errors[3], 1e-6)
         log["Metrics/contact_share"] = errors[4] / steps
         episodes = outcomes[-1]
@@ -79,7 +94,12 @@ class EpisodeMetrics:
                     log[f"Metrics/{name}_rate"] = count / episodes
             log["Metrics/collision_rate"] = outcomes[-2] / episodes
         log["Anomalies/diverged"] = outcomes[OUTCOMES.index("diverged")]
-        for tensor in (self._rewards, self._errors, self._outcomes):
+        for cause, count in zip(Failure, self._failures.tolist(), strict=True):
+            if cause != Failure.NONE:
+                log[f"Anomalies/{cause.name.lower()}"] = count
+        log["Anomalies/clipped_actions"] = int(self._clipped)
+        sums = (self._rewards, self._errors, self._outcomes, self._failures, self._clipped, self._healthy_steps)
+        for tensor in sums:
             tensor.zero_()
         self._steps = 0
         return log

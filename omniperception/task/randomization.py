@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
@@ -66,13 +67,15 @@ class RandomizationConfig:
             value = getattr(self, item.name)
             if item.name.startswith("lidar_") or item.name == "payload_position" or value is None:
                 continue
-            if len(value) != 2 or value[0] > value[1]:
+            if len(value) != 2 or not -math.inf < value[0] <= value[1] < math.inf:
                 raise ValueError(f"randomization.{item.name}={list(value)} must be [low, high] or null")
             object.__setattr__(self, item.name, (float(value[0]), float(value[1])))
         for name in ("ground_friction", "ground_restitution", "motor_strength", "latency_s"):
             value = getattr(self, name)
             if value is not None and value[0] < 0:
                 raise ValueError(f"randomization.{name}={list(value)} must not be negative")
+        if self.ground_restitution is not None and self.ground_restitution[1] > 1:
+            raise ValueError(f"randomization.ground_restitution={list(self.ground_restitution)} must not exceed 1")
 
     @property
     def noise(self) -> tuple[Noise, ...]:
@@ -93,6 +96,7 @@ class Randomizer:
         nominal = {"opt.gravity": model.opt.gravity} | {name: getattr(model, name) for name in _SCALED}
         self._nominal = {name: torch.tensor(value, device=sim.device) for name, value in nominal.items()}
         self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
+        self._check_mass()
         self.joint_offset: torch.Tensor | None = None
         """(num_envs, num_joints) rad added to the joint targets; None when not randomized."""
         self.delay: torch.Tensor | None = None
@@ -141,6 +145,16 @@ class Randomizer:
         """Writes float64 values into a model field in the engine's precision."""
         target = self._sim.model_field(field)
         target[index] = values.to(target.dtype)
+
+    def _check_mass(self) -> None:
+        """Refuses ranges that can leave the base without mass, with which physics diverges at once."""
+        config, base = self.config, float(self._model.body_mass[self._base])
+        lightest = base + sum(bounds[0] for bounds in (config.added_mass, config.payload_mass) if bounds)
+        if lightest <= 0:
+            raise ValueError(
+                f"randomization.added_mass={config.added_mass} and payload_mass={config.payload_mass} leave a base of"
+                f" {base:g} kg with {lightest:g} kg; it must keep a positive mass"
+            )
 
     def _draw(self, env_ids: torch.Tensor, name: str, shape: Sequence[int] = ()) -> torch.Tensor:
         low, high = getattr(self.config, name)

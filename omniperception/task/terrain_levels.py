@@ -29,15 +29,21 @@ class TerrainLevels:
         self.walked, self.commanded, self.reach, self._steps = torch.zeros(4, num_envs, device=device).unbind(0)
         self._start = torch.zeros(num_envs, 2, device=device)
 
-    def record(self, kinematics: Kinematics, command: torch.Tensor) -> None:
-        """Takes in a control step with commands (num_envs, 3): v_x, v_y (m/s) and yaw rate in the base frame."""
+    def record(self, kinematics: Kinematics, command: torch.Tensor, healthy: torch.Tensor) -> None:
+        """Takes in a control step.
+
+        Args:
+            kinematics: state at its end.
+            command: (num_envs, 3) v_x, v_y (m/s) and yaw rate in the base frame.
+            healthy: (num_envs,) bool: whose physics is sound; the others have walked nowhere.
+        """
         speed = command[:, :2].norm(dim=1)
         along = (kinematics.base_lin_vel_yaw * command[:, :2]).sum(1) / speed.clamp(min=_MIN_SPEED)
-        self.walked += torch.where(speed > _MIN_SPEED, along, 0.0) * self._dt
+        self.walked += torch.where((speed > _MIN_SPEED) & healthy, along, 0.0) * self._dt
         self.commanded += speed * self._dt
         self._steps += 1.0
         from_start = (kinematics.base_pos_w[:, :2] - self._start).norm(dim=1)
-        torch.maximum(self.reach, from_start, out=self.reach)
+        torch.maximum(self.reach, torch.where(healthy, from_start, 0.0), out=self.reach)
 
     def start(self, env_ids: torch.Tensor, xy_w: torch.Tensor, complete: torch.Tensor | None = None) -> None:
         """Begins new episodes in environments (n,), whose robots stand at (n, 2) m, on the tiles that they deserve.

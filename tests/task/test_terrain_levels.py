@@ -34,7 +34,7 @@ def walk(levels, velocity, command, steps, start=(0.0, 0.0)):
         state = SimpleNamespace(
             base_lin_vel_yaw=velocity.expand(num_envs, 2), base_pos_w=torch.tensor([*xy, 0.3]).expand(num_envs, 3)
         )
-        levels.record(state, command.expand(num_envs, 3))
+        levels.record(state, command.expand(num_envs, 3), torch.ones(num_envs, dtype=torch.bool))
 
 
 def curriculum_of(num_envs=1, level=3, **settings):
