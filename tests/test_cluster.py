@@ -35,8 +35,8 @@ def test_torchrun_trains_one_run_and_one_process_resumes_it(tmp_path):
 @pytest.mark.slow
 def test_a_sweep_goes_to_submitits_local_executor(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    sweep = ("-m", "seed=1,2", "hydra/launcher=submitit_local", "hydra.sweep.dir=sweep", "ppo.max_iterations=1")
-    run(tmp_path, str(ROOT / "train.py"), *TINY, *sweep)
+    sweep = ("seed=1,2", "hydra/launcher=submitit_local", "hydra.sweep.dir=sweep", "ppo.max_iterations=1")
+    run(tmp_path, str(ROOT / "train.py"), "-m", *TINY, *sweep)
     jobs = sorted(saved.parent for saved in (tmp_path / "sweep").glob(f"*/{config.CONFIG_FILE}"))
     assert [config.load(job).seed for job in jobs] == [1, 2]
     assert all((job / "checkpoints" / "model_1.pt").is_file() for job in jobs)

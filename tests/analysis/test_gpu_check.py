@@ -1,6 +1,7 @@
 """The GPU's check and the memory command at tiny size on a CPU, and what they say without a GPU."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +20,8 @@ TINY = ("experiment=walk", "ppo.num_steps_per_env=4", "ppo.hidden_dims=[32,16]",
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_it_says_so_in_one_line(tmp_path):
     command = [sys.executable, str(ROOT / "scripts" / "gpu_check.py"), f"out={tmp_path}"]
-    done = subprocess.run(command, capture_output=True, text=True)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].startswith("error: device=cuda:0")
     assert "device=cpu size=small" in done.stderr and "Traceback" not in done.stderr
 
