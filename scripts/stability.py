@@ -7,7 +7,7 @@
 
 physics   gains kp 5..2000, kv 0..50 by step 0.5..10 ms and integrator, PD in the engine and outside, with the analytic
           limit of the linearised joints; corners of the randomization, drops, impacts, overlaps, wild targets, latency.
-          only=maps or only=scenes runs one half.
+          only=floating, only=standing or only=scenes runs one part.
 lidar     rays far away, at tiny and huge bodies, bad triangles, grazing, inside, without poses, none and very many,
           each against float64.
 learning  extreme rewards, observations, clouds, noise, gradients and batches, what training makes of them; float32

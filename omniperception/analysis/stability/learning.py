@@ -346,8 +346,7 @@ def _pass(alg: PerceptivePpo, dtype: torch.dtype) -> dict[str, tuple[torch.Tenso
     layers = {name: module for name, module in modules.items() if list(module.parameters(recurse=False))}
     layers = {name: module for name, module in layers.items() if not name.endswith("distribution")}
     for name, module in layers.items():
-        keep = partial(outputs.setdefault, name)  # a later call embeds the empty history
-        module.register_forward_hook(lambda _, __, output, keep=keep: keep(output.detach()))
+        module.register_forward_hook(partial(_keep_first, outputs, name))
     actor.zero_grad()
     critic.zero_grad()
     loss = _ppo_loss(alg, actor, critic, observations, batch, dtype)
@@ -359,6 +358,11 @@ def _pass(alg: PerceptivePpo, dtype: torch.dtype) -> dict[str, tuple[torch.Tenso
     }
     whole = torch.cat(list(gradients.values()))
     return {name: (outputs[name], gradients[name]) for name in layers} | {"loss": (loss.detach(), whole)}
+
+
+def _keep_first(outputs: dict[str, torch.Tensor], name: str, _: object, __: object, output: torch.Tensor) -> None:
+    """A forward hook; a later call of a perception network embeds the empty history."""
+    outputs.setdefault(name, output.detach())
 
 
 def _ppo_loss(alg: PerceptivePpo, actor, critic, observations, batch, dtype: torch.dtype) -> torch.Tensor:

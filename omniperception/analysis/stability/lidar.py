@@ -318,7 +318,7 @@ def _row(
     strict = np.ones(len(true), bool) if loose is None else ~loose
     missed = (np.isinf(ranges) != np.isinf(true)) & strict
     both = np.isfinite(ranges) & np.isfinite(true) & strict
-    error = np.abs(ranges - true, where=both, out=np.zeros(len(true)))
+    error = np.abs(np.where(both, ranges, 0.0) - np.where(both, true, 0.0))
     worst = float(error.max(initial=0.0))
     wrong = int(missed.sum() + np.isnan(ranges).sum() + (error > allowed).sum())
     return _judged(case, len(true), wrong, worst, f"within {allowed:.2g} m") | {"either way": int((~strict).sum())}

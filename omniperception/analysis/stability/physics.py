@@ -19,6 +19,8 @@ from omniperception.world import build_world
 
 INTEGRATORS = ("euler", "implicitfast", "implicit", "rk4")
 STEPS_MS = (0.5, 1.0, 2.0, 5.0, 10.0)
+FINE = 60
+"""Gains along each axis between which the analytic limit is drawn."""
 KICK = 1e-3
 """Displacement (rad) from which the joints of a map start: small enough for torque limits not to matter at first."""
 
@@ -33,6 +35,7 @@ class Map:
         growth: (V, K) log10 of the energy of the joints at the end over that at the start.
         failed: (V, K) bool: caught by the simulator.
         radius: (V, K) spectral radius of the linearised joints; beyond 1 they are unstable.
+        limit: (FINE, FINE) the same between the gains, evenly in their indices; None where nothing is linearised.
     """
 
     integrator: str
@@ -43,6 +46,7 @@ class Map:
     growth: np.ndarray
     failed: np.ndarray
     radius: np.ndarray
+    limit: np.ndarray | None = None
 
     @property
     def agreement(self) -> float:
@@ -77,10 +81,13 @@ def stability_map(env: EnvConfig, integrator: str, step_ms: float, outside: bool
         if step >= 0.9 * num_steps:
             late = torch.maximum(late, _joint_energy(sim, target, kp_of, inertia).nan_to_num(nan=torch.inf))
     growth = torch.log10(late / start).clamp(-20, 20).numpy().reshape(len(kv), len(kp))
-    damping = float(sim.world.model.dof_damping[6:].mean())
-    fixed = damping, step_ms / 1000.0, integrator, outside
-    radius = np.array([[spectral_radius(inertia, p, v, *fixed) for p in kp] for v in kv])
-    return Map(integrator, step_ms, outside, kp, kv, growth, sim.failed.numpy().reshape(growth.shape), radius)
+    fixed = float(sim.world.model.dof_damping[6:].mean()), step_ms / 1000.0, integrator, outside
+    radius = spectral_radius(inertia, kp, kv[:, None], *fixed)
+    between = np.linspace(0, size - 1, FINE)
+    fine_kp, fine_kv = np.exp(np.interp(between, range(size), np.log(kp))), np.interp(between, range(size), kv)
+    limit = spectral_radius(inertia, fine_kp, fine_kv[:, None], *fixed)
+    failed = sim.failed.numpy().reshape(growth.shape)
+    return Map(integrator, step_ms, outside, kp, kv, growth, failed, radius, limit)
 
 
 def standing_map(env: EnvConfig, integrator: str, step_ms: float, outside: bool, size: int, seconds: float) -> Map:
@@ -118,8 +125,8 @@ def joint_inertia(sim: MujocoSimulator) -> np.ndarray:
 
 
 def spectral_radius(
-    inertia: np.ndarray, kp: float, kv: float, damping: float, step: float, integrator: str, outside: bool
-) -> float:
+    inertia: np.ndarray, kp: np.ndarray, kv: np.ndarray, damping: float, step: float, integrator: str, outside: bool
+) -> np.ndarray:
     """Largest over the modes m x'' + (kv + d) x' + kp x = 0 of the joints of |eigenvalue| of one step.
 
     Euler takes the passive damping d implicitly, v+ = ((m - h kv) v - h kp x) / (m + h d), x+ = x + h v+; the implicit
@@ -130,32 +137,45 @@ def spectral_radius(
 
     Args:
         inertia: (J, J) kg m^2.
-        kp: N m/rad.
-        kv: N m s/rad.
+        kp, kv: N m/rad and N m s/rad; the result has the shape to which they broadcast.
         damping: d, N m s/rad.
         step: h, s.
         integrator: as in SimConfig.
         outside: whether the torque is computed before the step and held.
     """
-    modes = np.linalg.eigvalsh(inertia)
-    return max(_mode_radius(m, kp, kv, damping, step, integrator, outside) for m in modes)
+    m = np.linalg.eigvalsh(inertia)
+    p, v = (x[..., None] for x in np.broadcast_arrays(np.asarray(kp, float), np.asarray(kv, float)))
+    rk4 = integrator == "rk4"
+    steps = (
+        _runge_kutta(m, p, v, damping, step, outside) if rk4 else _euler(m, p, v, damping, step, integrator, outside)
+    )
+    return np.abs(np.linalg.eigvals(steps)).max((-1, -2))
 
 
-def _mode_radius(m: float, kp: float, kv: float, d: float, h: float, integrator: str, outside: bool) -> float:
-    if integrator == "rk4":
-        spring = np.array([[0.0, 0.0], [-kp / m, -kv / m]])
-        rest = np.array([[0.0, 1.0], [0.0, -d / m]])
-        z = h * (rest if outside else rest + spring)
-        powers = [np.linalg.matrix_power(z, k) for k in range(5)]
-        step = sum(power / float(np.prod(range(1, k + 1))) for k, power in enumerate(powers))
-        if outside:
-            held = sum(power / float(np.prod(range(1, k + 2))) for k, power in enumerate(powers[:4]))
-            step = step + h * held @ spring
-    else:
-        explicit, implicit = (kv, d) if outside or integrator == "euler" else (0.0, kv + d)
-        speed = np.array([-h * kp, m - h * explicit]) / (m + h * implicit)
-        step = np.array([[1.0, 0.0] + h * speed, speed])
-    return float(np.abs(np.linalg.eigvals(step)).max())
+def _euler(
+    m: np.ndarray, kp: np.ndarray, kv: np.ndarray, d: float, h: float, integrator: str, outside: bool
+) -> np.ndarray:
+    """(..., 2, 2) steps of (x, v) of Euler and of its implicit kin."""
+    explicit, implicit = (kv, d) if outside or integrator == "euler" else (0.0, kv + d)
+    mass = m + h * implicit
+    from_x, from_v = -h * kp / mass, (m - h * explicit) / mass
+    return _matrix(1.0 + h * from_x, h * from_v, from_x, from_v)
+
+
+def _runge_kutta(m: np.ndarray, kp: np.ndarray, kv: np.ndarray, d: float, h: float, outside: bool) -> np.ndarray:
+    """(..., 2, 2) steps of (x, v) of the classical Runge-Kutta scheme."""
+    spring, rest = _matrix(0.0, 0.0, -kp / m, -kv / m), _matrix(0.0, 1.0, 0.0 * kp, -d / m + 0.0 * kp)
+    z = h * (rest if outside else rest + spring)
+    powers = [np.linalg.matrix_power(z, k) for k in range(5)]
+    step = sum(power / math.factorial(k) for k, power in enumerate(powers))
+    if outside:
+        step = step + h * sum(power / math.factorial(k + 1) for k, power in enumerate(powers[:4])) @ spring
+    return step
+
+
+def _matrix(*entries: np.ndarray | float) -> np.ndarray:
+    """(..., 2, 2) from its entries by rows."""
+    return np.stack(np.broadcast_arrays(*entries), -1).reshape(*np.broadcast_shapes(*map(np.shape, entries)), 2, 2)
 
 
 # ---- scenes ----------------------------------------------------------------------------------------------------------

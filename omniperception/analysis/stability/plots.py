@@ -51,8 +51,10 @@ def _panel(axis, found: Map, bounds: tuple[float, float]):
     """Colours by gains; the limit of the linearised joints as a line, what the simulator caught as crosses."""
     rows, columns = np.arange(len(found.kv)), np.arange(len(found.kp))
     image = axis.imshow(found.growth, origin="lower", aspect="auto", cmap="coolwarm", vmin=bounds[0], vmax=bounds[1])
-    if found.radius.min() < 1.0 < found.radius.max():
-        axis.contour(columns, rows, found.radius, levels=[1.0], colors="black", linewidths=1.0)
+    if found.limit is not None and found.limit.min() < 1.0 < found.limit.max():
+        rows_of, columns_of = found.limit.shape
+        fine = np.linspace(0, len(found.kp) - 1, columns_of), np.linspace(0, len(found.kv) - 1, rows_of)
+        axis.contour(*fine, np.log(found.limit), levels=[0.0], colors="black", linewidths=1.0)
     caught = np.argwhere(found.failed)
     axis.plot(caught[:, 1], caught[:, 0], "kx", markersize=2)
     every = max(1, len(found.kp) // 4)

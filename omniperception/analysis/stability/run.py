@@ -27,7 +27,7 @@ class Options:
         many: rays of the case with very many.
         iterations: of each training.
         frames: through which a carried state goes.
-        only: part of the names of the learning cases to run, or of the parts "maps" and "scenes" of physics.
+        only: part of the names of the learning cases to run, or of the parts "floating", "standing" and "scenes".
         overrides: of the configuration whose robot and physics settings are tried.
     """
 
@@ -83,14 +83,14 @@ def _physics(options: Options, about: Mapping[str, object]) -> bool:
     paper = config.assemble(config.compose([*BLIND, "randomization=paper"])).env.randomization
     good = True
     if options.only in "scenes":
-        trouble = physics.scenes(env, options.num_envs, paper)
         gains = env.robot.kp, env.robot.kv
-        rows = [physics.play(scene, options.seconds, gains) for scene in trouble]
+        rows = [physics.play(scene, options.seconds, gains) for scene in physics.scenes(env, options.num_envs, paper)]
         _show(options.out, "scenes", rows, about, list(rows[0]))
-    if options.only in "maps":
+    if options.only in "floating":
         floating = list(_maps(physics.INTEGRATORS, physics.stability_map, env, options.size, 200))
         good = _tell_maps(options.out, "floating", floating, about)
         plots.draw_maps(floating, "log10 of late over initial energy", (-3.0, 3.0), options.out / "floating.png")
+    if options.only in "standing":
         standing = list(_maps((env.sim.integrator,), physics.standing_map, env, options.size, 1.0))
         _tell_maps(options.out, "standing", standing, about)
         plots.draw_maps(standing, "log10 of late joint speed (rad/s)", (-2.0, 2.0), options.out / "standing.png")
