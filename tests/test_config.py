@@ -24,6 +24,7 @@ COMPANIONS = {
     "commands/corridor": ["obstacles=corridor"],
     "obstacles/corridor": ["commands=corridor"],
     "lidar/none": BLIND,
+    "experiment/gait": ["init=unread"],
 }
 """What a preset needs beside it."""
 LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
