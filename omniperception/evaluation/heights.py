@@ -84,11 +84,12 @@ def _summary(errors: dict[str, torch.Tensor], seen: torch.Tensor) -> HeightError
     distance = height_grid(seen.device).norm(dim=1)
     edges = (0.0, *RINGS)
     rings = [(distance >= low) & (distance < high) for low, high in itertools.pairwise(edges)]
-    frames = seen.sum(0).clamp(min=1.0)
+    frames = seen.sum(0)
+    saw = frames[:, 0] > 0
     rmse, half_width, by_distance = {}, {}, {}
     for name, squared in errors.items():
         mse = float(squared.mean(-1, keepdim=True).sum() / seen.sum())
-        per_env = (squared.mean(-1, keepdim=True).sum(0) / frames).flatten()
+        per_env = (squared.mean(-1, keepdim=True).sum(0)[saw] / frames[saw]).flatten()
         spread = 1.96 * float(per_env.std() / math.sqrt(len(per_env)))
         rmse[name] = math.sqrt(mse)
         half_width[name] = spread / (2 * rmse[name]) if rmse[name] else 0.0  # of a square root
