@@ -67,6 +67,11 @@ class Sampler(ABC):
     def sizes(self) -> dict[str, int]:
         return {"num_points": self.num_points}
 
+    @property
+    @abstractmethod
+    def kernels(self) -> tuple[str, ...]:
+        """Names of the kernels that sampling a frame launches."""
+
     def __call__(
         self,
         ranges: torch.Tensor,
@@ -122,6 +127,10 @@ class RawSampler(Sampler):
     @property
     def sizes(self) -> dict[str, int]:
         return {"num_rays": self.num_points}
+
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        return ("raw_points",)
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         inputs = [view(ranges, float32), view(directions_s, vec3), 1.0 / self.max_range, view(out, vec3)]
@@ -199,6 +208,12 @@ class PdSampler(Sampler):
     @property
     def sizes(self) -> dict[str, int]:
         return {"num_proximal": self.num_proximal, "num_distal": self.num_points - self.num_proximal}
+
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        thinning = ("thin_proximal",) if self.grid else ()
+        proximal = ("gather_proximal", *thinning, "pick_farthest", "write_proximal") if self.num_proximal else ()
+        return (*proximal, "write_distal") if self.num_distal else proximal
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         n, r = ranges.shape
@@ -340,6 +355,10 @@ class ProximitySampler(PdSampler):
         self.num_distal = 0  # of the averages that PdSampler would write
         self.num_sectors = num_sectors
         self.edges, self.decay, self.blind, self.body = torch.tensor(edges), decay, blind, tuple(body)
+
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        return (*super().kernels, "proximity_grid")
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         super()._sample(ranges, directions_s, elevation, azimuth, out, attitude)

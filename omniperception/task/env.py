@@ -40,6 +40,13 @@ HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target
 RISK_TARGET = "risk_target"
 """Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector, the
 avoidance velocity, and the risk of candidate velocities."""
+TARGET_FIELDS = {
+    HEIGHT_TARGET: "heights",
+    SECTOR_TARGET: "sectors",
+    AVOIDANCE_TARGET: "sectors",
+    RISK_TARGET: "sectors",
+}
+"""The optional field that each of them is made from."""
 
 NEARNESS_RANGE = 4.0
 """Distance (m) from which on an obstacle counts as not near at all."""
@@ -119,16 +126,18 @@ class EnvConfig:
                     " use lidar=mid360 or rewards=walk observations=walk"
                 )
 
-    def fields_read(self) -> frozenset[str]:
-        """Optional fields that some reward or observation of this task reads."""
-        fields = self.rewards.fields_read() | self.observations.fields_read()
-        if HEIGHT_TARGET in self.targets:
-            fields |= {"heights"}
-        if {SECTOR_TARGET, AVOIDANCE_TARGET, RISK_TARGET} & set(self.targets):
-            fields |= {"sectors"}
+    def readers(self) -> dict[str, tuple[str, ...]]:
+        """Optional fields of this task and the rewards, observations and targets that read each of them."""
+        reads = {**self.rewards.readers(), **self.observations.readers()}
+        reads |= {f"supervision.{target}": frozenset({TARGET_FIELDS[target]}) for target in self.targets}
         if self.obstacles.num_obstacles:
-            fields |= {"obstacle_contact"}
-        return fields
+            reads["metrics.contacts"] = frozenset({"obstacle_contact"})
+        read = sorted(frozenset().union(*reads.values()))
+        return {field: tuple(name for name, its in reads.items() if field in its) for field in read}
+
+    def fields_read(self) -> frozenset[str]:
+        """Optional fields that something in this task reads."""
+        return frozenset(self.readers())
 
     @property
     def lidar_noise(self) -> tuple[Noise, ...]:

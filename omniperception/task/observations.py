@@ -50,9 +50,10 @@ class ObservationsConfig:
         object.__setattr__(self, "actor", tuple(self.actor))
         object.__setattr__(self, "critic", tuple(self.critic))
 
-    def fields_read(self) -> frozenset[str]:
-        terms = [term for group in self.groups.values() for term in group.terms.values()]
-        return frozenset().union(*(fields_read(term) for term in terms))
+    def readers(self) -> dict[str, frozenset[str]]:
+        """The optional fields that each term reads."""
+        terms = {f"{name}.{term}": f for name, group in self.groups.items() for term, f in group.terms.items()}
+        return {f"observations.{name}": fields_read(term) for name, term in terms.items()}
 
 
 class GroupBuffer:

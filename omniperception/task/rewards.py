@@ -44,8 +44,9 @@ class RewardsConfig:
         checked = {name: replace(t, func=checked_term(f"terms.{name}.func", t.func)) for name, t in used.items()}
         object.__setattr__(self, "terms", checked)
 
-    def fields_read(self) -> frozenset[str]:
-        return frozenset().union(*(fields_read(term.func) for term in self.terms.values()))
+    def readers(self) -> dict[str, frozenset[str]]:
+        """The optional fields that each term reads."""
+        return {f"rewards.{name}": fields_read(term.func) for name, term in self.terms.items()}
 
 
 @dataclass(frozen=True)

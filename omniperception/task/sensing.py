@@ -99,7 +99,7 @@ class LidarSensing:
             raise ValueError(
                 f"lidar.sensor.period_s={config.sensor.period_s} must be a multiple of the control step {control_dt} s"
             )
-        self._sim, self._needs, self._sampler = sim, needs, sampler
+        self._sim, self._needs, self.sampler = sim, needs, sampler
         shapes = ray_shapes(sim.world)
         self._bodies = shapes.bodies
         self._base = shapes.bodies.index(sim.world.base_body)
@@ -156,7 +156,7 @@ class LidarSensing:
             return
         frame, sensor = self.frame, self.config.sensor
         attitude = Attitude(base_quat.contiguous(), sensor.mount_pos, sensor.quat)
-        self._sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, self._newest, attitude)
+        self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, self._newest, attitude)
         self.frames = torch.cat((self.frames[:, 1:], self._newest[:, None]), 1)
         self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
 
