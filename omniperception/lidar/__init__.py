@@ -5,7 +5,7 @@ from .heightfield import HeightField
 from .meshes import TriangleMesh
 from .motion import PoseTrack
 from .mujoco import GeomShapes, MujocoScene, geom_shapes
-from .noise import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
+from .noise import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise, largest_lean
 from .patterns import (
     LIVOX,
     ScanPattern,
@@ -77,6 +77,7 @@ __all__ = [
     "hdl64e",
     "height_scanner",
     "horizon",
+    "largest_lean",
     "make_selection",
     "mid40",
     "mid70",

@@ -179,8 +179,13 @@ def noise_figures(named: dict[str, Noise], seed: int, min_range: float, max_rang
     return figures
 
 
-def spread(named: dict[str, Noise]) -> float:
+def largest_lean(noise: Sequence[Noise]) -> float:
     """Largest angle between a nominal direction and one that is cast for it, rad."""
+    return spread(noise_by_name(noise))
+
+
+def spread(named: dict[str, Noise]) -> float:
+    """``largest_lean`` of models by name."""
     angle = 0.0
     if "jitter" in named:
         angle += math.atan(MAX_SIGMAS * math.tan(math.radians(named["jitter"].sigma_deg)))

@@ -245,8 +245,7 @@ class Lidar:
         self._seek(time_s)
         if self.track is not None:
             self.track.advance()
-        self._placed.refresh()
-        if self._pack is not None:
+        if self._placed.refresh() and self._pack is not None:
             self._pack()
         self._cast()
         self.frame_count.add_(1)

@@ -16,11 +16,12 @@ from omniperception.lidar import (
     RayScene,
     ScanPattern,
     SectorDistances,
+    largest_lean,
 )
 from omniperception.perception import Attitude
 from omniperception.sim import Simulator
-from omniperception.world import ray_shapes
-from omniperception.world.rays import HitClass
+from omniperception.world.rays import HitClass, hidden_geoms, ray_shapes
+from omniperception.world.reach import FieldOfView
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ class LidarSensing:
     A reset empties an environment's history; its next frame comes with the sensor's next tick.
 
     Attributes:
+        hidden: geoms that are not in the ray scene because no ray meets them, and why.
+        base: index of the robot's base among the bodies of the ray scene.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
             newest last; None without a sampler.
         frame_count: (num_envs, 1) int64 how many of the newest frames are valid.
@@ -100,19 +103,18 @@ class LidarSensing:
                 f"lidar.sensor.period_s={config.sensor.period_s} must be a multiple of the control step {control_dt} s"
             )
         self._sim, self._needs, self.sampler = sim, needs, sampler
-        shapes = ray_shapes(sim.world)
-        self._bodies = shapes.bodies
-        self._base = shapes.bodies.index(sim.world.base_body)
-        self.config = config
+        self.config, pattern = config, config.pattern()
+        self.hidden = hidden_geoms(sim.world, config.exclude_geoms, field_of_view(config.sensor, pattern, noise))
+        shapes = ray_shapes(sim.world, self.hidden)
+        self._bodies, self.base = shapes.bodies, shapes.base
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
         )
         self.lidar = Lidar(
             config.sensor,
-            config.pattern(),
+            pattern,
             self.scene,
-            mount_body=self._base,
-            exclude_shapes=shapes.indices(tuple(config.exclude_geoms)),
+            mount_body=self.base,
             noise=tuple(noise),
             seed=seed,
             outputs=_outputs_read(needs, sampler is not None),
@@ -227,7 +229,7 @@ class LidarSensing:
             frame.directions_s,
             frame.class_id,
             self.scene.body_quat,
-            self._base,
+            self.base,
             sensor.mount_pos,
             sensor.quat,
             obstacle_class=int(HitClass.OBSTACLE),
@@ -235,6 +237,13 @@ class LidarSensing:
             num_sectors=self._needs.sectors,
             num_threads=num_threads,
         )
+
+
+def field_of_view(sensor: LidarConfig, pattern: ScanPattern, noise: Sequence[Noise]) -> FieldOfView:
+    """Where the rays of a sensor go."""
+    directions, origins = pattern.directions_s.numpy(), pattern.origins_s
+    reach = 0.0 if origins is None else float(origins.double().norm(dim=1).max())
+    return FieldOfView.of(sensor.mount_pos, sensor.quat, directions, largest_lean(noise), reach)
 
 
 def _outputs_read(needs: SensingNeeds, sampled: bool) -> tuple[str, ...]:
