@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from rsl_rl.env import VecEnv
@@ -19,14 +20,10 @@ from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
 from omniperception.task.rewards import RewardsConfig, avoidance_velocity
 from omniperception.task.rotations import rotate_yaw, yaw_quat
-from omniperception.task.sensing import LidarSensing, SensingNeeds, SensorConfig
 from omniperception.task.state import Kinematics
 from omniperception.task.terminations import TerminationsConfig
-from omniperception.task.terrain_levels import TerrainLevels
 from omniperception.task.timing import StageTimer
-from omniperception.task.true_risk import TrueVelocityRisk
 from omniperception.world import (
-    Ground,
     ObstacleField,
     ObstaclesConfig,
     RobotConfig,
@@ -35,6 +32,12 @@ from omniperception.world import (
     build_world,
 )
 from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
+
+if TYPE_CHECKING:  # parts that not every task has, and what they import, are loaded where they are built
+    from omniperception.task.sensing import LidarSensing, SensorConfig
+    from omniperception.task.terrain_levels import TerrainLevels
+    from omniperception.task.true_risk import TrueVelocityRisk
+    from omniperception.world import Ground
 
 HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target", "avoidance_target"
 RISK_TARGET = "risk_target"
@@ -523,11 +526,16 @@ class OmniEnv(VecEnv):
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _build_ground(self, terrain: TiledTerrainConfig) -> None:
+        from omniperception.task.terrain_levels import TerrainLevels
+        from omniperception.world import Ground
+
         self.ground = Ground(terrain, self.world.model, self.sim.ground_pos)
         self.terrain_levels = TerrainLevels(self.ground, self.random, self.control_dt, self.max_episode_length)
         self._height_grid, self._footprint = height_grid(self.device), footprint_grid(self.device)
 
     def _build_sensing(self, fields: frozenset[str]) -> LidarSensing:
+        from omniperception.task.sensing import LidarSensing, SensingNeeds
+
         config = self.config
         needs = SensingNeeds(
             sectors=config.rewards.avoidance.num_sectors if "sectors" in fields else 0,
@@ -550,6 +558,8 @@ class OmniEnv(VecEnv):
         config, law = self.config, self.config.rewards.avoidance.risk
         if self.sensing is None or law is None or "sectors" not in fields:
             return None
+        from omniperception.task.true_risk import TrueVelocityRisk
+
         return TrueVelocityRisk(law, config.obstacles, self.obstacles, self.num_envs, self.device)
 
     def _allocate(self) -> None:

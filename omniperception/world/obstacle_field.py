@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 
 from omniperception.random import EnvRandom
-from omniperception.world.ground import Ground
 from omniperception.world.obstacles import Obstacle, ObstaclesConfig
+
+if TYPE_CHECKING:
+    from omniperception.world.ground import Ground
 
 PARKED_HEIGHT = -100.0
 """Height (m) at which an obstacle that takes no part waits, below the ground where no ray and no contact finds it."""

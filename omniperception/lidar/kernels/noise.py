@@ -8,14 +8,12 @@ from functools import cache
 
 import warp as wp
 
+from ..noise import MAX_SIGMAS
 from .geometry import INF, PI
 
 wp.set_module_options({"enable_backward": False})
 
 JITTER, GAUSSIAN, DISTANCE, DROPOUT, MASK = (wp.constant(k) for k in range(5))
-MAX_SIGMAS = 5.0
-"""Jitter ends here, so that a ray stays within known bounds; exp(-12.5), or 4 in a million, would go beyond."""
-
 GOLDEN_ANGLE = wp.constant(wp.float32(2.399963229728653))
 
 
