@@ -127,6 +127,7 @@ class Plan:
         """One line."""
         left_out = sum(len(section.left_out) for section in self.sections)
         stages, kernels, packages = (len(self[t].has) for t in ("stages of a step", "kernels", "optional packages"))
+        kernels = max(kernels - 1, 0)  # without the line of the cache
         return (
             f"plan: {stages} stages a step, {kernels} compiled kernels, {packages} optional packages,"
             f" {self.bytes_per_env / 1e3:.1f} kB an environment and {self.shared_bytes / 1e6:.1f} MB shared;"
@@ -309,17 +310,24 @@ def _stages(run: RunConfig, env: OmniEnv) -> Section:
 
 
 def _kernels(run: RunConfig, env: OmniEnv, things: Mapping[str, object]) -> Section:
-    names = Counter(thing.kernel.key for thing in things.values() if type(thing).__name__ == "SplitLaunch")
-    entries = []
-    for name in names:
-        detail = _variant(env) if name == "cast_scan" else ""
-        entries.append(Entry(name, "the LiDAR launches it", detail))
-    sampler = getattr(env.sensing, "sampler", None)
-    entries += [Entry(name, f"{type(sampler).__name__} launches it") for name in getattr(sampler, "kernels", ())]
+    if env.sensing is None:
+        return Section("kernels", (), (Entry("kernels of the LiDAR", _why_no_lidar(run)),))
+    names = dict.fromkeys(thing.name for thing in things.values() if type(thing).__name__ == "SplitLaunch")
+    entries = [Entry(name, "", _variant(env) if name == "cast_scan" else "") for name in names]
+    if env.sensing.sampler is not None:
+        entries += [Entry(name, type(env.sensing.sampler).__name__) for name in env.sensing.sampler.kernels]
     if env.true_risk is not None:
         entries.append(Entry("velocity_risks", "rewards.avoidance.risk is a law"))
-    left_out = [Entry("LiDAR kernels", _why_no_lidar(run))] if env.sensing is None else []
-    return Section("kernels", tuple(entries), tuple(left_out))
+    return Section("kernels", (*entries, _cache()), ())
+
+
+def _cache() -> Entry:
+    """What this process and Warp's cache on the disk hold of compiled kernels."""
+    from omniperception.lidar.kernels.variants import MAX_VARIANTS, kept_variants, num_built
+
+    folder = sys.modules["warp"].config.kernel_cache_dir
+    detail = f"{len(kept_variants())} of at most {MAX_VARIANTS} variants kept, {num_built()} built; on disk in {folder}"
+    return Entry("cache of variants", "warp.clear_kernel_cache() empties the disk", detail)
 
 
 def _variant(env: OmniEnv) -> str:
@@ -360,6 +368,7 @@ def _rays(run: RunConfig, env: OmniEnv) -> Section:
             "nothing moves",
         ),
         (triangles > 0, "triangles and their trees", f"{triangles}", "meshes", "every shape is exact: no mesh"),
+        *((False, geom, "", "", why) for geom, why in env.sensing.hidden.items()),
         (cells > 0, "height field", f"{cells} heights", "the terrain is one", "the ground is a plane"),
     )
 

@@ -1,8 +1,10 @@
 """What a composed scene consists of and what was left out, each with the reason, without training.
 
     python scripts/plan.py [overrides as for train.py]
+    python scripts/plan.py what=gain [scene=all|walk|quickstart|camera|everything] [num_envs=256] [repeats=9]
 
-A few environments are built, and what exists is listed. Every training run saves the same as plan.yaml.
+A few environments are built, and what exists is listed. Every training run saves the same as plan.yaml. `what=gain`
+measures what it would cost to have what is left out: step, memory and start-up with each thing forced in.
 """
 
 from __future__ import annotations
@@ -25,9 +27,26 @@ def plan_of(overrides: list[str]) -> Plan:
     return describe(run, build_runner(built, None))
 
 
+def gain(arguments: list[str]) -> str:
+    """Tables of what forcing things in costs."""
+    from omniperception.analysis import pruning_benchmark as benchmark
+
+    own, rest = config.split_arguments(arguments, {"scene": "all", "num_envs": "256", "repeats": "9"})
+    if rest:
+        raise config.ConfigError(f"what=gain takes scene, num_envs and repeats, not {rest[0]}")
+    num_envs, repeats = (int(config.positive(key, own[key], int)) for key in ("num_envs", "repeats"))
+    scenes = tuple(benchmark.SCENES) if own["scene"] == "all" else (own["scene"],)
+    gains = [gain for scene in scenes for gain in benchmark.measure(scene, num_envs, repeats)]
+    starts = [start for scene in scenes for start in benchmark.start_up(scene, num_envs, min(repeats, 3))]
+    return benchmark.tables(gains, starts, num_envs)
+
+
 def main() -> None:
     with config.one_line_errors():
-        print(plan_of(sys.argv[1:]).text())
+        own, rest = config.split_arguments(sys.argv[1:], {"what": "plan"})
+        if own["what"] not in ("plan", "gain"):
+            raise config.ConfigError(f"what={own['what']} must be plan or gain")
+        print(plan_of(rest).text() if own["what"] == "plan" else gain(rest))
 
 
 if __name__ == "__main__":

@@ -163,6 +163,7 @@ class OmniEnv(VecEnv):
     contacts with obstacles are those of all physics steps of the control step.
 
     Attributes:
+        actions: those applied, newest first, as many as some term reads.
         ground: the terrain's height field; None on flat ground.
         base_height: (num_envs,) height (m) of the base's origin above the ground, the mean of what lies below it and
             below the hips.
@@ -220,8 +221,9 @@ class OmniEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """One control step with actions (num_envs, num_actions); see rsl_rl.env.VecEnv."""
         actions = actions.clamp(-MAX_ACTION, MAX_ACTION)
-        self.actions = (actions, self.actions[0], self.actions[1])
-        self.last_joint_vel = self.kinematics.joint_vel
+        self.actions = (actions, *self.actions[:-1])
+        if "last_joint_vel" in self._reads:
+            self.last_joint_vel = self.kinematics.joint_vel
         self.step_count += 1
         self.episode_length_buf += 1
         self._advance_physics(actions)
@@ -562,6 +564,10 @@ class OmniEnv(VecEnv):
 
         return TrueVelocityRisk(law, config.obstacles, self.obstacles, self.num_envs, self.device)
 
+    def _actions_before(self) -> int:
+        """How many actions before the newest something reads."""
+        return 2 if "action_before_last" in self._reads else int("last_action" in self._reads)
+
     def _allocate(self) -> None:
         robot, model = self.robot, self.world.model
         joint_ids = [model.joint(name).id for name in robot.joints]
@@ -569,8 +575,7 @@ class OmniEnv(VecEnv):
         self.joint_lower, self.joint_upper = limits[:, 0], limits[:, 1]
         self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
         zero = torch.zeros(self.num_envs, self.num_actions, device=self.device)
-        self.actions: tuple[torch.Tensor, ...] = (zero, zero, zero)
-        self.last_joint_vel = zero
+        self.actions: tuple[torch.Tensor, ...] = (zero,) * (1 + self._actions_before())
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
         self.risk: torch.Tensor | None = None

@@ -57,7 +57,7 @@ class ObservationsConfig:
 
 
 class GroupBuffer:
-    """Holds one group's history and writes each new observation into it."""
+    """Holds one group's history, if it has one, and writes each new observation into it."""
 
     def __init__(self, name: str, group: ObservationGroup, env: OmniEnv) -> None:
         self._terms = tuple(group.terms.values())
@@ -72,8 +72,9 @@ class GroupBuffer:
             self.slices[term_name] = slice(start, start + value.shape[1])
             start += value.shape[1]
         self.width = start
-        self._history = group.history
-        self.buffer = torch.zeros(env.num_envs, group.history, self.width, device=env.device)
+        self.buffer: torch.Tensor | None = None
+        if group.history > 1:
+            self.buffer = torch.zeros(env.num_envs, group.history, self.width, device=env.device)
 
     def update(self, env: OmniEnv, fresh: torch.Tensor) -> torch.Tensor:
         """Appends the current observation; `fresh` (num_envs,) bool marks environments just reset.
@@ -83,7 +84,7 @@ class GroupBuffer:
         """
         values = [term(env) for term in self._terms]
         value = torch.cat(values, 1) if len(values) > 1 else values[0].clone()
-        if self._history == 1:
+        if self.buffer is None:
             return value
         self.buffer = torch.cat((self.buffer[:, 1:], value[:, None]), 1)
         self.buffer[fresh] = value[fresh][:, None]

@@ -200,16 +200,19 @@ def joint_velocity_squared(env: OmniEnv) -> torch.Tensor:
     return env.kinematics.joint_vel.square().sum(1)
 
 
+@reads("last_joint_vel")
 def joint_acceleration_squared(env: OmniEnv) -> torch.Tensor:
     """|qddot|^2, (rad/s^2)^2, by the difference of joint velocities over the control step."""
     return ((env.kinematics.joint_vel - env.last_joint_vel) / env.control_dt).square().sum(1)
 
 
+@reads("last_action")
 def action_rate_squared(env: OmniEnv) -> torch.Tensor:
     """|a_{t-1} - a_t|^2."""
     return (env.actions[1] - env.actions[0]).square().sum(1)
 
 
+@reads("last_action", "action_before_last")
 def action_acceleration_squared(env: OmniEnv) -> torch.Tensor:
     """|a_{t-2} - 2 a_{t-1} + a_t|^2."""
     return (env.actions[2] - 2 * env.actions[1] + env.actions[0]).square().sum(1)

@@ -4,12 +4,13 @@ The random numbers are a function of seed, environment, frame, ray and model: no
 """
 
 from collections.abc import Iterable
-from functools import cache
+from functools import lru_cache
 
 import warp as wp
 
 from ..noise import MAX_SIGMAS
 from .geometry import INF, PI
+from .variants import MAX_VARIANTS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -85,7 +86,7 @@ def mixed(figures: NoiseFigures, first: float, second: float):
     return near + (1.0 - figures.mixed_weight) * gap
 
 
-@cache
+@lru_cache(MAX_VARIANTS)
 def disturb_function(models: Iterable[str]) -> wp.Function:
     """(figures, distance, true distance, key) -> what is measured of a hit; for the models named here."""
     has_gaussian, has_distance = "gaussian" in models, "distance" in models
