@@ -17,15 +17,16 @@ import yaml
 
 from omniperception import config
 from omniperception.assembly import build_runner
+from omniperception.inventory import walk
 from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid
 from omniperception.lidar.kernels import variants
 from omniperception.lidar.launch import SplitLaunch
-from omniperception.plan import PLAN_FILE, contact_pairs, describe, walk
+from omniperception.plan import PLAN_FILE, contact_pairs, describe
 from omniperception.task import sensing as sensing_module
 from omniperception.task.heights import NUM_HEIGHTS
 from omniperception.world import build_world, ray_shapes
 from omniperception.world.rays import hidden_geoms
-from omniperception.world.reach import JOINT_MARGIN, FieldOfView, unreachable_geoms
+from omniperception.world.reach import FieldOfView, unreachable_geoms
 
 ROOT = Path(__file__).resolve().parents[1]
 WALK = ("experiment=walk", "num_envs=13")
@@ -149,7 +150,8 @@ def test_tiled_ground_is_a_height_field_in_the_rays_and_their_kernel(make_env):
 def code_of_scan(env):
     """What the scan's kernel was compiled from."""
     module = env.sensing.lidar._cast.kernel.module.get_module_identifier(1)  # one thread to a block, as on a CPU
-    return Path(wp.config.kernel_cache_dir, module, f"{module}.cpp").read_text()
+    lines = Path(wp.config.kernel_cache_dir, module, f"{module}.cpp").read_text().splitlines()
+    return "\n".join(line for line in lines if not line.lstrip().startswith("//"))
 
 
 @pytest.fixture
@@ -221,29 +223,17 @@ NUM_POSTURES = 96
 
 
 def random_postures(model, count):
-    """Positions and orientations of all bodies: half of the joints anywhere, the others at one end or the other."""
+    """Positions and orientations of all bodies: half of the joints at an end of their range, the others anywhere."""
     rng, data = np.random.default_rng(0), mujoco.MjData(model)
-    low, high = model.jnt_range[1:].T + np.array([[-JOINT_MARGIN], [JOINT_MARGIN]])
+    low, high = model.jnt_range[1:].T
     pos, quat = np.zeros((count, model.nbody, 3)), np.zeros((count, model.nbody, 4))
     for k in range(count):
         ends = np.where(rng.random(len(low)) < 0.5, low, high)
-        data.qpos[7:] = np.where(rng.random(len(low)) < 0.5, ends, rng.uniform(low, high))
+        data.qpos[7:] = np.where(rng.random(len(low)) < 0.5, ends, rng.uniform(-np.pi, np.pi, len(low)))
         data.qpos[:7] = [*rng.uniform(-1, 1, 2), 0.4, *rng.normal(size=4)]
         mujoco.mj_kinematics(model, data)
         pos[k], quat[k] = data.xpos, data.xquat
     return pos, quat
-
-
-def test_joints_stay_within_the_margin_of_the_bound(make_env):
-    """However wild the actions, no joint is pressed farther beyond its range than the bound allows for."""
-    env = make_env(blind=True, num_envs=32)
-    worst = 0.0
-    for _ in range(100):
-        env.step(60.0 * torch.randn(32, env.num_actions).sign())
-        q = env.sim.qpos[:, 7:][~env.sim.failed]
-        beyond = torch.maximum(q - env.joint_upper, env.joint_lower - q)
-        worst = max(worst, float(beyond.max()))
-    assert 0.0 < worst < JOINT_MARGIN
 
 
 def test_an_unknown_link_counts_as_within_reach():
@@ -280,7 +270,7 @@ def test_contact_sensors_and_torques_exist_for_terms_that_read_them(make_env):
     paper = make_env("rewards=paper", "perception=none", "lidar.sensor.num_rays=50")
     assert paper.world.sensors == {"foot_force", "link_force", "obstacle_contact"} and "sensordata" in paper.sim._record
     assert "actuator_force" in paper.sim.batch._bound
-    blind = make_env(blind=True)
+    blind = make_env("obstacles=none", blind=True)
     assert blind.world.model.nsensor == 0 and not blind.sim._record and not blind.sim._records
     assert not {"foot_force", "link_force"} & vars(blind).keys()
 
@@ -319,7 +309,7 @@ def test_heights_are_looked_up_for_critic_or_supervision_only(overrides, read, m
 def test_only_what_is_randomized_is_a_field_of_its_own(make_env):
     plain = make_env(blind=True)
     assert not plain.sim.batch._expanded and not [name for name in arrays_of(plain) if "randomizer" in name]
-    some = make_env("randomization.motor_strength=[0.9,1.1]", "randomization.latency_s=[0.005,0.02]", blind=True)
+    some = make_env("+randomization.motor_strength=[0.9,1.1]", "+randomization.latency_s=[0.005,0.02]", blind=True)
     assert set(some.sim.batch._expanded) == {"actuator_gainprm", "actuator_biasprm"}
     assert some.randomizer.joint_offset is None and some._past[0].shape[1] == 1 + 4  # 20 ms in steps of 5 ms
 
@@ -384,10 +374,7 @@ def test_stages_and_kernels_are_those_that_run(overrides, launched):
     for _ in range(env.sensing.period_steps if env.sensing else 1):
         env.step(torch.zeros(env.num_envs, env.num_actions))
     assert names(plan, "stages of a step") == set(env.timer.seconds)
-    ran = set(launched) - {"ground_heights"}
-    assert ran <= names(plan, "kernels")
-    once = {"place_shapes"}
-    assert names(plan, "kernels") - ran - once <= {"cache of variants"}
+    assert names(plan, "kernels") == set(launched)
 
 
 def test_readers_and_reasons_are_named(quick_run, walk_run):
@@ -427,7 +414,7 @@ def test_the_plan_is_saved_and_summed_up_in_a_line(walk_run, tmp_path):
     plan = describe(*walk_run)
     plan.save(tmp_path)
     assert yaml.safe_load((tmp_path / PLAN_FILE).read_text()) == plan.as_dict()
-    assert plan.summary().startswith("plan: 5 stages a step, 0 compiled kernels") and "\n" not in plan.summary()
+    assert plan.summary().startswith("plan: 5 stages of a step, 0 kernels") and "\n" not in plan.summary()
     assert "lidar=none" in plan.text() and "joint_torques" in plan.text()
 
 

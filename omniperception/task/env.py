@@ -370,11 +370,13 @@ class OmniEnv(VecEnv):
             return
         with self.timer.stage("rays"):
             self.sensing.cast(self.step_count * self.control_dt)
-        with self.timer.stage("sampling"):
-            self.sensing.sample(self.sensed.base_quat_w)
-        with self.timer.stage("sectors"):
-            self.sensing.measure_sectors()
-            self._read_avoidance()
+        if self.sensing.frames is not None:
+            with self.timer.stage("sampling"):
+                self.sensing.sample(self.sensed.base_quat_w)
+        if self.sensing.sector_distance is not None:
+            with self.timer.stage("sectors"):
+                self.sensing.measure_sectors()
+                self._read_avoidance()
         if self.true_risk is not None:
             with self.timer.stage("risk"):
                 self.risk = self.true_risk.measure(self.kinematics)

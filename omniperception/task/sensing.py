@@ -102,7 +102,7 @@ class LidarSensing:
             raise ValueError(
                 f"lidar.sensor.period_s={config.sensor.period_s} must be a multiple of the control step {control_dt} s"
             )
-        self._sim, self._needs, self.sampler = sim, needs, sampler
+        self._sim, self.needs, self.sampler = sim, needs, sampler
         self.config, pattern = config, config.pattern()
         self.hidden = hidden_geoms(sim.world, config.exclude_geoms, field_of_view(config.sensor, pattern, noise))
         shapes = ray_shapes(sim.world, self.hidden)
@@ -153,9 +153,11 @@ class LidarSensing:
         self._distal_range.clear()
 
     def sample(self, base_quat: torch.Tensor) -> None:
-        """Appends the sampled points of the newest frame to the history; `base_quat` (num_envs, 4) as sensed."""
-        if self.frames is None:
-            return
+        """Appends the sampled points of the newest frame to the history; for a LiDAR with a sampler.
+
+        Args:
+            base_quat: (num_envs, 4) as sensed.
+        """
         frame, sensor = self.frame, self.config.sensor
         attitude = Attitude(base_quat.contiguous(), sensor.mount_pos, sensor.quat)
         self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, self._newest, attitude)
@@ -163,9 +165,8 @@ class LidarSensing:
         self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
 
     def measure_sectors(self) -> None:
-        """Distances to the nearest obstacle per azimuth sector."""
-        if self.sector_distance is not None:
-            self._measure_sectors()
+        """Distances to the nearest obstacle per azimuth sector, where somebody reads them."""
+        self._measure_sectors()
 
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
         """(num_envs,) mean of the noise-free distal ranges (m), each capped at `max_distance`."""
@@ -212,7 +213,7 @@ class LidarSensing:
         if self.frames is not None:
             self.frames[env_ids] = 0.0
         if self.sector_distance is not None:
-            self.sector_distance[env_ids] = self._needs.sector_max
+            self.sector_distance[env_ids] = self.needs.sector_max
         for max_distance, mean in self._distal_range.items():
             mean[env_ids] = max_distance
 
@@ -233,8 +234,8 @@ class LidarSensing:
             sensor.mount_pos,
             sensor.quat,
             obstacle_class=int(HitClass.OBSTACLE),
-            max_distance=self._needs.sector_max,
-            num_sectors=self._needs.sectors,
+            max_distance=self.needs.sector_max,
+            num_sectors=self.needs.sectors,
             num_threads=num_threads,
         )
 

@@ -8,9 +8,6 @@ from itertools import product
 import mujoco
 import numpy as np
 
-JOINT_MARGIN = 0.3
-"""How far (rad or m) beyond its range a joint may be pressed; limits are soft."""
-
 _MAX_CELLS = 50_000
 """Cells of joint angles looked at together; a geom that needs more counts as within reach."""
 _MAX_BALLS = 8
@@ -69,7 +66,8 @@ def unreachable_geoms(model: mujoco.MjModel, carrier: int, view: FieldOfView) ->
 
     Geoms are covered with balls. A ball's centre moves by at most (distance from the axis) x (angle) with each joint
     between it and the carrier, so that one test of a ball widened by that decides for a whole cell of joint angles;
-    cells that stay open are divided. What occludes what is not considered.
+    cells that stay open are divided. Joints may turn all around: the engine's limits are soft, and a hard command
+    presses a joint a radian beyond them. What occludes what is not considered.
 
     Args:
         model: the compiled model.
@@ -104,8 +102,7 @@ def _joints(model: mujoco.MjModel, body: int) -> range:
 def _within_reach(model: mujoco.MjModel, chain: list[int], geom: int, view: FieldOfView) -> bool:
     points, radius = _balls(model, geom)
     joints = [j for body in chain for j in _joints(model, body)]
-    low, high = (np.array([_range(model, j)[k] for j in joints]) for k in (0, 1))
-    centre, half = ((low + high) / 2)[None], (high - low) / 2
+    centre, half = np.zeros((1, len(joints))), np.full(len(joints), np.pi)
     halves = np.array(list(product((-0.5, 0.5), repeat=len(joints)))).reshape(2 ** len(joints), len(joints))
     while True:
         placed, arm = _place(model, chain, centre, points)  # (C, B, 3), (joints, B)
@@ -118,13 +115,6 @@ def _within_reach(model: mujoco.MjModel, chain: list[int], geom: int, view: Fiel
             return True
         centre = (centre[:, None] + halves * half).reshape(-1, len(joints))
         half = half / 2
-
-
-def _range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:
-    if not model.jnt_limited[joint]:
-        return -np.pi, np.pi
-    low, high = model.jnt_range[joint]
-    return low - JOINT_MARGIN, high + JOINT_MARGIN
 
 
 def _balls(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
@@ -144,9 +134,10 @@ def _balls(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
 def _place(
     model: mujoco.MjModel, chain: list[int], angles: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (C, B, 3) in the carrier's frame for joint angles (C, J), and (J, B) how far each is from a joint at most.
+    """Points (C, B, 3) in the carrier's frame, and (J, B) how far each is from a joint at most.
 
-    The largest distance from a joint's anchor, whatever the joints below it do, is the way along the links.
+    Angles (C, J) count from the reference pose. The largest distance from a joint's anchor, whatever the joints below
+    it do, is the way along the links.
     """
     placed = np.broadcast_to(points, (len(angles), *points.shape))
     arms: list[np.ndarray] = []
@@ -158,7 +149,7 @@ def _place(
             anchor = model.jnt_pos[joint]
             spans = np.linalg.norm(points - anchor, axis=-1) if away is None else away + np.linalg.norm(anchor)
             arms.insert(0, spans)
-            turn = _rotations(model.jnt_axis[joint], angles[:, column] - model.qpos0[model.jnt_qposadr[joint]])
+            turn = _rotations(model.jnt_axis[joint], angles[:, column])
             placed = np.einsum("cij,cbj->cbi", turn, placed - anchor) + anchor
             away = spans + np.linalg.norm(anchor)
         step = np.linalg.norm(model.body_pos[body])
