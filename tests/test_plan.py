@@ -219,7 +219,7 @@ def test_geoms_left_out_of_the_rays_are_never_met(name, make_config):
         assert torch.equal(seen[False][0], seen[True][0]) and seen[False][1] == seen[True][1]
 
 
-NUM_POSTURES = 96
+NUM_POSTURES = 48
 
 
 def random_postures(model, count):

@@ -578,6 +578,8 @@ class OmniEnv(VecEnv):
         self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
         zero = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         self.actions: tuple[torch.Tensor, ...] = (zero,) * (1 + self._actions_before())
+        if "last_joint_vel" in self._reads:
+            self.last_joint_vel = zero
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
         self.risk: torch.Tensor | None = None
