@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-_ENTERED = ("omniperception.", "mujoco.batch", "rsl_rl.storage")
+_ENTERED = ("omniperception.", "mujoco.batch", "mujoco_warp.", "rsl_rl.storage")
 """Objects of these modules are looked into, and so are dicts, lists and Warp's structs; networks and others are not."""
 
 

@@ -27,8 +27,8 @@ def plan_of(overrides: list[str]) -> Plan:
     return describe(run, build_runner(built, None))
 
 
-def gain(arguments: list[str]) -> str:
-    """Tables of what forcing things in costs."""
+def print_gain(arguments: list[str]) -> None:
+    """Tables of what forcing things in costs, each scene's as soon as it is measured."""
     from omniperception.analysis import pruning_benchmark as benchmark
 
     own, rest = config.split_arguments(arguments, {"scene": "all", "num_envs": "256", "repeats": "9"})
@@ -36,9 +36,12 @@ def gain(arguments: list[str]) -> str:
         raise config.ConfigError(f"what=gain takes scene, num_envs and repeats, not {rest[0]}")
     num_envs, repeats = (int(config.positive(key, own[key], int)) for key in ("num_envs", "repeats"))
     scenes = tuple(benchmark.SCENES) if own["scene"] == "all" else (own["scene"],)
-    gains = [gain for scene in scenes for gain in benchmark.measure(scene, num_envs, repeats)]
-    starts = [start for scene in scenes for start in benchmark.start_up(scene, num_envs, min(repeats, 3))]
-    return benchmark.tables(gains, starts, num_envs)
+    print("\n".join(benchmark.step_header(num_envs)))
+    for scene in scenes:
+        print("\n".join(map(benchmark.step_row, benchmark.measure(scene, num_envs, repeats))), flush=True)
+    print("\n".join(("", *benchmark.START_HEADER)))
+    for scene in scenes:
+        print(benchmark.start_row(*benchmark.start_up(scene, num_envs, min(repeats, 3))), flush=True)
 
 
 def main() -> None:
@@ -46,7 +49,10 @@ def main() -> None:
         own, rest = config.split_arguments(sys.argv[1:], {"what": "plan"})
         if own["what"] not in ("plan", "gain"):
             raise config.ConfigError(f"what={own['what']} must be plan or gain")
-        print(plan_of(rest).text() if own["what"] == "plan" else gain(rest))
+        if own["what"] == "gain":
+            print_gain(rest)
+        else:
+            print(plan_of(rest).text())
 
 
 if __name__ == "__main__":

@@ -352,24 +352,27 @@ def _import_if_installed(name: str) -> None:
         return
 
 
-def tables(gains: Sequence[Gain], starts: Sequence[StartUp], num_envs: int) -> str:
-    """Both tables as Markdown."""
-    lines = [
-        f"| scene, {num_envs} environments | forced in | step, CPU time | pairs | bytes per environment |",
-        "|---|---|---|---|---|",
-    ]
-    for g in gains:
-        median, low, high = g.step_ratio
-        before, after = g.bytes_per_env
-        lines.append(
-            f"| {g.scene} ({g.step_us:.1f} us) | {g.item} | x {median:.2f} | {low:.2f} to {high:.2f} |"
-            f" {before:,.0f} -> {after:,.0f} |"
-        )
-    lines += ["", "| scene | start-up, CPU time | resident memory | modules |", "|---|---|---|---|"]
-    for plain, forced in zip(starts[::2], starts[1::2], strict=True):
-        lines.append(
-            f"| {plain.scene} | {plain.cpu_s:.1f} s, forced {forced.cpu_s:.1f} s |"
-            f" {plain.memory_mb:.0f} MB, forced {forced.memory_mb:.0f} MB | {plain.modules:.0f}, forced"
-            f" {forced.modules:.0f} |"
-        )
-    return "\n".join(lines)
+START_HEADER = ("| scene | start-up, CPU time | resident memory | modules |", "|---|---|---|---|")
+
+
+def step_header(num_envs: int) -> tuple[str, str]:
+    """Head of the Markdown table of gains."""
+    columns = ("forced in", "step, CPU time", "pairs", "bytes per environment")
+    return f"| scene, {num_envs} environments | {' | '.join(columns)} |", "|---|---|---|---|---|"
+
+
+def step_row(gain: Gain) -> str:
+    """A line of that table."""
+    (median, low, high), (before, after) = gain.step_ratio, gain.bytes_per_env
+    return (
+        f"| {gain.scene} ({gain.step_us:.1f} us) | {gain.item} | x {median:.2f} | {low:.2f} to {high:.2f} |"
+        f" {before:,.0f} -> {after:,.0f} |"
+    )
+
+
+def start_row(plain: StartUp, forced: StartUp) -> str:
+    """A line of the table of start-ups."""
+    return (
+        f"| {plain.scene} | {plain.cpu_s:.1f} s, forced {forced.cpu_s:.1f} s | {plain.memory_mb:.0f} MB, forced"
+        f" {forced.memory_mb:.0f} MB | {plain.modules:.0f}, forced {forced.modules:.0f} |"
+    )
