@@ -371,9 +371,8 @@ def _learning(run: RunConfig, runner: Runner) -> Section:
     section.add("critic", count(runner.alg.critic))
     detail = f"{count(network)} of the actor's, history {network.history}" if network is not None else ""
     section.either(network is not None, "perception network", detail, "", "perception=none")
-    for name in (
-        (item.name for item in fields(run.perception) if item.name.endswith("_weight")) if network is not None else ()
-    ):
+    weights = [item.name for item in fields(run.perception) if item.name.endswith("_weight")] if run.perception else []
+    for name in weights:
         weight = getattr(run.perception, name)
         section.either(weight != 0, f"perception.{name}", f"{weight:g}", "supervises the embedding", "weight 0")
     return section
