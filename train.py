@@ -24,6 +24,8 @@ def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
         runner.load(str(latest_checkpoint(run_dir)))
         print(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
     else:
+        if run.init is not None:
+            runner.start_from(config.find_run(run.init))
         print(f"run directory: {run_dir}")
     plan = describe(run, runner)
     plan.save(run_dir)

@@ -43,13 +43,23 @@ class RunConfig:
         env: the task.
         perception: the actor's view of the LiDAR, or None.
         ppo: the learning settings.
+        init: the run whose weights this one starts from, or None.
         composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
     """
 
     env: EnvConfig
     perception: PerceptionConfig | None
     ppo: PPOConfig
+    init: str | None
     composed: dict
+
+    def __post_init__(self) -> None:
+        supervised = self.perception is not None and self.perception.supervised_epochs > 0
+        if self.ppo.num_learning_epochs == 0 and not supervised:
+            raise ValueError(
+                "ppo.num_learning_epochs=0 keeps the policy as it is, and nothing else learns; set it to at least 1, or"
+                " perception.supervised_epochs"
+            )
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:
@@ -78,15 +88,16 @@ def assemble(config: DictConfig) -> RunConfig:
             seed=composed["seed"],
             sampler=perception.sampler if perception else None,
             frame_history=perception.history if perception else 0,
+            base_motion=perception.base_motion if perception else False,
             targets=tuple(perception.supervision) if perception else (),
             log_interval=ppo.num_steps_per_env,
             **parts,
         )
+        return RunConfig(env, perception, ppo, composed.get("init"), composed)
     except (OmegaConfBaseException, InstantiationException) as error:
         raise ConfigError(_one_line(error)) from None
     except (TypeError, ValueError) as error:
         raise ConfigError(_one_line(error)) from None
-    return RunConfig(env, perception, ppo, composed)
 
 
 def check(overrides: Sequence[str]) -> None:

@@ -192,7 +192,8 @@ def _lidar(run: RunConfig) -> Lidar:
 
 def _perception(run: RunConfig) -> Perception:
     sampler = run.perception.sampler()
-    return Perception(run.perception.history, sampler.num_points, sampler_figures(sampler))
+    moves = run.perception.base_motion
+    return Perception(run.perception.history, sampler.num_points + moves, sampler_figures(sampler), moves)
 
 
 def sampler_figures(sampler: Sampler) -> dict:

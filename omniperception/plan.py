@@ -41,7 +41,7 @@ OPTIONAL_FIELDS: dict[str, tuple[str, Callable[[OmniEnv], bool]]] = {
     "link_force": ("forces on the penalised links", lambda env: hasattr(env, "link_force")),
     "obstacle_contact": ("contacts with obstacles", lambda env: "obstacle_contact" in env.world.sensors),
     "joint_torque": ("actuator torques", lambda env: hasattr(env, "joint_torque")),
-    "heights": ("heights of the ground around the robot", lambda env: hasattr(env, "heights")),
+    "heights": ("heights of the ground around the robot", lambda env: env.heights.shape[1] > 0),
     "obstacles": ("places and velocities of obstacles", lambda env: hasattr(env, "obstacle_rel_pos_yaw")),
     "sectors": ("distances to obstacles by sector", lambda env: _sensing(env, "sector_distance") is not None),
     "rays": ("noise-free ranges, for their mean", lambda env: env.sensing is not None and env.sensing.needs.rays),
@@ -221,8 +221,10 @@ def _stages(run: RunConfig, env: OmniEnv) -> Section:
     sampled, measured = (_sensing(env, name) is not None for name in ("frames", "sector_distance"))
     section.either(sampled, "sampling", every, "the network reads points", blind or "no network reads points")
     section.either(measured, "sectors", every, _readers(run, "sectors"), blind or "nothing reads sectors")
-    law = "rewards.avoidance.risk"
-    section.either(env.true_risk is not None, "risk", every, f"{law} is a law", f"{law} is null")
+    followed = env.true_sectors is not None
+    section.either(followed, "risk", every, "rewards.avoidance.risk is a law", "rewards.avoidance.risk is null")
+    late = env.heights.shape[1] > 0 and not env.heights_every_step
+    section.either(late, "heights", every, _readers(run, "heights"), "no network is supervised with them alone")
     section.either(env.ground is not None, "terrain", "", "levels follow how far robots walk", "flat ground")
     section.add("rewards", f"{len(run.env.rewards.terms)} terms, and terminations")
     section.add("resets")
@@ -236,11 +238,26 @@ def _kernels(run: RunConfig, env: OmniEnv, things: dict[str, object]) -> Section
         section.add(name, _variant(sensing) if name == "cast_scan" else "")
     for name in _sensing(env, "sampler").kernels if _sensing(env, "frames") is not None else ():
         section.add(name, "", type(sensing.sampler).__name__)
-    if env.true_risk is not None:
-        section.add("velocity_risks", "", "rewards.avoidance.risk is a law")
+    for name, why in _kernels_beside(env):
+        section.add(name, "", why)
     if sensing is None:
         section.leave_out("those of the LiDAR", _why_blind(run))
     return section
+
+
+def _kernels_beside(env: OmniEnv) -> Iterator[tuple[str, str]]:
+    """Kernels that are launched on tensors which come with each call, and why."""
+    if env.true_sectors is not None:
+        yield "nearest_by_sector", "rewards.avoidance.risk is a law"
+    if env.risk is not None:
+        yield "worst_sectors", "rewards.avoidance.risk is a law"
+    if env.ground is not None:
+        yield "heights_at", "robots and obstacles start on the ground"
+        yield "base_heights", "height above ground that is not flat"
+    if env.ground is not None and env.heights.shape[1] > 0:
+        yield "heights_around", "the heights are read"
+    if env.ground is not None and env.obstacles is not None:
+        yield "lift", "obstacles move over ground that is not flat"
 
 
 def _variant(sensing: LidarSensing) -> str:

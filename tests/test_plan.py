@@ -293,17 +293,12 @@ def test_weight_0_removes_term_input_and_sensor(term, sensor, make_env):
 
 
 @pytest.mark.parametrize(("overrides", "read"), [((), False), (("observations=paper",), True)])
-def test_heights_are_looked_up_for_critic_or_supervision_only(overrides, read, make_env, monkeypatch):
+def test_heights_are_looked_up_for_critic_or_supervision_only(overrides, read, make_env, launched):
     env = make_env("terrain=rough", "perception=none", "lidar.sensor.num_rays=50", *overrides)
-    points, height = [], type(env.ground).height
-
-    def look_up(self, xy_w, *rest):
-        points.append(xy_w.shape)
-        return height(self, xy_w, *rest)
-
-    monkeypatch.setattr(type(env.ground), "height", look_up)
+    launched.clear()
     env.step(torch.zeros(env.num_envs, env.num_actions))
-    assert points and any(NUM_HEIGHTS in shape for shape in points) == read == hasattr(env, "heights")
+    assert "base_heights" in launched and ("heights_around" in launched) == read
+    assert env.heights.shape[1] == (NUM_HEIGHTS if read else 0)
 
 
 def test_only_what_is_randomized_is_a_field_of_its_own(make_env):
@@ -373,6 +368,7 @@ def test_stages_and_kernels_are_those_that_run(overrides, launched):
     launched.clear()
     for _ in range(env.sensing.period_steps if env.sensing else 1):
         env.step(torch.zeros(env.num_envs, env.num_actions))
+    env._reset(torch.arange(env.num_envs))
     assert names(plan, "stages of a step") == set(env.timer.seconds)
     assert names(plan, "kernels") == set(launched)
 

@@ -103,13 +103,15 @@ class Perception:
 
     Attributes:
         history: frames that the network sees.
-        num_points: points of a frame after sampling.
+        num_points: rows of a frame, sampled points and the base's motion.
         sampler: kind and figures of the sampler, see `omniperception.deploy.sampling.make_sampler`.
+        base_motion: whether a frame's last row is how the base moved since the frame before.
     """
 
     history: int
     num_points: int
     sampler: Mapping
+    base_motion: bool = False
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from omniperception.deploy.description import DeployError, Description, Group
+from omniperception.deploy.odometry import Odometry
 from omniperception.deploy.sampling import Attitude, make_sampler
 
 if TYPE_CHECKING:
@@ -26,8 +27,8 @@ class RobotState:
         joint_vel: (num_joints,) rad/s.
         base_quat: (4,) orientation of the base in the world from the IMU, (w, x, y, z); the heading does not matter.
         base_ang_vel: (3,) angular velocity in the base frame from the gyroscope, rad/s.
-        base_lin_vel: (3,) linear velocity in the base frame from a state estimator, m/s; None if the policy does not
-            observe it.
+        base_lin_vel: (3,) linear velocity in the base frame from a state estimator, m/s; None if the policy neither
+            observes it nor follows the base's motion.
     """
 
     joint_pos: Sequence[float]
@@ -62,6 +63,8 @@ class ExportedPolicy:
         self.frames: np.ndarray | None = None
         if perception is not None:
             self.frames = np.zeros((perception.history, perception.num_points, 3), np.float32)
+        follows = perception is not None and perception.base_motion
+        self._odometry = Odometry(description.control_period_s) if follows else None
         self.observation = np.zeros(description.observation_size, np.float32)
         self._check_network()
         self.reset()
@@ -105,6 +108,8 @@ class ExportedPolicy:
         self.frame_count = 0
         if self.frames is not None:
             self.frames = np.zeros_like(self.frames)
+        if self._odometry is not None:
+            self._odometry = Odometry(self.description.control_period_s)
 
     def thin(self, points: np.ndarray) -> np.ndarray:
         """Of a device's whole frame (n, 3), misses as zeros or left out, the points that training would have kept."""
@@ -127,7 +132,9 @@ class ExportedPolicy:
             raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
         attitude = Attitude(_quaternion(base_quat), lidar.mount_pos, lidar.mount_quat)
         self.frames[:-1] = self.frames[1:]
-        self.frames[-1] = self._sampler(points, attitude)
+        self.frames[-1, : self._sampler.num_points] = self._sampler(points, attitude)
+        if self._odometry is not None:
+            self.frames[-1, -1] = self._odometry.since_last_frame()
         self.frame_count = min(self.frame_count + 1, len(self.frames))
 
     def step(self, state: RobotState, command: Sequence[float], points: np.ndarray | None = None) -> np.ndarray:
@@ -141,6 +148,8 @@ class ExportedPolicy:
         Returns:
             (num_joints,) float32 joint targets, rad, in the order of `description.joints`.
         """
+        if self._odometry is not None:
+            self._odometry.advance(_quaternion(state.base_quat), _vector("base_lin_vel")(self, state, command))
         if points is not None:
             self.see(points, state.base_quat)
         self.observation = self._observe(state, command)
@@ -188,10 +197,13 @@ class ExportedPolicy:
             raise DeployError(
                 f"the network's inputs are {given}, its description says {self.description.inputs}; export again"
             )
-        if self.frames is not None and self._sampler.num_points != self.frames.shape[1]:
+        if self.frames is None:
+            return
+        rows = self._sampler.num_points + (self._odometry is not None)
+        if rows != self.frames.shape[1]:
             raise DeployError(
-                f"the sampler gives {self._sampler.num_points} points, the network reads {self.frames.shape[1]};"
-                " export again"
+                f"the sampler and the base's motion give {rows} rows, the network reads {self.frames.shape[1]}; export"
+                " again"
             )
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
 from omniperception.perception import PerceptionNetwork, Sampler
-from omniperception.perception.velocity_risk import VelocityRisk
-from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, RISK_TARGET, SECTOR_TARGET
+from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, MOTION_TARGET, SECTOR_TARGET
+
+if TYPE_CHECKING:
+    from omniperception.perception import VelocityRisk
 
 
 @dataclass(frozen=True)
@@ -24,11 +27,14 @@ class PerceptionConfig:
         sector_weight: weight of the supervision with obstacle nearness by sector; 0, as in the paper, leaves it out.
         avoidance_weight: weight of the supervision of an avoidance velocity that is added to the command which the
             actor follows; 0, as in the paper, leaves it out.
-        risk_weight: weight of the supervision of the risk of candidate velocities, from which the velocity that is
-            added follows instead; 0, as in the paper, leaves it out.
+        motion_weight: weight of the supervision of how near obstacles are and how they move, by sector; the velocity
+            that is added follows from the risk of velocities among them instead; 0, as in the paper, leaves it out.
         supervised_epochs: passes over each rollout in which the network is trained by supervision alone, while PPO
             takes the embedding as it is; 0, as in the paper: PPO's loss and the supervision together, end to end.
         learning_rate: of those passes.
+        final_learning_rate: what it falls to, linearly, until ppo.max_iterations; None keeps it.
+        base_motion: whether a frame's last row says how the base moved since the frame before (x, y, yaw), from the
+            state estimator.
         memory_gb: memory (10^9 bytes) that the network may need in training, checked before anything is allocated; None
             for all of the device's.
     """
@@ -39,9 +45,11 @@ class PerceptionConfig:
     height_weight: float
     sector_weight: float
     avoidance_weight: float = 0.0
-    risk_weight: float = 0.0
+    motion_weight: float = 0.0
     supervised_epochs: int = 0
     learning_rate: float = 1.0e-3
+    final_learning_rate: float | None = None
+    base_motion: bool = False
     memory_gb: float | None = None
 
     def __post_init__(self) -> None:
@@ -49,25 +57,37 @@ class PerceptionConfig:
             raise ValueError(f"perception.memory_gb={self.memory_gb} must be positive, or null for the device's memory")
         if self.history < 1:
             raise ValueError(f"perception.history={self.history} must be at least 1")
-        for name in ("height_weight", "sector_weight", "avoidance_weight", "risk_weight", "supervised_epochs"):
+        for name in ("height_weight", "sector_weight", "avoidance_weight", "motion_weight", "supervised_epochs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"perception.{name}={getattr(self, name)} must not be negative")
-        if self.avoidance_weight and self.risk_weight:
+        if self.avoidance_weight and self.motion_weight:
             raise ValueError(
-                f"perception.avoidance_weight={self.avoidance_weight} and risk_weight={self.risk_weight} would both"
+                f"perception.avoidance_weight={self.avoidance_weight} and motion_weight={self.motion_weight} would both"
                 " change the command; set one of them to 0"
             )
         if self.learning_rate <= 0:
             raise ValueError(f"perception.learning_rate={self.learning_rate} must be positive")
+        if self.final_learning_rate is not None and not 0 < self.final_learning_rate <= self.learning_rate:
+            raise ValueError(
+                f"perception.final_learning_rate={self.final_learning_rate} must lie in (0, {self.learning_rate}], or"
+                " be null"
+            )
+        if self.motion_weight and not self.supervised_epochs:
+            raise ValueError(
+                f"perception.motion_weight={self.motion_weight} is learned beside PPO; set"
+                " perception.supervised_epochs to at least 1, or motion_weight=0"
+            )
         if self.supervised_epochs and not self.supervision:
             raise ValueError(
                 f"perception.supervised_epochs={self.supervised_epochs} needs something to learn from; set"
-                " perception.avoidance_weight, risk_weight, sector_weight or height_weight, or supervised_epochs=0"
+                " perception.avoidance_weight, motion_weight, sector_weight or height_weight, or supervised_epochs=0"
             )
 
     def build_network(self) -> PerceptionNetwork:
         """The network that fits the sampler's points and the history."""
-        sizes = self.sampler().sizes
+        sizes = dict(self.sampler().sizes)
+        if self.base_motion:
+            sizes[list(sizes)[-1]] += 1
         try:
             return self.network(**sizes, history=self.history)
         except TypeError as error:
@@ -80,7 +100,7 @@ class PerceptionConfig:
             HEIGHT_TARGET: self.height_weight,
             SECTOR_TARGET: self.sector_weight,
             AVOIDANCE_TARGET: self.avoidance_weight,
-            RISK_TARGET: self.risk_weight,
+            MOTION_TARGET: self.motion_weight,
         }
         return {target: weight for target, weight in weights.items() if weight > 0}
 
@@ -95,6 +115,7 @@ class PPOConfig:
         save_interval: iterations between checkpoints.
         keep_checkpoints: how many of the newest checkpoints stay.
         num_steps_per_env: control steps per environment and iteration.
+        num_learning_epochs: passes of PPO over a rollout; 0 keeps the policy as it is, and perception learns alone.
         hidden_dims: hidden layers of the actor and of the critic.
         init_std: initial standard deviation of the actions.
         obs_normalization: whether observations are normalised by running statistics.
@@ -132,11 +153,12 @@ class PPOConfig:
             "save_interval",
             "keep_checkpoints",
             "num_steps_per_env",
-            "num_learning_epochs",
             "num_mini_batches",
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be at least 1")
+        if self.num_learning_epochs < 0:
+            raise ValueError(f"ppo.num_learning_epochs={self.num_learning_epochs} must not be negative")
         for name in ("clip_param", "learning_rate", "max_grad_norm", "init_std", "desired_kl"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive")
@@ -186,7 +208,12 @@ def runner_config(
         actor["supervision"] = perception.supervision
         actor["velocity_risk"] = velocity_risk
         actor["end_to_end"] = perception.supervised_epochs == 0
-        supervision = {"epochs": perception.supervised_epochs, "learning_rate": perception.learning_rate}
+        first, last = perception.learning_rate, perception.final_learning_rate
+        supervision = {
+            "epochs": perception.supervised_epochs,
+            "learning_rates": (first, first if last is None else last),
+            "num_updates": ppo.max_iterations,
+        }
     return {
         "num_steps_per_env": ppo.num_steps_per_env,
         "save_interval": ppo.save_interval,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDict
 
@@ -19,8 +21,12 @@ class RolloutEmbedding:
         before: (N, D) embedding before the newest frame, of a network that carries its state, else None.
     """
 
-    def __init__(self, network: PerceptionNetwork) -> None:
-        self._network = network
+    def __init__(
+        self, network: PerceptionNetwork, extend: Callable[[torch.Tensor], torch.Tensor] | None = None
+    ) -> None:
+        """Args: network; extend: makes what is acted on, once per embedding, from embeddings (N, D)."""
+        self._network, self._extend = network, extend
+        self._acted_on: torch.Tensor | None = None
         self.before: torch.Tensor | None = None
         self._after: torch.Tensor | None = None
         self._empty: torch.Tensor | None = None
@@ -29,15 +35,18 @@ class RolloutEmbedding:
         self._seen: tuple[torch.Tensor, torch.Tensor] | None = None
 
     def __call__(self, obs: TensorDict) -> torch.Tensor:
-        """(N, D) embeddings of the histories in the observations; the empty one without a frame since the reset."""
+        """(N, D) embeddings of the histories in the observations, extended; the empty one without a frame since the
+        reset."""
         frames, count = obs["frames"], obs["frame_count"]
         with torch.no_grad():
             self._follow(obs)
         if torch.is_grad_enabled():
             state = None if self.before is None else self.before.clone()  # it may come from inference mode
             features, empty = self._network(frames, count, state)[:, 0], self._network.empty(frames)
+            if self._extend is not None:
+                features, empty = self._extend(features), self._extend(empty)
         else:
-            features, empty = self._after, self._empty
+            features, empty = self._acted_on, self._empty
         return torch.where(count > 0, features, empty)
 
     def state_dict(self) -> dict | None:
@@ -70,6 +79,9 @@ class RolloutEmbedding:
             self.before = self._after if known else frames.new_zeros(len(frames), self._network.feature_dim)
         self._after = self._network(frames, count, self.before)[:, 0]
         self._empty = self._network.empty(frames)
+        self._acted_on = self._after
+        if self._extend is not None:
+            self._acted_on, self._empty = self._extend(self._after), self._extend(self._empty)
         self._tick, self._made_with, self._seen = tick, made_with, (probe, count.squeeze(-1).clone())
 
     def _tick_and_change(self, ticks: torch.Tensor, probe: torch.Tensor, count: torch.Tensor) -> tuple[int, bool]:

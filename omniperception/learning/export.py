@@ -54,7 +54,7 @@ class PerceptiveNetwork(BlindNetwork):
     def forward(self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor) -> torch.Tensor:
         """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> (B, num_actions)."""
         features = self.actor.perception(frames, frame_count)[:, 0]
-        if self.actor.read_out is not None:
+        if self.actor.read_out_target is not None:
             start, stop = self.command_start, self.command_start + 2
             command = observations[:, start:stop]
             command = command + self.actor.avoidance(features, command) * (frame_count > 0)
@@ -83,7 +83,7 @@ def exportable(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
             f"{type(actor.perception).__name__} carries its state from frame to frame, which an exported policy cannot;"
             " export a variant that sees a window, such as perception=pd_risknet"
         )
-    if actor.read_out is not None:
+    if actor.read_out_target is not None:
         names = list(group_sizes)
         before = sum(group_sizes[name] for name in names[: names.index(actor.command_group)])
     return PerceptiveNetwork(actor, before)

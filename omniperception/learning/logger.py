@@ -86,7 +86,8 @@ class CompactLogger(Logger):
         ]
         if self.rewbuffer:
             parts.append(f"reward {statistics.mean(self.rewbuffer):.3f}, length {statistics.mean(self.lenbuffer):.0f}")
-        parts.append(f"value {losses['value']:.3g}")
+        if "value" in losses:
+            parts.append(f"value {losses['value']:.3g}")
         parts += [f"{name} {value:.3g}" for name, value in losses.items() if name.endswith("_target")]
         parts += [f"{name} {value:.3g}" for name, value in metrics.items()]
         remaining = datetime.timedelta(seconds=round(statistics.mean(self._recent) * (total - done)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from rsl_rl.models import MLPModel
@@ -14,7 +15,10 @@ from torch.nn import functional
 from omniperception.learning.embedding import RolloutEmbedding
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
-from omniperception.perception.velocity_risk import VelocityRisk
+from omniperception.perception.sector_motion import decode, motion_error
+
+if TYPE_CHECKING:
+    from omniperception.perception import VelocityRisk
 
 
 class _AddLoss(torch.autograd.Function):
@@ -31,11 +35,11 @@ class _AddLoss(torch.autograd.Function):
         return gradient, torch.ones_like(loss)
 
 
-AVOIDANCE, RISK = "avoidance_target", "risk_target"
+AVOIDANCE, MOTION = "avoidance_target", "motion_target"
 """The supervised targets that are not a part of the embedding but read out of it, for a velocity that is added to the
-command: this velocity itself, or the risk of candidate velocities."""
+command: this velocity itself, or nearness and motion of obstacles by sector, whence the risk of velocities."""
 
-READ_OUT_HIDDEN = {AVOIDANCE: 64, RISK: 128}
+READ_OUT_HIDDEN = {AVOIDANCE: 64, MOTION: 256}
 """Widths of the read-outs' hidden layers."""
 
 
@@ -55,8 +59,8 @@ class PerceptionActor(MLPModel):
     With supervision of ``avoidance_target`` an avoidance velocity is read out of the embedding and added to the
     commanded one before the MLP sees it, because that sum is what the reward wants tracked (paper, r_vel_avoid): a
     gait that follows commands then avoids as soon as the read-out is right. Without a frame it is 0. With supervision
-    of ``risk_target`` the risks of candidate velocities are read out, and the avoidance velocity follows from them and
-    the command.
+    of ``motion_target`` distance and velocity of the nearest obstacle in each sector are read out; the risks of
+    candidate velocities follow from them, once per embedding, and the avoidance velocity from these and the command.
     """
 
     def __init__(
@@ -81,7 +85,7 @@ class PerceptionActor(MLPModel):
             output_dim: number of actions.
             perception: the network, or a function without arguments that builds it.
             supervision: weight of the regression on each privileged observation group; 0 leaves it out.
-            velocity_risk: needed for supervision of ``risk_target``.
+            velocity_risk: needed for supervision of ``motion_target``.
             command_group: the group that begins with the commanded velocity (v_x, v_y).
             end_to_end: whether the loss of an update reaches the perception network; otherwise it is trained by a
                 :class:`~omniperception.learning.supervision.PerceptionTrainer` alone.
@@ -94,19 +98,22 @@ class PerceptionActor(MLPModel):
             if weight < 0.0:
                 raise ValueError(f"supervision: the weight of {target} must not be negative, got {weight}")
         self.command_group, self.end_to_end, self.velocity_risk = command_group, end_to_end, velocity_risk
-        self.read_out_target = next((target for target in (AVOIDANCE, RISK) if target in supervision), None)
+        self.read_out_target = next((target for target in (AVOIDANCE, MOTION) if target in supervision), None)
         self._feature_dim = network.feature_dim  # read by _get_latent_dim while the base class builds the MLP
         super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
         self.perception: PerceptionNetwork = network
         with torch.no_grad():  # an untrained embedding is noise to the gait; it enters as its weights learn
             self.mlp[0].weight[:, self.obs_dim :] = 0.0
         self.supervision = supervision
-        self.read_out = self._build_read_out(obs) if self.read_out_target else None
-        if self.read_out_target == RISK:
+        reads_out = self.read_out_target is not None and self.read_out_target not in network.supervised
+        self.read_out = self._build_read_out(obs) if reads_out else None
+        if self.read_out_target == MOTION:
             self.register_buffer("_candidates", velocity_risk.candidates(), persistent=False)
         for target in supervision:
             self._check_target(target, obs)
-        self.rollout = RolloutEmbedding(network)
+        if self.read_out_target is not None:
+            self._check_command(obs)
+        self.rollout = RolloutEmbedding(network, self._with_risks if self.read_out_target == MOTION else None)
         self._losses: dict[str, list[torch.Tensor]] = {target: [] for target in supervision}
 
     @property
@@ -134,9 +141,10 @@ class PerceptionActor(MLPModel):
                 obs = obs.groups
             else:
                 features, has_frame = self.rollout(obs), obs["frame_count"].squeeze(-1) > 0
-            if self.read_out is not None:
+            if self.read_out_target is not None:
                 obs = self._avoiding(obs, features, has_frame)
-        return torch.cat([super().get_latent(obs, masks, hidden_state), features], dim=-1)
+        embedding = features[:, : self._feature_dim]
+        return torch.cat([super().get_latent(obs, masks, hidden_state), embedding], dim=-1)
 
     def perception_parameters(self) -> Iterator[nn.Parameter]:
         """Parameters of the network and of what is read out of its embedding."""
@@ -145,34 +153,49 @@ class PerceptionActor(MLPModel):
             yield from self.read_out.parameters()
 
     def avoidance(self, features: torch.Tensor, command: torch.Tensor) -> torch.Tensor:
-        """(B, 2) avoidance velocity (m/s, yaw-aligned frame) read out of embeddings (B, D) at commands (B, 2)."""
-        values = self._read(features)
+        """(B, 2) avoidance velocity (m/s, yaw-aligned frame) of embeddings at commands (B, 2).
+
+        Args:
+            features: (B, D) embeddings, or (B, D + K) with the risks of the candidate velocities behind them.
+            command: m/s.
+        """
         if self.read_out_target == AVOIDANCE:
-            return values
-        return self.velocity_risk.avoidance(values, command, self._candidates)
+            return self._read(features)
+        if features.shape[1] == self._feature_dim:
+            features = self._with_risks(features)
+        return self.velocity_risk.avoidance(features[:, self._feature_dim :], command, self._candidates)
 
     def embed(self, obs: WindowedObservations) -> torch.Tensor:
-        """(B, D) embeddings of the steps of an update; each window is embedded once."""
+        """(B, D) embeddings of the steps of an update, or with what they were acted on; each window is embedded
+        once."""
         if not obs.has_frames:  # the sensor sleeps: there is nothing to embed
             return self.perception.empty(obs.frames).expand(obs.batch_size[0], -1)
-        windows = self.embed_windows(obs) if obs.window_features is None else obs.window_features
-        table = torch.cat([windows.flatten(0, 1), self.perception.empty(obs.frames)])
+        empty = self.perception.empty(obs.frames)
+        windows = obs.window_features
+        if windows is None:
+            windows = self.perception(obs.frames, obs.window_count, obs.state)
+        else:
+            empty = functional.pad(empty, (0, windows.shape[2] - empty.shape[1]))
+        table = torch.cat([windows.flatten(0, 1), empty])
         return table[torch.where(obs.step_count > 0, obs.step_window, table.shape[0] - 1)]
 
     def embed_windows(self, obs: WindowedObservations) -> torch.Tensor:
-        """(E, W, D) embeddings of an update's windows."""
-        return self.perception(obs.frames, obs.window_count, obs.state)
+        """(E, W, D) embeddings of an update's windows, with the risks of the candidate velocities where the actor
+        acts on them: (E, W, D + K)."""
+        windows = self.perception(obs.frames, obs.window_count, obs.state)
+        return self._with_risks(windows) if self.read_out_target == MOTION else windows
 
     def supervised_loss(self, features: torch.Tensor, obs: WindowedObservations) -> torch.Tensor:
         """Weighted sum of the mean squared errors of all targets, over the steps that have a frame."""
         has_frame = obs.step_count > 0
         total = torch.zeros((), device=features.device)
         for target, weight in self.supervision.items():
-            if target == self.read_out_target:
-                predicted = self._read(features)
+            if target == MOTION:
+                error = self._motion_error(features, obs[target].unflatten(-1, (-1, 3)))
             else:
-                predicted = features[:, self.perception.supervised[target]]
-            error = (predicted - obs[target]).square().mean(dim=-1)
+                reads = target == AVOIDANCE
+                predicted = self._read(features) if reads else features[:, self.perception.supervised[target]]
+                error = (predicted - obs[target]).square().mean(dim=-1)
             loss = (error * has_frame).sum() / has_frame.sum().clamp(min=1)
             self._losses[target].append(loss.detach())
             total = total + weight * loss
@@ -189,21 +212,33 @@ class PerceptionActor(MLPModel):
         return self.obs_dim + self._feature_dim
 
     def _build_read_out(self, obs: TensorDict) -> nn.Module:
-        if self.command_group not in self.obs_groups or obs[self.command_group].shape[-1] < 2:
-            raise ValueError(
-                f"perception.avoidance_weight and risk_weight need the actor to observe '{self.command_group}', it"
-                f" observes {self.obs_groups}; add it to observations.actor or set both to 0"
-            )
         width = READ_OUT_HIDDEN[self.read_out_target]
         last = nn.Linear(width, obs[self.read_out_target].shape[-1])
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         return nn.Sequential(nn.Linear(self._feature_dim, width), nn.ELU(), last)
 
-    def _read(self, features: torch.Tensor) -> torch.Tensor:
-        """What is read out of the embedding: (B, 2) an avoidance velocity (m/s), or (B, K) risks."""
-        values = self.read_out(features).float()
-        return values if self.read_out_target == AVOIDANCE else values.sigmoid()
+    def _read(self, embedding: torch.Tensor) -> torch.Tensor:
+        """What is read out of embeddings: (B, 2) avoidance velocities (m/s), or (B, S, 3) obstacles by sector."""
+        if self.read_out is None:
+            values = embedding[:, self.perception.supervised[self.read_out_target]].float()
+        else:
+            values = self.read_out(embedding).float()
+        return values if self.read_out_target == AVOIDANCE else values.unflatten(-1, (-1, 3))
+
+    def _motion_error(self, features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """(B,) squared errors of what is read out, (B, S, 3), and of the risks that follow from it."""
+        predicted = self._read(features)
+        with torch.no_grad():
+            risk = self.velocity_risk.risk(decode(target), self._candidates)
+        followed = self.velocity_risk.risk(decode(predicted), self._candidates)
+        return motion_error(predicted, target) + (followed - risk).square().mean(-1)
+
+    def _with_risks(self, embedding: torch.Tensor) -> torch.Tensor:
+        """Embeddings (..., D) with the risks of the candidate velocities behind them (..., D + K)."""
+        rows = embedding.flatten(0, -2)
+        risk = self.velocity_risk.risk(decode(self._read(rows)), self._candidates)
+        return torch.cat((embedding, risk.unflatten(0, embedding.shape[:-1])), -1)
 
     def _avoiding(self, groups: TensorDict, features: torch.Tensor, has_frame: torch.Tensor) -> TensorDict:
         """The observations with the avoidance velocity, 0 without a frame, added to the commanded one."""
@@ -213,8 +248,15 @@ class PerceptionActor(MLPModel):
         groups[self.command_group] = command + functional.pad(velocity, (0, command.shape[-1] - 2))
         return groups
 
+    def _check_command(self, obs: TensorDict) -> None:
+        if self.command_group not in self.obs_groups or obs[self.command_group].shape[-1] < 2:
+            raise ValueError(
+                f"perception.avoidance_weight and motion_weight need the actor to observe '{self.command_group}', it"
+                f" observes {self.obs_groups}; add it to observations.actor or set both to 0"
+            )
+
     def _check_target(self, target: str, obs: TensorDict) -> None:
-        if target == self.read_out_target:
+        if target == self.read_out_target and self.read_out is not None:
             return
         if target not in self.perception.supervised:
             raise ValueError(

@@ -34,6 +34,7 @@ class PerceptivePpo(PPO):
         """Arguments of rsl_rl's PPO."""
         super().__init__(*args, **kwargs)
         self.num_updates = 0
+        self.learns_policy = self.num_learning_epochs > 0
         self.perception_trainer: PerceptionTrainer | None = None
         if type(self.optimizer) is torch.optim.Adam:  # rsl_rl's choice, in one pass over the parameters
             parameters = self.optimizer.param_groups[0]["params"]
@@ -86,21 +87,45 @@ class PerceptivePpo(PPO):
 
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Sample actions; LiDAR frames are copied now because the environment may reuse their memory."""
-        actions = super().act(obs)
+        actions = super().act(obs) if self.learns_policy else self._follow(obs)
         self.storage.record_frames(obs, self._raw_actor.carried_state if self.storage.has_frames else None)
         return actions
 
+    def train_mode(self) -> None:
+        """As rsl_rl's; a policy that does not learn keeps the statistics of its observations, too."""
+        super().train_mode()
+        if not self.learns_policy:
+            for model in (self._raw_actor, self._raw_critic):
+                model.obs_normalizer.eval()
+
+    def _follow(self, obs: TensorDict) -> torch.Tensor:
+        """As rsl_rl's `act` of a policy that does not learn: nothing is valued."""
+        self.transition.observations = obs
+        self.transition.actions = self.actor(obs, stochastic_output=True).detach()
+        self.transition.values = torch.zeros(len(obs), 1, device=self.device)
+        self.transition.actions_log_prob = torch.zeros(len(obs), device=self.device)
+        self.transition.distribution_params = tuple(p.detach() for p in self.actor.output_distribution_params)
+        return self.transition.actions
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """As rsl_rl's, for a policy that learns."""
+        if self.learns_policy:
+            super().compute_returns(obs)
+
     def update(self) -> dict[str, float]:
-        """One PPO update; mean losses, among them those of the supervised targets.
+        """One PPO update; mean losses, among them those of the supervised targets. Without epochs of PPO the policy
+        stays as it is and perception learns alone.
 
         A perception network that is not trained end to end has embedded the rollout before it learns from it, so that
         PPO sees what the policy acted on.
         """
         if self.perception_trainer is not None:
-            acted_on = self._embed_rollout()
-            self.perception_trainer.train(self.storage, self.num_mini_batches, self.use_mixed_precision)
+            acted_on = self._embed_rollout() if self.learns_policy else None
+            self.perception_trainer.train(
+                self.storage, self.num_updates, self.num_mini_batches, self.use_mixed_precision
+            )
             self.storage.window_features = acted_on
-        losses = super().update()
+        losses = super().update() if self.learns_policy else self.storage.clear() or {}
         self.num_updates += 1
         if isinstance(self._raw_actor, PerceptionActor):
             losses |= self._raw_actor.pop_supervised_losses()

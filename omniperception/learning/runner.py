@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from omniperception.learning.checkpoint import (
     CheckpointError,
     checkpoint_path,
+    latest_checkpoint,
     load_checkpoint,
     prune_checkpoints,
     rng_state,
@@ -26,6 +27,7 @@ from omniperception.learning.checkpoint import (
 )
 from omniperception.learning.logger import CompactLogger
 from omniperception.learning.ppo import PerceptivePpo, TrainingDiverged
+from omniperception.learning.warm_start import start_from
 
 _EVERYTHING = {
     "actor": True,
@@ -177,6 +179,13 @@ class Runner(OnPolicyRunner):
         if parts.get("rng"):
             set_rng_state(state["rng"])
         return state["infos"]
+
+    def start_from(self, run_dir: str | Path) -> None:
+        """Begin with the newest weights of another run: the actor's, and the critic's where it observes the same."""
+        state = load_checkpoint(latest_checkpoint(run_dir), self.device)
+        start_from(self.alg._raw_actor, state["actor_state_dict"], str(run_dir))
+        with contextlib.suppress(CheckpointError):
+            start_from(self.alg._raw_critic, state["critic_state_dict"], str(run_dir))
 
     def _iterate(self, it: int, first: int, last: int, obs: TensorDict) -> TensorDict:
         """One iteration: rollout, returns, update, log; returns the observations to go on from."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from rsl_rl.storage import RolloutStorage
@@ -46,6 +46,18 @@ class WindowedObservations:
     def batch_size(self) -> torch.Size:
         """Number of control steps, as a one-element size."""
         return self.groups.batch_size
+
+    def at_steps(self, steps: Sequence[int]) -> WindowedObservations:
+        """Those of some control steps alone.
+
+        Args:
+            steps: indices of control steps in 0..T-1, E rows each.
+        """
+        num_envs = len(self.frames)
+        rows = torch.cat([torch.arange(num_envs, device=self.frames.device) + step * num_envs for step in steps])
+        return replace(
+            self, groups=self.groups[rows], step_window=self.step_window[rows], step_count=self.step_count[rows]
+        )
 
     def __getitem__(self, group: str) -> torch.Tensor:
         return self.groups[group]
@@ -134,6 +146,11 @@ class PerceptiveStorage(RolloutStorage):
     def num_windows(self) -> int:
         """Windows recorded in this rollout so far."""
         return len(self._ticks)
+
+    @property
+    def first_steps(self) -> list[int]:
+        """The first control step of this rollout at which each window is the newest."""
+        return [self._step_windows.index(window) for window in range(self.num_windows)]
 
     def record_frames(self, obs: TensorDict, state: torch.Tensor | None = None) -> None:
         """Copy what is new in the observations of the current step; call before the environment moves on.

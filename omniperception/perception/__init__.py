@@ -1,6 +1,6 @@
 """Point-cloud sampling (FPS, averaging, sorting) and the networks that read sampled LiDAR histories.
 
-The samplers need Warp and are loaded when one is first used.
+What needs Warp is loaded when it is first used.
 """
 
 from importlib import import_module
@@ -9,12 +9,17 @@ from typing import TYPE_CHECKING
 from omniperception.perception.networks import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
 from omniperception.perception.pd_risknet import CarriedPdRiskNet, PdRiskNet
 from omniperception.perception.sampler import Attitude, Sampler
-from omniperception.perception.velocity_risk import VelocityRisk
 
 if TYPE_CHECKING:
+    from omniperception.perception.rings import RingPath
     from omniperception.perception.sampling import FpsSampler, PdSampler, ProximitySampler, RawSampler
+    from omniperception.perception.velocity_risk import VelocityRisk
 
-_LOADED_WHEN_USED = ("FpsSampler", "PdSampler", "ProximitySampler", "RawSampler")
+_LOADED_WHEN_USED = {
+    "rings": ("RingPath",),
+    "sampling": ("FpsSampler", "PdSampler", "ProximitySampler", "RawSampler"),
+    "velocity_risk": ("VelocityRisk",),
+}
 
 __all__ = [
     "Attitude",
@@ -28,12 +33,14 @@ __all__ = [
     "PerceptionNetwork",
     "ProximitySampler",
     "RawSampler",
+    "RingPath",
     "Sampler",
     "VelocityRisk",
 ]
 
 
 def __getattr__(name: str) -> object:
-    if name in _LOADED_WHEN_USED:
-        return getattr(import_module("omniperception.perception.sampling"), name)
+    for module, names in _LOADED_WHEN_USED.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

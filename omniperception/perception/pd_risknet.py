@@ -3,11 +3,17 @@ variants for the ablation."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import torch
 from torch import nn
 
 from omniperception.perception.networks import NUM_SECTORS, PerceptionNetwork
 from omniperception.perception.windows import CARRIED_HISTORY, CarriedGru, WindowedGru
+
+if TYPE_CHECKING:
+    from omniperception.perception.rings import RingPath
 
 
 class PdRiskNet(PerceptionNetwork):
@@ -17,7 +23,8 @@ class PdRiskNet(PerceptionNetwork):
     on the height grid (17 x 11 = 187 values in -1..1, as a GRU's state), so supervision needs no extra layer.
     Beyond the paper, the first 36 distal values can be regressed on the nearness of obstacles by sector.
 
-    A path of size 0 does not exist (ablation): the embedding is then the other path's alone.
+    A path of size 0 does not exist (ablation): the embedding is then the other path's alone. With ``rings`` the distal
+    path is a :class:`RingPath` instead of a GRU, and what it says of the obstacles is its part of the embedding.
     """
 
     def __init__(
@@ -28,6 +35,7 @@ class PdRiskNet(PerceptionNetwork):
         proximal_dim: int = 187,
         distal_dim: int = 64,
         distal_encoder: int = 0,
+        rings: Callable[..., RingPath] | None = None,
     ) -> None:
         """Configure both paths.
 
@@ -39,10 +47,16 @@ class PdRiskNet(PerceptionNetwork):
             distal_dim: size of the distal embedding; 0 leaves the path out.
             distal_encoder: width of an ELU layer that each distal frame passes before its GRU; 0, as in the paper,
                 has none.
+            rings: makes the distal path, given the cells per frame and H; the last row of a frame must be the base's
+                motion (``perception.base_motion``), and ``distal_dim`` and ``distal_encoder`` say nothing.
         """
         _check_path("proximal", num_proximal, proximal_dim)
+        path = rings(num_distal=num_distal - 1, history=history) if rings is not None else None
+        if path is not None:
+            distal_dim, distal_encoder = path.feature_dim, 0
         _check_path("distal", num_distal, distal_dim)
         super().__init__(num_proximal + num_distal, history, proximal_dim + distal_dim)
+        self.rings = path
         self.num_proximal = num_proximal
         self.proximal_dim = proximal_dim
         self.supervised = {}
@@ -50,7 +64,9 @@ class PdRiskNet(PerceptionNetwork):
         if proximal_dim:
             self.proximal = self._gru(3 * num_proximal, proximal_dim)
             self.supervised["height_target"] = slice(0, proximal_dim)
-        if distal_dim:
+        if path is not None:
+            self.supervised["motion_target"] = slice(proximal_dim, proximal_dim + distal_dim)
+        elif distal_dim:
             if distal_encoder:
                 self.encoder = nn.Sequential(nn.Linear(3 * num_distal, distal_encoder), nn.ELU())
             self.distal = self._gru(distal_encoder or 3 * num_distal, distal_dim)
@@ -62,6 +78,8 @@ class PdRiskNet(PerceptionNetwork):
         if self.proximal is not None:
             near = frames[:, :, : self.num_proximal].flatten(2)
             embeddings.append(self._path(self.proximal, near, count, state, slice(0, self.proximal_dim)))
+        if self.rings is not None:
+            embeddings.append(self.rings(frames[:, :, self.num_proximal : -1], frames[:, :, -1], count))
         if self.distal is not None:
             far = frames[:, :, self.num_proximal :].flatten(2)
             far = far if self.encoder is None else self.encoder(far)

@@ -11,10 +11,11 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from omniperception.lidar import DEVICES, Noise
+from omniperception.perception.sector_motion import NEARNESS_RANGE, encode, nothing_near
 from omniperception.random import EnvRandom
 from omniperception.sim import MujocoSimulator, SimConfig
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.task.heights import footprint_grid, height_grid, relative_heights
+from omniperception.task.heights import NUM_HEIGHTS, flat_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
@@ -36,23 +37,17 @@ from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 if TYPE_CHECKING:  # parts that not every task has, and what they import, are loaded where they are built
     from omniperception.task.sensing import LidarSensing, SensorConfig
     from omniperception.task.terrain_levels import TerrainLevels
-    from omniperception.task.true_risk import TrueVelocityRisk
+    from omniperception.task.true_sectors import TrueSectors
     from omniperception.world import Ground
 
 HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target", "avoidance_target"
-RISK_TARGET = "risk_target"
-"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector, the
-avoidance velocity, and the risk of candidate velocities."""
-TARGET_FIELDS = {
-    HEIGHT_TARGET: "heights",
-    SECTOR_TARGET: "sectors",
-    AVOIDANCE_TARGET: "sectors",
-    RISK_TARGET: "sectors",
-}
-"""The optional field that each of them is made from."""
-
-NEARNESS_RANGE = 4.0
-"""Distance (m) from which on an obstacle counts as not near at all."""
+MOTION_TARGET = "motion_target"
+"""Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector of what
+the LiDAR hits, the avoidance velocity, and nearness and velocity of the true obstacles by sector."""
+TARGET_FIELDS = {HEIGHT_TARGET: ("heights",), SECTOR_TARGET: ("sectors",), AVOIDANCE_TARGET: ("sectors",)}
+"""The optional fields that each of them is made from."""
+SUPERVISION = "supervision."
+"""What the names of such readers begin with."""
 
 FOOTING = 0.35
 """Nothing of the ground within this distance (m) of the base reaches above the feet when a robot starts."""
@@ -72,6 +67,7 @@ class EnvConfig:
         lidar: the sensor, or None.
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
+        base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with; those named *_TARGET here.
         log_interval: control steps between two reports of the metrics.
         initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
@@ -91,6 +87,7 @@ class EnvConfig:
     lidar: SensorConfig | None = None
     sampler: Callable | None = None
     frame_history: int = 0
+    base_motion: bool = False
     targets: Sequence[str] = ()
     log_interval: int = 24
     initial_obstacle_level: float | None = None
@@ -102,10 +99,10 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
             raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
-        if RISK_TARGET in self.targets and self.rewards.avoidance.risk is None:
+        if MOTION_TARGET in self.targets and self.rewards.avoidance.risk is None:
             raise ValueError(
-                "perception.risk_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
-                " perception.risk_weight=0"
+                "perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
+                " perception.motion_weight=0"
             )
         fixed = [name for name, group in self.obstacles.groups.items() if group.poses is not None]
         if fixed and isinstance(self.terrain, TiledTerrainConfig):
@@ -132,7 +129,7 @@ class EnvConfig:
     def readers(self) -> dict[str, tuple[str, ...]]:
         """Optional fields of this task and the rewards, observations and targets that read each of them."""
         reads = {**self.rewards.readers(), **self.observations.readers()}
-        reads |= {f"supervision.{target}": frozenset({TARGET_FIELDS[target]}) for target in self.targets}
+        reads |= {f"{SUPERVISION}{target}": frozenset(TARGET_FIELDS.get(target, ())) for target in self.targets}
         if self.obstacles.num_obstacles:
             reads["metrics.contacts"] = frozenset({"obstacle_contact"})
         read = sorted(frozenset().union(*reads.values()))
@@ -141,6 +138,11 @@ class EnvConfig:
     def fields_read(self) -> frozenset[str]:
         """Optional fields that something in this task reads."""
         return frozenset(self.readers())
+
+    @property
+    def remembered_frames(self) -> int:
+        """LiDAR frames for which an obstacle that was seen counts in the velocity risk: those that the network sees."""
+        return max(self.frame_history, 1)
 
     @property
     def lidar_noise(self) -> tuple[Noise, ...]:
@@ -169,7 +171,12 @@ class OmniEnv(VecEnv):
             below the hips.
         avoidance_velocity: (num_envs, 2) m/s in the yaw-aligned frame, from what was near at the newest frame when a
             term reads it, else 0.
-        risk: (num_envs, K) true risk of each candidate velocity at the newest frame; None where V_avoid is the paper's.
+        motion: (num_envs, S, 3) distance (m) and velocity (m/s, yaw-aligned) of the nearest obstacle by sector at the
+            newest frame; None where V_avoid is the paper's.
+        risk: (num_envs, K) true risk of each candidate velocity that follows from it; None when nobody reads it.
+        heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; of this
+            moment when a term reads them, else, for supervision, at the newest frame, and 0 before the first.
+        heights_every_step: whether they are of this moment.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -181,6 +188,8 @@ class OmniEnv(VecEnv):
         self.timer = StageTimer()
         fields = config.fields_read()
         self._reads = fields
+        observed = any(not name.startswith(SUPERVISION) for name in config.readers().get("heights", ()))
+        self.heights_every_step = observed or ("heights" in fields and not config.uses_lidar)
         sensors = {FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT} & fields
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
         late = config.randomization.latency_s is not None
@@ -199,8 +208,8 @@ class OmniEnv(VecEnv):
             self.obstacles = ObstacleField(config.obstacles, *poses, self.random, self.ground)
             if config.initial_obstacle_level is not None:
                 self.obstacles.level = config.initial_obstacle_level
+        self.true_sectors = self._build_true_sectors(fields) if config.uses_lidar else None
         self.sensing = self._build_sensing(fields) if config.uses_lidar else None
-        self.true_risk = self._build_true_risk(fields)
         self._allocate()
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self.probes: list[Callable[[], None]] = []  # called in each step before finished environments are reset
@@ -210,6 +219,8 @@ class OmniEnv(VecEnv):
         self._read_state()
         self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
         self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if self.sensing is not None:
+            self.sensing.start(self._all_envs, self.sensed)
         self._sense()
         self.observations = self._observe()
 
@@ -229,8 +240,10 @@ class OmniEnv(VecEnv):
         self._advance_physics(actions)
         with self.timer.stage("state"):
             self._read_state()
-        if self.sensing is not None and self.sensing.due(self.step_count):
-            self._sense()
+        if self.sensing is not None:
+            self.sensing.follow(self.sensed)
+            if self.sensing.due(self.step_count):
+                self._sense()
         if self.ground is not None:
             with self.timer.stage("terrain"):
                 self.terrain_levels.record(self.kinematics, self.command.value)
@@ -248,6 +261,8 @@ class OmniEnv(VecEnv):
             if len(ids):
                 self._reset(ids)
                 self._read_state()
+                if self.sensing is not None:
+                    self.sensing.start(ids, self.sensed)
         with self.timer.stage("observations"):
             self.observations = self._observe()
         extras: dict = {"time_outs": outcomes["time_out"].float()}
@@ -266,6 +281,8 @@ class OmniEnv(VecEnv):
             "actions": list(self.actions),
             "past": list(self._past or ()),
             "risk": self.risk,
+            "obstacle_motion": self.motion,
+            "heights": self.heights,
             "histories": {name: group.buffer for name, group in self._groups.items()},
             "observations": {name: self.observations[name] for name in self._groups},
         }
@@ -284,9 +301,10 @@ class OmniEnv(VecEnv):
             self._groups[name].buffer = buffer
         self._read_state()
         if self.sensing is not None:
-            self.risk = state["risk"]
+            self.risk, self.motion = state["risk"], state["obstacle_motion"]
             self._read_avoidance()
             self._choose_avoidance()
+        self.heights = state.get("heights", self.heights)  # older checkpoints have none
         self.observations = self._collect(dict(state["observations"]))
 
     # ---- the parts of a step -----------------------------------------------------------------------------------------
@@ -310,16 +328,11 @@ class OmniEnv(VecEnv):
 
     def _obstacle_path(self) -> torch.Tensor:
         """Moves the obstacles through the control step; where they are during each of its physics steps."""
-        path = []
         if self.obstacles.any_approaches:
             commanded = rotate_yaw(self.kinematics.yaw, self.command.value[:, :2])
             self.obstacles.start_anew(self.sim.qpos[:, :2], commanded)
-        for _ in range(self.config.sim.decimation):
-            self.obstacles.advance(self.config.sim.timestep, self.sim.qpos[:, :2])
-            path.append(self.obstacles.pos_w.clone())
-        path = torch.stack(path, 1)
-        self.obstacles.follow_ground(path)
-        return path
+        sim = self.config.sim
+        return self.obstacles.travel(sim.timestep, sim.decimation, self.sim.qpos[:, :2])
 
     def _read_state(self) -> None:
         self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)
@@ -332,17 +345,17 @@ class OmniEnv(VecEnv):
             self.link_force = self.sim.contact_sensor(LINK_FORCE).unflatten(1, (-1, 3))
         self.base_height = self.kinematics.base_pos_w[:, 2]
         if self.ground is not None:
-            self.base_height = self.base_height - self._ground_heights(self._footprint).mean(1)
-        if "heights" in self._reads:
-            terrain = 0.0 if self.ground is None else self._ground_heights(self._height_grid)
-            self.heights = relative_heights(self.kinematics.base_pos_w[:, 2], terrain)
+            self._height_lookup.place(self.kinematics)
+            self.base_height = self._height_lookup.base_height()
+        if self.heights_every_step:
+            self._read_heights()
         if "obstacles" in self._reads:
             self._locate_obstacles()
 
-    def _ground_heights(self, grid: torch.Tensor) -> torch.Tensor:
-        """(num_envs, P) heights (m) of the ground at points (P, 2) of the yaw-aligned frame around the base."""
-        points = rotate_yaw(self.kinematics.yaw, grid.expand(self.num_envs, -1, -1))
-        return self.ground.height(points + self.kinematics.base_pos_w[:, None, :2])
+    def _read_heights(self) -> None:
+        """Heights of the base above the ground around it, at the latest state that `_read_state` has seen."""
+        flat = self.ground is None
+        self.heights = flat_heights(self.base_height) if flat else self._height_lookup.around()
 
     def _late_kinematics(self) -> Kinematics:
         """The state `delay` physics steps ago, by environment."""
@@ -377,20 +390,27 @@ class OmniEnv(VecEnv):
             with self.timer.stage("sectors"):
                 self.sensing.measure_sectors()
                 self._read_avoidance()
-        if self.true_risk is not None:
+        if "heights" in self._reads and not self.heights_every_step:
+            with self.timer.stage("heights"):
+                self._read_heights()
+        if self.true_sectors is not None:
             with self.timer.stage("risk"):
-                self.risk = self.true_risk.measure(self.kinematics)
+                unseen = self.sensing.unseen
+                known = None if unseen is None else unseen < self.config.remembered_frames
+                self.motion = self.true_sectors.measure(self.kinematics, known)
+                if self.risk is not None:
+                    self.risk = self.config.rewards.avoidance.risk.risk(self.motion, self._candidates)
 
     def _read_avoidance(self) -> None:
         """V_avoid of the paper, which holds from one frame to the next."""
-        if "sectors" in self._reads and self.true_risk is None:
+        if "sectors" in self._reads and self.true_sectors is None:
             self.avoidance_velocity = avoidance_velocity(self.sensing.sector_distance, self.config.rewards.avoidance)
 
     def _choose_avoidance(self) -> None:
         """V_avoid from the risk of velocities, which depends on the command of the moment."""
-        if self.true_risk is not None:
+        if self.risk is not None:
             law, command = self.config.rewards.avoidance.risk, self.command.value[:, :2]
-            self.avoidance_velocity = law.avoidance(self.risk, command, self.true_risk.candidates)
+            self.avoidance_velocity = law.avoidance(self.risk, command, self._candidates)
 
     def _terminate(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Why environments end, each environment for one reason, and whether they do."""
@@ -473,6 +493,10 @@ class OmniEnv(VecEnv):
             self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
             if self.risk is not None:
                 self.risk = self.risk.index_fill(0, env_ids, 0.0)
+            if self.motion is not None:
+                self.motion[env_ids] = nothing_near(1, self.motion.shape[1], self.device)
+            if not self.heights_every_step:
+                self.heights = self.heights.index_fill(0, env_ids, 0.0)
 
     def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
@@ -495,8 +519,8 @@ class OmniEnv(VecEnv):
             groups[SECTOR_TARGET] = (1.0 - self.sensing.sector_distance / NEARNESS_RANGE).clamp(min=0.0)
         if AVOIDANCE_TARGET in self.config.targets:
             groups[AVOIDANCE_TARGET] = self.avoidance_velocity
-        if RISK_TARGET in self.config.targets:
-            groups[RISK_TARGET] = self.risk
+        if MOTION_TARGET in self.config.targets:
+            groups[MOTION_TARGET] = encode(self.motion).flatten(1)
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:
@@ -530,12 +554,14 @@ class OmniEnv(VecEnv):
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _build_ground(self, terrain: TiledTerrainConfig) -> None:
+        from omniperception.task.height_lookup import HeightLookup
         from omniperception.task.terrain_levels import TerrainLevels
         from omniperception.world import Ground
 
-        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos)
+        threads = self.config.sim.num_threads or None
+        self.ground = Ground(terrain, self.world.model, self.sim.ground_pos, threads)
         self.terrain_levels = TerrainLevels(self.ground, self.random, self.control_dt, self.max_episode_length)
-        self._height_grid, self._footprint = height_grid(self.device), footprint_grid(self.device)
+        self._height_lookup = HeightLookup(self.ground, self.num_envs, self.device)
 
     def _build_sensing(self, fields: frozenset[str]) -> LidarSensing:
         from omniperception.task.sensing import LidarSensing, SensingNeeds
@@ -545,6 +571,7 @@ class OmniEnv(VecEnv):
             sectors=config.rewards.avoidance.num_sectors if "sectors" in fields else 0,
             sector_max=config.lidar.sensor.max_range,
             rays="rays" in fields,
+            obstacles=self.true_sectors.names if self.true_sectors is not None else (),
         )
         return LidarSensing(
             config.lidar,
@@ -556,15 +583,16 @@ class OmniEnv(VecEnv):
             config.sim.num_threads or None,
             config.sampler() if config.sampler is not None else None,
             config.frame_history,
+            config.base_motion,
         )
 
-    def _build_true_risk(self, fields: frozenset[str]) -> TrueVelocityRisk | None:
-        config, law = self.config, self.config.rewards.avoidance.risk
-        if self.sensing is None or law is None or "sectors" not in fields:
+    def _build_true_sectors(self, fields: frozenset[str]) -> TrueSectors | None:
+        config, avoidance = self.config, self.config.rewards.avoidance
+        if avoidance.risk is None or not ("sectors" in fields or MOTION_TARGET in config.targets):
             return None
-        from omniperception.task.true_risk import TrueVelocityRisk
+        from omniperception.task.true_sectors import TrueSectors
 
-        return TrueVelocityRisk(law, config.obstacles, self.obstacles, self.num_envs, self.device)
+        return TrueSectors(avoidance.num_sectors, config.obstacles, self.obstacles, self.num_envs, self.device)
 
     def _actions_before(self) -> int:
         """How many actions before the newest something reads."""
@@ -582,9 +610,15 @@ class OmniEnv(VecEnv):
             self.last_joint_vel = zero
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
+        self.heights = torch.zeros(self.num_envs, NUM_HEIGHTS if "heights" in self._reads else 0, device=self.device)
         self.risk: torch.Tensor | None = None
-        if self.true_risk is not None:
-            self.risk = torch.zeros(self.num_envs, len(self.true_risk.candidates), device=self.device)
+        self.motion: torch.Tensor | None = None
+        if self.true_sectors is not None:
+            law, num_sectors = self.config.rewards.avoidance.risk, self.true_sectors.num_sectors
+            self.motion = nothing_near(self.num_envs, num_sectors, self.device)
+            if "sectors" in self._reads:
+                self._candidates = law.candidates(self.device)
+                self.risk = torch.zeros(self.num_envs, law.num_candidates, device=self.device)
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._past: tuple[torch.Tensor, torch.Tensor] | None = None
         if self.randomizer.delay is not None:

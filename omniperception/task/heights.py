@@ -6,6 +6,8 @@ import torch
 
 NUM_X, NUM_Y, SPACING = 17, 11, 0.1
 NUM_HEIGHTS = NUM_X * NUM_Y
+MAX_HEIGHT = 1.0
+"""Relative heights are clipped to this magnitude (m)."""
 
 
 def height_grid(device: torch.device | str = "cpu") -> torch.Tensor:
@@ -20,15 +22,6 @@ def footprint_grid(device: torch.device | str = "cpu") -> torch.Tensor:
     return torch.tensor([[0.0, 0.0], [0.2, 0.1], [0.2, -0.1], [-0.2, 0.1], [-0.2, -0.1]], device=device)
 
 
-def relative_heights(base_height: torch.Tensor, terrain_height: torch.Tensor | float) -> torch.Tensor:
-    """Base height minus terrain height, clipped to +-1 m.
-
-    Args:
-        base_height: (n,) m.
-        terrain_height: (n, 187) m at the grid's points, or one height for flat ground.
-
-    Returns:
-        (n, 187) m.
-    """
-    heights = base_height[:, None] - terrain_height
-    return heights.expand(-1, NUM_HEIGHTS).clamp(-1.0, 1.0)
+def flat_heights(base_height: torch.Tensor) -> torch.Tensor:
+    """(n, 187) heights (m) of bases (n,) above a plane at 0, clipped to +-1 m."""
+    return base_height[:, None].expand(-1, NUM_HEIGHTS).clamp(-MAX_HEIGHT, MAX_HEIGHT)

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from omniperception.perception.velocity_risk import VelocityRisk
+from omniperception.perception.sector_motion import sector_bearings
 from omniperception.task.state import checked_term, fields_read, reads
 
 if TYPE_CHECKING:
+    from omniperception.perception import VelocityRisk
     from omniperception.task.env import OmniEnv
 
 
@@ -74,12 +75,6 @@ class AvoidanceConfig:
                 raise ValueError(f"rewards.avoidance.{key}={getattr(self, key)} must be positive")
         if self.max_speed is not None and self.max_speed <= 0:
             raise ValueError(f"rewards.avoidance.max_speed={self.max_speed} must be positive or null")
-
-
-def sector_bearings(num_sectors: int, device: torch.device | str = "cpu") -> torch.Tensor:
-    """Unit vectors (num_sectors, 2) to the sectors' centres in the yaw-aligned frame; sector 0 starts at -pi."""
-    angle = -torch.pi + (torch.arange(num_sectors, device=device) + 0.5) * (2 * torch.pi / num_sectors)
-    return torch.stack((angle.cos(), angle.sin()), -1)
 
 
 def avoidance_velocity(distance: torch.Tensor, config: AvoidanceConfig) -> torch.Tensor:

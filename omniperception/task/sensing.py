@@ -20,8 +20,13 @@ from omniperception.lidar import (
 )
 from omniperception.perception import Attitude
 from omniperception.sim import Simulator
+from omniperception.task.odometry import Odometry
+from omniperception.task.state import Kinematics
 from omniperception.world.rays import HitClass, hidden_geoms, ray_shapes
 from omniperception.world.reach import FieldOfView
+
+NEVER = 2**31
+"""Frames since something was seen that has not been seen in this episode."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +61,13 @@ class SensingNeeds:
         sectors: number of azimuth sectors of obstacle distances, or 0.
         sector_max: distance (m) of a sector without an obstacle.
         rays: whether the mean distal range is read.
+        obstacles: geoms of the obstacles whose sightings are noted, none by default.
     """
 
     sectors: int
     sector_max: float
     rays: bool
+    obstacles: Sequence[str] = ()
 
 
 class LidarSensing:
@@ -72,11 +79,13 @@ class LidarSensing:
         hidden: geoms that are not in the ray scene because no ray meets them, and why.
         base: index of the robot's base among the bodies of the ray scene.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
-            newest last; None without a sampler.
+            newest last, with `base_motion` one row more: how the base moved since the frame before; None without a
+            sampler.
         frame_count: (num_envs, 1) int64 how many of the newest frames are valid.
         frame_tick: (num_envs, 1) int64 number of the newest frame, the same for all environments.
         sector_distance: (num_envs, num_sectors) horizontal distance (m) from the base to the nearest obstacle hit,
             without noise, in the yaw-aligned frame; None when nobody reads it.
+        unseen: (num_envs, O) int64 frames since a ray last hit each of the obstacles of the needs; None without any.
     """
 
     def __init__(
@@ -90,6 +99,7 @@ class LidarSensing:
         num_threads: int | None,
         sampler: Callable | None = None,
         history: int = 0,
+        base_motion: bool = False,
     ) -> None:
         if config.sensor.motion_segments > 1:
             raise ValueError(
@@ -127,13 +137,31 @@ class LidarSensing:
         self.frame_tick = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
         self.frames: torch.Tensor | None = None
         if sampler is not None:
-            self._newest = torch.zeros(sim.num_envs, sampler.num_points, 3, device=sim.device)
-            self.frames = torch.zeros(sim.num_envs, history, sampler.num_points, 3, device=sim.device)
+            self._newest = torch.zeros(sim.num_envs, sampler.num_points + base_motion, 3, device=sim.device)
+            self.frames = self._newest[:, None].repeat(1, history, 1, 1)
+        self.odometry = Odometry(sim.num_envs, control_dt, sim.device) if base_motion else None
         self.sector_distance: torch.Tensor | None = None
         if needs.sectors:
             self._measure_sectors = self._record_sectors(num_threads)
             self.sector_distance = self._measure_sectors.distances
         self._distal_range: dict[float, torch.Tensor] = {}
+        self.unseen: torch.Tensor | None = None
+        if needs.obstacles:
+            self._obstacle_of = torch.full((len(shapes.shapes) + 1,), len(needs.obstacles), device=sim.device)
+            self._obstacle_of[1 + torch.tensor(shapes.indices(tuple(needs.obstacles)))] = torch.arange(
+                len(needs.obstacles), device=sim.device
+            )  # row 0 is a miss; all other shapes are one more obstacle, which is left out
+            self.unseen = torch.full((sim.num_envs, len(needs.obstacles)), NEVER, device=sim.device)
+
+    def start(self, env_ids: torch.Tensor, sensed: Kinematics) -> None:
+        """Notes where the base of some environments starts; call after their reset."""
+        if self.odometry is not None:
+            self.odometry.start(env_ids, sensed)
+
+    def follow(self, sensed: Kinematics) -> None:
+        """Notes how the base moves; call at every control step."""
+        if self.odometry is not None:
+            self.odometry.advance(sensed)
 
     def due(self, step: int) -> bool:
         """Whether a frame ends with control step number `step`."""
@@ -151,6 +179,14 @@ class LidarSensing:
         self.tick += 1
         self.frame_tick.fill_(self.tick)
         self._distal_range.clear()
+        if self.unseen is not None:
+            self._note_sightings()
+
+    def _note_sightings(self) -> None:
+        hit = self._obstacle_of[self.frame.shape_id.long() + 1]
+        seen = torch.zeros(len(hit), self.unseen.shape[1] + 1, dtype=torch.bool, device=hit.device)
+        seen.scatter_(1, hit, True)
+        self.unseen = torch.where(seen[:, :-1], 0, self.unseen + 1)
 
     def sample(self, base_quat: torch.Tensor) -> None:
         """Appends the sampled points of the newest frame to the history; for a LiDAR with a sampler.
@@ -160,7 +196,10 @@ class LidarSensing:
         """
         frame, sensor = self.frame, self.config.sensor
         attitude = Attitude(base_quat.contiguous(), sensor.mount_pos, sensor.quat)
-        self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, self._newest, attitude)
+        points = self._newest[:, : self.sampler.num_points]
+        self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
+        if self.odometry is not None:
+            self._newest[:, -1] = self.odometry.since_last_frame()
         self.frames = torch.cat((self.frames[:, 1:], self._newest[:, None]), 1)
         self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
 
@@ -187,6 +226,8 @@ class LidarSensing:
             "sector_distance": None if self.sector_distance is None else self.sector_distance.clone(),
             "distal_range": {str(key): value for key, value in self._distal_range.items()},
             "motion": self._last_poses(),
+            "unseen": self.unseen,
+            "odometry": self.odometry.state_dict() if self.odometry is not None else None,
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -198,6 +239,10 @@ class LidarSensing:
             self.frames = state["frames"].clone()
         if self.sector_distance is not None:
             self.sector_distance.copy_(state["sector_distance"])
+        if self.unseen is not None:
+            self.unseen = state["unseen"].clone()
+        if self.odometry is not None:
+            self.odometry.load_state_dict(state["odometry"])
         self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
         if self.lidar.track is not None and state.get("motion") is not None:
             pos, quat, placed_anew = state["motion"]
@@ -214,6 +259,8 @@ class LidarSensing:
             self.frames[env_ids] = 0.0
         if self.sector_distance is not None:
             self.sector_distance[env_ids] = self.needs.sector_max
+        if self.unseen is not None:
+            self.unseen[env_ids] = NEVER
         for max_distance, mean in self._distal_range.items():
             mean[env_ids] = max_distance
 
@@ -254,6 +301,8 @@ def _outputs_read(needs: SensingNeeds, sampled: bool) -> tuple[str, ...]:
         outputs |= {"ranges", "directions_s", "elevation", "azimuth"}
     if needs.sectors:
         outputs |= {"true_ranges", "directions_s", "class_id"}
+    if needs.obstacles:
+        outputs |= {"shape_id"}
     if needs.rays:
         outputs |= {"true_ranges", "elevation"}
     return tuple(sorted(outputs))

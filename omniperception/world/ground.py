@@ -6,12 +6,19 @@ import math
 
 import mujoco
 import torch
+import warp as wp
 
+from omniperception.perception.launch import launch_over_envs, view
+from omniperception.world import ground_kernels as kernels
 from omniperception.world.terrain import GROUND
 from omniperception.world.tiled_terrain import TiledTerrainConfig
 
 EDGE = 1.0
 """Distance (m) from the outer edge of the terrain at which an environment counts as outside."""
+
+_LOOKUPS_PER_THREAD = 4096
+"""Looking up so many heights (about 40 microseconds) is worth another thread's waking up."""
+_REAL = {torch.float32: (wp.float32, wp.vec2), torch.float64: (wp.float64, wp.vec2d)}
 
 
 class Ground:
@@ -26,14 +33,17 @@ class Ground:
         kinds: names of the kinds of tiles, by column.
     """
 
-    def __init__(self, config: TiledTerrainConfig, model: mujoco.MjModel, pos_w: torch.Tensor) -> None:
+    def __init__(
+        self, config: TiledTerrainConfig, model: mujoco.MjModel, pos_w: torch.Tensor, num_threads: int | None = None
+    ) -> None:
         """
         Args:
             config: the terrain that is in the model.
             model: the compiled model.
             pos_w: (num_envs, 3) float64, the simulator's own position (m) of the ground's body; written here.
+            num_threads: CPU threads that look up heights; None for all.
         """
-        self.config, self.kinds = config, config.column_kinds()
+        self.config, self.kinds, self._num_threads = config, config.column_kinds(), num_threads
         geom = model.geom(GROUND)
         field = int(geom.dataid[0])
         self._rows, self._cols = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
@@ -49,7 +59,9 @@ class Ground:
         self.column = torch.arange(num_envs, device=device) * config.columns // num_envs
         self._middle = torch.zeros(num_envs, 2, dtype=torch.int64, device=device)
         self._middle_height = torch.zeros(num_envs, device=device)
-        self.move(torch.arange(num_envs, device=device), self.level.clone())
+        self._all_envs = torch.arange(num_envs, device=device)
+        self._surface = self._as_struct()
+        self.move(self._all_envs, self.level.clone())
 
     def move(self, env_ids: torch.Tensor, level: torch.Tensor) -> None:
         """Puts environments (n,) on the tiles of levels (n,) in their columns."""
@@ -67,18 +79,32 @@ class Ground:
 
         Beyond its edge the terrain goes on as high as at the edge.
         """
-        spread = (slice(None),) + (None,) * (xy_w.dim() - 2)
-        middle, level = self._of(self._middle, env_ids), self._of(self._middle_height, env_ids)
-        middle = middle[spread]
-        cells = xy_w / self.config.cell
-        index = (cells.floor().long() + middle).clamp(min=0).minimum(self._last)
-        across = (cells - (index - middle)).clamp(0.0, 1.0)
-        u, v = across.unbind(-1)
-        low = index[..., 1] * self._cols + index[..., 0]
-        corner = low + torch.where(u >= v, 1, self._cols)
-        h_low, h_corner, h_high = (self._heights[k] for k in (low, corner, low + self._cols + 1))
-        surface = h_low + torch.maximum(u, v) * (h_corner - h_low) + torch.minimum(u, v) * (h_high - h_corner)
-        return surface - level[spread]
+        if not xy_w.numel():
+            return xy_w.new_zeros(xy_w.shape[:-1])
+        points = xy_w.reshape(len(xy_w), -1, 2)
+        heights = points.new_empty(points.shape[:2])
+        real, vec2 = _REAL[xy_w.dtype]
+        ids = self._all_envs if env_ids is None else env_ids.contiguous()
+        arrays = [view(ids, wp.int64), view(points, vec2), view(heights, real)]
+        self.launch(kernels.heights_kernel(real), arrays, *points.shape[:2])
+        return heights.reshape(xy_w.shape[:-1])
+
+    def lift(self, path: torch.Tensor, above: torch.Tensor, there: torch.Tensor, elsewhere: float) -> None:
+        """Puts bodies on their way onto the ground, in place.
+
+        Args:
+            path: (num_envs, T, B, 3) float64, m, in the environments' frames; its heights are written.
+            above: (num_envs, B) float64, m, of each body above the ground below it.
+            there: (num_envs, B) bool, which bodies are there.
+            elsewhere: height (m) of the others.
+        """
+        arrays = [view(above, wp.float64), view(there, wp.bool), elsewhere, view(path, wp.vec3d)]
+        self.launch(kernels.lift, arrays, len(path), path.shape[1] * path.shape[2])
+
+    def launch(self, kernel: wp.Kernel, inputs: list, num_envs: int, lookups: int) -> None:
+        """Runs `kernel(env_offset, surface, *inputs)` of `ground_kernels` with `lookups` heights per environment."""
+        threads = self._num_threads if num_envs * lookups > _LOOKUPS_PER_THREAD else 1
+        launch_over_envs(kernel, num_envs, [self._surface, *inputs], self._heights.device, num_threads=threads)
 
     def highest(self, xy_w: torch.Tensor, radius: float, env_ids: torch.Tensor | None = None) -> torch.Tensor:
         """Heights (n,) in m of the highest grid point within a square of 2 `radius` (m) and the cells around it.
@@ -116,6 +142,13 @@ class Ground:
 
     def load_state_dict(self, state: dict) -> None:
         self.move(torch.arange(len(self.level), device=self.level.device), state["level"].to(self.level.device))
+
+    def _as_struct(self) -> kernels.Surface:
+        surface = kernels.Surface()
+        surface.heights, surface.level = view(self._heights, wp.float32), view(self._middle_height, wp.float32)
+        surface.middle = view(self._middle, wp.int64)
+        surface.rows, surface.cols, surface.cell = self._rows, self._cols, self.config.cell
+        return surface
 
     @staticmethod
     def _of(values: torch.Tensor, env_ids: torch.Tensor | None) -> torch.Tensor:

@@ -72,9 +72,9 @@ class ObstacleField:
         self.velocity_w = torch.zeros(pos_w.shape[0], len(slots), 2, dtype=torch.float64, device=device)
         self.active = torch.zeros(pos_w.shape[0], len(slots), dtype=torch.bool, device=device)
         self.level = 1.0 if config.curriculum is None else 0.0
-        self._all_envs = torch.arange(pos_w.shape[0], device=device)
         followers = pos_w.shape[:2] if ground is not None else (0,)
         self._above_ground = torch.zeros(followers, dtype=torch.float64, device=device)
+        self._path = torch.zeros(pos_w.shape[0], 0, len(slots), 3, dtype=torch.float64, device=device)
 
     def reset(
         self,
@@ -127,11 +127,22 @@ class ObstacleField:
         else:
             self._wrap(robot_xy_w)
 
-    def follow_ground(self, path: torch.Tensor) -> None:
-        """Lifts where the obstacles have been, (num_envs, num_steps, num_placed, 3), to the ground; the last is now."""
-        if self._ground is not None:
-            path[..., 2] = self._over_ground(path[..., :2], self._all_envs)
-            self.pos_w.copy_(path[:, -1])
+    def travel(self, dt: float, num_steps: int, robot_xy_w: torch.Tensor) -> torch.Tensor:
+        """Moves every obstacle by `num_steps` steps of `dt` (s); see `advance`.
+
+        Returns:
+            (num_envs, num_steps, num_placed, 3) m, where they are after each step, on the ground; the same memory in
+            every call.
+        """
+        if self._path.shape[1] != num_steps:
+            self._path = self._path.new_zeros(len(self.pos_w), num_steps, *self.pos_w.shape[1:])
+        for step in range(num_steps):
+            self.advance(dt, robot_xy_w)
+            self._path[:, step] = self.pos_w
+        if self._ground is not None and self._path.numel():
+            self._ground.lift(self._path, self._above_ground, self.active, PARKED_HEIGHT)
+            self.pos_w.copy_(self._path[:, -1])
+        return self._path
 
     @property
     def yaw(self) -> torch.Tensor:
@@ -243,10 +254,9 @@ class ObstacleField:
     # ---- moving ------------------------------------------------------------------------------------------------------
 
     def _over_ground(self, xy: torch.Tensor, env_ids: torch.Tensor) -> torch.Tensor:
-        """Heights (n, ..., num_placed) of the obstacles' centres where they are at (n, ..., num_placed, 2)."""
-        spread = (slice(None),) + (None,) * (xy.dim() - 3)
-        above, active = self._above_ground[env_ids][spread], self.active[env_ids][spread]
-        return torch.where(active, above + self._ground.height(xy, env_ids), PARKED_HEIGHT)
+        """Heights (n, num_placed) of the obstacles' centres where they are at (n, num_placed, 2)."""
+        above = self._above_ground[env_ids] + self._ground.height(xy, env_ids)
+        return torch.where(self.active[env_ids], above, PARKED_HEIGHT)
 
     def _bounce(self) -> None:
         xy, free = self.pos_w[..., :2], self.approaches[:, None]

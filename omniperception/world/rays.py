@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -36,6 +36,10 @@ class RayShapes:
     geom_names: tuple[str, ...]
     bodies: tuple[int, ...]
     base: int
+
+    def indices(self, geom_names: Sequence[str]) -> tuple[int, ...]:
+        """Positions of the named geoms in `shapes`."""
+        return tuple(self.geom_names.index(name) for name in geom_names)
 
 
 def ray_shapes(world: World, leave_out: Collection[str] = ()) -> RayShapes:

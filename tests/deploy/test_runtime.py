@@ -39,7 +39,8 @@ RECIPES = {
     "pd_risknet_small": ("perception=pd_risknet_small", "randomization=paper"),
     "pd_risknet_no_distal": ("perception=pd_risknet_no_distal",),
     "pd_risknet_small_no_proximal": ("perception=pd_risknet_small_no_proximal",),
-    "velocity_risk": ("experiment=avoid",),
+    "pd_risknet_rings": ("experiment=avoid", "init=unread"),
+    "motion_by_fps": ("experiment=avoid", "init=unread", "perception=fps_gru_small", "perception.base_motion=true"),
 }
 ALIKE = {
     "fps_mlp_small": "fps_mlp",
@@ -89,7 +90,7 @@ def trained(run_dir, *overrides):
 
 def test_every_preset_is_tried():
     presets = {path.stem for path in (config.CONFIG_DIR / "perception").glob("*.yaml")}
-    assert presets == {*RECIPES, *ALIKE, *CARRIED} - {"velocity_risk"}
+    assert presets == {*RECIPES, *ALIKE, *CARRIED} - {"motion_by_fps"}
 
 
 @pytest.mark.parametrize("preset", CARRIED)

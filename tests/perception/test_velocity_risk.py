@@ -65,3 +65,60 @@ def test_what_lies_ahead_is_passed_on_the_free_side():
 def test_impossible_settings_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         VelocityRisk(**GIVEN | change)
+
+
+class TestRisk:
+    def by_search(self, law, sectors, candidate):
+        """The definition, obstacle by obstacle and time by time."""
+        worst = 0.0
+        for s, (distance, vx, vy) in enumerate(sectors.tolist()):
+            bearing = -math.pi + (s + 0.5) * 2 * math.pi / len(sectors)
+            for time in law.times:
+                x = distance * math.cos(bearing) + (vx - candidate[0]) * time
+                y = distance * math.sin(bearing) + (vy - candidate[1]) * time
+                gap = max(math.hypot(x, y) - law.robot_radius, 0.0)
+                worst = max(worst, math.exp(-gap / law.decay - time / law.time_constant))
+        return worst
+
+    def scene(self, seed, n=6, num_sectors=12):
+        generator = torch.Generator().manual_seed(seed)
+        distance = 0.4 + 2 * torch.rand(n, num_sectors, 1, generator=generator)
+        distance[torch.rand(n, num_sectors, 1, generator=generator) < 0.5] = torch.inf
+        return torch.cat((distance, torch.randn(n, num_sectors, 2, generator=generator)), -1)
+
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_is_that_of_the_definition(self, seed):
+        law = VelocityRisk(**GIVEN)
+        sectors, candidates = self.scene(seed), law.candidates()
+        sectors[2, :, 0] = torch.inf
+        risk = law.risk(sectors, candidates)
+        for n in range(6):
+            rows = torch.where(sectors[n, :, :1].isinf(), torch.tensor([1e6, 0.0, 0.0]), sectors[n])
+            for k in range(9):
+                expected = self.by_search(law, rows, candidates[k].tolist())
+                assert risk[n, k].item() == pytest.approx(expected, abs=1e-5)
+        assert not risk[2].any() and risk.max() > 0.5
+
+    def test_the_kernel_finds_what_the_exported_operations_find(self):
+        law = VelocityRisk(**GIVEN)
+        sectors, candidates = self.scene(3, n=40), law.candidates()
+        risk = law.risk(sectors, candidates)
+        bearing = -math.pi + (torch.arange(12) + 0.5) * math.pi / 6
+        place = sectors[..., :1].clamp(max=100.0) * torch.stack((bearing.cos(), bearing.sin()), -1)
+        sector, when = law._worst(place, sectors[..., 1:], candidates)
+        index = sector[..., None].expand(-1, -1, 2)
+        offset = place.gather(1, index) + when[..., None] * (sectors[..., 1:].gather(1, index) - candidates)
+        gap = (offset.norm(dim=-1) - law.robot_radius).clamp(min=0.0)
+        assert torch.allclose((-gap / law.decay - when / law.time_constant).exp(), risk, atol=1e-5)
+
+    def test_gradient_is_that_of_differences(self):
+        law = VelocityRisk(**GIVEN)
+        sectors = self.scene(5, n=3)
+        sectors[..., 0].clamp_(max=3.0)
+        sectors.requires_grad_()
+        weights = torch.randn(3, 9, generator=torch.Generator().manual_seed(0))
+        (gradient,) = torch.autograd.grad((law.risk(sectors, law.candidates()) * weights).sum(), sectors)
+        with torch.no_grad():
+            direction = torch.randn(sectors.shape, generator=torch.Generator().manual_seed(1))
+            up, down = ((law.risk(sectors + s * 2e-4 * direction, law.candidates()) * weights).sum() for s in (1, -1))
+        assert (gradient * direction).sum().item() == pytest.approx(((up - down) / 4e-4).item(), rel=3e-2, abs=2e-3)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.task.heights import height_grid, relative_heights
+from omniperception.task.heights import flat_heights, height_grid
 from omniperception.task.rotations import rotate_inverse, rotate_yaw, yaw_of, yaw_quat
 from omniperception.task.state import Kinematics, fields_read, reads
 
@@ -117,13 +117,7 @@ class TestHeights:
         torch.testing.assert_close(grid[-1], torch.tensor([0.8, 0.5]))
         torch.testing.assert_close(grid[93], torch.zeros(2))  # the middle lies under the base
 
-    def test_heights_are_above_ground_and_clipped(self):
-        heights = relative_heights(torch.tensor([0.3, -0.2, 5.0, -5.0]), 0.0)
+    def test_heights_over_flat_ground_are_clipped(self):
+        heights = flat_heights(torch.tensor([0.3, -0.2, 5.0, -5.0]))
         assert heights.shape == (4, 187)
         torch.testing.assert_close(heights, torch.tensor([[0.3], [-0.2], [1.0], [-1.0]]).expand(4, 187))
-
-    def test_uneven_ground(self):
-        ground = torch.zeros(1, 187)
-        ground[0, 5] = 0.1
-        heights = relative_heights(torch.tensor([0.3]), ground)
-        assert heights[0, 5].item() == pytest.approx(0.2) and heights[0, 4].item() == pytest.approx(0.3)

@@ -177,6 +177,31 @@ class TestSurface:
             np.testing.assert_allclose(heights[i][on_terrain], expected, atol=2e-5)
         assert outside < 400
 
+    def test_heights_are_those_of_two_triangles_to_a_cell_in_float64(self, env):
+        """A plane through the three corners, solved for each point, also beyond the edge, where the edge goes on."""
+        rng = np.random.default_rng(2)
+        xy = rng.uniform(-60.0, 60.0, (20, 100, 2))
+        data = env.world.model.hfield_data.astype(np.float64).reshape(env.ground._rows, env.ground._cols)
+        geom = env.world.model.geom("ground")
+        z = (data * env.world.model.hfield_size[0, 2] + geom.pos[2]).astype(np.float32)
+        half, cell = env.world.model.hfield_size[0, :2], env.config.terrain.cell
+        heights, expected = env.ground.height(torch.tensor(xy)).numpy(), np.zeros((20, 100))
+        for i, origin in enumerate(env.sim.ground_pos.numpy()):
+            for k, (x, y) in enumerate((xy[i] - origin[:2] + half) / cell):
+                x, y = np.clip(x, 0, z.shape[1] - 1), np.clip(y, 0, z.shape[0] - 1)
+                a, b = min(int(x), z.shape[1] - 2), min(int(y), z.shape[0] - 2)
+                third = (a + 1, b) if x - a >= y - b else (a, b + 1)
+                corners = np.array([(a, b), (a + 1, b + 1), third])
+                lines = np.column_stack((corners, np.ones(3)))
+                expected[i, k] = np.linalg.solve(lines, z[corners[:, 1], corners[:, 0]]) @ (x, y, 1) + origin[2]
+        np.testing.assert_allclose(heights, expected, atol=1e-6)  # the cells of 0.1 m are not those of linspace
+        assert (np.abs(xy) > 45).any() and np.ptp(expected) > 1.0
+
+    def test_points_that_are_no_numbers_do_no_harm(self, env):
+        xy = torch.tensor([[math.nan, 0.0], [math.inf, -math.inf], [1e30, -1e30]]).expand(20, 3, 2)
+        assert env.ground.height(xy)[:, 1:].isfinite().all()
+        assert env.ground.height(xy[:, :0]).shape == (20, 0) and env.ground.height(xy[:0]).shape == (0, 3)
+
     def test_the_height_grid_is_the_robots_view_of_them(self, make_env):
         seen = f"+observations.groups.privileged.terms.heights={HEIGHTS}"
         env = make_env(*FREE, "commands.spawn.x=[2.5,2.5]", seen, num_envs=10, blind=True)
@@ -264,6 +289,23 @@ def _ground_body(run):
     return int(world.model.geom("ground").bodyid[0])
 
 
+class TestSupervision:
+    def test_heights_are_those_of_the_newest_frame(self, make_env):
+        """The base's height at the LiDAR's ticks, held until the next; where a term reads them, of the moment."""
+        for terms, fresh in (((), False), ((f"+observations.groups.privileged.terms.heights={HEIGHTS}",), True)):
+            env = make_env(*SMALL, "obstacles=mixed", "perception=pd_risknet_small", *terms, num_envs=3)
+            env.obstacles.level = 1.0
+            at_tick = None
+            for step in range(1, 13):
+                height = env.step(0.5 * torch.ones(3, 12))[0]["height_target"]
+                if step % env.sensing.period_steps == 0:
+                    at_tick = env._height_lookup.around()
+                if at_tick is not None:
+                    expected = env._height_lookup.around() if fresh else at_tick
+                    assert torch.equal(height, expected), (step, fresh)
+            assert not torch.equal(env._height_lookup.around(), at_tick) and env.episode_length_buf.min() == 12
+
+
 class TestRobots:
     @pytest.mark.parametrize("spread", [0.0, 3.0])
     def test_start_on_the_surface(self, make_env, spread):
@@ -319,6 +361,20 @@ class TestObstacles:
                 env.step(torch.zeros(10, 12))
         assert torch.equal(env.sim.ground_pos, before)
         assert field.bottom_above_ground().abs().max() < 1e-9
+
+    def test_follow_the_ground_at_every_physics_step(self, make_env):
+        env = make_env(*SMALL, "obstacles=moving", num_envs=4, blind=True)
+        field = env.obstacles
+        half = torch.tensor([slot.half_height for slot in field.config.placed_slots()])
+        before = field.pos_w[..., :2].clone()
+        path = field.travel(0.05, 6, env.sim.qpos[:, :2])
+        assert torch.equal(path[:, -1], field.pos_w) and field.travel(0.05, 6, env.sim.qpos[:, :2]) is path
+        assert path.shape == (4, 6, field.pos_w.shape[1], 3) and (field.pos_w[..., :2] - before).abs().max() > 0.5
+        for i in range(4):
+            for step in range(6):
+                inside = ((path[i, step, :, :2] - env.sim.ground_pos[i, :2]).abs() < env.ground._half).all(-1)
+                ground = looking_down(env, i, path[i, step, inside, :2])
+                np.testing.assert_allclose(path[i, step, inside, 2] - half[inside], ground, atol=1e-5)
 
     def test_what_takes_no_part_stays_below_the_ground(self, make_env):
         env = make_env(*SMALL, "obstacles=moving", num_envs=4, blind=True)

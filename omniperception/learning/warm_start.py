@@ -1,0 +1,46 @@
+"""Starts a policy from the weights of another run, whatever the two perceive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import nn
+
+from omniperception.learning.checkpoint import CheckpointError
+
+_FIRST_LAYER = "mlp.0.weight"
+_OPTIONAL = ("perception.", "read_out.")
+
+
+def start_from(model: nn.Module, weights: Mapping[str, torch.Tensor], source: str) -> None:
+    """Copies the actor's weights of another run into a model with the same one-dimensional observations.
+
+    The first layer reads these observations before an embedding, so a policy that walked blind starts to walk with
+    eyes; the columns of the embedding keep their initial values unless the perception network fits too.
+
+    Args:
+        model: whose weights are replaced in place.
+        weights: the state of the other.
+        source: names the other run in an error.
+
+    Raises:
+        CheckpointError: observations, hidden layers or actions differ.
+    """
+    state = model.state_dict()
+    optional = {name for name in state if name.startswith(_OPTIONAL)}
+    perceives_alike = all(name in weights and weights[name].shape == state[name].shape for name in optional)
+    for name in [name for name in state if perceives_alike or name not in optional]:
+        own, other = state[name], weights.get(name)
+        if name == _FIRST_LAYER and other is not None and len(other) == len(own):
+            shared = own.shape[1] if perceives_alike else model.obs_dim
+            if other.shape[1] >= shared:
+                own[:, :shared] = other[:, :shared]
+                continue
+        if other is None or other.shape != own.shape:
+            given = "nothing" if other is None else f"shape {tuple(other.shape)}"
+            raise CheckpointError(
+                f"init={source} does not fit: this run's {name} has shape {tuple(own.shape)}, that run's {given}; give"
+                " both the same observations (groups and history) and ppo.hidden_dims"
+            )
+        own.copy_(other)

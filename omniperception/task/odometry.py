@@ -1,0 +1,43 @@
+"""How the base has moved since the last LiDAR frame, as a state estimator tells it."""
+
+from __future__ import annotations
+
+import torch
+
+from omniperception.task.rotations import rotate_yaw
+from omniperception.task.state import Kinematics
+
+
+class Odometry:
+    """Adds up the sensed velocity from one frame to the next; the heading is the IMU's."""
+
+    def __init__(self, num_envs: int, control_dt: float, device: torch.device) -> None:
+        self._dt = control_dt
+        self._travelled_w = torch.zeros(num_envs, 2, device=device)
+        self._yaw = torch.zeros(num_envs, device=device)
+        self._yaw_before = torch.zeros(num_envs, device=device)
+
+    def start(self, env_ids: torch.Tensor, sensed: Kinematics) -> None:
+        """Some robots stand elsewhere."""
+        self._yaw = self._yaw.index_copy(0, env_ids, sensed.yaw[env_ids])
+        self._yaw_before = self._yaw_before.index_copy(0, env_ids, sensed.yaw[env_ids])
+        self._travelled_w = self._travelled_w.index_fill(0, env_ids, 0.0)
+
+    def advance(self, sensed: Kinematics) -> None:
+        """One control step."""
+        self._yaw = sensed.yaw
+        self._travelled_w = self._travelled_w + rotate_yaw(sensed.yaw, sensed.base_lin_vel_yaw) * self._dt
+
+    def since_last_frame(self) -> torch.Tensor:
+        """(num_envs, 3) x, y (m) and yaw (rad) since the call before, in the levelled base of then."""
+        turned = torch.remainder(self._yaw - self._yaw_before + torch.pi, 2 * torch.pi) - torch.pi
+        moved = torch.cat((rotate_yaw(-self._yaw_before, self._travelled_w), turned[:, None]), 1)
+        self._yaw_before = self._yaw
+        self._travelled_w = torch.zeros_like(self._travelled_w)
+        return moved
+
+    def state_dict(self) -> dict:
+        return {"travelled": self._travelled_w, "yaw": self._yaw, "yaw_before": self._yaw_before}
+
+    def load_state_dict(self, state: dict) -> None:
+        self._travelled_w, self._yaw, self._yaw_before = state["travelled"], state["yaw"], state["yaw_before"]

@@ -1,0 +1,104 @@
+"""A policy that starts from another run's weights, and one that stays as it is while perception learns."""
+
+import pytest
+import torch
+
+from omniperception.assembly import build_runner
+from omniperception.learning import CheckpointError
+from omniperception.learning.checkpoint import checkpoint_path
+from omniperception.task.env import HEIGHT_TARGET
+
+SMALL = ("num_envs=8", "ppo.hidden_dims=[32,16]", "ppo.num_mini_batches=2", "ppo.num_steps_per_env=10")
+BLIND = ("experiment=walk", *SMALL)
+SEEING = ("experiment=avoid", *SMALL, "lidar.sensor.num_rays=200", "perception.supervised_epochs=1")
+
+
+@pytest.fixture
+def walk(make_config, tmp_path):
+    """Run directory of a blind policy."""
+    runner = build_runner(make_config(*BLIND, "seed=5"), None)
+    with torch.no_grad():
+        runner.alg.actor.obs_normalizer._mean.normal_()
+        runner.alg.actor.mlp[0].weight.normal_()
+    runner.save(str(checkpoint_path(tmp_path / "walk", 3)))
+    return tmp_path / "walk", runner
+
+
+def test_walks_alike_before_it_has_seen_anything(make_config, walk):
+    run_dir, blind = walk
+    runner = build_runner(make_config(*SEEING, f"init={run_dir}"), None)
+    runner.start_from(run_dir)
+    obs = runner.env.get_observations()
+    obs["frame_count"] = torch.zeros_like(obs["frame_count"])
+    with torch.no_grad():
+        assert torch.allclose(runner.alg.actor(obs), blind.alg.actor(obs), atol=1e-6)
+    assert torch.equal(runner.alg.critic.mlp[0].weight, blind.alg.critic.mlp[0].weight)  # it observes the same
+
+
+def test_perception_comes_along_where_it_fits(make_config, tmp_path):
+    first = build_runner(make_config(*SEEING, "init=unread", "seed=9"), None)
+    first.save(str(checkpoint_path(tmp_path / "seeing", 1)))
+    second = build_runner(make_config(*SEEING, "init=unread", "seed=10"), None)
+    before = [p.clone() for p in second.alg.actor.perception_parameters()]
+    second.start_from(tmp_path / "seeing")
+    mine, theirs = second.alg.actor.state_dict(), first.alg.actor.state_dict()
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
+    assert not all(torch.equal(a, b) for a, b in zip(before, second.alg.actor.perception_parameters(), strict=True))
+
+
+def test_other_observations_are_refused(make_config, walk):
+    run_dir, _ = walk
+    runner = build_runner(make_config(*SEEING, "init=unread", "observations.groups.proprioception.history=2"), None)
+    with pytest.raises(
+        CheckpointError, match=r"init=.*walk does not fit: this run's .* give both the same observations"
+    ):
+        runner.start_from(run_dir)
+
+
+def test_perception_learns_and_the_policy_stays_as_it_is(make_config, walk):
+    run_dir, _ = walk
+    terrain = ("terrain=mixed", "perception.height_weight=1.0")
+    runner = build_runner(make_config(*SEEING, *terrain, f"init={run_dir}", "perception.learning_rate=3e-3"), None)
+    runner.start_from(run_dir)
+    actor, critic = runner.alg.actor, runner.alg.critic
+    kept = {name: value.clone() for name, value in actor.state_dict().items() if not name.startswith("perception.")}
+    valued = {name: value.clone() for name, value in critic.state_dict().items()}
+    seen = {name: value.clone() for name, value in actor.perception.state_dict().items()}
+    losses = []
+    obs = runner.env.get_observations()
+    runner.alg.train_mode()
+    for _ in range(12):
+        with torch.inference_mode():
+            for _ in range(10):
+                obs = runner._step(obs)
+        losses.append(runner.alg.update())
+    assert all(torch.equal(actor.state_dict()[name], value) for name, value in kept.items())
+    assert all(torch.equal(critic.state_dict()[name], value) for name, value in valued.items())
+    assert not any(torch.equal(actor.perception.state_dict()[name], value) for name, value in seen.items())
+    assert set(losses[0]) == {"motion_target", HEIGHT_TARGET}
+    for target in losses[0]:
+        early, late = (sum(loss[target] for loss in part) for part in (losses[:3], losses[-3:]))
+        assert late < 0.9 * early, target
+
+
+def test_the_learning_rate_falls(make_config):
+    run = make_config(
+        *SEEING, "init=unread", "ppo.max_iterations=4", "perception.learning_rate=1e-3",
+        "perception.final_learning_rate=2e-4",
+    )  # fmt: skip
+    runner = build_runner(run, None)
+    rates, obs = [], runner.env.get_observations()
+    for _ in range(5):
+        with torch.inference_mode():
+            for _ in range(10):
+                obs = runner._step(obs)
+        runner.alg.update()
+        rates.append(runner.alg.perception_trainer.optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4, 2e-4])
+
+
+def test_nothing_that_learns_is_refused(make_config):
+    with pytest.raises(
+        ValueError, match=r"ppo\.num_learning_epochs=0 keeps the policy as it is, and nothing else learns"
+    ):
+        make_config(*BLIND, "ppo.num_learning_epochs=0")
