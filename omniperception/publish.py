@@ -1,0 +1,67 @@
+"""Strips a run of everything that replaying, evaluating and starting from it do not need."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import torch
+
+from omniperception import config
+from omniperception.config import ConfigError
+from omniperception.evaluation.report import provenance
+from omniperception.learning import latest_checkpoint
+from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+
+PROVENANCE = "provenance.json"
+LIMIT = 4_000_000
+"""Most bytes of a published checkpoint: it goes into a repository."""
+
+
+def publish(run_dir: Path, folder: Path) -> dict:
+    """Writes a run directory that holds the newest weights, the configuration and where they come from.
+
+    The critic stays, because a run that starts from this one may learn on; the optimisers, the environments' state and
+    the logs go.
+
+    Args:
+        run_dir: a run.
+        folder: becomes a run directory; what it held of another run is replaced.
+
+    Returns:
+        What provenance.json holds.
+
+    Raises:
+        ConfigError: the weights are larger than LIMIT.
+        CheckpointError: the run has no checkpoint.
+    """
+    newest = latest_checkpoint(run_dir)
+    state = load_checkpoint(newest, "cpu")
+    weights = {name: _single_precision(state[name]) for name in ("actor_state_dict", "critic_state_dict")}
+    size = sum(tensor.numel() * tensor.element_size() for part in weights.values() for tensor in part.values())
+    if size > LIMIT:
+        raise ConfigError(f"{newest} has {size / 1e6:.1f} MB of weights, at most {LIMIT / 1e6:.0f} MB are published")
+    composed = config.load(run_dir)
+    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copy(run_dir / config.CONFIG_FILE, folder / config.CONFIG_FILE)
+    save_checkpoint(
+        checkpoint_path(folder, state["iteration"]), {**weights, "iteration": state["iteration"], "infos": None}
+    )
+    steps = state["iteration"] * composed.num_envs * composed.ppo.num_steps_per_env
+    record = {
+        "run": str(run_dir),
+        "init": composed.get("init"),
+        "seed": composed.seed,
+        "iterations": state["iteration"],
+        "control_steps": steps,
+        "training_hours": round(state["total_time"] / 3600, 3),
+        **provenance("cpu"),
+    }
+    (folder / PROVENANCE).write_text(json.dumps(record, indent=2) + "\n")
+    return record
+
+
+def _single_precision(part: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: value.float() if value.is_floating_point() else value for name, value in part.items()}

@@ -1,0 +1,43 @@
+"""A published run replays as the run that it was made from."""
+
+import json
+
+import pytest
+import torch
+
+from omniperception import config, publish
+from omniperception.assembly import build_runner, load_policy
+from omniperception.learning.checkpoint import checkpoint_path, latest_checkpoint
+
+
+@pytest.fixture
+def run(make_config, tmp_path):
+    """A run directory with a checkpoint of everything."""
+    run = make_config("experiment=avoid", "init=unread", "terrain=flat", "num_envs=2", "lidar.sensor.num_rays=200")
+    config.save(run.composed, tmp_path / "run")
+    build_runner(run, None).save(str(checkpoint_path(tmp_path / "run", 0)))
+    return tmp_path / "run"
+
+
+def test_the_published_policy_acts_alike(run, tmp_path):
+    record = publish.publish(run, tmp_path / "published")
+    assert json.loads((tmp_path / "published" / publish.PROVENANCE).read_text()) == record
+    assert latest_checkpoint(tmp_path / "published").stat().st_size < latest_checkpoint(run).stat().st_size
+    replays = [load_policy(config.assemble(config.load(folder)), folder) for folder in (run, tmp_path / "published")]
+    obs = [trained.env.get_observations() for trained in replays]
+    with torch.no_grad():
+        assert torch.equal(*(trained.policy(o) for trained, o in zip(replays, obs, strict=True)))
+
+
+def test_another_run_starts_from_it(run, tmp_path, make_config):
+    publish.publish(run, tmp_path / "published")
+    runner = build_runner(config.assemble(config.load(run, ["seed=8"])), None)
+    runner.start_from(tmp_path / "published")
+    weights = torch.load(latest_checkpoint(run), weights_only=True)["actor_state_dict"]
+    assert all(torch.equal(value, weights[name]) for name, value in runner.alg.actor.state_dict().items())
+
+
+def test_too_large_a_policy_is_refused(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(publish, "LIMIT", 1000)
+    with pytest.raises(config.ConfigError, match=r"MB of weights, at most 0 MB are published"):
+        publish.publish(run, tmp_path / "published")
