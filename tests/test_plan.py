@@ -209,7 +209,7 @@ def test_geoms_left_out_of_the_rays_are_never_met(name, make_config):
         shapes = ray_shapes(world, left_out)
         scene = RayScene(shapes.shapes, NUM_POSTURES, len(shapes.bodies), num_threads=1)
         scene.set_poses(*(field[:, list(shapes.bodies)] for field in poses))
-        more = replace(sensor, num_rays=min(2000, pattern.points_per_frame(sensor.period_s)), min_range=0.0)
+        more = replace(sensor, num_rays=min(1000, pattern.points_per_frame(sensor.period_s)), min_range=0.0)
         lidar = Lidar(more, pattern, scene, mount_body=shapes.base, outputs=("ranges", "shape_id"), seed=1)
         frame = lidar.cast(1.0)
         met = [shapes.geom_names[k] if k >= 0 else None for k in frame.shape_id.flatten().tolist()]
