@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from omniperception import config
 from omniperception.assembly import build_runner
 from omniperception.learning import CheckpointError, TrainingDiverged, latest_checkpoint, list_checkpoints
+from omniperception.plan import describe
 
 
 def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
@@ -26,6 +27,9 @@ def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
         if run.init is not None:
             runner.start_from(config.find_run(run.init))
         print(f"run directory: {run_dir}")
+    plan = describe(run, runner)
+    plan.save(run_dir)
+    print(plan.summary())
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
     print(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
 

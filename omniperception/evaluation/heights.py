@@ -40,7 +40,8 @@ def height_errors(env: OmniEnv, policy: Policy, actor: PerceptionActor, steps: i
     """Lets the policy walk and compares heights at each new frame.
 
     The constant predictor says at every point of the grid the mean that is found there in these very frames, so no
-    constant does better; "flat ground" says the mean of each frame at all its points, as one who knew the base's height alone.
+    constant does better; "flat ground" says the mean of each frame at all its points, as one who knew no more than the
+    height of the base.
 
     Args:
         env: terrain and obstacles that training has not seen.

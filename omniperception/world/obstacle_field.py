@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-import warp as wp
 
-from omniperception.perception.launch import view
 from omniperception.random import EnvRandom
-from omniperception.world.ground import Ground
-from omniperception.world.ground_kernels import lift
 from omniperception.world.obstacles import Obstacle, ObstaclesConfig
+
+if TYPE_CHECKING:
+    from omniperception.world.ground import Ground
 
 PARKED_HEIGHT = -100.0
 """Height (m) at which an obstacle that takes no part waits, below the ground where no ray and no contact finds it."""
@@ -140,9 +140,7 @@ class ObstacleField:
             self.advance(dt, robot_xy_w)
             self._path[:, step] = self.pos_w
         if self._ground is not None and self._path.numel():
-            arrays = [view(self._above_ground, wp.float64), view(self.active, wp.bool)]
-            arrays += [PARKED_HEIGHT, view(self._path, wp.vec3d)]
-            self._ground.launch(lift, arrays, len(self.pos_w), num_steps * self.pos_w.shape[1])
+            self._ground.lift(self._path, self._above_ground, self.active, PARKED_HEIGHT)
             self.pos_w.copy_(self._path[:, -1])
         return self._path
 
