@@ -20,6 +20,7 @@ from omniperception.learning import (
     latest_checkpoint,
     list_checkpoints,
 )
+from omniperception.plan import describe
 
 
 def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
@@ -32,6 +33,10 @@ def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
         if run.init is not None:
             runner.start_from(config.find_run(run.init))
         tell(f"run directory: {run_dir}")
+    plan = describe(run, runner)
+    if distributed.rank() == 0:
+        plan.save(run_dir)
+    tell(plan.summary())
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
     tell(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
     distributed.disconnect()

@@ -138,7 +138,7 @@ def _table(scenario: str, rows: dict, study: Ablation) -> str:
     for variant, row in rows.items():
         cells = [variant, *(_cell(row[scenario][name]) for name in names)]
         if paper:
-            cells.append(PAPER.get(variant.removesuffix("_small"), "").replace("|", "\\|"))
+            cells.append(PAPER.get(variant.removesuffix("_small").removesuffix("_rings"), "").replace("|", "\\|"))
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

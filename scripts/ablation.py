@@ -1,7 +1,7 @@
 """Trains perception variants over seeds, evaluates them in scenarios, and writes the paper's table beside ours.
 
     python scripts/ablation.py [stage=all|train|evaluate|table] [out=outputs/ablation] [experiment=avoid]
-        [variants=fps_mlp_small,fps_gru_small,pd_risknet_small] [seeds=1,2,3] [scenarios=corridor,static|all]
+        [variants=fps_mlp_small,fps_gru_small,pd_risknet_rings] [seeds=1,2,3] [scenarios=corridor,static|all]
         [trials=1000] [overrides of the training]
 
 Runs lie in <out>/<variant>/seed<seed>. The same command goes on where it was stopped: finished runs and evaluations
@@ -24,7 +24,7 @@ ARGUMENTS = {
     "stage": "all",
     "out": "outputs/ablation",
     "experiment": "avoid",
-    "variants": "fps_mlp_small,fps_gru_small,pd_risknet_small",
+    "variants": "fps_mlp_small,fps_gru_small,pd_risknet_rings",
     "seeds": "1,2,3",
     "scenarios": "all",
     "trials": "1000",

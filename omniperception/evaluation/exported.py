@@ -12,7 +12,6 @@ from omniperception.deploy import DeployError, ExportedPolicy, RobotState
 from omniperception.deploy.latency import Reading
 from omniperception.lidar import Lidar, LidarFrame
 from omniperception.task.env import OmniEnv
-from omniperception.world import ray_shapes
 
 
 class ExportedPolicies:
@@ -100,14 +99,12 @@ def record(env: OmniEnv, policy: ExportedPolicy, steps: int, whole_frames: bool)
 
 def _whole_device(env: OmniEnv) -> Lidar:
     """The environment's LiDAR with every point that it measures."""
-    config, sensing = env.config.lidar, env.sensing
-    pattern, shapes = config.pattern(), ray_shapes(env.world)
+    config, sensing, pattern = env.config.lidar, env.sensing, env.config.lidar.pattern()
     lidar = Lidar(
         replace(config.sensor, num_rays=pattern.points_per_frame(config.sensor.period_s), selection="every_kth"),
         pattern,
         sensing.scene,
-        mount_body=shapes.bodies.index(env.world.base_body),
-        exclude_shapes=shapes.indices(tuple(config.exclude_geoms)),
+        mount_body=sensing.base,
         seed=env.config.seed,
         outputs=("ranges", "directions_s"),
     )

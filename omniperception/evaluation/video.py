@@ -85,7 +85,6 @@ class Recorder:
         self.frames_left = max(1, round(duration_s / dt))
         self._steps = 0
         self._shapes = ray_shapes(env.world)
-        self._base = self._shapes.bodies.index(env.world.base_body)
         self._renderer = self._build_renderer(1, samples=1)
         self._camera = FollowCamera(dt)
         self._split = _split_elevation(env)
@@ -155,8 +154,8 @@ class Recorder:
         points_s = frame.directions_s[self._id, hit] * frame.ranges[self._id, hit, None]
         points_b = _rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
         at, turned = (
-            sensing.scene.body_pos[self._id, self._base],
-            sensing.scene.body_quat[self._id, self._base],
+            sensing.scene.body_pos[self._id, sensing.base],
+            sensing.scene.body_quat[self._id, sensing.base],
         )
         return _rotate(turned, points_b) + at, frame.elevation[self._id, hit] > self._split
 

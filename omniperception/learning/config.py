@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
 from omniperception.perception import PerceptionNetwork, Sampler
-from omniperception.perception.velocity_risk import VelocityRisk
 from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, MOTION_TARGET, SECTOR_TARGET
+
+if TYPE_CHECKING:
+    from omniperception.perception import VelocityRisk
 
 
 @dataclass(frozen=True)

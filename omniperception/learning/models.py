@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from rsl_rl.models import MLPModel
@@ -15,7 +16,9 @@ from omniperception.learning.embedding import RolloutEmbedding
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
 from omniperception.perception.sector_motion import decode, motion_error
-from omniperception.perception.velocity_risk import VelocityRisk
+
+if TYPE_CHECKING:
+    from omniperception.perception import VelocityRisk
 
 
 class _AddLoss(torch.autograd.Function):

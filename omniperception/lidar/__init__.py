@@ -1,11 +1,22 @@
-"""A stand-alone LiDAR toolkit: scan patterns, scenes, sensors and noise, for thousands of environments."""
+"""A stand-alone LiDAR toolkit: scan patterns, scenes, sensors and noise, for thousands of environments.
+
+Descriptions (patterns, devices, noise) are loaded at once; what needs Warp is loaded when it is first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from .devices import DEVICES, DeviceSpec
-from .heightfield import HeightField
-from .meshes import TriangleMesh
-from .motion import PoseTrack
-from .mujoco import GeomShapes, MujocoScene, geom_shapes
-from .noise import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
+from .noise import (
+    AngularJitter,
+    DistanceNoise,
+    Dropout,
+    GaussianNoise,
+    MaskNoise,
+    MixedPixels,
+    Noise,
+    largest_lean,
+)
 from .patterns import (
     LIVOX,
     ScanPattern,
@@ -35,10 +46,27 @@ from .patterns import (
     xt16,
     xt32,
 )
-from .scene import RayHits, RayScene
-from .sectors import SectorDistances, sector_distances
-from .sensor import OUTPUTS, Lidar, LidarConfig, LidarFrame, quat_from_rpy
-from .shapes import Shape, ShapeKind
+
+if TYPE_CHECKING:
+    from .heightfield import HeightField
+    from .meshes import TriangleMesh
+    from .motion import PoseTrack
+    from .mujoco import GeomShapes, MujocoScene, geom_shapes
+    from .scene import RayHits, RayScene
+    from .sectors import SectorDistances, sector_distances
+    from .sensor import OUTPUTS, Lidar, LidarConfig, LidarFrame, quat_from_rpy
+    from .shapes import Shape, ShapeKind
+
+_LOADED_WHEN_USED = {
+    "heightfield": ("HeightField",),
+    "meshes": ("TriangleMesh",),
+    "motion": ("PoseTrack",),
+    "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
+    "scene": ("RayHits", "RayScene"),
+    "sectors": ("SectorDistances", "sector_distances"),
+    "sensor": ("OUTPUTS", "Lidar", "LidarConfig", "LidarFrame", "quat_from_rpy"),
+    "shapes": ("Shape", "ShapeKind"),
+}
 
 __all__ = [
     "DEVICES",
@@ -77,6 +105,7 @@ __all__ = [
     "hdl64e",
     "height_scanner",
     "horizon",
+    "largest_lean",
     "make_selection",
     "mid40",
     "mid70",
@@ -95,3 +124,10 @@ __all__ = [
     "xt16",
     "xt32",
 ]
+
+
+def __getattr__(name: str) -> object:
+    for module, names in _LOADED_WHEN_USED.items():
+        if name in names:
+            return getattr(import_module(f".{module}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

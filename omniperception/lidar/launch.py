@@ -56,6 +56,7 @@ class SplitLaunch:
         work_per_env: int = 1,
         block_dim: int = 256,
     ) -> None:
+        self.kernel, self.name = kernel, kernel.key.rpartition("__")[2]
         self.cuda_device = device if device.type == "cuda" else None
         threads = 1 if self.cuda_device else num_threads
         chunks = split(num_envs, work_per_env, threads) if num_envs else []

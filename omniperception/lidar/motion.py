@@ -101,12 +101,13 @@ class SweptShapes:
         self._visible: torch.Tensor | None = None
         self._launch = self._record()
 
-    def refresh(self) -> None:
-        """Bounds the shapes along the track."""
+    def refresh(self) -> bool:
+        """Bounds the shapes along the track; always True."""
         if self._visible is not self._scene.visible_if_used:
             self._visible = self._scene.visible_if_used
             self._launch = self._record()
         self._launch()
+        return True
 
     def _record(self) -> SplitLaunch:
         scene, view, track = self._scene, self._view, self._track

@@ -6,11 +6,18 @@ point below the minimum range; the mask replaces it; dropout loses it. No model 
 jitter turns may meet what the nominal one would have missed.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from .kernels.noise import MAX_SIGMAS, NoiseFigures
+if TYPE_CHECKING:
+    from .kernels.noise import NoiseFigures
+
+MAX_SIGMAS = 5.0
+"""Jitter ends here, so that a ray stays within known bounds; exp(-12.5), or 4 in a million, would go beyond."""
 
 
 @dataclass(frozen=True)
@@ -159,6 +166,8 @@ def noise_by_name(noise: Sequence[Noise]) -> dict[str, Noise]:
 
 def noise_figures(named: dict[str, Noise], seed: int, min_range: float, max_range: float) -> NoiseFigures:
     """The models' figures as the kernels read them, angles as their tangents."""
+    from .kernels.noise import NoiseFigures
+
     figures = NoiseFigures()
     figures.seed, figures.min_range, figures.max_range = seed & 0x7FFFFFFF, min_range, max_range
     for name, model in named.items():
@@ -179,8 +188,13 @@ def noise_figures(named: dict[str, Noise], seed: int, min_range: float, max_rang
     return figures
 
 
-def spread(named: dict[str, Noise]) -> float:
+def largest_lean(noise: Sequence[Noise]) -> float:
     """Largest angle between a nominal direction and one that is cast for it, rad."""
+    return spread(noise_by_name(noise))
+
+
+def spread(named: dict[str, Noise]) -> float:
+    """``largest_lean`` of models by name."""
     angle = 0.0
     if "jitter" in named:
         angle += math.atan(MAX_SIGMAS * math.tan(math.radians(named["jitter"].sigma_deg)))

@@ -84,18 +84,26 @@ class PlacedShapes:
         self._spare = wp.zeros(slots, dtype=wp.float32, device=device)
         self._scene, self._view, self._num_viewed = scene, view, len(viewed)
         self._viewed = wp.array(viewed or [0], dtype=wp.int32, device=device)
+        carriers = {scene.shapes[k].body for k in viewed} | {-1 if view is None else view.body}
+        self._moves = carriers != {-1}
         self._launches: list[SplitLaunch] = []
         self._visible: torch.Tensor | None = None
 
-    def refresh(self) -> None:
-        """Places the shapes where their bodies are now."""
+    def refresh(self) -> bool:
+        """Places the shapes where their bodies are now; whether there was anything to do.
+
+        What no body carries is placed once, unless ``visible`` is in use.
+        """
         if not self._launches or self._visible is not self._scene.visible_if_used:
             self._visible = self._scene.visible_if_used
             self._launches = [self._record_place()]
             if self.group is not None:
                 self._launches.append(self._record_groups())
+        elif not self._moves and self._visible is None:
+            return False
         for launch in self._launches:
             launch()
+        return True
 
     def _record_groups(self) -> SplitLaunch:
         args = [self._scene.geometry.radius, self.shape, self.pose, self.count, self.group]

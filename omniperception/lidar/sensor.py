@@ -172,6 +172,7 @@ class Lidar:
         outputs: Names of the fields of ``frame`` that are computed.
         frame: The frame that ``cast`` fills and returns.
         phase_rows: Rows by which each environment's device is ahead, (num_envs,) int64, from the seed.
+        variant: What the scan's kernel was compiled for.
         track: The poses that motion distortion needs; None without it. ``cast`` takes the scene's poses as those at
             the frame's end; with more than one segment, call ``track.advance()`` at the ends of the others.
         frame_count: Frames cast by each environment since its last ``reset``, (num_envs,) int32; the noise and a
@@ -244,8 +245,7 @@ class Lidar:
         self._seek(time_s)
         if self.track is not None:
             self.track.advance()
-        self._placed.refresh()
-        if self._pack is not None:
+        if self._placed.refresh() and self._pack is not None:
             self._pack()
         self._cast()
         self.frame_count.add_(1)
@@ -332,7 +332,7 @@ class Lidar:
             noise_figures(self._noise, seed, config.min_range, config.max_range),
             self._output_arrays(written),
         ]
-        variant = ScanVariant(
+        self.variant = variant = ScanVariant(
             kinds=scene.kinds,
             outputs=frozenset(written),
             noise=frozenset(self._noise),

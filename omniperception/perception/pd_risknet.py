@@ -4,13 +4,16 @@ variants for the ablation."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
 
 from omniperception.perception.networks import NUM_SECTORS, PerceptionNetwork
-from omniperception.perception.rings import RingPath
 from omniperception.perception.windows import CARRIED_HISTORY, CarriedGru, WindowedGru
+
+if TYPE_CHECKING:
+    from omniperception.perception.rings import RingPath
 
 
 class PdRiskNet(PerceptionNetwork):

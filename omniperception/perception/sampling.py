@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 
 from omniperception.perception import kernels
 from omniperception.perception.launch import launch_over_envs, view
+from omniperception.perception.sampler import Sampler
 
 _FPS_LANES = 128
 """CUDA threads that share one environment's farthest point sampling."""
@@ -23,93 +21,6 @@ BUCKETS_FROM = 1024
 
 vec4 = kernels.wp.vec4
 vec3, float32, int32 = kernels.wp.vec3, kernels.wp.float32, kernels.wp.int32
-
-
-@dataclass(frozen=True)
-class Attitude:
-    """How the sensors of N robots stand.
-
-    Attributes:
-        base_quat: (N, 4) float32, (w, x, y, z), orientation of the bases in the world.
-        mount_pos: sensor position in the base frame, metres.
-        mount_quat: sensor orientation in the base frame, (w, x, y, z).
-    """
-
-    base_quat: torch.Tensor
-    mount_pos: tuple[float, float, float]
-    mount_quat: tuple[float, float, float, float]
-
-
-class Sampler(ABC):
-    """Writes a fixed number of points per environment from one frame of rays.
-
-    Attributes:
-        num_points: P, points written per environment.
-        max_range: metres; points are divided by it.
-        needs_attitude: whether it looks at the cloud from the levelled base.
-        sizes: P by the parts of a frame, named as the arguments of a network that reads them.
-    """
-
-    num_points: int
-    max_range: float
-    needs_attitude: ClassVar[bool] = False
-
-    def __init__(self, num_points: int, max_range: float, num_threads: int | None = None) -> None:
-        if num_points < 1:
-            raise ValueError(f"a sampler needs at least one point, got num_points={num_points}")
-        if not (math.isfinite(max_range) and max_range > 0.0):
-            raise ValueError(f"max_range must be a positive length in metres, got {max_range}")
-        self.num_points = num_points
-        self.max_range = float(max_range)
-        self.num_threads = num_threads
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        return {"num_points": self.num_points}
-
-    def __call__(
-        self,
-        ranges: torch.Tensor,
-        directions_s: torch.Tensor,
-        elevation: torch.Tensor,
-        azimuth: torch.Tensor,
-        out: torch.Tensor,
-        attitude: Attitude | None = None,
-    ) -> None:
-        """Sample one frame; every element of ``out`` is written.
-
-        Args:
-            ranges: (N, R) float32, metres; infinity is a miss. Misses are no points.
-            directions_s: (N, R, 3) float32, unit vectors in the sensor frame.
-            elevation: (N, R) float32, theta in the sensor frame, radians.
-            azimuth: (N, R) float32, phi in the sensor frame, radians, any branch.
-            out: (N, P, 3) float32, points in the sensor frame divided by ``max_range``; may be a strided
-                slice.
-            attitude: how the sensor stands, for a sampler with ``needs_attitude``.
-        """
-        n, r = ranges.shape
-        expected = {
-            "directions_s": (n, r, 3),
-            "elevation": (n, r),
-            "azimuth": (n, r),
-            "out": (n, self.num_points, 3),
-        }
-        given = {"directions_s": directions_s, "elevation": elevation, "azimuth": azimuth, "out": out}
-        for name, shape in expected.items():
-            if tuple(given[name].shape) != shape:
-                raise ValueError(f"sampler: {name} must have shape {shape}, got {tuple(given[name].shape)}")
-        for name, tensor in {"ranges": ranges, **given}.items():
-            if tensor.dtype != torch.float32 or tensor.device != ranges.device:
-                raise ValueError(
-                    f"sampler: {name} must be float32 on {ranges.device}, got {tensor.dtype} on {tensor.device}"
-                )
-        if self.needs_attitude and attitude is None:
-            raise ValueError(f"{type(self).__name__} needs the attitude of the base")
-        self._sample(ranges, directions_s, elevation, azimuth, out, attitude)
-
-    @abstractmethod
-    def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
-        """Write ``out`` from checked tensors."""
 
 
 class RawSampler(Sampler):
@@ -122,6 +33,10 @@ class RawSampler(Sampler):
     @property
     def sizes(self) -> dict[str, int]:
         return {"num_rays": self.num_points}
+
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        return ("raw_points",)
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         inputs = [view(ranges, float32), view(directions_s, vec3), 1.0 / self.max_range, view(out, vec3)]
@@ -199,6 +114,12 @@ class PdSampler(Sampler):
     @property
     def sizes(self) -> dict[str, int]:
         return {"num_proximal": self.num_proximal, "num_distal": self.num_points - self.num_proximal}
+
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        thinning = ("thin_proximal",) if self.grid else ()
+        proximal = ("gather_proximal", *thinning, "pick_farthest", "write_proximal") if self.num_proximal else ()
+        return (*proximal, "write_distal") if self.num_distal else proximal
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         n, r = ranges.shape
@@ -340,6 +261,10 @@ class ProximitySampler(PdSampler):
         self.num_distal = 0  # of the averages that PdSampler would write
         self.num_sectors = num_sectors
         self.edges, self.decay, self.blind, self.body = torch.tensor(edges), decay, blind, tuple(body)
+
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        return (*super().kernels, "proximity_grid")
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         super()._sample(ranges, directions_s, elevation, azimuth, out, attitude)

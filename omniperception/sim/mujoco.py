@@ -52,6 +52,18 @@ class MujocoSimulator:
         self._torque: torch.Tensor | None = None
         self._poses: tuple[np.ndarray, np.ndarray] | None = None
         self._geom_poses: tuple[np.ndarray, np.ndarray] | None = None
+        self._roots = self._find_roots()
+
+    def _find_roots(self) -> dict[int, tuple[torch.Tensor, torch.Tensor]]:
+        """Position and orientation of each body that floats or is kinematic, as views of the state."""
+        model, (mocap_pos, mocap_quat) = self.world.model, self._kinematic
+        ids = {k: int(model.body_mocapid[k]) for k in range(model.nbody) if model.body_mocapid[k] >= 0}
+        roots = {body: (mocap_pos[:, k], mocap_quat[:, k]) for body, k in ids.items()}
+        for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+            first = int(model.jnt_qposadr[joint])
+            pose = self.qpos[:, first : first + 3], self.qpos[:, first + 3 : first + 7]
+            roots[int(model.jnt_bodyid[joint])] = pose
+        return roots
 
     @property
     def failed(self) -> torch.Tensor:
@@ -145,12 +157,20 @@ class MujocoSimulator:
         return torch.from_numpy(found.any(axis=(1, 2)))
 
     def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        if set(bodies) <= self._roots.keys():
+            return self._root_poses(bodies)
         if self._poses is None:
             self._poses = self.batch.bind("xpos"), self.batch.bind("xquat")
         self.batch.forward(stage=_STAGE_POS)
         index = np.asarray(bodies)
         pos, quat = (field[:, index].astype(np.float32) for field in self._poses)
         return torch.from_numpy(pos), torch.from_numpy(quat)
+
+    def _root_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        """`body_poses` of bodies whose poses are part of the state, without computing anything."""
+        pos, quat = zip(*(self._roots[body] for body in bodies), strict=True)
+        pos, quat = torch.stack(pos, 1), torch.stack(quat, 1)
+        return pos.float(), torch.nn.functional.normalize(quat, dim=-1).float()
 
     def geom_poses(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         if self._geom_poses is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from rsl_rl.env import VecEnv
@@ -14,20 +15,16 @@ from omniperception.perception.sector_motion import NEARNESS_RANGE, encode, noth
 from omniperception.random import EnvRandom
 from omniperception.sim import SimConfig, Simulator
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.task.heights import NUM_HEIGHTS, HeightLookup, flat_heights
+from omniperception.task.heights import NUM_HEIGHTS, flat_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
 from omniperception.task.rewards import RewardsConfig, avoidance_velocity
 from omniperception.task.rotations import rotate_yaw, yaw_quat
-from omniperception.task.sensing import LidarSensing, SensingNeeds, SensorConfig
 from omniperception.task.state import Kinematics
 from omniperception.task.terminations import TerminationsConfig
-from omniperception.task.terrain_levels import TerrainLevels
 from omniperception.task.timing import StageTimer
-from omniperception.task.true_sectors import TrueSectors
 from omniperception.world import (
-    Ground,
     ObstacleField,
     ObstaclesConfig,
     RobotConfig,
@@ -37,10 +34,20 @@ from omniperception.world import (
 )
 from omniperception.world.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 
+if TYPE_CHECKING:  # parts that not every task has, and what they import, are loaded where they are built
+    from omniperception.task.sensing import LidarSensing, SensorConfig
+    from omniperception.task.terrain_levels import TerrainLevels
+    from omniperception.task.true_sectors import TrueSectors
+    from omniperception.world import Ground
+
 HEIGHT_TARGET, SECTOR_TARGET, AVOIDANCE_TARGET = "height_target", "sector_target", "avoidance_target"
 MOTION_TARGET = "motion_target"
 """Observation groups that a network can be supervised with: the height grid, 1 - d / NEARNESS_RANGE by sector of what
 the LiDAR hits, the avoidance velocity, and nearness and velocity of the true obstacles by sector."""
+TARGET_FIELDS = {HEIGHT_TARGET: ("heights",), SECTOR_TARGET: ("sectors",), AVOIDANCE_TARGET: ("sectors",)}
+"""The optional fields that each of them is made from."""
+SUPERVISION = "supervision."
+"""What the names of such readers begin with."""
 
 FOOTING = 0.35
 """Nothing of the ground within this distance (m) of the base reaches above the feet when a robot starts."""
@@ -119,16 +126,18 @@ class EnvConfig:
                     " use lidar=mid360 or rewards=walk observations=walk"
                 )
 
-    def fields_read(self) -> frozenset[str]:
-        """Optional fields that some reward or observation of this task reads."""
-        fields = self.rewards.fields_read() | self.observations.fields_read()
-        if HEIGHT_TARGET in self.targets:
-            fields |= {"heights"}
-        if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
-            fields |= {"sectors"}
+    def readers(self) -> dict[str, tuple[str, ...]]:
+        """Optional fields of this task and the rewards, observations and targets that read each of them."""
+        reads = {**self.rewards.readers(), **self.observations.readers()}
+        reads |= {f"{SUPERVISION}{target}": frozenset(TARGET_FIELDS.get(target, ())) for target in self.targets}
         if self.obstacles.num_obstacles:
-            fields |= {"obstacle_contact"}
-        return fields
+            reads["metrics.contacts"] = frozenset({"obstacle_contact"})
+        read = sorted(frozenset().union(*reads.values()))
+        return {field: tuple(name for name, its in reads.items() if field in its) for field in read}
+
+    def fields_read(self) -> frozenset[str]:
+        """Optional fields that something in this task reads."""
+        return frozenset(self.readers())
 
     @property
     def remembered_frames(self) -> int:
@@ -156,6 +165,7 @@ class OmniEnv(VecEnv):
     contacts with obstacles are those of all physics steps of the control step.
 
     Attributes:
+        actions: those applied, newest first, as many as some term reads.
         ground: the terrain's height field; None on flat ground.
         base_height: (num_envs,) height (m) of the base's origin above the ground, the mean of what lies below it and
             below the hips.
@@ -167,6 +177,7 @@ class OmniEnv(VecEnv):
         heights: (num_envs, 187) height (m) of the base's origin above the ground around it, see `HeightLookup`; of this
             moment when a term reads them, else, for supervision, at the newest frame, and 0 before the first.
         weighted_rewards: (num_envs,) of each term in the last step, times its weight and the control step.
+        heights_every_step: whether they are of this moment.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -178,8 +189,8 @@ class OmniEnv(VecEnv):
         self.timer = StageTimer()
         fields = config.fields_read()
         self._reads = fields
-        observed = "heights" in config.rewards.fields_read() | config.observations.fields_read()
-        self._heights_every_step = observed or ("heights" in fields and not config.uses_lidar)
+        observed = any(not name.startswith(SUPERVISION) for name in config.readers().get("heights", ()))
+        self.heights_every_step = observed or ("heights" in fields and not config.uses_lidar)
         sensors = {FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT} & fields
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
         late = config.randomization.latency_s is not None
@@ -224,8 +235,9 @@ class OmniEnv(VecEnv):
         """One control step with actions (num_envs, num_actions); see rsl_rl.env.VecEnv."""
         self.metrics.record_clipped(actions.abs().amax(1) > MAX_ACTION)
         actions = torch.where(actions.isinf(), torch.nan, actions).clamp(-MAX_ACTION, MAX_ACTION)
-        self.actions = (actions, self.actions[0], self.actions[1])
-        self.last_joint_vel = self.kinematics.joint_vel
+        self.actions = (actions, *self.actions[:-1])
+        if "last_joint_vel" in self._reads:
+            self.last_joint_vel = self.kinematics.joint_vel
         self.step_count += 1
         self.episode_length_buf += 1
         self._advance_physics(actions)
@@ -358,7 +370,7 @@ class OmniEnv(VecEnv):
         if self.ground is not None:
             self._height_lookup.place(self.kinematics)
             self.base_height = self._height_lookup.base_height()
-        if self._heights_every_step:
+        if self.heights_every_step:
             self._read_heights()
         if "obstacles" in self._reads:
             self._locate_obstacles()
@@ -394,12 +406,14 @@ class OmniEnv(VecEnv):
             return
         with self.timer.stage("rays"):
             self.sensing.cast(self.step_count * self.control_dt)
-        with self.timer.stage("sampling"):
-            self.sensing.sample(self.sensed.base_quat_w)
-        with self.timer.stage("sectors"):
-            self.sensing.measure_sectors()
-            self._read_avoidance()
-        if "heights" in self._reads and not self._heights_every_step:
+        if self.sensing.frames is not None:
+            with self.timer.stage("sampling"):
+                self.sensing.sample(self.sensed.base_quat_w)
+        if self.sensing.sector_distance is not None:
+            with self.timer.stage("sectors"):
+                self.sensing.measure_sectors()
+                self._read_avoidance()
+        if "heights" in self._reads and not self.heights_every_step:
             with self.timer.stage("heights"):
                 self._read_heights()
         if self.true_sectors is not None:
@@ -505,7 +519,7 @@ class OmniEnv(VecEnv):
                 self.risk = self.risk.index_fill(0, env_ids, 0.0)
             if self.motion is not None:
                 self.motion[env_ids] = nothing_near(1, self.motion.shape[1], self.device)
-            if not self._heights_every_step:
+            if not self.heights_every_step:
                 self.heights = self.heights.index_fill(0, env_ids, 0.0)
 
     def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
@@ -564,12 +578,18 @@ class OmniEnv(VecEnv):
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _build_ground(self, terrain: TiledTerrainConfig) -> None:
+        from omniperception.task.height_lookup import HeightLookup
+        from omniperception.task.terrain_levels import TerrainLevels
+        from omniperception.world import Ground
+
         threads = self.config.sim.num_threads or None
         self.ground = Ground(terrain, self.world.model, self.sim.ground_pos, threads)
         self.terrain_levels = TerrainLevels(self.ground, self.random, self.control_dt, self.max_episode_length)
         self._height_lookup = HeightLookup(self.ground, self.num_envs, self.device)
 
     def _build_sensing(self, fields: frozenset[str]) -> LidarSensing:
+        from omniperception.task.sensing import LidarSensing, SensingNeeds
+
         config = self.config
         needs = SensingNeeds(
             sectors=config.rewards.avoidance.num_sectors if "sectors" in fields else 0,
@@ -594,7 +614,13 @@ class OmniEnv(VecEnv):
         config, avoidance = self.config, self.config.rewards.avoidance
         if avoidance.risk is None or not ("sectors" in fields or MOTION_TARGET in config.targets):
             return None
+        from omniperception.task.true_sectors import TrueSectors
+
         return TrueSectors(avoidance.num_sectors, config.obstacles, self.obstacles, self.num_envs, self.device)
+
+    def _actions_before(self) -> int:
+        """How many actions before the newest something reads."""
+        return 2 if "action_before_last" in self._reads else int("last_action" in self._reads)
 
     def _allocate(self) -> None:
         robot, model = self.robot, self.world.model
@@ -603,8 +629,9 @@ class OmniEnv(VecEnv):
         self.joint_lower, self.joint_upper = limits[:, 0], limits[:, 1]
         self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
         zero = torch.zeros(self.num_envs, self.num_actions, device=self.device)
-        self.actions: tuple[torch.Tensor, ...] = (zero, zero, zero)
-        self.last_joint_vel = zero
+        self.actions: tuple[torch.Tensor, ...] = (zero,) * (1 + self._actions_before())
+        if "last_joint_vel" in self._reads:
+            self.last_joint_vel = zero
         self.touching = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.avoidance_velocity = torch.zeros(self.num_envs, 2, device=self.device)
         self.heights = torch.zeros(self.num_envs, NUM_HEIGHTS if "heights" in self._reads else 0, device=self.device)

@@ -50,13 +50,14 @@ class ObservationsConfig:
         object.__setattr__(self, "actor", tuple(self.actor))
         object.__setattr__(self, "critic", tuple(self.critic))
 
-    def fields_read(self) -> frozenset[str]:
-        terms = [term for group in self.groups.values() for term in group.terms.values()]
-        return frozenset().union(*(fields_read(term) for term in terms))
+    def readers(self) -> dict[str, frozenset[str]]:
+        """The optional fields that each term reads."""
+        terms = {f"{name}.{term}": f for name, group in self.groups.items() for term, f in group.terms.items()}
+        return {f"observations.{name}": fields_read(term) for name, term in terms.items()}
 
 
 class GroupBuffer:
-    """Holds one group's history and writes each new observation into it."""
+    """Holds one group's history, if it has one, and writes each new observation into it."""
 
     def __init__(self, name: str, group: ObservationGroup, env: OmniEnv) -> None:
         self._terms = tuple(group.terms.values())
@@ -71,8 +72,9 @@ class GroupBuffer:
             self.slices[term_name] = slice(start, start + value.shape[1])
             start += value.shape[1]
         self.width = start
-        self._history = group.history
-        self.buffer = torch.zeros(env.num_envs, group.history, self.width, device=env.device)
+        self.buffer: torch.Tensor | None = None
+        if group.history > 1:
+            self.buffer = torch.zeros(env.num_envs, group.history, self.width, device=env.device)
 
     def update(self, env: OmniEnv, fresh: torch.Tensor) -> torch.Tensor:
         """Appends the current observation; `fresh` (num_envs,) bool marks environments just reset.
@@ -82,7 +84,7 @@ class GroupBuffer:
         """
         values = [term(env) for term in self._terms]
         value = torch.cat(values, 1) if len(values) > 1 else values[0].clone()
-        if self._history == 1:
+        if self.buffer is None:
             return value
         self.buffer = torch.cat((self.buffer[:, 1:], value[:, None]), 1)
         self.buffer[fresh] = value[fresh][:, None]

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from omniperception.perception.sector_motion import sector_bearings
-from omniperception.perception.velocity_risk import VelocityRisk
 from omniperception.task.state import checked_term, fields_read, reads
 
 if TYPE_CHECKING:
+    from omniperception.perception import VelocityRisk
     from omniperception.task.env import OmniEnv
 
 
@@ -45,8 +45,9 @@ class RewardsConfig:
         checked = {name: replace(t, func=checked_term(f"terms.{name}.func", t.func)) for name, t in used.items()}
         object.__setattr__(self, "terms", checked)
 
-    def fields_read(self) -> frozenset[str]:
-        return frozenset().union(*(fields_read(term.func) for term in self.terms.values()))
+    def readers(self) -> dict[str, frozenset[str]]:
+        """The optional fields that each term reads."""
+        return {f"rewards.{name}": fields_read(term.func) for name, term in self.terms.items()}
 
 
 @dataclass(frozen=True)
@@ -194,16 +195,19 @@ def joint_velocity_squared(env: OmniEnv) -> torch.Tensor:
     return env.kinematics.joint_vel.square().sum(1)
 
 
+@reads("last_joint_vel")
 def joint_acceleration_squared(env: OmniEnv) -> torch.Tensor:
     """|qddot|^2, (rad/s^2)^2, by the difference of joint velocities over the control step."""
     return ((env.kinematics.joint_vel - env.last_joint_vel) / env.control_dt).square().sum(1)
 
 
+@reads("last_action")
 def action_rate_squared(env: OmniEnv) -> torch.Tensor:
     """|a_{t-1} - a_t|^2."""
     return (env.actions[1] - env.actions[0]).square().sum(1)
 
 
+@reads("last_action", "action_before_last")
 def action_acceleration_squared(env: OmniEnv) -> torch.Tensor:
     """|a_{t-2} - 2 a_{t-1} + a_t|^2."""
     return (env.actions[2] - 2 * env.actions[1] + env.actions[0]).square().sum(1)

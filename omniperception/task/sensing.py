@@ -16,13 +16,14 @@ from omniperception.lidar import (
     RayScene,
     ScanPattern,
     SectorDistances,
+    largest_lean,
 )
 from omniperception.perception import Attitude
 from omniperception.sim import Simulator
 from omniperception.task.odometry import Odometry
 from omniperception.task.state import Kinematics
-from omniperception.world import ray_shapes
-from omniperception.world.rays import HitClass
+from omniperception.world.rays import HitClass, hidden_geoms, ray_shapes
+from omniperception.world.reach import FieldOfView
 
 NEVER = 2**31
 """Frames since something was seen that has not been seen in this episode."""
@@ -75,6 +76,8 @@ class LidarSensing:
     A reset empties an environment's history; its next frame comes with the sensor's next tick.
 
     Attributes:
+        hidden: geoms that are not in the ray scene because no ray meets them, and why.
+        base: index of the robot's base among the bodies of the ray scene.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
             newest last, with `base_motion` one row more: how the base moved since the frame before; None without a
             sampler.
@@ -109,20 +112,19 @@ class LidarSensing:
             raise ValueError(
                 f"lidar.sensor.period_s={config.sensor.period_s} must be a multiple of the control step {control_dt} s"
             )
-        self._sim, self._needs, self._sampler = sim, needs, sampler
-        shapes = ray_shapes(sim.world)
-        self._bodies = shapes.bodies
-        self._base = shapes.bodies.index(sim.world.base_body)
-        self.config = config
+        self._sim, self.needs, self.sampler = sim, needs, sampler
+        self.config, pattern = config, config.pattern()
+        self.hidden = hidden_geoms(sim.world, config.exclude_geoms, field_of_view(config.sensor, pattern, noise))
+        shapes = ray_shapes(sim.world, self.hidden)
+        self._bodies, self.base = shapes.bodies, shapes.base
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
         )
         self.lidar = Lidar(
             config.sensor,
-            config.pattern(),
+            pattern,
             self.scene,
-            mount_body=self._base,
-            exclude_shapes=shapes.indices(tuple(config.exclude_geoms)),
+            mount_body=self.base,
             noise=tuple(noise),
             seed=seed,
             outputs=_outputs_read(needs, sampler is not None),
@@ -187,22 +189,23 @@ class LidarSensing:
         self.unseen = torch.where(seen[:, :-1], 0, self.unseen + 1)
 
     def sample(self, base_quat: torch.Tensor) -> None:
-        """Appends the sampled points of the newest frame to the history; `base_quat` (num_envs, 4) as sensed."""
-        if self.frames is None:
-            return
+        """Appends the sampled points of the newest frame to the history; for a LiDAR with a sampler.
+
+        Args:
+            base_quat: (num_envs, 4) as sensed.
+        """
         frame, sensor = self.frame, self.config.sensor
         attitude = Attitude(base_quat.contiguous(), sensor.mount_pos, sensor.quat)
-        points = self._newest[:, : self._sampler.num_points]
-        self._sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
+        points = self._newest[:, : self.sampler.num_points]
+        self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
         if self.odometry is not None:
             self._newest[:, -1] = self.odometry.since_last_frame()
         self.frames = torch.cat((self.frames[:, 1:], self._newest[:, None]), 1)
         self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
 
     def measure_sectors(self) -> None:
-        """Distances to the nearest obstacle per azimuth sector."""
-        if self.sector_distance is not None:
-            self._measure_sectors()
+        """Distances to the nearest obstacle per azimuth sector, where somebody reads them."""
+        self._measure_sectors()
 
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
         """(num_envs,) mean of the noise-free distal ranges (m), each capped at `max_distance`."""
@@ -255,7 +258,7 @@ class LidarSensing:
         if self.frames is not None:
             self.frames[env_ids] = 0.0
         if self.sector_distance is not None:
-            self.sector_distance[env_ids] = self._needs.sector_max
+            self.sector_distance[env_ids] = self.needs.sector_max
         if self.unseen is not None:
             self.unseen[env_ids] = NEVER
         for max_distance, mean in self._distal_range.items():
@@ -274,14 +277,21 @@ class LidarSensing:
             frame.directions_s,
             frame.class_id,
             self.scene.body_quat,
-            self._base,
+            self.base,
             sensor.mount_pos,
             sensor.quat,
             obstacle_class=int(HitClass.OBSTACLE),
-            max_distance=self._needs.sector_max,
-            num_sectors=self._needs.sectors,
+            max_distance=self.needs.sector_max,
+            num_sectors=self.needs.sectors,
             num_threads=num_threads,
         )
+
+
+def field_of_view(sensor: LidarConfig, pattern: ScanPattern, noise: Sequence[Noise]) -> FieldOfView:
+    """Where the rays of a sensor go."""
+    directions, origins = pattern.directions_s.numpy(), pattern.origins_s
+    reach = 0.0 if origins is None else float(origins.double().norm(dim=1).max())
+    return FieldOfView.of(sensor.mount_pos, sensor.quat, directions, largest_lean(noise), reach)
 
 
 def _outputs_read(needs: SensingNeeds, sampled: bool) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import torch
 
 from omniperception.random import EnvRandom
 from omniperception.task.state import Kinematics
-from omniperception.world import Ground
+from omniperception.world.ground import Ground
 
 _MIN_SPEED = 1e-3
 """Commands slower than this (m/s) command no way."""

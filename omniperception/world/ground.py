@@ -89,6 +89,19 @@ class Ground:
         self.launch(kernels.heights_kernel(real), arrays, *points.shape[:2])
         return heights.reshape(xy_w.shape[:-1])
 
+    def lift(self, path: torch.Tensor, above: torch.Tensor, there: torch.Tensor, elsewhere: float) -> None:
+        """Puts bodies on their way onto the ground, in place.
+
+        Args:
+            path: (num_envs, T, B, 3) float64 or float32, m, in the environments' frames; its heights are written.
+            above: (num_envs, B) likewise, m, of each body above the ground below it.
+            there: (num_envs, B) bool, which bodies are there.
+            elsewhere: height (m) of the others.
+        """
+        real, vec3 = (wp.float32, wp.vec3) if path.dtype == torch.float32 else (wp.float64, wp.vec3d)
+        arrays = [view(above, real), view(there, wp.bool), elsewhere, view(path, vec3)]
+        self.launch(kernels.lift_kernel(real), arrays, len(path), path.shape[1] * path.shape[2])
+
     def launch(self, kernel: wp.Kernel, inputs: list, num_envs: int, lookups: int) -> None:
         """Runs `kernel(env_offset, surface, *inputs)` of `ground_kernels` with `lookups` heights per environment."""
         threads = self._num_threads if num_envs * lookups > _LOOKUPS_PER_THREAD else 1

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-import warp as wp
 
-from omniperception.perception.launch import view
 from omniperception.random import EnvRandom
-from omniperception.world.ground import Ground
-from omniperception.world.ground_kernels import lift_kernel
 from omniperception.world.obstacles import Obstacle, ObstaclesConfig
+
+if TYPE_CHECKING:
+    from omniperception.world.ground import Ground
 
 PARKED_HEIGHT = -100.0
 """Height (m) at which an obstacle that takes no part waits, below the ground where no ray and no contact finds it."""
@@ -19,7 +19,6 @@ LOSE_SIGHT = 1.0
 """How far (m) beyond its farthest start an approaching obstacle gets before it starts anew."""
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PUSH_OFF_TURNS = 16
-_REAL = {torch.float32: (wp.float32, wp.vec3), torch.float64: (wp.float64, wp.vec3d)}
 _CANDIDATES = 48
 """Places drawn for an obstacle that has to keep clear of something; the first that does is taken."""
 
@@ -144,9 +143,7 @@ class ObstacleField:
             self.advance(dt, robot_xy_w)
             self._path[:, step] = self.pos_w
         if self._ground is not None and self._path.numel():
-            real, vec3 = _REAL[self._dtype]
-            arrays = [view(self._above_ground, real), view(self.active, wp.bool), PARKED_HEIGHT, view(self._path, vec3)]
-            self._ground.launch(lift_kernel(real), arrays, len(self.pos_w), num_steps * self.pos_w.shape[1])
+            self._ground.lift(self._path, self._above_ground, self.active, PARKED_HEIGHT)
             self.pos_w.copy_(self._path[:, -1])
         return self._path
 

@@ -23,7 +23,7 @@ def test_supervision_learns_the_target():
     collect(alg, env, 8)
     errors = []
     for _ in range(60):
-        alg.perception_trainer.train(alg.storage, 2, mixed_precision=False)
+        alg.perception_trainer.train(alg.storage, 0, 2, mixed_precision=False)
         errors.append(alg.actor.pop_supervised_losses()["height_target"])
     assert errors[-1] < 0.3 * errors[0]
 
@@ -45,7 +45,7 @@ def test_ppo_sees_the_embedding_that_the_policy_acted_on_and_does_not_change_it(
     alg = algorithm(env)
     collect(alg, env, 8)
     acted_on = alg._embed_rollout()
-    alg.perception_trainer.train(alg.storage, 2, mixed_precision=False)
+    alg.perception_trainer.train(alg.storage, 0, 2, mixed_precision=False)
     alg.storage.window_features = acted_on
     after_supervision = parameters(alg.actor.perception)
     alg.perception_trainer = None  # what follows is PPO alone

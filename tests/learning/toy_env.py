@@ -85,7 +85,7 @@ class ToyEnv(VecEnv):
             setattr(self, name, state[name])
 
 
-SUPERVISED = {"epochs": 2, "learning_rate": 1e-2}
+SUPERVISED = {"epochs": 2, "learning_rates": (1e-2, 1e-2), "num_updates": 100}
 """Of a perception network that PPO does not train."""
 
 

@@ -10,7 +10,7 @@ from omniperception.perception.sector_motion import encode
 from omniperception.random import EnvRandom
 from omniperception.task.env import OmniEnv
 from omniperception.task.true_sectors import TrueSectors
-from omniperception.world import ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.world import ObstacleField, ObstacleGroup, ObstaclesConfig, ray_shapes
 
 POST = ObstacleGroup("cylinder", 1, [[0.5, 0.5], [0.5, 0.5]])
 SOUTH_EAST, EAST, NORTH = 1, 2, 3  # of four sectors that begin at -180, -90, 0 and 90 degrees: EAST is 0 to 90 degrees
@@ -151,7 +151,7 @@ def test_risk_is_of_what_a_ray_has_hit_alone(risky_env):
     assert known.any() and not known.all()  # the mount is blind behind
     assert torch.equal(env.motion, env.true_sectors.measure(env.kinematics, known)) or env.step_count % 5
     hit = env.sensing.frame.shape_id
-    names = [env.world.model.geom(k).name for k in range(env.world.model.ngeom)]
+    names = ray_shapes(env.world, env.sensing.hidden).geom_names
     for env_id in range(5):
         seen = {names[k] for k in hit[env_id].unique().tolist() if k >= 0}
         for o, name in enumerate(env.true_sectors.names):

@@ -7,7 +7,8 @@ import torch
 
 from omniperception.lidar import RayScene
 from omniperception.world import build_world, ray_shapes
-from omniperception.world.rays import HitClass
+from omniperception.world.rays import HitClass, hidden_geoms
+from omniperception.world.reach import FieldOfView
 
 NUM_RAYS = 400
 
@@ -80,5 +81,6 @@ def test_fixed_obstacles_carry_no_pose(make_config):
 
 
 def test_unknown_excluded_geoms_are_named(world):
+    view = FieldOfView.of(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.eye(3))
     with pytest.raises(ValueError, match=r"lidar\.exclude_geoms names \['nose'\]"):
-        ray_shapes(world).indices(("nose",))
+        hidden_geoms(world, ("nose",), view)

@@ -5,13 +5,14 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import warp as wp
 
 from .heightfield import FieldPart, heightfield_normal, meet_heightfield, refine_heightfield
 from .intersections import intersections
 from .mesh import MeshPart, corner_of, descend, plane_through, slab_inverse
+from .variants import MAX_VARIANTS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -162,7 +163,7 @@ def shape_functions(kinds: Iterable[int]) -> ShapeFunctions:
     return _shape_functions(frozenset(int(kind) for kind in kinds))
 
 
-@cache
+@lru_cache(MAX_VARIANTS)
 def _shape_functions(kinds: frozenset[int]) -> ShapeFunctions:
     has_plane, has_box, has_sphere = PLANE in kinds, BOX in kinds, SPHERE in kinds
     has_cylinder, has_capsule, has_ellipsoid = CYLINDER in kinds, CAPSULE in kinds, ELLIPSOID in kinds

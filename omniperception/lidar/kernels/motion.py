@@ -3,11 +3,11 @@
 # ruff: noqa: UP018  (in a kernel, int(0) and float(0) declare a variable that may change)
 
 import math
-from functools import cache
 
 import warp as wp
 
 from .geometry import INF, PI
+from .variants import variants
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,7 +59,7 @@ def to_quatd(wxyz: wp.vec4d):
     return wp.normalize(wp.quatd(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
 
 
-@cache
+@variants
 def record_kernel(pose_type: type) -> wp.Kernel:
     """The kernel for poses of bodies in ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, pose_type)

@@ -4,18 +4,17 @@ The random numbers are a function of seed, environment, frame, ray and model: no
 """
 
 from collections.abc import Iterable
-from functools import cache
+from functools import lru_cache
 
 import warp as wp
 
+from ..noise import MAX_SIGMAS
 from .geometry import INF, PI
+from .variants import MAX_VARIANTS
 
 wp.set_module_options({"enable_backward": False})
 
 JITTER, GAUSSIAN, DISTANCE, DROPOUT, MASK = (wp.constant(k) for k in range(5))
-MAX_SIGMAS = 5.0
-"""Jitter ends here, so that a ray stays within known bounds; exp(-12.5), or 4 in a million, would go beyond."""
-
 GOLDEN_ANGLE = wp.constant(wp.float32(2.399963229728653))
 
 
@@ -87,7 +86,7 @@ def mixed(figures: NoiseFigures, first: float, second: float):
     return near + (1.0 - figures.mixed_weight) * gap
 
 
-@cache
+@lru_cache(MAX_VARIANTS)
 def disturb_function(models: Iterable[str]) -> wp.Function:
     """(figures, distance, true distance, key) -> what is measured of a hit; for the models named here."""
     has_gaussian, has_distance = "gaussian" in models, "distance" in models

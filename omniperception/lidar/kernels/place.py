@@ -3,11 +3,11 @@
 # ruff: noqa: UP018  (in a kernel, wp.int32(0) declares a variable that may change)
 
 import math
-from functools import cache
 
 import warp as wp
 
 from .geometry import INF, PLANE, SLACK, distance_to_shape
+from .variants import variants
 
 wp.set_module_options({"enable_backward": False})
 
@@ -183,7 +183,7 @@ def _is_between(c: wp.vec3, distance: float, radius: float, sin_low: float, sin_
     return above and below
 
 
-@cache
+@variants
 def place_kernel(pose_type: type) -> wp.Kernel:
     """The kernel for poses of bodies in ``wp.float32`` or ``wp.float64``. Poses are composed in float64."""
     vec3 = wp.types.vector(3, pose_type)

@@ -2,15 +2,14 @@
 
 # ruff: noqa: UP018  (in a kernel, bool(False) declares a variable that may change)
 
-from functools import cache
-
 import warp as wp
 
 from .geometry import INF, SLACK, Geometry, shape_functions, uncertain
 from .place import GROUP
+from .variants import variants
 
 
-@cache
+@variants
 def rays_kernel(kinds: frozenset[int], ray_type: type) -> wp.Kernel:
     """The kernel for scenes of these kinds of shapes and rays in ``wp.float32`` or ``wp.float64``."""
     functions = shape_functions(kinds)

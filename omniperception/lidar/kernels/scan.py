@@ -4,7 +4,6 @@
 # wp.static stands alone)
 
 from dataclasses import dataclass
-from functools import cache
 
 import warp as wp
 
@@ -12,6 +11,7 @@ from .geometry import INF, Geometry, shape_functions
 from .motion import Moment, Track, Viewpoint, moment_at, to_quatd
 from .noise import NoiseFigures, beside, child_key, disturb_function, jittered, mixed
 from .search import Slots, locate_functions, search_function
+from .variants import variants
 
 NAN = wp.constant(wp.float32(float("nan")))
 NO_BODY = wp.constant(-2)
@@ -106,7 +106,7 @@ def turn_of(pose: wp.transformd):
     return wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
 
 
-@cache
+@variants
 def scan_kernel(variant: ScanVariant) -> wp.Kernel:
     """The kernel of one variant; a task casts ``Rays.block`` rays of one environment, one after the other."""
     outputs, noise = variant.outputs, variant.noise

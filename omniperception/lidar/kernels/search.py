@@ -3,13 +3,14 @@
 # ruff: noqa: UP018  (in a kernel, wp.int32(0) declares a variable that may change)
 
 from collections.abc import Iterable
-from functools import cache
+from functools import lru_cache
 
 import warp as wp
 
 from .geometry import INF, SLACK, Geometry, Hit, shape_functions, uncertain
 from .motion import Moment, Track, shape_at
 from .place import settled
+from .variants import MAX_VARIANTS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -109,7 +110,7 @@ class Located:
     axes: wp.mat33
 
 
-@cache
+@lru_cache(MAX_VARIANTS)
 def locate_functions(moving: bool, displaced: bool) -> tuple[wp.Function, wp.Function]:
     """(slots, track, moment, env, slot) -> Located, and the same as a pose in float64.
 
@@ -153,7 +154,7 @@ def locate_functions(moving: bool, displaced: bool) -> tuple[wp.Function, wp.Fun
     return locate, pose_of
 
 
-@cache
+@lru_cache(MAX_VARIANTS)
 def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced: bool) -> wp.Function:
     """(geometry, slots, track, moment, env, d, limit) -> Met: the nearest hit closer than ``limit`` along unit d.
 
