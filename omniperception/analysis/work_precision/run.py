@@ -1,0 +1,72 @@
+"""What `scripts/work_precision.py` can be asked for: measure, print, write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from omniperception import config
+from omniperception.analysis.figures import new_figure
+from omniperception.analysis.lidar_benchmark.report import machine, machine_line, write
+
+from . import lidar
+from .pareto import Study, plot
+
+SIZES = ("full", "small")
+
+
+@dataclass(frozen=True)
+class Options:
+    """The command line.
+
+    Attributes:
+        subject: A name out of ``SUBJECTS``.
+        out: Folder of the results of all subjects.
+        small: Whether sizes are tiny, to see in seconds that everything works.
+        only: Names of the studies to run; all if empty.
+        overrides: Of the configuration.
+    """
+
+    subject: str
+    out: Path
+    small: bool = False
+    only: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
+
+
+def run_lidar(options: Options) -> list[Study]:
+    run = config.assemble(config.compose(_with("obstacles=mixed", options.overrides)))
+    if run.env.lidar is None:
+        raise config.ConfigError("lidar=none leaves nothing to measure; use lidar=mid360")
+    return lidar.measure(run, lidar.SMALL if options.small else lidar.Sizes(), options.only)
+
+
+STUDIES = {"lidar": tuple(lidar.STUDIES)}
+SUBJECTS: dict[str, Callable[[Options], list[Study]]] = {"lidar": run_lidar}
+
+
+def execute(options: Options) -> list[Study]:
+    """Measures a subject, prints its tables with what they say, and writes them with the plot."""
+    if unknown := set(options.only) - set(STUDIES[options.subject]):
+        known = ", ".join(STUDIES[options.subject])
+        raise config.ConfigError(f"only={','.join(sorted(unknown))} must be out of {known}")
+    new_figure(1.0, 1.0)  # an error now rather than after minutes
+    torch.set_num_threads(1)
+    folder, about = options.out / options.subject, machine(1, "cpu")
+    studies = SUBJECTS[options.subject](options)
+    for study in studies:
+        table = study.table()
+        write(table, about, folder)
+        print(f"{table.markdown()}\n", flush=True)
+    plot(studies, folder / "fronts.png", machine_line(about))
+    print(f"{machine_line(about)}\nwrote {folder}")
+    return studies
+
+
+def _with(preset: str, overrides: tuple[str, ...]) -> list[str]:
+    """Overrides with a preset in front, unless they choose that group themselves."""
+    group = preset.split("=")[0] + "="
+    return [*overrides] if any(o.startswith(group) for o in overrides) else [preset, *overrides]
