@@ -291,7 +291,7 @@ def rates_study(
     bench: Bench, periods_s: Sequence[float] = (0.2, 0.1, 0.06, 0.04, 0.02), control_dt: float = 0.02
 ) -> Study:
     """Frames per second: what the newest frame says against what is there, at the control steps in between."""
-    instants = [3 * k * control_dt for k in range(4, 4 + 5 * bench.sizes.num_frames)]  # every third: all ages occur
+    instants = [7 * k * control_dt for k in range(2, 2 + 5 * bench.sizes.num_frames)]  # every seventh: all ages occur
     true = np.stack([bench.true_sectors(t, 2.0 * bench.sizes.dense_deg) for t in instants])
     coarse: dict[float, np.ndarray] = {}
 

@@ -174,4 +174,4 @@ def _draw(study: Study, axis) -> None:
     axis.set(xscale="log", yscale="log", xlabel=study.cost, ylabel=study.error)
     axis.set_title(study.title, fontsize=8, wrap=True)
     axis.grid(True, which="both", alpha=0.2)
-    axis.legend(fontsize=6, title=f"n = {len(drawn)} choices", title_fontsize=6)
+    axis.legend(loc="lower left", fontsize=6, title=f"n = {len(drawn)} choices", title_fontsize=6)

@@ -11,8 +11,9 @@ import torch
 from omniperception import config
 from omniperception.analysis.figures import new_figure
 from omniperception.analysis.lidar_benchmark.report import machine, machine_line, write
+from omniperception.perception import PdSampler
 
-from . import lidar
+from . import lidar, perception, physics
 from .pareto import Study, plot
 
 SIZES = ("full", "small")
@@ -44,8 +45,28 @@ def run_lidar(options: Options) -> list[Study]:
     return lidar.measure(run, lidar.SMALL if options.small else lidar.Sizes(), options.only)
 
 
-STUDIES = {"lidar": tuple(lidar.STUDIES)}
-SUBJECTS: dict[str, Callable[[Options], list[Study]]] = {"lidar": run_lidar}
+def run_physics(options: Options) -> list[Study]:
+    run = config.assemble(config.compose(_with("experiment=walk", options.overrides)))
+    try:
+        return physics.measure(run, physics.SMALL if options.small else physics.Sizes(), options.only)
+    except ValueError as error:
+        raise config.ConfigError(str(error)) from None
+
+
+def run_perception(options: Options) -> list[Study]:
+    overrides = _with("experiment=quickstart", options.overrides)
+    run = config.assemble(config.compose(overrides))
+    if run.perception is None or not isinstance(run.perception.sampler(), PdSampler):
+        raise config.ConfigError("the perception must sample a proximal and a distal half; use perception=pd_risknet")
+    return perception.measure(overrides, perception.SMALL if options.small else perception.Sizes(), options.only)
+
+
+STUDIES = {"lidar": tuple(lidar.STUDIES), "physics": physics.STUDIES, "perception": tuple(perception.STUDIES)}
+SUBJECTS: dict[str, Callable[[Options], list[Study]]] = {
+    "lidar": run_lidar,
+    "physics": run_physics,
+    "perception": run_perception,
+}
 
 
 def execute(options: Options) -> list[Study]:
