@@ -11,13 +11,16 @@ import torch
 
 from omniperception.analysis.lidar_benchmark.timing import paired_timings
 from omniperception.config import RunConfig, assemble, compose
-from omniperception.lidar import quat_from_rpy
+from omniperception.lidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
 from omniperception.perception import Attitude, CarriedPdRiskNet, PdRiskNet, PdSampler, ProximitySampler, Sampler
 from omniperception.task.env import HEIGHT_TARGET, NEARNESS_RANGE, SECTOR_TARGET, OmniEnv
 from omniperception.task.heights import height_grid
 from omniperception.task.rotations import yaw_quat
+from omniperception.world import ray_shapes
+from omniperception.world.rays import HitClass
 
 from .pareto import Choice, Study
+from .scene import dense_directions
 
 SAMPLING = "CPU time of sampling a frame (us per environment)"
 EMBEDDING = "CPU time of an embedding (us per environment)"
@@ -25,9 +28,13 @@ COVERAGE, HEIGHT, SECTOR = "coverage radius (m)", "height RMSE (m)", "sector dis
 FRAME_BYTES = "bytes per frame"
 ABOVE_GROUND = 0.1
 """A kept point so far (m) above flat ground is an obstacle's to the decoder of sectors."""
+NEAR = 1.5
+"""A sector whose obstacle is this near (m) counts as near."""
 BODY = (0.5, 0.28)
 """Half length and half width of the robot's own body around the base, metres; the decoders skip what lies there."""
 EPISODE_S = 1.2
+DENSE_DEG = 1.5
+"""Spacing of the rays that tell what is truly near."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,8 @@ class Cloud:
         ranges, directions_s, elevation, azimuth: As a sampler takes them, noise-free.
         attitude: How the sensors stand.
         heights: The 17 x 11 grid, base height minus ground, m, (E, 187).
-        sectors: Horizontal distance to the nearest obstacle hit of all rays by sector, m, (E, 36).
+        sectors: Horizontal distance to the nearest obstacle hit of the frame's rays by sector, m, (E, 36).
+        true_sectors: The same of rays ``DENSE_DEG`` apart all over the field of view.
         max_range: Of the sensor, m.
     """
 
@@ -73,6 +81,7 @@ class Cloud:
     attitude: Attitude
     heights: torch.Tensor
     sectors: torch.Tensor
+    true_sectors: torch.Tensor
     max_range: float
 
     def sample(self, sampler: Sampler, out: torch.Tensor) -> torch.Tensor:
@@ -99,6 +108,22 @@ class Recorder:
         targets = (HEIGHT_TARGET, SECTOR_TARGET)
         self.env = OmniEnv(replace(self.run.env, targets=targets, initial_obstacle_level=1.0))
         self.generator = torch.Generator().manual_seed(0)
+        self._dense, self._dense_sectors = self._look_everywhere()
+
+    def _look_everywhere(self) -> tuple[Lidar, SectorDistances]:
+        """A sensor at the same place with rays all over its field of view."""
+        sensing, shapes = self.env.sensing, ray_shapes(self.env.world)
+        elevation, config = sensing.lidar.pattern.elevation, sensing.config.sensor
+        directions = dense_directions((float(elevation.min()), float(elevation.max())), DENSE_DEG)
+        pattern = ScanPattern.from_directions(directions, len(directions) / config.period_s)
+        config = replace(config, num_rays=len(directions), selection="every_kth", motion_segments=0)
+        base = shapes.bodies.index(self.env.world.base_body)
+        housing = shapes.indices(tuple(sensing.config.exclude_geoms))
+        outputs = ("true_ranges", "directions_s", "class_id")
+        dense = Lidar(config, pattern, sensing.scene, base, housing, outputs=outputs)
+        rays = (dense.frame.true_ranges, dense.frame.directions_s, dense.frame.class_id)
+        place = (sensing.scene.body_quat, base, config.mount_pos, config.quat)
+        return dense, SectorDistances(*rays, *place, int(HitClass.OBSTACLE), config.max_range, num_threads=1)
 
     def frames(self, count: int) -> list[Cloud]:
         """The next frames while the robots stand and shake a little."""
@@ -118,17 +143,25 @@ class Recorder:
     def _cloud(self) -> Cloud:
         sensor, frame = self.env.sensing.config.sensor, self.env.sensing.frame
         rays = (frame.true_ranges, frame.directions_s, frame.elevation, frame.azimuth)
+        self._dense.cast(self.env.step_count * self.env.control_dt)
         quat = self.env.kinematics.base_quat_w.float().contiguous().clone()
         return Cloud(
             *(tensor.clone() for tensor in rays),
             Attitude(quat, sensor.mount_pos, sensor.mount_quat or quat_from_rpy(*sensor.mount_rpy)),
             self.env.heights.clone(),
             self.env.sensing.sector_distance.clone(),
+            self._dense_sectors().clone(),
             sensor.max_range,
         )
 
 
-ROUGH = ("obstacles=none", "terrain=mixed", "commands.spawn.x=[-3,3]", "commands.spawn.y=[-3,3]")
+ROUGH = (
+    "obstacles=none",
+    "terrain=mixed",
+    "terrain.curriculum=null",
+    "commands.spawn.x=[-3,3]",
+    "commands.spawn.y=[-3,3]",
+)
 """For heights: uneven ground without obstacles, robots anywhere on its tiles."""
 CROWD = ("obstacles=mixed",)
 """For sectors: obstacles on flat ground."""
@@ -207,6 +240,7 @@ def sectors_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] 
     if isinstance(configured, ProximitySampler):
         default = f"{configured.num_sectors} x {len(configured.edges) - 1} proximity"
     costs, kept = _sampled(cloud, samplers, sizes)
+    every = cloud.sectors.clamp(max=NEARNESS_RANGE)
     choices = []
     for name, points in kept.items():
         sampler, height = samplers[name], cloud.heights.median(1).values
@@ -214,16 +248,21 @@ def sectors_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] 
             read = read_proximity(points, sampler, height)
         else:
             read = read_sectors(cloud.level(points * cloud.max_range), points.abs().sum(-1) > 0, height)
-        errors = {SECTOR: _rmse(read, cloud.sectors.clamp(max=NEARNESS_RANGE))}
-        near = cloud.sectors < 1.5
-        errors["near sectors, RMSE (m)"] = _rmse(read[near], cloud.sectors[near]) if near.any() else 0.0
+        near = cloud.true_sectors < NEAR
+        errors = {
+            SECTOR: _rmse(read, cloud.true_sectors.clamp(max=NEARNESS_RANGE)),
+            "near sectors, RMSE (m)": _rmse(read[near], cloud.true_sectors[near]) if near.any() else 0.0,
+            "against all rays kept (m)": _rmse(read, cloud.sectors.clamp(max=NEARNESS_RANGE)),
+        }
         family = name.split(" ")[-1]
         choices.append(Choice(name, costs[name], errors, name == default, family, {FRAME_BYTES: points[0].numel() * 4}))
     notes = (
         f"Decoder: the nearest kept point more than {ABOVE_GROUND:g} m above the flat ground in a sector, the robot's"
-        f" body left out; of proximities, the largest of the bands above it. Up to {NEARNESS_RANGE:g} m. Reference:"
-        f" obstacle hits of all {cloud.ranges.shape[1]} rays of the same frame, so that what is cut off at"
-        f" {split:g} degrees counts as an error. {len(cloud.sectors)} robots among obstacles=mixed on flat ground.",
+        f" body left out; of proximities, the largest of the bands above it. Up to {NEARNESS_RANGE:g} m; near: within"
+        f" {NEAR:g} m. Reference: obstacle hits of rays {DENSE_DEG:g} degrees apart over the whole field of view, so"
+        f" that what is cut off at {split:g} degrees and what {cloud.ranges.shape[1]} rays miss counts as an error. All"
+        f" rays: {_rmse(every, cloud.true_sectors.clamp(max=NEARNESS_RANGE)):.3f} m."
+        f" {len(cloud.sectors)} robots among obstacles=mixed on flat ground.",
     )
     return Study("sectors", "Distal points kept: sectors", SAMPLING, SECTOR, choices, 1e-4, notes)
 
@@ -240,7 +279,7 @@ def history_study(overrides: Sequence[str], sizes: Sizes, histories: Sequence[in
     frames = frames.unflatten(1, (sizes.episodes, per_episode)).flatten(0, 1)[
         :, :-1
     ]  # the reset takes the last one's truth
-    targets = torch.stack([cloud.sectors for cloud in clouds], 1).unflatten(1, (sizes.episodes, per_episode))
+    targets = torch.stack([cloud.true_sectors for cloud in clouds], 1).unflatten(1, (sizes.episodes, per_episode))
     targets = (1.0 - targets.flatten(0, 1)[:, -2] / NEARNESS_RANGE).clamp(min=0.0)
     held_out = torch.arange(len(frames)) >= len(frames) * 3 // 4  # other environments
     options = {key: value for key, value in perception.network.keywords.items() if key != "history"}
@@ -269,7 +308,8 @@ def history_study(overrides: Sequence[str], sizes: Sizes, histories: Sequence[in
     notes = (
         f"PD-RiskNet as configured, {sizes.steps} steps of Adam (1e-3) on {int((~held_out).sum())} scenes of"
         f" {per_episode - 1} frames, tested on {int(held_out.sum())} others; robots stand among obstacles=mixed. Short"
-        " training: it compares what is easily learnt. Cost: one newest embedding for 64 environments.",
+        " training: it compares what is easily learnt. Reference: rays all over the field of view at the newest frame."
+        " Cost: one newest embedding for 64 environments.",
     )
     return Study("history", "Frames that a network sees", EMBEDDING, SECTOR, choices, 1e-3, notes)
 

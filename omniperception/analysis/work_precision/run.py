@@ -13,7 +13,7 @@ from omniperception.analysis.figures import new_figure
 from omniperception.analysis.lidar_benchmark.report import machine, machine_line, write
 from omniperception.perception import PdSampler
 
-from . import lidar, perception, physics
+from . import lidar, perception, physics, policy
 from .pareto import Study, plot
 
 SIZES = ("full", "small")
@@ -29,6 +29,8 @@ class Options:
         small: Whether sizes are tiny, to see in seconds that everything works.
         only: Names of the studies to run; all if empty.
         overrides: Of the configuration.
+        runs: Run directories whose policies are compared; all that are evaluated and exported if empty.
+        default: The one of them that counts as the default, or none.
     """
 
     subject: str
@@ -36,6 +38,8 @@ class Options:
     small: bool = False
     only: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
+    runs: tuple[str, ...] = ()
+    default: str = ""
 
 
 def run_lidar(options: Options) -> list[Study]:
@@ -61,17 +65,33 @@ def run_perception(options: Options) -> list[Study]:
     return perception.measure(overrides, perception.SMALL if options.small else perception.Sizes(), options.only)
 
 
-STUDIES = {"lidar": tuple(lidar.STUDIES), "physics": physics.STUDIES, "perception": tuple(perception.STUDIES)}
+def run_policy(options: Options) -> list[Study]:
+    if options.overrides:
+        raise config.ConfigError(
+            f"{options.overrides[0]}: policies are taken as they were trained; leave overrides out"
+        )
+    if options.only:
+        raise config.ConfigError("only= chooses no scenario; evaluate the runs in those that should be compared")
+    return policy.measure(options.runs, policy.SMALL if options.small else policy.Sizes(), options.default)
+
+
+STUDIES = {
+    "lidar": tuple(lidar.STUDIES),
+    "physics": physics.STUDIES,
+    "perception": tuple(perception.STUDIES),
+    "policy": (),
+}
 SUBJECTS: dict[str, Callable[[Options], list[Study]]] = {
     "lidar": run_lidar,
     "physics": run_physics,
     "perception": run_perception,
+    "policy": run_policy,
 }
 
 
 def execute(options: Options) -> list[Study]:
     """Measures a subject, prints its tables with what they say, and writes them with the plot."""
-    if unknown := set(options.only) - set(STUDIES[options.subject]):
+    if options.subject != "policy" and (unknown := set(options.only) - set(STUDIES[options.subject])):
         known = ", ".join(STUDIES[options.subject])
         raise config.ConfigError(f"only={','.join(sorted(unknown))} must be out of {known}")
     new_figure(1.0, 1.0)  # an error now rather than after minutes
