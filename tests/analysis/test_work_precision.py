@@ -121,7 +121,7 @@ def within_margin(measured: Study) -> float:
 
 @pytest.fixture(scope="module")
 def lidar_bench(make_config):
-    sizes = replace(lidar.SMALL, num_envs=4, rounds=5, dense_deg=1.0)
+    sizes = replace(lidar.SMALL, num_envs=4, rounds=5)
     return lidar.Bench(make_config("obstacles=mixed"), sizes)
 
 
@@ -140,10 +140,10 @@ def test_fresh_poses_lie_on_the_front(lidar_bench):
 
 
 def test_kept_rays_lie_on_the_front(lidar_bench):
-    measured = lidar.rays_study(lidar_bench, counts=(200, 1000, 5000), strategies=("every_kth", "stratified"))
+    measured = lidar.rays_study(lidar_bench, counts=(500, 1000), strategies=("every_kth", "stratified"))
     within_margin(measured)
     errors = {c.name: c.errors[lidar.SECTOR] for c in measured.choices}
-    assert errors["5000 stratified"] < errors["1000 stratified"] < errors["200 stratified"]
+    assert errors["1000 stratified"] < errors["500 stratified"] and errors["1000 every_kth"] < errors["500 every_kth"]
 
 
 def test_motion_pieces_converge_to_rays_at_their_own_times(lidar_bench):
@@ -153,7 +153,7 @@ def test_motion_pieces_converge_to_rays_at_their_own_times(lidar_bench):
     assert off > 0.05 and ten < two / 3.0 < off / 3.0
 
 
-SHORT = replace(physics.SMALL, timesteps=(0.002, 0.005, 0.01), duration_s=0.2, num_starts=2, rounds=5)
+SHORT = replace(physics.SMALL, rounds=5, block_s=0.005)
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def physics_bench(make_config):
 
 
 def test_step_and_integrator_lie_on_the_front(physics_bench):
-    measured = physics.steps_study(physics_bench, integrators=("euler", "implicitfast", "implicit"))
+    measured = physics.steps_study(physics_bench, integrators=("euler", "implicitfast", "implicit"), outside=())
     within_margin(measured)
     errors = {c.name: c.errors[physics.SAME] for c in measured.choices}
     assert errors["implicitfast 2 ms"] < errors["implicitfast 5 ms"] < errors["implicitfast 10 ms"]

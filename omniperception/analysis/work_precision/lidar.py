@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -389,10 +389,10 @@ STUDIES: dict[str, Callable[[Bench], Study]] = {
 }
 
 
-def measure(run: RunConfig, sizes: Sizes, only: Sequence[str] = ()) -> list[Study]:
-    """All studies, or some by name."""
+def measure(run: RunConfig, sizes: Sizes, only: Sequence[str] = ()) -> Iterator[Study]:
+    """All studies, or some by name, as they are done."""
     bench = Bench(run, sizes)
-    return [study(bench) for name, study in STUDIES.items() if not only or name in only]
+    yield from (study(bench) for name, study in STUDIES.items() if not only or name in only)
 
 
 class Instances:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -322,9 +322,9 @@ STUDIES: dict[str, Callable[[Sequence[str], Sizes], Study]] = {
 }
 
 
-def measure(overrides: Sequence[str], sizes: Sizes, only: Sequence[str] = ()) -> list[Study]:
-    """All studies, or some by name, of the configuration that the overrides compose to."""
-    return [study(overrides, sizes) for name, study in STUDIES.items() if not only or name in only]
+def measure(overrides: Sequence[str], sizes: Sizes, only: Sequence[str] = ()) -> Iterator[Study]:
+    """All studies, or some by name, of the configuration that the overrides compose to, as they are done."""
+    yield from (study(overrides, sizes) for name, study in STUDIES.items() if not only or name in only)
 
 
 def read_heights(points: torch.Tensor, used: torch.Tensor) -> torch.Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -152,7 +152,10 @@ class Bench:
         self.sizes, self.sim, self.robot, self.terrain = sizes, run.env.sim, run.env.robot, run.env.terrain
         self.default = default_method(self.sim)
         if abs(self.sim.control_dt - CONTROL_DT) > 1e-9:
-            raise ValueError(f"sim.timestep * sim.decimation = {self.sim.control_dt} must be {CONTROL_DT} s here")
+            raise ValueError(
+                f"sim.timestep * sim.decimation = {self.sim.control_dt:g} s must be {CONTROL_DT:g} s, the period of the"
+                " recorded gait"
+            )
         self.trajectories = [self._gait(), self._drop(), self._stumble()]
         self._truths: dict[tuple[str, str], Course] = {}
         self.horizons: dict[str, int] = {}
@@ -341,15 +344,16 @@ def penetration(model: mujoco.MjModel, qpos: np.ndarray) -> float:
 
 
 def steps_study(
-    bench: Bench, integrators: Sequence[str] = ("euler", "implicitfast", "implicit", "rk4", "discrete")
+    bench: Bench,
+    integrators: Sequence[str] = ("euler", "implicitfast", "implicit", "rk4", "discrete"),
+    outside: Sequence[str] = ("euler", "implicitfast"),
 ) -> Study:
-    """Time step x integrator, and the PD law in the engine or outside."""
+    """Time step x integrator, with the PD law in the engine and, for some integrators, outside."""
     default, methods = bench.default, {}
     for timestep in sorted({*bench.sizes.timesteps, default.timestep}):
-        for integrator in integrators:
-            methods |= _named(replace(default, timestep=timestep, integrator=integrator))
-        for integrator in ("euler", default.integrator):
-            methods |= _named(replace(default, timestep=timestep, integrator=integrator, outside=True))
+        for names, is_outside in ((integrators, False), (outside, True)):
+            for integrator in names:
+                methods |= _named(replace(default, timestep=timestep, integrator=integrator, outside=is_outside))
     note = f"Solver as configured: {default.iterations} iterations, {default.cone} cone."
     return _study(bench, "steps", "Time step, integrator, place of the PD law", methods, note)
 
@@ -496,14 +500,16 @@ def _energy_drift(world: World, method: Method, sim: SimConfig, duration_s: floa
 STUDIES = ("steps", "solver", "order")
 
 
-def measure(run: RunConfig, sizes: Sizes, only: Sequence[str] = ()) -> list[Study]:
-    """All studies, or some by name."""
-    wanted, studies = only or STUDIES, []
+def measure(run: RunConfig, sizes: Sizes, only: Sequence[str] = ()) -> Iterator[Study]:
+    """All studies, or some by name, as they are done."""
+    wanted = only or STUDIES
     if {"steps", "solver"} & set(wanted):
         bench = Bench(run, sizes)
-        studies += [steps_study(bench)] if "steps" in wanted else []
-        studies += [solver_study(bench)] if "solver" in wanted else []
-    return studies + ([order_study(run, sizes)] if "order" in wanted else [])
+        yield from (
+            study(bench) for name, study in (("steps", steps_study), ("solver", solver_study)) if name in wanted
+        )
+    if "order" in wanted:
+        yield order_study(run, sizes)
 
 
 def _weight(model: mujoco.MjModel) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -85,7 +85,7 @@ class TrainedRun:
             "training (min)": state["total_time"] / 60.0,
         }
 
-    def stepper(self):
+    def stepper(self) -> Callable[[int], None]:
         """Control steps through readings recorded in an environment of the run; called with their number."""
         run = config.assemble(config.load(self.path, ["num_envs=1"]))
         env = OmniEnv(replace(run.env, initial_obstacle_level=1.0))
@@ -112,7 +112,7 @@ def evaluated_runs() -> list[str]:
     return [str(run) for run in runs if (run / EVALUATION).is_dir() and (run / EXPORTED).is_dir()]
 
 
-def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> list[Study]:
+def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> Iterator[Study]:
     """One study per scenario that some run has been evaluated in.
 
     Args:
@@ -129,7 +129,6 @@ def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> list[Study
     reports, facts = {run.name: run.scenarios() for run in runs}, {run.name: run.facts() for run in runs}
     timings = paired_timings({run.name: run.stepper() for run in runs}, sizes.rounds, block_s=sizes.block_s)
     chosen = config.find_run(default).resolve() if default else None
-    studies = []
     for scenario in sorted({name for report in reports.values() for name in report}):
         choices = [
             Choice(
@@ -147,8 +146,7 @@ def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> list[Study
             " Time: median of the rounds' means over control steps with and without a frame, sampling included.",
         )
         title = f"Trained policies: {scenario}"
-        studies.append(Study(f"policy_{scenario}", title, COST, FAILED, choices, 0.1, notes))
-    return studies
+        yield Study(f"policy_{scenario}", title, COST, FAILED, choices, 0.1, notes)
 
 
 def _rates(summary: dict) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,22 +42,22 @@ class Options:
     default: str = ""
 
 
-def run_lidar(options: Options) -> list[Study]:
+def run_lidar(options: Options) -> Iterator[Study]:
     run = config.assemble(config.compose(_with("obstacles=mixed", options.overrides)))
     if run.env.lidar is None:
         raise config.ConfigError("lidar=none leaves nothing to measure; use lidar=mid360")
     return lidar.measure(run, lidar.SMALL if options.small else lidar.Sizes(), options.only)
 
 
-def run_physics(options: Options) -> list[Study]:
+def run_physics(options: Options) -> Iterator[Study]:
     run = config.assemble(config.compose(_with("experiment=walk", options.overrides)))
     try:
-        return physics.measure(run, physics.SMALL if options.small else physics.Sizes(), options.only)
+        yield from physics.measure(run, physics.SMALL if options.small else physics.Sizes(), options.only)
     except ValueError as error:
         raise config.ConfigError(str(error)) from None
 
 
-def run_perception(options: Options) -> list[Study]:
+def run_perception(options: Options) -> Iterator[Study]:
     overrides = _with("experiment=quickstart", options.overrides)
     run = config.assemble(config.compose(overrides))
     if run.perception is None or not isinstance(run.perception.sampler(), PdSampler):
@@ -65,7 +65,7 @@ def run_perception(options: Options) -> list[Study]:
     return perception.measure(overrides, perception.SMALL if options.small else perception.Sizes(), options.only)
 
 
-def run_policy(options: Options) -> list[Study]:
+def run_policy(options: Options) -> Iterator[Study]:
     if options.overrides:
         raise config.ConfigError(
             f"{options.overrides[0]}: policies are taken as they were trained; leave overrides out"
@@ -81,7 +81,7 @@ STUDIES = {
     "perception": tuple(perception.STUDIES),
     "policy": (),
 }
-SUBJECTS: dict[str, Callable[[Options], list[Study]]] = {
+SUBJECTS: dict[str, Callable[[Options], Iterator[Study]]] = {
     "lidar": run_lidar,
     "physics": run_physics,
     "perception": run_perception,
@@ -97,8 +97,9 @@ def execute(options: Options) -> list[Study]:
     new_figure(1.0, 1.0)  # an error now rather than after minutes
     torch.set_num_threads(1)
     folder, about = options.out / options.subject, machine(1, "cpu")
-    studies = SUBJECTS[options.subject](options)
-    for study in studies:
+    studies = []
+    for study in SUBJECTS[options.subject](options):
+        studies.append(study)
         table = study.table()
         write(table, about, folder)
         print(f"{table.markdown()}\n", flush=True)
