@@ -167,11 +167,36 @@ def _draw(study: Study, axis) -> None:
     if study.default is not None and study.default in drawn:
         place = [study.default.cost], [study.error_of(study.default)]
         axis.plot(*place, "*", color="crimson", markersize=13, label=f"default: {study.default.name}")
-    named = front if len(drawn) > 16 else drawn
-    for choice in named:
-        place = (choice.cost, study.error_of(choice))
-        axis.annotate(choice.name, place, fontsize=6, xytext=(3, 3), textcoords="offset points")
+    _name(axis, study, front if len(drawn) > 16 else [*front, *drawn])
     axis.set(xscale="log", yscale="log", xlabel=study.cost, ylabel=study.error)
+    axis.margins(x=0.12, y=0.1)
+    for which, values in (("x", [c.cost for c in drawn]), ("y", [study.error_of(c) for c in drawn])):
+        ticks = _ticks(min(values), max(values))
+        getattr(axis, f"set_{which}ticks")(ticks, labels=[f"{tick:g}" for tick in ticks])
+    axis.minorticks_off()
     axis.set_title(study.title, fontsize=8, wrap=True)
-    axis.grid(True, which="both", alpha=0.2)
-    axis.legend(loc="lower left", fontsize=6, title=f"n = {len(drawn)} choices", title_fontsize=6)
+    axis.grid(True, alpha=0.2)
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 3}
+    axis.legend(fontsize=6, title=f"n = {len(drawn)} choices", title_fontsize=6, **below)
+
+
+def _name(axis, study: Study, choices: Sequence[Choice]) -> None:
+    """Writes names beside points; of points that lie together, the first one's."""
+    placed: list[tuple[float, float]] = []
+    for choice in choices:
+        cost, error = choice.cost, study.error_of(choice)
+        near = [1 for c, e in placed if max(c / cost, cost / c) < 1.06 and max(e / error, error / e) < 1.06]
+        if not near:
+            placed.append((cost, error))
+            axis.annotate(choice.name, (cost, error), fontsize=6, xytext=(3, 3), textcoords="offset points")
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round numbers around ``low`` to ``high``, at least three if there are."""
+    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
+    for steps in ((1.0,), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)):
+        ticks = [step * 10.0**decade for decade in decades for step in steps]
+        ticks = [tick for tick in ticks if low / 1.2 <= tick <= 1.2 * high]
+        if len(ticks) > 2:
+            break
+    return ticks
