@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.analysis.work_precision import lidar, perception, physics
+from omniperception.analysis.work_precision import lidar, perception, physics, policy
 from omniperception.analysis.work_precision.pareto import Choice, Study
 from omniperception.analysis.work_precision.scene import MovingScene, Truth, dense_directions, moving_scene
 from omniperception.analysis.work_precision.tessellation import tessellate
+from omniperception.config import ConfigError
 from omniperception.lidar import LidarConfig
 from omniperception.perception import ProximitySampler
 
@@ -233,6 +234,22 @@ def test_farthest_points_lie_on_the_front(preset):
 def test_sectors_lie_on_the_front():
     measured = perception.sectors_study(("experiment=quickstart",), TINY, counts=(64, 216))
     within_margin(measured)
+
+
+def test_policies_are_judged_by_what_evaluation_wrote(tmp_path):
+    run = policy.TrainedRun(tmp_path, "run")
+    with pytest.raises(ConfigError, match=r"has not been evaluated; python scripts/evaluate.py run="):
+        run.scenarios()
+    rates = {"success": 0.9, "success_untouched": 0.7, "collision": 0.25, "fall": 0.05}
+    summary = {"rates": {name: {"rate": r, "low": r - 0.1, "high": r + 0.1} for name, r in rates.items()}}
+    report = {"scenario": "corridor", "policies": {"run": summary, "blind": {}}}
+    (tmp_path / "evaluation").mkdir()
+    (tmp_path / "evaluation" / "corridor.json").write_text(json.dumps(report))
+    errors = policy.rates_of(run.scenarios()["corridor"])
+    assert errors[policy.FAILED] == pytest.approx(30.0) and errors["collision (%)"] == pytest.approx(25.0)
+    assert errors["low (%)"] == pytest.approx(20.0) and errors["high (%)"] == pytest.approx(40.0)
+    with pytest.raises(ConfigError, match=r"has not been exported; python scripts/export.py run="):
+        _ = run.exported
 
 
 def load_script():

@@ -416,19 +416,19 @@ def orders(run: RunConfig, timesteps: Sequence[float], duration_s: float = 0.2) 
     env = run.env
     world = build_world(env.robot, env.terrain, ObstaclesConfig())
     sim, results = env.sim, []
-    truth = _tumble(world, replace_method(sim, "rk4", REFERENCE_DT), sim, duration_s)
+    truth = _tumble(world, _configured_but(sim, "rk4", REFERENCE_DT), sim, duration_s)
     for integrator, theory in THEORY.items():
         order = Order(integrator, theory, {}, {})
         for timestep in timesteps:
             if abs(duration_s / timestep - round(duration_s / timestep)) < 1e-9:
-                method = replace_method(sim, integrator, timestep)
+                method = _configured_but(sim, integrator, timestep)
                 order.errors[timestep] = float(np.abs(_tumble(world, method, sim, duration_s) - truth).max())
                 order.energy[timestep] = _energy_drift(world, method, sim, duration_s)
         results.append(order)
     return results
 
 
-def replace_method(sim: SimConfig, integrator: str, timestep: float) -> Method:
+def _configured_but(sim: SimConfig, integrator: str, timestep: float) -> Method:
     """The configured way of stepping with another integrator and step."""
     return replace(default_method(sim), integrator=integrator, timestep=timestep)
 

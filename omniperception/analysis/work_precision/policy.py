@@ -69,6 +69,7 @@ class TrainedRun:
 
     @cached_property
     def exported(self) -> ExportedPolicy:
+        """What scripts/export.py wrote."""
         folder = self.path / EXPORTED
         if not folder.is_dir():
             raise config.ConfigError(
@@ -134,7 +135,7 @@ def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> Iterator[S
             Choice(
                 run.name,
                 1e6 * timings[run.name].median_cpu_s,
-                _rates(reports[run.name][scenario]),
+                rates_of(reports[run.name][scenario]),
                 run.path.resolve() == chosen,
                 facts={**facts[run.name], "trials": reports[run.name][scenario]["episodes"]},
             )
@@ -149,7 +150,8 @@ def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> Iterator[S
         yield Study(f"policy_{scenario}", title, COST, FAILED, choices, 0.1, notes)
 
 
-def _rates(summary: dict) -> dict[str, float]:
+def rates_of(summary: dict) -> dict[str, float]:
+    """Errors, in percent, of an evaluation's summary of one policy."""
     rates = summary["rates"]
     untouched = rates["success_untouched"]
     return {
