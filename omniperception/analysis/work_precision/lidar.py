@@ -54,8 +54,8 @@ class Sizes:
 
     num_envs: int = 8
     num_frames: int = 4
-    rounds: int = 5
-    block_s: float = 0.05
+    rounds: int = 9
+    block_s: float = 0.1
     dense_deg: float = 0.5
 
 

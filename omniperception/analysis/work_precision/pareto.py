@@ -198,5 +198,5 @@ def _ticks(low: float, high: float) -> list[float]:
         ticks = [step * 10.0**decade for decade in decades for step in steps]
         ticks = [tick for tick in ticks if low / 1.2 <= tick <= 1.2 * high]
         if len(ticks) > 2:
-            break
-    return ticks
+            return ticks
+    return [float(f"{tick:.3g}") for tick in (low, math.sqrt(low * high), high)]
