@@ -12,9 +12,9 @@ perception  farthest, heights, sectors, history: points kept and how, and how ma
 policy      what scripts/evaluate.py measured against the time of the policy that scripts/export.py wrote; by default of
             all runs under outputs/ that have both
 
-Everything runs on one thread, choices in turn; a cost is the median of this process's CPU time. Writes a table (CSV,
-JSON) for each study and one plot with all fronts, the default marked, into <out>/<subject>/. The default is what the
-composed configuration chooses. What was measured stands in docs/work_precision.md.
+Everything runs on one thread, choices in turn; a cost is this process's CPU time in the quickest round. Writes a table
+(CSV, JSON) for each study and one plot with all fronts, the default marked, into <out>/<subject>/. The default is what
+the composed configuration chooses. What was measured stands in docs/work_precision.md.
 """
 
 from __future__ import annotations
