@@ -1,0 +1,1 @@
+"""Accuracy against cost of the choices that the framework offers."""
