@@ -16,7 +16,7 @@ from omniperception.world.rays import HitClass, RayShapes
 WIDTH, HEIGHT = 64, 36
 BALL = Shape(ShapeKind.SPHERE, (0.5,), body=0, class_id=HitClass.ROBOT)
 GROUND = Shape(ShapeKind.PLANE, class_id=HitClass.TERRAIN)
-BALL_ON_GROUND = RayShapes((GROUND, BALL), ("ground", "ball"), (1,))
+BALL_ON_GROUND = RayShapes((GROUND, BALL), ("ground", "ball"), (1,), base=0)
 NO_POINTS = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
 
 
