@@ -15,6 +15,7 @@ from omniperception import config
 from omniperception.assembly import build_runner
 from omniperception.learning import (
     CheckpointError,
+    RolloutTooSmall,
     TrainingDiverged,
     distributed,
     latest_checkpoint,
@@ -49,7 +50,7 @@ def tell(text: str) -> None:
 
 @hydra.main(config_path="conf", config_name="config", version_base="1.3")
 def train(composed: DictConfig) -> None:
-    with config.one_line_errors(CheckpointError, TrainingDiverged):
+    with config.one_line_errors(CheckpointError, RolloutTooSmall, TrainingDiverged):
         run = config.assemble(composed)
         distributed.connect(run.env.sim.torch_device)
         run_dir = distributed.of_first(Path(os.path.relpath(HydraConfig.get().runtime.output_dir)))
@@ -69,7 +70,7 @@ def main() -> None:
     if any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments):
         train()  # Hydra's own flags: --help, --cfg job, --info
         return
-    with config.one_line_errors(CheckpointError, TrainingDiverged):
+    with config.one_line_errors(CheckpointError, RolloutTooSmall, TrainingDiverged):
         own, overrides = config.split_arguments(arguments, {"run": ""})
         if own["run"]:
             resume(own["run"], overrides)

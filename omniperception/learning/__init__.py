@@ -9,7 +9,7 @@ from omniperception.learning.checkpoint import (
     save_checkpoint,
 )
 from omniperception.learning.models import PerceptionActor
-from omniperception.learning.ppo import PerceptivePpo, TrainingDiverged
+from omniperception.learning.ppo import PerceptivePpo, RolloutTooSmall, TrainingDiverged
 from omniperception.learning.runner import Runner
 from omniperception.learning.storage import PerceptiveStorage, WindowedObservations, point_cloud_bytes
 
@@ -18,6 +18,7 @@ __all__ = [
     "PerceptionActor",
     "PerceptivePpo",
     "PerceptiveStorage",
+    "RolloutTooSmall",
     "Runner",
     "TrainingDiverged",
     "WindowedObservations",

@@ -23,6 +23,10 @@ class TrainingDiverged(RuntimeError):
     """A loss, gradient or parameter is no longer finite; no step has been taken with it."""
 
 
+class RolloutTooSmall(ValueError):
+    """There is too little in a rollout to learn from it."""
+
+
 class PerceptivePpo(PPO):
     """rsl_rl's PPO on a :class:`PerceptiveStorage`.
 
@@ -77,7 +81,6 @@ class PerceptivePpo(PPO):
         alg_cfg = resolve_rnd_config(alg_cfg, obs, cfg["obs_groups"], env)
         alg_cfg = resolve_symmetry_config(alg_cfg, env)
 
-        _check_batches(env.num_envs, cfg["num_steps_per_env"], alg_cfg.get("num_mini_batches", 4), perceptive)
         actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
         critic = critic_class(obs, cfg["obs_groups"], "critic", 1, **critic_cfg).to(device)
         groups = {group for names in cfg["obs_groups"].values() for group in names}
@@ -176,6 +179,23 @@ class PerceptivePpo(PPO):
             self._raw_actor.rollout.load_state_dict(loaded_dict.get("carried"))
         return super().load(loaded_dict, load_cfg, strict)
 
+    def check_rollout(self) -> None:
+        """Refuses rollouts that leave a mini-batch without content; those with frames are of whole environments."""
+        num_envs, num_steps = self.storage.num_envs, self.storage.num_transitions_per_env
+        available = num_envs if self.storage.has_frames else num_envs * num_steps
+        if available < self.num_mini_batches:
+            steps = f"steps ({num_envs} environments x {num_steps})"
+            what = "environments" if self.storage.has_frames else steps
+            raise RolloutTooSmall(
+                f"ppo.num_mini_batches={self.num_mini_batches} must not exceed the {available} {what} of a rollout;"
+                " lower it or raise num_envs"
+            )
+        if num_envs * num_steps < 2:
+            raise RolloutTooSmall(
+                f"num_envs={num_envs} and ppo.num_steps_per_env={num_steps} make rollouts of one step, whose advantages"
+                " have no spread to be divided by; raise one of them"
+            )
+
     def _check_gradients(self) -> None:
         models = {"actor": self._raw_actor, "critic": self._raw_critic}
         for name, model in models.items():
@@ -265,19 +285,3 @@ def _finite_and_largest(tensors: list[torch.Tensor]) -> tuple[bool, float]:
         return True, 0.0
     largest = float(torch.stack(torch._foreach_norm(tensors)).detach().amax())
     return math.isfinite(largest) or all(bool(torch.isfinite(tensor).all()) for tensor in tensors), largest
-
-
-def _check_batches(num_envs: int, num_steps: int, num_mini_batches: int, whole_envs: bool) -> None:
-    """Refuses mini-batches without content; those with frames are of whole environments."""
-    available = num_envs if whole_envs else num_envs * num_steps
-    if available < num_mini_batches:
-        what = "environments" if whole_envs else f"steps ({num_envs} environments x {num_steps})"
-        raise ValueError(
-            f"ppo.num_mini_batches={num_mini_batches} must not exceed the {available} {what} of a rollout; lower it or"
-            " raise num_envs"
-        )
-    if num_envs * num_steps < 2:
-        raise ValueError(
-            f"num_envs={num_envs} and ppo.num_steps_per_env={num_steps} make rollouts of one step, whose advantages"
-            " have no spread to be divided by; raise one of them"
-        )

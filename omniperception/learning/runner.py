@@ -103,6 +103,7 @@ class Runner(OnPolicyRunner):
             init_at_random_ep_len: spread the environments over their episodes, at the very start of a run
                 only.
         """
+        self.alg.check_rollout()
         first = self.current_learning_iteration
         if init_at_random_ep_len and first == 0:
             lengths = self.env.episode_length_buf

@@ -48,6 +48,8 @@ ALIKE = {
     "direct_mlp_small": "direct_mlp",
     "pd_risknet_no_proximal": "pd_risknet_small_no_proximal",
     "pd_risknet_small_no_distal": "pd_risknet_no_distal",
+    "pd_risknet_rings_no_height": "pd_risknet_rings",
+    "pd_risknet_rings_no_proximal": "pd_risknet_rings",
 }
 """Presets that differ from a recipe's in sizes alone."""
 STAND = RobotState([0.0] * 12, [0.0] * 12, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3)

@@ -5,7 +5,7 @@ import torch
 from test_ppo import algorithm, collect
 from toy_env import SUPERVISED, ToyEnv, config
 
-from omniperception.learning import PerceptivePpo, Runner, TrainingDiverged
+from omniperception.learning import PerceptivePpo, RolloutTooSmall, Runner, TrainingDiverged
 
 
 def stopped_by(alg):
@@ -80,13 +80,15 @@ def test_an_observation_whose_square_overflows_is_the_cause():
     ],
 )
 def test_empty_mini_batches_are_refused_before_a_rollout(num_envs, frames, steps, message):
-    with pytest.raises(ValueError, match=message):
-        algorithm(ToyEnv(num_envs, frames=frames), num_steps=steps, frames=frames)
+    alg = algorithm(ToyEnv(num_envs, frames=frames), num_steps=steps, frames=frames)
+    with pytest.raises(RolloutTooSmall, match=message):
+        alg.check_rollout()
 
 
 def test_a_single_step_has_no_spread_of_advantages():
-    with pytest.raises(ValueError, match="no spread"):
-        algorithm(ToyEnv(1, frames=False), num_steps=1, frames=False, num_mini_batches=1)
+    alg = algorithm(ToyEnv(1, frames=False), num_steps=1, frames=False, num_mini_batches=1)
+    with pytest.raises(RolloutTooSmall, match="no spread"):
+        alg.check_rollout()
 
 
 def test_anomalies_are_on_the_console_when_they_happen(tmp_path, capsys):
