@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .geometry import REFINE
 from .heightfield import FieldPart
 
 wp.set_module_options({"enable_backward": False})
@@ -27,9 +28,9 @@ _WALK_BLOCK = """
     float* const slope_row = slope_out.data + size_t(env) * (slope_out.strides[0] / sizeof(float)) + first;
     int* const face_row = face_out.data + size_t(env) * (face_out.strides[0] / sizeof(int)) + first;
     const int cols = field.cols, last_x = field.cols - 2, last_y = field.rows - 2;
-    const double grid_x = ((double)o[0] + field.half_x) * field.per_x;
-    const double grid_y = ((double)o[1] + field.half_y) * field.per_y;
-    if (!(grid_x >= 0.0 && grid_y >= 0.0 && grid_x <= last_x + 1 && grid_y <= last_y + 1 && o[2] > 0.0f)) {
+    const double grid_x = (o[0] + field.half_x) * field.per_x;
+    const double grid_y = (o[1] + field.half_y) * field.per_y;
+    if (!(grid_x >= 0.0 && grid_y >= 0.0 && grid_x <= last_x + 1 && grid_y <= last_y + 1 && o[2] > 0.0)) {
         for (int i = 0; i < n; ++i)
             face_row[i] = UNKNOWN;
         return;
@@ -37,7 +38,7 @@ _WALK_BLOCK = """
     const int near_x = (int)grid_x, near_y = (int)grid_y;
     const float gx = (float)(grid_x - near_x), gy = (float)(grid_y - near_y);
     const float per_x = (float)field.per_x, per_y = (float)field.per_y, unit = 1.0f / (float)field.scale;
-    const float oz = o[2] * unit, margin = 1.0e-5f * (float)(field.half_x + field.half_y) * unit;
+    const float height = (float)o[2], oz = height * unit, margin = 1.0e-5f * (float)(field.half_x + field.half_y) * unit;
     const float floor_z = -margin - oz, ceiling_z = field.top + margin - oz;
     const float west = -near_x - gx, east = last_x + 1 - near_x - gx;
     const float south = -near_y - gy, north = last_y + 1 - near_y - gy;
@@ -193,8 +194,10 @@ _WALK_BLOCK = """
                 const float rise_y = (triangle == 0 ? h11 - h10 : h01 - h00) * per_y;
                 const float into = dz[i] - (triangle == 0 ? h10 - h00 : h11 - h01) * dx[i]
                     - (triangle == 0 ? h11 - h10 : h01 - h00) * dy[i];
-                t_row[i] = over > 0.0f ? from + (to - from) * over / (over - over_next) : from;
-                slope_row[i] = fabsf(into) / sqrtf(unit * unit + rise_x * rise_x + rise_y * rise_y);
+                const float at = over > 0.0f ? from + (to - from) * over / (over - over_next) : from;
+                const float slope = fabsf(into) / sqrtf(unit * unit + rise_x * rise_x + rise_y * rise_y);
+                t_row[i] = at;
+                slope_row[i] = slope * (1.0f + at) * REFINE < at + height ? -1.0f : slope;
                 face_row[i] = 2 * (iy[i] * cols + ix[i]) + triangle;
             } else {
                 t[i] = next;
@@ -216,6 +219,7 @@ _WALK_BLOCK = """
 _SLACK = 0.05
 _WALK_BLOCK = "    const float reach[4] = {" + ", ".join(f"{r - _SLACK}f" for r in REACHES) + "};" + _WALK_BLOCK
 _WALK_BLOCK = _WALK_BLOCK.replace("BLOCK", str(BLOCK)).replace("UNKNOWN", str(int(UNKNOWN)))
+_WALK_BLOCK = _WALK_BLOCK.replace("REFINE", f"{float(REFINE)}f")
 
 
 @wp.func_native(_WALK_BLOCK)
@@ -229,7 +233,7 @@ def walk_block(
     steps: int,
     first: int,
     last: int,
-    o: wp.vec3,
+    o: wp.vec3d,
     axes: wp.mat33,
     limit: float,
     env: int,
@@ -239,6 +243,7 @@ def walk_block(
 ):
     """What ``meet_heightfield`` finds for rays ``first`` to ``last`` of an environment, all from ``o``.
 
-    Their directions, turned by ``axes``, are rows ``start + (steps + ray) % cycle``.
+    Their directions, turned by ``axes``, are rows ``start + (steps + ray) % cycle``. The slope is negative where the
+    distance is ``uncertain``; as ``o`` has float64, the field's centre may be far away without making it so.
     """
     ...

@@ -176,8 +176,8 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
             for s in range(slots.count[env]):
                 field = slots.shape[env, s]
                 if geometry.kind[field] == HEIGHTFIELD:
-                    centre = slots.bound[env, s]
-                    axes = slots.axes[env, s]
+                    pose = slots.pose[env, s]
+                    q = wp.transform_get_rotation(pose)
                     walk_block(
                         geometry.field_part[geometry.part[field]],
                         geometry.field_height,
@@ -188,8 +188,8 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
                         steps,
                         first,
                         last,
-                        -(axes * wp.vec3(centre[0], centre[1], centre[2])),
-                        axes,
+                        wp.quat_rotate_inv(q, -wp.transform_get_translation(pose)),
+                        slots.axes[env, s],
                         rays.max_range,
                         env,
                         slots.walked_t,

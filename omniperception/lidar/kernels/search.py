@@ -202,8 +202,8 @@ def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced:
                 hit = Hit(slots.walked_t[env, ray], slots.walked_face[env, ray], slots.walked_slope[env, ray])
         if hit.face == UNKNOWN:
             hit = meet(geometry, shape, env, d, at.c, at.axes, limit)
-        if uncertain(hit, at.c):
-            hit.slope = -1.0
+            if uncertain(hit, at.c):
+                hit.slope = -1.0
         return hit
 
     @wp.func
