@@ -16,10 +16,10 @@ UNKNOWN = wp.constant(-3)
 
 # A step of a walk waits for the one before it, and hardly a branch of it can be foretold: a ray alone leaves most of a
 # core idle. Here all rays of a block take a step each, and lists of those that go on are kept without branches, so that
-# steps of different rays overlap. A ray first jumps over windows: from a point of a block of cells it stays below no
-# highest point of a window for as long as it is above it and in the window, whichever window allows the most. Where none
-# allows half a cell, it visits its cell, as ``meet_heightfield`` does. Rays that do not start above the surface, and the
-# rare one that rounding takes through it, are left to that function.
+# steps of different rays overlap. A ray first jumps over windows: in a window, and above its highest point, it
+# meets nothing, and the window that lets it go farthest counts. Where none allows half a cell, it visits its cell, as
+# ``meet_heightfield`` does. Rays that do not start above the surface, and the rare one that rounding takes through it,
+# are left to that function.
 _WALK_BLOCK = """
     constexpr int most = BLOCK;
     const float tiny = 1.0e-12f;
@@ -38,7 +38,8 @@ _WALK_BLOCK = """
     const int near_x = (int)grid_x, near_y = (int)grid_y;
     const float gx = (float)(grid_x - near_x), gy = (float)(grid_y - near_y);
     const float per_x = (float)field.per_x, per_y = (float)field.per_y, unit = 1.0f / (float)field.scale;
-    const float height = (float)o[2], oz = height * unit, margin = 1.0e-5f * (float)(field.half_x + field.half_y) * unit;
+    const float height = (float)o[2], oz = height * unit;
+    const float margin = 1.0e-5f * (float)(field.half_x + field.half_y) * unit;
     const float floor_z = -margin - oz, ceiling_z = field.top + margin - oz;
     const float west = -near_x - gx, east = last_x + 1 - near_x - gx;
     const float south = -near_y - gy, north = last_y + 1 - near_y - gy;
@@ -141,8 +142,8 @@ _WALK_BLOCK = """
             const float z = oz + t[i] * dz[i], z_next = oz + next * dz[i];
             const float* const c = h + (iy[i] * cols + ix[i]);
             const float low_z = z < z_next ? z : z_next;
-            const float south_high = c[0] > c[1] ? c[0] : c[1], north_high = c[cols] > c[cols + 1] ? c[cols] : c[cols + 1];
-            const int meets = low_z <= (south_high > north_high ? south_high : north_high);
+            const float high_s = c[0] > c[1] ? c[0] : c[1], high_n = c[cols] > c[cols + 1] ? c[cols] : c[cols + 1];
+            const int meets = low_z <= (high_s > high_n ? high_s : high_n);
             const int passes = !meets;
             const int cx = ix[i] + (along_x ? 2 * forward_x - 1 : 0), cy = iy[i] + (along_x ? 0 : 2 * forward_y - 1);
             t[i] = passes ? next : t[i];

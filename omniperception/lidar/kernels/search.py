@@ -1,6 +1,6 @@
 """The nearest hit of a sensor's ray among the shapes placed in its frame."""
 
-# ruff: noqa: UP018  (in a kernel, wp.int32(0) declares a variable that may change)
+# ruff: noqa: SIM102, UP018  (in a kernel, a branch on wp.static stands alone, and wp.int32(0) declares a variable)
 
 from collections.abc import Iterable
 from functools import cache
