@@ -16,8 +16,12 @@ from .shapes import Shape, ShapeKind
 
 @dataclass
 class _Arrays:
-    """What has been laid out so far; ``num_nodes`` and ``num_leaves`` include the copies of deformables."""
+    """What has been laid out so far; ``num_nodes`` and ``num_leaves`` include the copies of deformables.
 
+    ``windowed``: whether blocks of rays will walk over height fields.
+    """
+
+    windowed: bool
     mesh_parts: list[MeshPart] = field(default_factory=list)
     child: list[np.ndarray] = field(default_factory=list)
     bounds: list[np.ndarray] = field(default_factory=list)
@@ -71,16 +75,17 @@ class _Arrays:
             self.levels.append((self.num_extremes, cols))
             self.extremes.append(nodes)
             self.num_extremes += len(nodes)
-        part.first_window, part.window_cols = self.num_windows, asset.windows.shape[1]
-        self.windows.append(asset.windows.reshape(-1, 4))
-        self.num_windows += len(self.windows[-1])
+        if self.windowed:
+            part.first_window, part.window_cols = self.num_windows, asset.windows.shape[1]
+            self.windows.append(asset.windows.reshape(-1, 4))
+            self.num_windows += len(self.windows[-1])
         self.field_parts.append(part)
         return len(self.field_parts) - 1
 
 
 def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[Geometry, dict[int, MeshPart]]:
     """The shapes on the device, and the part of each deformable shape; an asset that shapes share is there once."""
-    arrays = _Arrays()
+    arrays = _Arrays(windowed=device.is_cpu)
     parts, shared, deformables = [], {}, {}
     for k, shape in enumerate(shapes):
         part = 0

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .geometry import REFINE
-from .heightfield import FieldPart
+from .heightfield import LEVEL_SHIFT, FieldPart
 
 wp.set_module_options({"enable_backward": False})
 
@@ -103,7 +103,7 @@ _WALK_BLOCK = """
         int kept = 0, stuck = 0, met = 0;
         for (int k = 0; k < count; ++k) {
             const int i = todo[k];
-            const float* const high = window + 4 * ((iy[i] >> 2) * window_cols + (ix[i] >> 2));
+            const float* const high = window + 4 * ((iy[i] >> SHIFT) * window_cols + (ix[i] >> SHIFT));
             const float z = oz + t[i] * dz[i];
             float jump = 0.0f;
 #pragma unroll
@@ -217,10 +217,10 @@ _WALK_BLOCK = """
         count = kept;
     }
 """
-_SLACK = 0.05
+_SLACK = 0.05  # cells by which rounding may misplace a ray
 _WALK_BLOCK = "    const float reach[4] = {" + ", ".join(f"{r - _SLACK}f" for r in REACHES) + "};" + _WALK_BLOCK
 _WALK_BLOCK = _WALK_BLOCK.replace("BLOCK", str(BLOCK)).replace("UNKNOWN", str(int(UNKNOWN)))
-_WALK_BLOCK = _WALK_BLOCK.replace("REFINE", f"{float(REFINE)}f")
+_WALK_BLOCK = _WALK_BLOCK.replace("REFINE", f"{float(REFINE)}f").replace("SHIFT", str(int(LEVEL_SHIFT)))
 
 
 @wp.func_native(_WALK_BLOCK)
