@@ -167,14 +167,14 @@ def test_windows_hold_the_highest_points_around_each_block(rows, cols):
             assert highest == field.heights[low[0] : high[0], low[1] : high[1]].max()
 
 
-@pytest.mark.parametrize("base", [0.0, 0.5])
-def test_a_scan_meets_what_single_rays_meet(base):
+@pytest.mark.parametrize(("base", "scale"), [(0.0, 1.0), (0.5, 1.0), (0.5, 1e-3), (0.0, 100.0)])
+def test_a_scan_meets_what_single_rays_meet(base, scale):
     """From above, near the rim, in the ground, below it, far over it and beside it, upright and tilted."""
     rng = np.random.default_rng(3)
     steps = 0.15 * np.floor(np.arange(240) / 3 % 20)
     heights = steps[None, :] + np.where(rng.random((200, 240)) < 0.02, rng.uniform(0, 0.6, (200, 240)), 0.0)
-    field = HeightField(heights, 12.0, 10.0, base)
-    pos, quat = np.array([30.0, -20.0, 1.0]), np.array([math.cos(0.3), 0.0, 0.0, math.sin(0.3)])
+    field = HeightField(heights, 12.0 * scale, 10.0 * scale, base * scale, scale)
+    pos, quat = scale * np.array([30.0, -20.0, 1.0]), np.array([math.cos(0.3), 0.0, 0.0, math.sin(0.3)])
     shapes = [Shape(ShapeKind.HEIGHTFIELD, asset=field, pos=tuple(pos), quat=tuple(quat))]
     places = [
         (0, 0, 3.2),
@@ -186,7 +186,7 @@ def test_a_scan_meets_what_single_rays_meet(base):
         (3, 3, 20),
         (-14, 0, 1),
     ]
-    places = np.array(places, np.float64)
+    places = scale * np.array(places, np.float64)
     pairs = np.stack([places, places])  # upright and tilted
     turn = np.array([[math.cos(0.6), -math.sin(0.6), 0], [math.sin(0.6), math.cos(0.6), 0], [0, 0, 1]])
     origins = torch.from_numpy(pairs.reshape(-1, 3) @ turn.T + pos)
@@ -196,12 +196,20 @@ def test_a_scan_meets_what_single_rays_meet(base):
     tilt = torch.from_numpy(rng.normal(size=(len(places), 4)))
     scene.body_quat[len(places) :, 0] = tilt / tilt.norm(dim=-1, keepdim=True)
     pattern = ScanPattern.from_angles(np.arcsin(rng.uniform(-1, 1, 3000)), rng.uniform(0, 2 * np.pi, 3000), 30000.0)
-    lidar = Lidar(LidarConfig(3000, min_range=0.0), pattern, scene, 0, outputs=("ranges", "directions_s", "normals_w"))
+    lidar = Lidar(
+        LidarConfig(3000, min_range=0.0, max_range=40.0 * scale),
+        pattern,
+        scene,
+        0,
+        outputs=("ranges", "directions_s", "normals_w"),
+    )
     frame = lidar.cast(0.3)
     directions = frame.directions_s.double()
     w, v = scene.body_quat[:, :1, :1], scene.body_quat[:, :1, 1:].expand_as(directions)
     directions = directions + 2 * torch.linalg.cross(v, torch.linalg.cross(v, directions) + w * directions)
-    single = scene.cast(origins[:, None].expand_as(directions).contiguous(), directions, max_range=40.0, normals=True)
+    single = scene.cast(
+        origins[:, None].expand_as(directions).contiguous(), directions, max_range=40.0 * scale, normals=True
+    )
     assert 0.3 < single.ranges.isfinite().float().mean() < 0.9
     near = (frame.ranges - single.ranges).abs() <= 1e-5 + 1e-5 * single.ranges
     same = near | (frame.ranges == single.ranges)
