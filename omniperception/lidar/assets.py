@@ -16,8 +16,12 @@ from .shapes import Shape, ShapeKind
 
 @dataclass
 class _Arrays:
-    """What has been laid out so far; ``num_nodes`` and ``num_leaves`` include the copies of deformables."""
+    """What has been laid out so far; ``num_nodes`` and ``num_leaves`` include the copies of deformables.
 
+    ``windowed``: whether blocks of rays will walk over height fields.
+    """
+
+    windowed: bool
     mesh_parts: list[MeshPart] = field(default_factory=list)
     child: list[np.ndarray] = field(default_factory=list)
     bounds: list[np.ndarray] = field(default_factory=list)
@@ -29,8 +33,10 @@ class _Arrays:
     heights: list[np.ndarray] = field(default_factory=list)
     levels: list[tuple[int, int]] = field(default_factory=list)
     extremes: list[np.ndarray] = field(default_factory=list)
+    windows: list[np.ndarray] = field(default_factory=list)
     num_heights: int = 0
     num_extremes: int = 0
+    num_windows: int = 0
 
     def add_mesh(self, mesh: TriangleMesh, copies: int) -> int:
         """Lays out a mesh once, or ``copies`` times for a deformable; its part."""
@@ -69,13 +75,17 @@ class _Arrays:
             self.levels.append((self.num_extremes, cols))
             self.extremes.append(nodes)
             self.num_extremes += len(nodes)
+        if self.windowed:
+            part.first_window, part.window_cols = self.num_windows, asset.windows.shape[1]
+            self.windows.append(asset.windows.reshape(-1, 4))
+            self.num_windows += len(self.windows[-1])
         self.field_parts.append(part)
         return len(self.field_parts) - 1
 
 
 def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[Geometry, dict[int, MeshPart]]:
     """The shapes on the device, and the part of each deformable shape; an asset that shapes share is there once."""
-    arrays = _Arrays()
+    arrays = _Arrays(windowed=device.is_cpu)
     parts, shared, deformables = [], {}, {}
     for k, shape in enumerate(shapes):
         part = 0
@@ -113,4 +123,5 @@ def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[
     geometry.field_height = concatenated(arrays.heights, wp.float32)
     geometry.field_level = concatenated([np.array(arrays.levels, np.int32)] if arrays.levels else [], wp.vec2i)
     geometry.field_extreme = concatenated(arrays.extremes, wp.vec2)
+    geometry.field_window = concatenated(arrays.windows, wp.vec4)
     return geometry, deformables

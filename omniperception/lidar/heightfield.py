@@ -4,6 +4,7 @@ from functools import cached_property
 
 import numpy as np
 
+from .kernels.field_block import REACHES
 from .kernels.heightfield import LEVEL_SHIFT
 
 
@@ -73,10 +74,36 @@ class HeightField:
             columns.append(low.shape[1])
         return extremes, columns
 
+    @cached_property
+    def windows(self) -> np.ndarray:
+        """Highest points within each of ``REACHES`` cells of each block of 4 x 4 cells, (rows, columns, 4) float32.
 
-def _reduce(values: np.ndarray, fill: float) -> np.ndarray:
+        In units of ``scale``.
+        """
+        h = self.heights
+        cells = np.maximum(np.maximum(h[:-1, :-1], h[1:, :-1]), np.maximum(h[:-1, 1:], h[1:, 1:]))
+        blocks = _reduce(cells, -np.inf).max(axis=(1, 3))
+        halves = _reduce(cells, -np.inf, 2).max(axis=(1, 3))
+        halves = np.pad(halves, [(1, 2 * n + 1 - m) for n, m in zip(blocks.shape, halves.shape, strict=True)], "edge")
+        first = _highest(halves, 4)[::2, ::2]
+        wide = (_highest(np.pad(blocks, r // 4, "edge"), r // 2 + 1) for r in REACHES[1:])
+        return np.stack([first, *wide], axis=-1)
+
+
+def _highest(values: np.ndarray, size: int) -> np.ndarray:
+    """Maxima of all windows of ``size`` x ``size``."""
+    for axis in (0, 1):
+        width = 1
+        while width < size:
+            shift = min(width, size - width)
+            count = values.shape[axis] - shift
+            values = np.maximum(values.take(range(count), axis), values.take(range(shift, shift + count), axis))
+            width += shift
+    return values
+
+
+def _reduce(values: np.ndarray, fill: float, tile: int = 2**LEVEL_SHIFT) -> np.ndarray:
     """Values in tiles, (rows, tile, columns, tile), filled up at the end."""
-    tile = 2**LEVEL_SHIFT
     rows, cols = (-(-n // tile) for n in values.shape)
     padded = np.full((rows * tile, cols * tile), fill, np.float32)
     padded[: values.shape[0], : values.shape[1]] = values

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from .kernels.field_block import BLOCK
 from .kernels.motion import Track
 from .kernels.scan import Labels, Rays, ScanOutputs, ScanVariant, scan_kernel
 from .kernels.search import FEW_SLOTS, WORD, Slots, pack_slots
@@ -19,9 +20,9 @@ from .patterns import ROW_SLACK, ScanPattern, make_selection
 from .patterns.selection import Strategy
 from .rows import ScanRows
 from .scene import POSE_TYPES, PlacedShapes, RayScene, View
-from .shapes import finite_tuple
+from .shapes import ShapeKind, finite_tuple
 
-RAYS_PER_TASK = 256
+RAYS_PER_TASK = BLOCK
 """Rays of one environment that a CPU thread casts in one go."""
 
 
@@ -223,6 +224,7 @@ class Lidar:
         self._rays = self._lay_out_rays()
         self._view, self._placed = self._place(mount_body, exclude_shapes)
         num_viewed = len(scene.shapes) - len(set(exclude_shapes))
+        self._walked = self._meets_field_first(exclude_shapes)
         self._slots, self._pack = self._slots_of(num_viewed)
         self._cast = self._record_cast(seed, reflectivity or {}, num_viewed)
 
@@ -304,6 +306,19 @@ class Lidar:
         origins = self.pattern.origins_s
         return 0.0 if origins is None else float(torch.linalg.vector_norm(origins.double(), dim=1).max())
 
+    def _meets_field_first(self, exclude_shapes: Sequence[int]) -> bool:
+        """Whether a block's rays meet the height field all at once: on a CPU, from one place, along given rows."""
+        scene = self.scene
+        viewed = (shape for k, shape in enumerate(scene.shapes) if k not in exclude_shapes)
+        return (
+            scene.device.type == "cpu"
+            and sum(shape.kind == ShapeKind.HEIGHTFIELD for shape in viewed) == 1
+            and self.track is None
+            and self._variant is None
+            and self.pattern.origins_s is None
+            and "jitter" not in self._noise
+        )
+
     def _slots_of(self, num_viewed: int) -> tuple[Slots, SplitLaunch | None]:
         """The placed shapes as the kernels read them, and what packs them into words where there are many."""
         placed, slots = self._placed, Slots()
@@ -311,6 +326,10 @@ class Lidar:
         slots.count, slots.reach = placed.count, self._reach()
         if placed.axes is not None:
             slots.axes, slots.pose = placed.axes, placed.pose
+        if self._walked:
+            shape, device = (self.scene.num_envs, self.config.num_rays), self.scene.wp_device
+            slots.walked_t, slots.walked_slope = (wp.zeros(shape, wp.float32, device=device) for _ in range(2))
+            slots.walked_face = wp.zeros(shape, wp.int32, device=device)
         if num_viewed <= FEW_SLOTS or self.pattern.origins_s is not None:
             return slots, None
         num_words = -(-num_viewed // WORD)
@@ -341,6 +360,7 @@ class Lidar:
             displaced=self.pattern.origins_s is not None,
             selected=self._variant is not None,
             shots=self._lag is not None and self.pattern.rows_per_shot > 1,
+            walked=self._walked,
             pose_type=POSE_TYPES[scene.body_pos.dtype],
         )
         work = rays.block * (min(num_viewed, 64) + 4)

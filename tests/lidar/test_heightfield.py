@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.lidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh
+from omniperception.lidar import (
+    HeightField,
+    Lidar,
+    LidarConfig,
+    RayScene,
+    ScanPattern,
+    Shape,
+    ShapeKind,
+    TriangleMesh,
+)
+from omniperception.lidar.kernels.field_block import REACHES
 
 
 def field_shape(heights, half_x, half_y, base=0.0, scale=1.0, **options):
@@ -144,3 +154,65 @@ def test_environments_share_a_field_and_may_hide_it():
 def test_wrong_fields_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         HeightField(*arguments)
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(2, 2), (41, 86), (300, 270)])
+def test_windows_hold_the_highest_points_around_each_block(rows, cols):
+    field = HeightField(np.random.default_rng(rows).uniform(0, 1, (rows, cols)), 1.0, 1.0)
+    blocks = [-(-(n - 1) // 4) for n in (rows, cols)]
+    assert field.windows.shape == (*blocks, len(REACHES))
+    for row, col in np.random.default_rng(0).integers(0, blocks, (50, 2)):
+        for reach, highest in zip(REACHES, field.windows[row, col], strict=True):
+            low, high = np.maximum(4 * np.array([row, col]) - reach, 0), 4 * np.array([row, col]) + 4 + reach + 1
+            assert highest == field.heights[low[0] : high[0], low[1] : high[1]].max()
+
+
+@pytest.mark.parametrize(("base", "scale"), [(0.0, 1.0), (0.5, 1.0), (0.5, 1e-3), (0.0, 100.0)])
+def test_a_scan_meets_what_single_rays_meet(base, scale):
+    """From above, near the rim, in the ground, below it, far over it and beside it, upright and tilted."""
+    rng = np.random.default_rng(3)
+    steps = 0.15 * np.floor(np.arange(240) / 3 % 20)
+    heights = steps[None, :] + np.where(rng.random((200, 240)) < 0.02, rng.uniform(0, 0.6, (200, 240)), 0.0)
+    field = HeightField(heights, 12.0 * scale, 10.0 * scale, base * scale, scale)
+    pos, quat = scale * np.array([30.0, -20.0, 1.0]), np.array([math.cos(0.3), 0.0, 0.0, math.sin(0.3)])
+    shapes = [Shape(ShapeKind.HEIGHTFIELD, asset=field, pos=tuple(pos), quat=tuple(quat))]
+    places = [
+        (0, 0, 3.2),
+        (4, 5, 3.0),
+        (11.99, -9.99, 3.1),
+        (-7, 2, 0.1),
+        (1, 1, -0.2),
+        (1, 2, -5),
+        (3, 3, 20),
+        (-14, 0, 1),
+    ]
+    places = scale * np.array(places, np.float64)
+    pairs = np.stack([places, places])  # upright and tilted
+    turn = np.array([[math.cos(0.6), -math.sin(0.6), 0], [math.sin(0.6), math.cos(0.6), 0], [0, 0, 1]])
+    origins = torch.from_numpy(pairs.reshape(-1, 3) @ turn.T + pos)
+    scene = RayScene(shapes, len(origins), 1, pose_dtype=torch.float64)
+    scene.body_pos[:, 0] = origins
+    scene.body_quat[:, 0] = torch.tensor([1.0, 0, 0, 0])
+    tilt = torch.from_numpy(rng.normal(size=(len(places), 4)))
+    scene.body_quat[len(places) :, 0] = tilt / tilt.norm(dim=-1, keepdim=True)
+    pattern = ScanPattern.from_angles(np.arcsin(rng.uniform(-1, 1, 3000)), rng.uniform(0, 2 * np.pi, 3000), 30000.0)
+    lidar = Lidar(
+        LidarConfig(3000, min_range=0.0, max_range=40.0 * scale),
+        pattern,
+        scene,
+        0,
+        outputs=("ranges", "directions_s", "normals_w"),
+    )
+    frame = lidar.cast(0.3)
+    directions = frame.directions_s.double()
+    w, v = scene.body_quat[:, :1, :1], scene.body_quat[:, :1, 1:].expand_as(directions)
+    directions = directions + 2 * torch.linalg.cross(v, torch.linalg.cross(v, directions) + w * directions)
+    single = scene.cast(
+        origins[:, None].expand_as(directions).contiguous(), directions, max_range=40.0 * scale, normals=True
+    )
+    assert 0.3 < single.ranges.isfinite().float().mean() < 0.9
+    near = (frame.ranges - single.ranges).abs() <= 1e-5 + 1e-5 * single.ranges
+    same = near | (frame.ranges == single.ranges)
+    assert same.float().mean() > 0.9998  # beside the others, rays that graze an edge
+    normals_agree = (frame.normals_w - single.normals_w).abs().amax(-1) < 1e-3
+    assert normals_agree.float().mean() > 0.999

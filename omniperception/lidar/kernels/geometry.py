@@ -39,7 +39,7 @@ class Geometry:
     ``part`` is a shape's place in ``mesh_part`` or ``field_part``. The tree of a mesh has boxes ``mesh_bounds`` (node,
     axis of lows then highs) of four children ``mesh_child``: a node if > 0, none if 0, leaf -1 - child if < 0. A leaf
     is four triangles ``mesh_triangle`` (leaf, 3 * corner + axis). A height field's level is (first, columns) in
-    ``field_extreme``, which holds lowest and highest heights.
+    ``field_extreme``, which holds lowest and highest heights; ``field_window`` is read by ``walk_block``.
     """
 
     kind: wp.array(dtype=wp.int32)
@@ -56,6 +56,7 @@ class Geometry:
     field_height: wp.array(dtype=wp.float32)
     field_level: wp.array(dtype=wp.vec2i)
     field_extreme: wp.array(dtype=wp.vec2)
+    field_window: wp.array(dtype=wp.vec4)
 
 
 @wp.struct

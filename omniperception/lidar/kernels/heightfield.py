@@ -35,6 +35,8 @@ class FieldPart:
     first_height: wp.int32
     first_level: wp.int32
     top_level: wp.int32
+    first_window: wp.int32
+    window_cols: wp.int32
 
 
 @wp.struct

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from .geometry import INF, Geometry, shape_functions
+from .field_block import walk_block
+from .geometry import HEIGHTFIELD, INF, Geometry, shape_functions
 from .motion import Moment, Track, Viewpoint, moment_at, to_quatd
 from .noise import NoiseFigures, beside, child_key, disturb_function, jittered, mixed
 from .search import Slots, locate_functions, search_function
@@ -30,6 +31,7 @@ class ScanVariant:
         displaced: Whether rays start beside the sensor's origin.
         selected: Whether the rays of a frame are listed, rather than every k-th row.
         shots: Whether several rows fire at one instant.
+        walked: Whether a block's rays meet the scene's one height field all at once.
         pose_type: Of the bodies' poses, ``wp.float32`` or ``wp.float64``.
     """
 
@@ -41,6 +43,7 @@ class ScanVariant:
     displaced: bool
     selected: bool
     shots: bool
+    walked: bool
     pose_type: type
 
 
@@ -111,7 +114,8 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
     """The kernel of one variant; a task casts ``Rays.block`` rays of one environment, one after the other."""
     outputs, noise = variant.outputs, variant.noise
     moving, displaced, selected, shots = variant.moving, variant.displaced, variant.selected, variant.shots
-    search = search_function(variant.kinds, variant.packed, moving, displaced)
+    walked = variant.walked
+    search = search_function(variant.kinds, variant.packed, moving, displaced, walked)
     locate, _ = locate_functions(moving, displaced)
     normal_of = shape_functions(variant.kinds).normal
     disturb = disturb_function(noise)
@@ -168,6 +172,30 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
             into_shot = int(rays.first_row[env]) % rays.rows_per_shot
         if wp.static(noisy):
             env_key = child_key(child_key(wp.rand_init(figures.seed), env), labels.frame[env])
+        if wp.static(walked):
+            for s in range(slots.count[env]):
+                field = slots.shape[env, s]
+                if geometry.kind[field] == HEIGHTFIELD:
+                    pose = slots.pose[env, s]
+                    q = wp.transform_get_rotation(pose)
+                    walk_block(
+                        geometry.field_part[geometry.part[field]],
+                        geometry.field_height,
+                        geometry.field_window,
+                        rays.directions,
+                        cycle,
+                        rays.cycle,
+                        steps,
+                        first,
+                        last,
+                        wp.quat_rotate_inv(q, -wp.transform_get_translation(pose)),
+                        slots.axes[env, s],
+                        rays.max_range,
+                        env,
+                        slots.walked_t,
+                        slots.walked_slope,
+                        slots.walked_face,
+                    )
         for ray in range(first, last):
             at = steps + ray
             if wp.static(selected):
@@ -193,7 +221,7 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
                 key = child_key(env_key, ray)
             if wp.static(has_jitter):
                 cast_d = jittered(d, figures.jitter_sigma, key)
-            met = search(geometry, slots, track, moment, env, cast_d, rays.max_range)
+            met = search(geometry, slots, track, moment, env, ray, cast_d, rays.max_range)
             is_hit = met.slot >= 0 and met.t >= rays.min_range
             true_range = wp.where(is_hit, met.t, INF)
             measured = true_range
@@ -201,7 +229,7 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
                 if is_hit:
                     if wp.static(has_mixed):
                         second_d = beside(cast_d, figures.mixed_radius, at)
-                        second = search(geometry, slots, track, moment, env, second_d, rays.max_range)
+                        second = search(geometry, slots, track, moment, env, -1, second_d, rays.max_range)
                         if second.slot >= 0 and second.t >= rays.min_range:
                             measured = mixed(figures, measured, second.t)
                     measured = disturb(figures, measured, true_range, key)

@@ -1,13 +1,14 @@
 """The nearest hit of a sensor's ray among the shapes placed in its frame."""
 
-# ruff: noqa: UP018  (in a kernel, wp.int32(0) declares a variable that may change)
+# ruff: noqa: SIM102, UP018  (in a kernel, a branch on wp.static stands alone, and wp.int32(0) declares a variable)
 
 from collections.abc import Iterable
 from functools import lru_cache
 
 import warp as wp
 
-from .geometry import INF, SLACK, Geometry, Hit, shape_functions, uncertain
+from .field_block import UNKNOWN
+from .geometry import HEIGHTFIELD, INF, SLACK, Geometry, Hit, shape_functions, uncertain
 from .motion import Moment, Track, shape_at
 from .place import settled
 from .variants import MAX_VARIANTS
@@ -32,6 +33,9 @@ class Slots:
     pose: wp.array2d(dtype=wp.transformd)  # (num_envs, S) its pose in float64
     count: wp.array(dtype=wp.int32)  # (num_envs,) slots in use
     words: wp.array3d(dtype=wp.float32)  # (num_envs, W, 4 * WORD) x, y, z and threshold of each word's slots
+    walked_t: wp.array2d(dtype=wp.float32)  # (num_envs, N) what each ray meets of the height field
+    walked_slope: wp.array2d(dtype=wp.float32)
+    walked_face: wp.array2d(dtype=wp.int32)
     reach: wp.float32  # how far from the sensor's origin rays start, metres
 
 
@@ -155,10 +159,11 @@ def locate_functions(moving: bool, displaced: bool) -> tuple[wp.Function, wp.Fun
 
 
 @lru_cache(MAX_VARIANTS)
-def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced: bool) -> wp.Function:
-    """(geometry, slots, track, moment, env, d, limit) -> Met: the nearest hit closer than ``limit`` along unit d.
+def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced: bool, walked: bool) -> wp.Function:
+    """(geometry, slots, track, moment, env, ray, d, limit) -> Met: the nearest hit closer than ``limit`` along unit d.
 
-    What float32 leaves uncertain about its distance is computed again in float64.
+    What float32 leaves uncertain about its distance is computed again in float64. With ``walked``, what rays >= 0 meet
+    of the height field has been noted in ``slots`` beforehand.
     """
     functions = shape_functions(kinds)
     meet, refine = functions.meet, functions.refine
@@ -173,7 +178,15 @@ def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced:
 
     @wp.func
     def hit_of(
-        geometry: Geometry, slots: Slots, track: Track, moment: Moment, env: int, slot: int, d: wp.vec3, limit: float
+        geometry: Geometry,
+        slots: Slots,
+        track: Track,
+        moment: Moment,
+        env: int,
+        ray: int,
+        slot: int,
+        d: wp.vec3,
+        limit: float,
     ):
         """Where the ray meets a slot's shape; the slope is negative where float32 leaves the distance uncertain."""
         shape = slots.shape[env, slot]
@@ -184,9 +197,14 @@ def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced:
             outside = square - geometry.radius[shape] * geometry.radius[shape] * (1.0 + SLACK)
             if outside > SLACK * square and along * wp.abs(along) < outside - SLACK * square:
                 return Hit(INF, -1, 0.0)
-        hit = meet(geometry, shape, env, d, at.c, at.axes, limit)
-        if uncertain(hit, at.c):
-            hit.slope = -1.0
+        hit = Hit(INF, UNKNOWN, 0.0)
+        if wp.static(walked):
+            if ray >= 0 and geometry.kind[shape] == HEIGHTFIELD:
+                hit = Hit(slots.walked_t[env, ray], slots.walked_face[env, ray], slots.walked_slope[env, ray])
+        if hit.face == UNKNOWN:
+            hit = meet(geometry, shape, env, d, at.c, at.axes, limit)
+            if uncertain(hit, at.c):
+                hit.slope = -1.0
         return hit
 
     @wp.func
@@ -196,7 +214,9 @@ def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced:
         return refine(geometry, slots.shape[env, met.slot], env, met.face, wp.vec3d(d), pose, met.t)
 
     @wp.func
-    def search(geometry: Geometry, slots: Slots, track: Track, moment: Moment, env: int, d: wp.vec3, limit: float):
+    def search(
+        geometry: Geometry, slots: Slots, track: Track, moment: Moment, env: int, ray: int, d: wp.vec3, limit: float
+    ):
         best = limit
         slot = wp.int32(-1)
         face = wp.int32(-1)
@@ -205,7 +225,7 @@ def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced:
             if slots.near[env, s] - slots.reach >= best:
                 break
             if displaced_or_ahead(d, slots.bound[env, s]):
-                hit = hit_of(geometry, slots, track, moment, env, s, d, best)
+                hit = hit_of(geometry, slots, track, moment, env, ray, s, d, best)
                 if hit.t < best:
                     best = hit.t
                     slot = s
@@ -217,7 +237,7 @@ def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced:
 
     @wp.func
     def search_packed(
-        geometry: Geometry, slots: Slots, track: Track, moment: Moment, env: int, d: wp.vec3, limit: float
+        geometry: Geometry, slots: Slots, track: Track, moment: Moment, env: int, ray: int, d: wp.vec3, limit: float
     ):
         best = limit
         slot = wp.int32(-1)
@@ -236,7 +256,7 @@ def search_function(kinds: Iterable[int], packed: bool, moving: bool, displaced:
                     bits = wp.int32(0)
                     left = wp.int32(0)
                 else:
-                    hit = hit_of(geometry, slots, track, moment, env, s, d, best)
+                    hit = hit_of(geometry, slots, track, moment, env, ray, s, d, best)
                     if hit.t < best:
                         best = hit.t
                         slot = s
