@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from operator import attrgetter
 
 import torch
 
@@ -14,8 +15,6 @@ from omniperception.sim import Simulator
 from omniperception.world.terrain import contact_solrefs
 
 Range = Sequence[float] | None
-_SCALED = ("actuator_gainprm", "actuator_biasprm", "body_ipos")
-"""Model fields that are changed relative to their nominal values."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +92,7 @@ class Randomizer:
         self._base = sim.world.base_body
         self._ground = model.geom("ground").id
         self._mass = any(getattr(config, n) for n in ("added_mass", "payload_mass", "com_x", "com_y", "com_z"))
-        nominal = {"opt.gravity": model.opt.gravity} | {name: getattr(model, name) for name in _SCALED}
-        self._nominal = {name: torch.tensor(value, device=sim.device) for name, value in nominal.items()}
-        self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
+        self._nominal: dict[str, torch.Tensor] = {}  # of what is randomized, when it is first drawn
         self._check_mass()
         self.joint_offset: torch.Tensor | None = None
         """(num_envs, num_joints) rad added to the joint targets; None when not randomized."""
@@ -105,6 +102,13 @@ class Randomizer:
             self.joint_offset = torch.zeros(sim.num_envs, sim.world.robot.num_joints, device=sim.device)
         if config.latency_s:
             self.delay = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
+
+    def _nominal_of(self, name: str) -> torch.Tensor:
+        """A field of the model as compiled."""
+        if name not in self._nominal:
+            value = attrgetter(name)(self._model)
+            self._nominal[name] = torch.tensor(value, device=self._sim.device)
+        return self._nominal[name]
 
     @property
     def max_delay(self) -> int:
@@ -123,7 +127,7 @@ class Randomizer:
             self._scale_motors(env_ids)
         if config.gravity_offset:
             offset = self._draw(env_ids, "gravity_offset", (3,))
-            self._write("opt.gravity", env_ids, self._nominal["opt.gravity"] + offset)
+            self._write("opt.gravity", env_ids, self._nominal_of("opt.gravity") + offset)
         if self.joint_offset is not None:
             self.joint_offset[env_ids] = self._draw(env_ids, "joint_offset", self.joint_offset.shape[1:]).float()
         if self.delay is not None:
@@ -168,7 +172,7 @@ class Randomizer:
     def _scale_motors(self, env_ids: torch.Tensor) -> None:
         scale = self._draw(env_ids, "motor_strength", (self._model.nu, 1))
         for name in ("actuator_gainprm", "actuator_biasprm"):
-            self._write(name, env_ids, self._nominal[name] * scale)
+            self._write(name, env_ids, self._nominal_of(name) * scale)
 
     def _set_masses(self, env_ids: torch.Tensor) -> None:
         """Mass and centre of mass of base, added mass and payload together; the base's inertia stays nominal."""
@@ -176,9 +180,11 @@ class Randomizer:
         body = base_mass + self._draw_or_zero(env_ids, "added_mass")
         payload = self._draw_or_zero(env_ids, "payload_mass")
         offset = torch.stack([self._draw_or_zero(env_ids, name) for name in ("com_x", "com_y", "com_z")], 1)
-        centre = self._nominal["body_ipos"][self._base] + offset
+        centre = self._nominal_of("body_ipos")[self._base] + offset
         total = body + payload
         self._write("body_mass", (env_ids, self._base), total)
-        combined = (body[:, None] * centre + payload[:, None] * self._payload_position) / total[:, None]
+        combined = (
+            body[:, None] * centre + payload[:, None] * centre.new_tensor(self.config.payload_position)
+        ) / total[:, None]
         self._write("body_ipos", (env_ids, self._base), combined)
         self._sim.update_model(env_ids)
