@@ -28,6 +28,8 @@ HELD_OUT = (
     "obstacles=all",
     "obstacles.shape_seed=1000",
 )
+MEASURED = "perception.height_weight=1"
+"""Whatever the last stage of the training was supervised with."""
 
 
 def table(errors: HeightErrors) -> str:
@@ -46,10 +48,12 @@ def main() -> None:
     with config.one_line_errors(CheckpointError):
         own, overrides = config.split_arguments(sys.argv[1:], ARGUMENTS)
         run_dir = config.find_run(own["run"])
-        num_envs, steps = (config.positive(key, own[key], int) for key in ("num_envs", "steps"))
-        run = config.assemble(config.load(run_dir, [*HELD_OUT, "seed=1000", *overrides, f"num_envs={num_envs}"]))
-        if run.perception is None:
+        if not config.load(run_dir).perception:
             raise config.ConfigError(f"run={own['run']} sees nothing; give a run with perception")
+        num_envs, steps = (config.positive(key, own[key], int) for key in ("num_envs", "steps"))
+        run = config.assemble(
+            config.load(run_dir, [*HELD_OUT, MEASURED, "seed=1000", *overrides, f"num_envs={num_envs}"])
+        )
         runner = build_runner(run, None)
         checkpoint = latest_checkpoint(run_dir)
         runner.load(str(checkpoint), load_cfg={"actor": True})

@@ -89,6 +89,7 @@ class ExportedPolicy:
             raise DeployError(f"{folder} has no ONNX file; write it: python scripts/export.py run=... formats=onnx")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = num_threads, 1
+        options.log_severity_level = 3  # errors: it warns in every step of shapes that the exporter has guessed
         path = str(folder / description.files["onnx"])
         try:
             session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])

@@ -65,7 +65,11 @@ class PerceptiveNetwork(BlindNetwork):
         """Random inputs, with every number of valid frames in turn."""
         history, points = self.actor.perception.history, self.actor.perception.num_points
         count = torch.arange(batch)[:, None] % (history + 1)
-        return *super().examples(batch), torch.randn(batch, history, points, 3) / 3, count
+        bearing, nearness = 2 * torch.pi * torch.rand(2, batch, history, points)
+        nearness = (-nearness).exp()  # a place in the plane and its proximity, as rows of a grid are
+        rows = torch.stack((nearness * bearing.cos(), nearness * bearing.sin(), nearness), -1)
+        rows[:, :, -1] *= 0.1  # motion from frame to frame is small
+        return *super().examples(batch), rows, count
 
 
 def exportable(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:

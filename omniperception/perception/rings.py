@@ -85,10 +85,11 @@ def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, 
     distance = torch.where(hit, (x * x + y * y).sqrt(), _NOTHING)
     turned = (torch.atan2(y, x) + math.pi) * (shape.num_sectors / (2 * math.pi))
     sector = turned.long().clamp(0, shape.num_sectors - 1)
-    nearest = torch.full_like(distance, _NOTHING).scatter_reduce(-1, sector, distance, "amin")
+    empty = 0.0 * distance  # not zeros_like, whose shape an exporter takes for a constant
+    nearest = (empty + _NOTHING).scatter_reduce(-1, sector, distance, "amin")
     is_nearest = (distance <= nearest.gather(-1, sector)) & hit
     within = (turned - sector - 0.5) * (2 * math.pi / shape.num_sectors)
-    lateral = torch.zeros_like(distance).scatter_reduce(-1, sector, torch.where(is_nearest, within, 0.0), "sum")
+    lateral = empty.scatter_reduce(-1, sector, torch.where(is_nearest, within, 0.0), "sum")
     proximities = [torch.exp(-nearest / decay) for decay in shape.decays]
     return torch.stack((*proximities, _LATERAL * lateral * proximities[-1]), -2).flatten(2, 4)
 
