@@ -32,7 +32,7 @@ def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
         tell(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
     else:
         if run.init is not None:
-            runner.start_from(config.find_run(run.init))
+            runner.start_from(config.find_run(run.init, "init"))
         tell(f"run directory: {run_dir}")
     plan = describe(run, runner)
     if distributed.rank() == 0:

@@ -164,16 +164,16 @@ def scenarios() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (CONFIG_DIR / "scenario").glob("*.yaml")))
 
 
-def find_run(name: str) -> Path:
-    """The run directory that `run=...` names: a path, or `latest` for the newest under outputs/."""
+def find_run(name: str, key: str = "run") -> Path:
+    """The run directory that `run=...`, or another key, names: a path, or `latest` for the newest under outputs/."""
     if name != "latest":
         path = Path(name)
         if not path.is_dir():
-            raise ConfigError(f"run={name} does not exist; give a run directory or run=latest")
+            raise ConfigError(f"{key}={name} does not exist; give a run directory or {key}=latest")
         return path
     runs = sorted(OUTPUTS.glob(f"**/{CONFIG_FILE}"), key=lambda path: path.stat().st_mtime)
     if not runs:
-        raise ConfigError("run=latest finds no run under outputs/; train one with python train.py first")
+        raise ConfigError(f"{key}=latest finds no run under outputs/; train one with python train.py first")
     return runs[-1].parent
 
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from omniperception import config
 from omniperception.assembly import build_runner
 from omniperception.learning import CheckpointError
 from omniperception.learning.checkpoint import checkpoint_path
@@ -102,3 +103,10 @@ def test_nothing_that_learns_is_refused(make_config):
         ValueError, match=r"ppo\.num_learning_epochs=0 keeps the policy as it is, and nothing else learns"
     ):
         make_config(*BLIND, "ppo.num_learning_epochs=0")
+
+
+def test_a_gait_starts_from_a_walk_that_has_to_be_named(make_config):
+    run = make_config("experiment=gait")
+    message = r"init=<run of experiment=walk> does not exist; give a run directory or init=latest"
+    with pytest.raises(config.ConfigError, match=message):
+        config.find_run(run.init, "init")
