@@ -149,7 +149,10 @@ def _cell(rate: dict) -> str:
 
 
 def _report(run_dir: Path, scenario: str) -> dict:
-    return json.loads((run_dir / FOLDER / f"{scenario}.json").read_text())
+    path = run_dir / FOLDER / f"{scenario}.json"
+    if not path.is_file():
+        raise ConfigError(f"{path} does not exist: {run_dir} has not been evaluated; use stage=evaluate or stage=all")
+    return json.loads(path.read_text())
 
 
 def _evaluated(run_dir: Path, scenario: str, trials: int) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from omniperception.ablation import Ablation, pooled
+from omniperception.ablation import Ablation, pooled, write_tables
 from omniperception.config import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,6 +32,13 @@ def test_pooled_rates_by_hand():
 def test_mistakes_are_told_before_anything_runs(change, message):
     with pytest.raises(ConfigError, match=message):
         Ablation(**GIVEN | change)
+
+
+def test_a_table_of_what_has_not_been_evaluated_is_refused(tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"corridor\.json does not exist: .*seed1 has not been evaluated; use stage=eval"
+    ):
+        write_tables(Ablation(**GIVEN | {"out": tmp_path}))
 
 
 @pytest.mark.slow
