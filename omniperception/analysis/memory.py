@@ -12,6 +12,7 @@ import warp as wp
 from tensordict import TensorDictBase
 
 from omniperception.analysis.lidar_benchmark.memory import buffer_bytes
+from omniperception.analysis.resident import resident_bytes
 from omniperception.assembly import build_runner, steps_per_frame
 from omniperception.config import RunConfig
 from omniperception.learning import Runner
@@ -82,7 +83,7 @@ def held_bytes(runner: Runner) -> dict[str, int]:
 
 def measure(run: RunConfig) -> Used:
     """Builds the run at its real size and trains it for two iterations."""
-    before, device = _resident(), run.env.sim.torch_device
+    before, device = resident_bytes(), run.env.sim.torch_device
     on_gpu = device.type == "cuda"
     if on_gpu:
         torch.cuda.reset_peak_memory_stats(device)
@@ -95,7 +96,9 @@ def measure(run: RunConfig) -> Used:
         pool, most = wp.get_mempool_used_mem_current(engine), wp.get_mempool_used_mem_high(engine)
         held, peak = torch.cuda.memory_allocated(device) + pool, torch.cuda.max_memory_allocated(device) + most
         return Used(held, peak, "PyTorch's and Warp's allocators")
-    return Used(_resident() - before, _resident(peak=True) - before, "growth of the process's resident memory")
+    return Used(
+        resident_bytes() - before, resident_bytes(peak=True) - before, "growth of the process's resident memory"
+    )
 
 
 def table(parts: Sequence[Part], num_envs: int) -> list[tuple[str, float, float, float]]:
@@ -124,11 +127,3 @@ def _update_bytes(run: RunConfig) -> int:
     if run.perception is None:
         return layers
     return layers + footprint(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run)).mini_batch
-
-
-def _resident(peak: bool = False) -> int:
-    """Bytes of this process in memory, now or at most."""
-    key = "VmHWM:" if peak else "VmRSS:"
-    with open("/proc/self/status") as status:
-        line = next(line for line in status if line.startswith(key))
-    return 1024 * int(line.split()[1])

@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from pathlib import Path
 
 import torch
 
 from omniperception import config
+from omniperception.analysis.resident import resident_bytes
 from omniperception.assembly import build_runner
 from omniperception.config import RunConfig
 from omniperception.plan import OPTIONAL_FIELDS, OPTIONAL_PACKAGES, describe
@@ -331,18 +331,8 @@ def start(scene: str, num_envs: int, forced: bool) -> None:
             _import_if_installed(package)
     with during():
         build_runner(run, None)
-    taken = {"cpu_s": time.process_time(), "memory_mb": _peak_memory_mb(), "modules": len(sys.modules)}
+    taken = {"cpu_s": time.process_time(), "memory_mb": resident_bytes(peak=True) / 2**20, "modules": len(sys.modules)}
     print(json.dumps(taken))
-
-
-def _peak_memory_mb() -> float:
-    """Largest resident memory; `ru_maxrss` would begin, on Linux, with that of the process this one came from."""
-    status = Path("/proc/self/status")
-    if status.is_file():
-        return next(int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM")) / 1024
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _import_if_installed(name: str) -> None:

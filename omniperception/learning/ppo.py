@@ -51,14 +51,15 @@ class PerceptivePpo(PPO):
         self.optimizer.register_step_pre_hook(lambda *_: self._check_gradients())
 
     def set_perception_trainer(self, trainer: PerceptionTrainer) -> None:
-        """Lets supervision alone train the perception network, with the same check of its gradients."""
+        """Lets supervision alone train the perception network: on the gradients of all processes, with PPO's check."""
         self.perception_trainer = trainer
         network = list(self._raw_actor.perception_parameters())
 
-        def check(*_: object) -> None:
+        def prepare(*_: object) -> None:
+            average_gradients(network)
             self._check_finite("perception network", network)
 
-        trainer.optimizer.register_step_pre_hook(check)
+        trainer.optimizer.register_step_pre_hook(prepare)
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PerceptivePpo:
@@ -98,10 +99,7 @@ class PerceptivePpo(PPO):
         )
         alg = alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])
         if perceptive and not actor.end_to_end:
-            trainer = PerceptionTrainer(actor, max_grad_norm=alg.max_grad_norm, **cfg["supervision"])
-            parameters = list(actor.perception_parameters())
-            trainer.optimizer.register_step_pre_hook(lambda *_: average_gradients(parameters))
-            alg.set_perception_trainer(trainer)
+            alg.set_perception_trainer(PerceptionTrainer(actor, max_grad_norm=alg.max_grad_norm, **cfg["supervision"]))
         alg.compile(cfg.get("torch_compile_mode"))
         return alg
 
@@ -146,7 +144,11 @@ class PerceptivePpo(PPO):
             )
             self.storage.window_features = acted_on
         self._has_gradient.clear()
-        losses = super().update() if self.learns_policy else self.storage.clear() or {}
+        losses = {}
+        if self.learns_policy:
+            losses = super().update()
+        else:
+            self.storage.clear()
         self.num_updates += 1
         self._check_learning(losses)
         if isinstance(self._raw_actor, PerceptionActor):

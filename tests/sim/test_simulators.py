@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from robots import default_joints, stand, targets
 
 from omniperception.sim import SimConfig
 from omniperception.sim.mujoco_warp import MujocoWarpConfig
@@ -36,26 +37,6 @@ def sim(run, engine):
 
 def simulator(run, engine, num_envs=4):
     return engine.build(build_world(run.env.robot, run.env.terrain, run.env.obstacles, SENSORS), num_envs)
-
-
-def stand(sim):
-    """Puts every robot into its default pose, obstacles out of reach."""
-    qpos = torch.zeros(sim.num_envs, 19, dtype=torch.float64)
-    qpos[:, 2], qpos[:, 3] = 0.33, 1.0
-    qpos[:, 7:] = default_joints(sim)
-    sim.mocap_pos[:] = torch.tensor([0.0, 0.0, -100.0])
-    sim.mocap_quat[:] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    sim.reset(torch.arange(sim.num_envs), qpos, torch.zeros(sim.num_envs, 18))
-
-
-def default_joints(sim):
-    return torch.tensor(list(sim.world.robot.default_joint_pos.values()), dtype=torch.float64)
-
-
-def targets(sim, seed, steps):
-    generator = torch.Generator().manual_seed(seed)
-    noise = 0.3 * torch.randn(steps, sim.num_envs, 12, generator=generator, dtype=torch.float64)
-    return default_joints(sim) + noise
 
 
 def test_body_poses_are_those_of_the_current_state(sim):
