@@ -31,7 +31,7 @@ def main() -> None:
     print(f"{' '.join(overrides) or 'experiment=paper'}: {run.env.num_envs} environments, on {device}\n")
     print("| part | MB shared | kB per environment | MB |\n|---|---|---|---|")
     for name, shared, per_env, total in rows:
-        print(f"| {name} | {shared:.1f} | {per_env:.1f} | {total:.0f} |")
+        print(f"| {name} | {shared:z.1f} | {per_env:z.1f} | {total:z.0f} |")
     everything = device_bytes(device)
     if everything:
         print(f"\n{rows[-1][3] / 1e3:.2f} GB of {everything / 1e9:.1f} GB")
