@@ -11,11 +11,13 @@ from omniperception.perception.pd_risknet import CarriedPdRiskNet, PdRiskNet
 from omniperception.perception.sampler import Attitude, Sampler
 
 if TYPE_CHECKING:
+    from omniperception.perception.motion_match import MotionMatch
     from omniperception.perception.rings import RingPath
     from omniperception.perception.sampling import FpsSampler, PdSampler, ProximitySampler, RawSampler
     from omniperception.perception.velocity_risk import VelocityRisk
 
 _LOADED_WHEN_USED = {
+    "motion_match": ("MotionMatch",),
     "rings": ("RingPath",),
     "sampling": ("FpsSampler", "PdSampler", "ProximitySampler", "RawSampler"),
     "velocity_risk": ("VelocityRisk",),
@@ -28,6 +30,7 @@ __all__ = [
     "FpsGru",
     "FpsMlp",
     "FpsSampler",
+    "MotionMatch",
     "PdRiskNet",
     "PdSampler",
     "PerceptionNetwork",

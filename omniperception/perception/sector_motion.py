@@ -12,7 +12,7 @@ NEARNESS_RANGE = 4.0
 FAINT = 0.05
 """Nearness below which a regressed sector counts as empty."""
 
-VELOCITY_WEIGHT = 0.3
+VELOCITY_WEIGHT = 1.0
 """Of a squared velocity error ((m/s)^2) of what is at the robot, against a squared error of nearness."""
 
 

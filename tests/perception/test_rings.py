@@ -5,10 +5,11 @@ import math
 import pytest
 import torch
 
-from omniperception.perception import RingPath
+from omniperception.perception import MotionMatch, RingPath
 from omniperception.perception.rings import RingShape, _moved_rings, moved_rings
 
 SECTORS, BANDS, DECAY = 36, 2, 0.5
+MATCH = MotionMatch(speeds=(1.0,), num_directions=8, width=0.4, period_s=0.1)
 
 
 def cells_of(points, band=0):
@@ -71,9 +72,16 @@ def test_the_kernel_agrees_with_what_is_exported(seed):
     assert (rings > 0).float().mean() > 0.1
 
 
-def test_invalid_frames_and_other_windows_do_not_matter():
+def some_path(**options):
+    """Whose answer is not 0, as that of an untrained one."""
     torch.manual_seed(0)
-    path = RingPath(BANDS * SECTORS, 4, channels=(8, 8))
+    path = RingPath(BANDS * SECTORS, 4, match=MATCH, **options)
+    torch.nn.init.normal_(path.layers[-1].weight)
+    return path
+
+
+def test_invalid_frames_and_other_windows_do_not_matter():
+    path = some_path(channels=(8, 8), kernel_sizes=(5, 5))
     cells, moved, count = random_windows(torch.Generator().manual_seed(3))
     count[:] = 2
     out = path(cells, moved, count)
@@ -86,8 +94,7 @@ def test_invalid_frames_and_other_windows_do_not_matter():
 
 def test_a_turned_world_gives_turned_motion():
     """Nothing tells one azimuth from another: a world turned by two sectors gives the answer turned by two."""
-    torch.manual_seed(0)
-    path = RingPath(BANDS * SECTORS, 4, channels=(8,))
+    path = some_path(channels=(8,), kernel_sizes=(5,))
     cells, moved, count = random_windows(torch.Generator().manual_seed(4))
     moved[:] = 0.0
     turn = 2 * 2 * math.pi / SECTORS
@@ -95,11 +102,14 @@ def test_a_turned_world_gives_turned_motion():
     x, y = turned[..., 0].clone(), turned[..., 1].clone()
     turned[..., 0], turned[..., 1] = math.cos(turn) * x - math.sin(turn) * y, math.sin(turn) * x + math.cos(turn) * y
     out = path(cells, moved, count).unflatten(2, (SECTORS, 3))
+    assert out.abs().max() > 0.1
     assert torch.allclose(path(turned, moved, count).unflatten(2, (SECTORS, 3)), out.roll(2, 2), atol=1e-4)
 
 
 def test_sizes_that_do_not_fit():
     with pytest.raises(ValueError, match="num_distal=70 must be a multiple of num_sectors=36"):
         RingPath(70, 4)
-    with pytest.raises(ValueError, match="kernel_size=4 must be odd"):
-        RingPath(72, 4, kernel_size=4)
+    with pytest.raises(ValueError, match=r"kernel_sizes=\[4\] must be one odd number for each of the 1 channels"):
+        RingPath(72, 4, channels=(8,), kernel_sizes=(4,))
+    with pytest.raises(ValueError, match="ground_bands=2 must be less than the 2 bands"):
+        RingPath(72, 4, ground_bands=2)

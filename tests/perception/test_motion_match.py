@@ -1,0 +1,83 @@
+"""Which velocity explains what moved, against points that move at known velocities, and both ways of computing it."""
+
+import math
+
+import pytest
+import torch
+
+from omniperception.perception import MotionMatch, RingPath
+from omniperception.perception.motion_match import NOTHING
+
+SECTORS, HISTORY = 36, 5
+MATCH = MotionMatch(speeds=(0.75, 1.5), num_directions=12, width=0.4, period_s=0.1)
+
+
+def sector_of(x, y):
+    """Sector, and bearing from its middle (rad)."""
+    turned = (math.atan2(y, x) + math.pi) * SECTORS / (2 * math.pi)
+    return int(turned), (turned - int(turned) - 0.5) * 2 * math.pi / SECTORS
+
+
+def seen(place, velocity):
+    """(1, H, S) distances and (1, S) bearings of a point, and its sector in the newest frame."""
+    distance, bearing = torch.full((1, HISTORY, SECTORS), NOTHING), torch.zeros(1, SECTORS)
+    for k in range(HISTORY):
+        age = 0.1 * (HISTORY - 1 - k)
+        x, y = place[0] - velocity[0] * age, place[1] - velocity[1] * age
+        sector, within = sector_of(x, y)
+        distance[0, k, sector] = math.hypot(x, y)
+    bearing[0, sector] = within
+    return distance, bearing, sector
+
+
+@pytest.mark.parametrize("place", [(2.0, 0.4), (-1.2, 1.9), (0.3, -2.6)])
+@pytest.mark.parametrize("index", [0, 3, 13, 20])
+def test_the_velocity_of_a_point_fits_all_frames(place, index):
+    away, around = MATCH.velocities()[index]
+    middle = -math.pi + (sector_of(*place)[0] + 0.5) * 2 * math.pi / SECTORS
+    velocity = (
+        away * math.cos(middle) - around * math.sin(middle),
+        away * math.sin(middle) + around * math.cos(middle),
+    )
+    distance, bearing, sector = seen(place, velocity)
+    scores = MATCH(distance, bearing)[0].unflatten(0, (HISTORY - 1, -1))
+    fits = scores[:, :, sector].sum(0)
+    assert fits[index].item() > HISTORY - 1 - 0.05
+    assert fits.argmax() == index or fits[index] == fits.max()
+    assert (scores[:, :, [s for s in range(SECTORS) if s != sector]] == 0).all()
+
+
+def test_a_match_fades_with_distance():
+    distance, bearing = torch.full((1, 2, SECTORS), NOTHING), torch.zeros(1, SECTORS)
+    distance[0, 1, 18], distance[0, 0, 18] = 2.0, 2.1
+    assert MATCH(distance, bearing)[0, 0, 18].item() == pytest.approx(1 - 0.1 / 0.4, abs=1e-5)
+    distance[0, 0, 18] = 2.4
+    assert MATCH(distance, bearing)[0, 0, 18].item() == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_kernel_agrees_with_what_is_exported(seed):
+    torch.manual_seed(seed)
+    distance = 6 * torch.rand(50, HISTORY, SECTORS)
+    distance[torch.rand(distance.shape) < 0.4] = NOTHING
+    bearing = (torch.rand(50, SECTORS) - 0.5) * 2 * math.pi / SECTORS
+    scores = MATCH(distance, bearing)
+    assert scores.shape == (50, (HISTORY - 1) * MATCH.num_velocities, SECTORS)
+    expected = MATCH._match(distance, bearing, MATCH.velocities())
+    assert ((scores - expected).abs() > 1e-5).float().mean() < 1e-4  # on the border of two sectors
+    assert (scores > 0).float().mean() > 0.01
+
+
+def test_ground_is_not_matched():
+    """What lies in the lowest bands alone is nothing to match, unless they are told to be no ground."""
+    cells = torch.zeros(1, 5, 2 * SECTORS, 3)
+    cells[:, :, 18] = math.exp(-2.0 / 0.5) * torch.tensor([math.cos(0.08), math.sin(0.08), 1.0])
+    moved, count = torch.zeros(1, 5, 3), torch.tensor([[5]])
+    found = []
+    for ground_bands in (0, 1):
+        path = RingPath(2 * SECTORS, 5, match=MATCH, ground_bands=ground_bands)
+        seen_by_layers = []
+        path.layers.register_forward_pre_hook(lambda _, inputs, kept=seen_by_layers: kept.append(inputs[0]))
+        path(cells, moved, count)
+        found.append(bool(seen_by_layers[0][:, 5 * 2 * 3 :].any()))
+    assert found == [True, False]
