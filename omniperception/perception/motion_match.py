@@ -38,7 +38,8 @@ class MotionMatch:
 
     def velocities(self, device: torch.device | str = "cpu") -> torch.Tensor:
         """(K, 2) m/s away from the robot and counter-clockwise around it: standing still, then speed by speed."""
-        turn = torch.arange(self.num_directions, dtype=torch.float32, device=device) * (2 * math.pi / self.num_directions)
+        index = torch.arange(self.num_directions, dtype=torch.float32, device=device)
+        turn = index * (2 * math.pi / self.num_directions)
         ring = torch.stack((turn.cos(), turn.sin()), -1)
         return torch.cat((ring.new_zeros(1, 2), *(speed * ring for speed in self.speeds)))
 

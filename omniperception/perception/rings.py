@@ -226,7 +226,8 @@ class RingPath(nn.Module):
             raise ValueError(f"rings: num_distal={num_distal} must be a multiple of num_sectors={num_sectors}")
         if len(kernel_sizes) != len(channels) or any(size % 2 == 0 for size in kernel_sizes):
             raise ValueError(
-                f"rings: kernel_sizes={list(kernel_sizes)} must be one odd number for each of the {len(channels)} channels"
+                f"rings: kernel_sizes={list(kernel_sizes)} must be one odd number for each of the {len(channels)}"
+                " channels"
             )
         num_bands = num_distal // num_sectors
         if not 0 <= ground_bands < num_bands:

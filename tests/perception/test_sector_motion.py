@@ -25,5 +25,5 @@ def test_there_and_back():
 def test_error_by_hand():
     target = torch.tensor([[[0.5, 1.0, 0.0], [0.0, 0.0, 0.0]]])
     predicted = torch.tensor([[[0.3, 0.0, 2.0], [0.1, 9.0, 9.0]]])
-    expected = ((0.04 + 0.3 * 0.5 * (1.0 + 4.0)) + 0.01) / 2  # where nothing is, a velocity says nothing
+    expected = ((0.04 + 0.5 * (1.0 + 4.0)) + 0.01) / 2  # where nothing is, a velocity says nothing
     assert motion_error(predicted, target).item() == pytest.approx(expected)
