@@ -159,6 +159,9 @@ def plot(studies: Sequence[Study], file: Path, about: str, columns: int = 3) -> 
         _draw(study, axis)
     figure.text(0.005, 0.002, about, fontsize=5)
     figure.get_layout_engine().set(rect=(0.0, 0.02, 1.0, 0.98))
+    figure.draw_without_rendering()  # which places the panels, and so tells what names would cover
+    for study, axis in zip(studies, axes, strict=False):
+        _name(axis, study)
     figure.savefig(file, dpi=80)
 
 
@@ -173,7 +176,6 @@ def _draw(study: Study, axis) -> None:
     if study.default is not None and study.default in drawn:
         place = [study.default.cost], [study.error_of(study.default)]
         axis.plot(*place, "*", color="crimson", markersize=13, label=f"default: {study.default.name}")
-    _name(axis, study, front if len(drawn) > 16 else [*front, *drawn])
     axis.set(xscale="log", yscale="log", xlabel=study.cost, ylabel=study.error)
     axis.margins(x=0.12, y=0.1)
     for which, values in (("x", [c.cost for c in drawn]), ("y", [study.error_of(c) for c in drawn])):
@@ -186,15 +188,28 @@ def _draw(study: Study, axis) -> None:
     axis.legend(fontsize=6, title=f"n = {len(drawn)} choices", title_fontsize=6, **below)
 
 
-def _name(axis, study: Study, choices: Sequence[Choice]) -> None:
-    """Writes names beside points; of points that lie together, the first one's."""
-    placed: list[tuple[float, float]] = []
-    for choice in choices:
-        cost, error = choice.cost, study.error_of(choice)
-        near = [1 for c, e in placed if max(c / cost, cost / c) < 1.06 and max(e / error, error / e) < 1.06]
-        if not near:
-            placed.append((cost, error))
-            axis.annotate(choice.name, (cost, error), fontsize=6, xytext=(3, 3), textcoords="offset points")
+def _name(axis, study: Study) -> None:
+    """Writes names beside points where there is room, those on the front first; of many choices those alone."""
+    drawn = [choice for choice in study.choices if math.isfinite(study.error_of(choice))]
+    others = [choice for choice in drawn if choice not in study.front] if len(drawn) <= 16 else []
+    panel, taken = axis.get_window_extent(), []
+    for choice in [*study.front, *others]:
+        for x, y, across, upright in ((3, 3, "left", "bottom"), (-3, -3, "right", "top"), (3, -3, "left", "top")):
+            name = axis.annotate(
+                choice.name,
+                (choice.cost, study.error_of(choice)),
+                fontsize=6,
+                xytext=(x, y),
+                textcoords="offset points",
+                ha=across,
+                va=upright,
+                in_layout=False,
+            )
+            box = name.get_window_extent()
+            if panel.x0 <= box.x0 and box.x1 <= panel.x1 and not any(box.overlaps(other) for other in taken):
+                taken.append(box)
+                break
+            name.remove()
 
 
 def _ticks(low: float, high: float) -> list[float]:
