@@ -238,7 +238,7 @@ def _kernels(run: RunConfig, env: OmniEnv, things: dict[str, object]) -> Section
         section.add(name, _variant(sensing) if name == "cast_scan" else "")
     for name in _sensing(env, "sampler").kernels if _sensing(env, "frames") is not None else ():
         section.add(name, "", type(sensing.sampler).__name__)
-    for name, why in _kernels_beside(env):
+    for name, why in (*_kernels_beside(env), *_kernels_of_network(run)):
         section.add(name, "", why)
     if sensing is None:
         section.leave_out("those of the LiDAR", _why_blind(run))
@@ -258,6 +258,15 @@ def _kernels_beside(env: OmniEnv) -> Iterator[tuple[str, str]]:
         yield "heights_around", "the heights are read"
     if env.ground is not None and env.obstacles is not None:
         yield "lift", "obstacles move over ground that is not flat"
+
+
+def _kernels_of_network(run: RunConfig) -> Iterator[tuple[str, str]]:
+    """Kernels inside the perception network."""
+    if run.perception is None or "rings" not in getattr(run.perception.network, "keywords", {}):
+        return
+    yield "write_rings", "perception.network.rings"
+    if run.perception.network.keywords["rings"].keywords.get("match") is not None:
+        yield "match_motion", "perception.network.rings.match"
 
 
 def _variant(sensing: LidarSensing) -> str:

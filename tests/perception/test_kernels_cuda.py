@@ -7,12 +7,16 @@ import warp as wp
 from clouds import MAX_RANGE, random_rays, sample
 
 from omniperception.perception import PdSampler, kernels
+from omniperception.perception.motion_match import match_motion
+from omniperception.perception.rings import write_rings
+from omniperception.perception.velocity_risk import worst_sectors
 
 
-def test_kernels_compile_for_cuda(tmp_path):
+@pytest.mark.parametrize("module", [kernels, match_motion.module, write_rings.module, worst_sectors.module])
+def test_kernels_compile_for_cuda(module, tmp_path):
     wp.init()
     try:
-        files = wp.compile_aot_module(kernels, arch=80, module_dir=tmp_path)
+        files = wp.compile_aot_module(module, arch=80, module_dir=tmp_path)
     except RuntimeError as error:
         if "CUDA" in str(error) and "compil" not in str(error).lower():
             pytest.skip(f"no CUDA compiler in this Warp: {error}")
