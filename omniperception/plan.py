@@ -238,7 +238,7 @@ def _kernels(run: RunConfig, env: OmniEnv, things: dict[str, object]) -> Section
         section.add(name, _variant(sensing) if name == "cast_scan" else "")
     for name in _sensing(env, "sampler").kernels if _sensing(env, "frames") is not None else ():
         section.add(name, "", type(sensing.sampler).__name__)
-    for name, why in (*_kernels_beside(env), *_kernels_of_network(run)):
+    for name, why in dict((*_kernels_of_network(run), *_kernels_beside(env))).items():
         section.add(name, "", why)
     if sensing is None:
         section.leave_out("those of the LiDAR", _why_blind(run))
@@ -261,12 +261,16 @@ def _kernels_beside(env: OmniEnv) -> Iterator[tuple[str, str]]:
 
 
 def _kernels_of_network(run: RunConfig) -> Iterator[tuple[str, str]]:
-    """Kernels inside the perception network."""
-    if run.perception is None or "rings" not in getattr(run.perception.network, "keywords", {}):
+    """Kernels inside the policy."""
+    if run.perception is None:
         return
-    yield "write_rings", "perception.network.rings"
-    if run.perception.network.keywords["rings"].keywords.get("match") is not None:
+    rings = getattr(run.perception.network, "keywords", {}).get("rings")
+    if rings is not None:
+        yield "write_rings", "perception.network.rings"
+    if rings is not None and rings.keywords.get("match") is not None:
         yield "match_motion", "perception.network.rings.match"
+    if run.perception.motion_weight:
+        yield "worst_sectors", "perception.motion_weight: risks follow from what is perceived"
 
 
 def _variant(sensing: LidarSensing) -> str:

@@ -366,8 +366,9 @@ def test_stages_and_kernels_are_those_that_run(overrides, launched):
     plan, env = describe(run, runner), runner.env
     env.timer.drain()
     launched.clear()
-    for _ in range(env.sensing.period_steps if env.sensing else 1):
-        env.step(torch.zeros(env.num_envs, env.num_actions))
+    with torch.no_grad():
+        for _ in range(env.sensing.period_steps if env.sensing else 1):
+            env.step(runner.alg.actor(env.get_observations()))
     env._reset(torch.arange(env.num_envs))
     assert names(plan, "stages of a step") == set(env.timer.seconds)
     assert names(plan, "kernels") == set(launched)
