@@ -19,7 +19,11 @@ LIMIT = 4_000_000
 """Most bytes of a published checkpoint: it goes into a repository."""
 
 
-def publish(run_dir: Path, folder: Path) -> dict:
+PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
+"""How weights may be stored; float16 rounds them to three digits, and they are float32 again where they are used."""
+
+
+def publish(run_dir: Path, folder: Path, precision: str = "float32") -> dict:
     """Writes a run directory that holds the newest weights, the configuration and where they come from.
 
     The critic stays, because a run that starts from this one may learn on; the optimisers, the environments' state and
@@ -28,20 +32,26 @@ def publish(run_dir: Path, folder: Path) -> dict:
     Args:
         run_dir: a run.
         folder: becomes a run directory; what it held of another run is replaced.
+        precision: one of PRECISIONS; what matrices of weights are stored in.
 
     Returns:
         What provenance.json holds.
 
     Raises:
-        ConfigError: the weights are larger than LIMIT.
+        ConfigError: the weights are larger than LIMIT, or the precision is unknown.
         CheckpointError: the run has no checkpoint.
     """
+    if precision not in PRECISIONS:
+        raise ConfigError(f"precision={precision} must be one of {', '.join(PRECISIONS)}")
     newest = latest_checkpoint(run_dir)
     state = load_checkpoint(newest, "cpu")
-    weights = {name: _single_precision(state[name]) for name in ("actor_state_dict", "critic_state_dict")}
+    weights = {name: _stored(state[name], PRECISIONS[precision]) for name in ("actor_state_dict", "critic_state_dict")}
     size = sum(tensor.numel() * tensor.element_size() for part in weights.values() for tensor in part.values())
     if size > LIMIT:
-        raise ConfigError(f"{newest} has {size / 1e6:.1f} MB of weights, at most {LIMIT / 1e6:.0f} MB are published")
+        raise ConfigError(
+            f"{newest} has {size / 1e6:.1f} MB of weights, at most {LIMIT / 1e6:.0f} MB are published;"
+            " precision=float16 halves them"
+        )
     composed = config.load(run_dir)
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
@@ -57,11 +67,14 @@ def publish(run_dir: Path, folder: Path) -> dict:
         "iterations": state["iteration"],
         "control_steps": steps,
         "training_hours": round(state["total_time"] / 3600, 3),
+        "precision": precision,
         **provenance("cpu"),
     }
     (folder / PROVENANCE).write_text(json.dumps(record, indent=2) + "\n")
     return record
 
 
-def _single_precision(part: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {name: value.float() if value.is_floating_point() else value for name, value in part.items()}
+def _stored(part: dict[str, torch.Tensor], precision: torch.dtype) -> dict[str, torch.Tensor]:
+    """Matrices in a precision, all else that is not whole, such as statistics of observations, in float32."""
+    types = {name: precision if value.dim() > 1 else torch.float32 for name, value in part.items()}
+    return {name: value.to(types[name]) if value.is_floating_point() else value for name, value in part.items()}

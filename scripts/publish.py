@@ -1,9 +1,9 @@
 """Makes a small run directory of a run's newest policy, fit for a repository.
 
-python scripts/publish.py run=latest to=<folder>
+python scripts/publish.py run=latest to=<folder> [precision=float16]
 
 The folder holds weights, config.yaml and provenance.json; play.py, evaluate.py and export.py take it as run=<folder>,
-train.py as init=<folder>.
+train.py as init=<folder>. At most 4 MB are published; precision=float16 halves the weights, rounded to three digits.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from omniperception import config
 from omniperception.learning import CheckpointError
 from omniperception.publish import publish
 
-ARGUMENTS = {"run": "latest", "to": ""}
+ARGUMENTS = {"run": "latest", "to": "", "precision": "float32"}
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def main() -> None:
             raise config.ConfigError(
                 f"{overrides[0] if overrides else 'to='}: give run=<run directory> to=<folder>, no more"
             )
-        record = publish(config.find_run(own["run"]), Path(own["to"]))
+        record = publish(config.find_run(own["run"]), Path(own["to"]), own["precision"])
         print(f"{own['to']}: {record['iterations']} iterations, {record['training_hours']} h of training")
 
 
