@@ -31,6 +31,15 @@ class MotionMatch:
     width: float
     period_s: float
 
+    def __post_init__(self) -> None:
+        for name in ("num_directions", "width", "period_s"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"perception.network.rings.match.{name}={getattr(self, name)} must be positive")
+        if not self.speeds or min(self.speeds) <= 0:
+            raise ValueError(
+                f"perception.network.rings.match.speeds={list(self.speeds)} must be at least one, all positive (m/s)"
+            )
+
     @property
     def num_velocities(self) -> int:
         """K, standing still included."""

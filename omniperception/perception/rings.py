@@ -232,6 +232,10 @@ class RingPath(nn.Module):
         num_bands = num_distal // num_sectors
         if not 0 <= ground_bands < num_bands:
             raise ValueError(f"rings: ground_bands={ground_bands} must be less than the {num_bands} bands")
+        if match is not None and history < 2:
+            raise ValueError(
+                f"perception.history={history} shows no motion; take 2 or more, or perception.network.rings.match=null"
+            )
         self.shape = RingShape(num_sectors, history, decay, tuple(decays))
         self.match, self.ground_bands = match, ground_bands
         width = history * num_bands * self.shape.channels

@@ -81,3 +81,22 @@ def test_ground_is_not_matched():
         path(cells, moved, count)
         found.append(bool(seen_by_layers[0][:, 5 * 2 * 3 :].any()))
     assert found == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"width": 0.0}, r"match\.width=0\.0 must be positive"),
+        ({"num_directions": 0}, r"match\.num_directions=0 must be positive"),
+        ({"speeds": ()}, r"match\.speeds=\[\] must be at least one"),
+        ({"speeds": (1.0, -1.0)}, r"match\.speeds=\[1\.0, -1\.0\] must be at least one, all positive"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        MotionMatch(**{"speeds": (1.0,), "num_directions": 8, "width": 0.4, "period_s": 0.1} | given)
+
+
+def test_one_frame_shows_no_motion():
+    with pytest.raises(ValueError, match=r"perception\.history=1 shows no motion"):
+        RingPath(2 * SECTORS, 1, match=MATCH)
