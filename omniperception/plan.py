@@ -16,6 +16,7 @@ import yaml
 from omniperception.config import RunConfig
 from omniperception.inventory import Buffer, buffers_of, is_launch, walk
 from omniperception.learning import Runner
+from omniperception.learning.models import MOTION
 from omniperception.task.env import OmniEnv
 from omniperception.task.state import fields_read
 
@@ -186,7 +187,7 @@ def describe(run: RunConfig, runner: Runner) -> Plan:
     things = dict(walk({"env": env, "storage": runner.alg.storage}))
     sections = (
         _stages(run, env),
-        _kernels(run, env, things),
+        _kernels(run, runner, things),
         _rays(run, env),
         _physics(run, env),
         _fields(run, env),
@@ -232,13 +233,14 @@ def _stages(run: RunConfig, env: OmniEnv) -> Section:
     return section
 
 
-def _kernels(run: RunConfig, env: OmniEnv, things: dict[str, object]) -> Section:
-    section, sensing = Section("kernels"), env.sensing
+def _kernels(run: RunConfig, runner: Runner, things: dict[str, object]) -> Section:
+    section, env = Section("kernels"), runner.env
+    sensing = env.sensing
     for name in dict.fromkeys(thing.name for thing in things.values() if is_launch(thing)):
         section.add(name, _variant(sensing) if name == "cast_scan" else "")
     for name in _sensing(env, "sampler").kernels if _sensing(env, "frames") is not None else ():
         section.add(name, "", type(sensing.sampler).__name__)
-    for name, why in dict((*_kernels_of_network(run), *_kernels_beside(env))).items():
+    for name, why in dict((*_kernels_of_policy(runner), *_kernels_beside(env))).items():
         section.add(name, "", why)
     if sensing is None:
         section.leave_out("those of the LiDAR", _why_blind(run))
@@ -260,16 +262,15 @@ def _kernels_beside(env: OmniEnv) -> Iterator[tuple[str, str]]:
         yield "lift", "obstacles move over ground that is not flat"
 
 
-def _kernels_of_network(run: RunConfig) -> Iterator[tuple[str, str]]:
-    """Kernels inside the policy."""
-    if run.perception is None:
-        return
-    rings = getattr(run.perception.network, "keywords", {}).get("rings")
+def _kernels_of_policy(runner: Runner) -> Iterator[tuple[str, str]]:
+    """Kernels inside the actor."""
+    actor = runner.alg.actor
+    rings = getattr(getattr(actor, "perception", None), "rings", None)
     if rings is not None:
         yield "write_rings", "perception.network.rings"
-    if rings is not None and rings.keywords.get("match") is not None:
+    if rings is not None and rings.match is not None:
         yield "match_motion", "perception.network.rings.match"
-    if run.perception.motion_weight:
+    if getattr(actor, "read_out_target", None) == MOTION:
         yield "worst_sectors", "perception.motion_weight: risks follow from what is perceived"
 
 

@@ -45,26 +45,26 @@ class MotionMatch:
         """K, standing still included."""
         return 1 + len(self.speeds) * self.num_directions
 
-    def velocities(self, device: torch.device | str = "cpu") -> torch.Tensor:
+    def velocities(self, device: torch.device | str | None = None) -> torch.Tensor:
         """(K, 2) m/s away from the robot and counter-clockwise around it: standing still, then speed by speed."""
         index = torch.arange(self.num_directions, dtype=torch.float32, device=device)
         turn = index * (2 * math.pi / self.num_directions)
         ring = torch.stack((turn.cos(), turn.sin()), -1)
         return torch.cat((ring.new_zeros(1, 2), *(speed * ring for speed in self.speeds)))
 
-    def __call__(self, distance: torch.Tensor, bearing: torch.Tensor) -> torch.Tensor:
+    def __call__(self, distance: torch.Tensor, bearing: torch.Tensor, velocities: torch.Tensor) -> torch.Tensor:
         """What moved how, by sector.
 
         Args:
             distance: (n, H, S) nearest hit of each sector (m, NOTHING without one), oldest frame first, all frames as
                 seen from the newest.
             bearing: (n, S) of the newest frame's hits, from the middle of their sectors (rad).
+            velocities: those of :meth:`velocities`.
 
         Returns:
             (n, (H - 1) * K, S): 1 where the frame has a hit just where the velocity says, falling to 0 at `width` from
             there.
         """
-        velocities = self.velocities(distance.device)
         if torch.jit.is_tracing() or torch.onnx.is_in_onnx_export() or distance.is_meta:
             return self._match(distance, bearing, velocities)
         number, history, sectors = distance.shape

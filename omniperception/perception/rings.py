@@ -241,6 +241,7 @@ class RingPath(nn.Module):
         width = history * num_bands * self.shape.channels
         if match is not None:
             width += (history - 1) * match.num_velocities + 2 * history
+            self.register_buffer("_velocities", match.velocities(), persistent=False)
         layers: list[nn.Module] = []
         for size, span in zip(channels, kernel_sizes, strict=True):
             layers += [_ring_conv(width, size, span), nn.ELU()]
@@ -272,7 +273,9 @@ class RingPath(nn.Module):
         reach = -self.shape.decays[-1] * proximity.clamp(min=_FAINT).log()
         distance = torch.where(proximity > _FAINT, reach, NOTHING)
         nearness = _NEARNESS * (1.0 - distance / _REACH).clamp(min=0.0)
-        return torch.cat((self.match(distance, bearing[:, -1]), nearness, 2.0 * _LATERAL * bearing), 1)
+        return torch.cat(
+            (self.match(distance, bearing[:, -1], self._velocities), nearness, 2.0 * _LATERAL * bearing), 1
+        )
 
 
 class _RingConv(nn.Conv1d):

@@ -45,8 +45,10 @@ def test_what_is_forced_into_the_rays_does_not_change_them():
 def test_the_tables_have_a_line_for_every_item():
     gains = benchmark.measure("walk", num_envs=8, repeats=1, blocks=1)
     assert [g.item for g in gains] == [item.name for item in benchmark.items_of("walk")]
-    assert gains[0].bytes_per_env[1] > gains[0].bytes_per_env[0] > 0
-    assert all(gain.step_ratio[0] > 0.0 for gain in gains)  # how much is a measurement, on a quiet machine
+    for gain in (gains[0], gains[-1]):
+        assert gain.bytes_per_env[1] > gain.bytes_per_env[0] > 0
+    for ratio, lowest, highest in (gain.step_ratio for gain in gains):  # how much it is, other work decides, too
+        assert 0.0 < lowest <= ratio <= highest
     starts = benchmark.start_up("walk", num_envs=8, repeats=1)
     assert starts[1].memory_mb > starts[0].memory_mb and starts[1].modules > starts[0].modules
     assert benchmark.step_row(gains[0]).count("|") == benchmark.step_header(8)[0].count("|")

@@ -71,9 +71,14 @@ class Study:
         return max(error, self.floor) if math.isfinite(error) else math.inf
 
     @property
+    def drawn(self) -> list[Choice]:
+        """Choices that did not fail."""
+        return [choice for choice in self.choices if math.isfinite(self.error_of(choice))]
+
+    @property
     def front(self) -> list[Choice]:
         """Choices that no other beats in one of cost and error and equals in the other, cheapest first."""
-        kept = [c for c in self.choices if math.isfinite(self.error_of(c)) and not self._beaten(c)]
+        kept = [choice for choice in self.drawn if not self._beaten(choice)]
         return sorted(kept, key=lambda choice: choice.cost)
 
     def _beaten(self, choice: Choice) -> bool:
@@ -166,7 +171,7 @@ def plot(studies: Sequence[Study], file: Path, about: str, columns: int = 3) -> 
 
 
 def _draw(study: Study, axis) -> None:
-    drawn = [choice for choice in study.choices if math.isfinite(study.error_of(choice))]
+    drawn = study.drawn
     for family in dict.fromkeys(choice.family for choice in drawn):
         of = [choice for choice in drawn if choice.family == family]
         points = [c.cost for c in of], [study.error_of(c) for c in of]
@@ -190,8 +195,7 @@ def _draw(study: Study, axis) -> None:
 
 def _name(axis, study: Study) -> None:
     """Writes names beside points where there is room, those on the front first; of many choices those alone."""
-    drawn = [choice for choice in study.choices if math.isfinite(study.error_of(choice))]
-    others = [choice for choice in drawn if choice not in study.front] if len(drawn) <= 16 else []
+    others = [choice for choice in study.drawn if choice not in study.front] if len(study.drawn) <= 16 else []
     panel, taken = axis.get_window_extent(), []
     for choice in [*study.front, *others]:
         for x, y, across, upright in ((3, 3, "left", "bottom"), (-3, -3, "right", "top"), (3, -3, "left", "top")):
