@@ -15,6 +15,7 @@ from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import runner_config
 from omniperception.learning.memory import check_fits
 from omniperception.task.env import OmniEnv
+from omniperception.task.mirror import Mirror
 
 if TYPE_CHECKING:
     from omniperception.evaluation.episodes import Policy
@@ -35,7 +36,7 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
         if run.perception is not None:
             check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), run.env.sim.torch_device)
         env = OmniEnv(run.env)
-        return Runner(env, learning_settings(run), str(log_dir) if log_dir else None, str(env.device))
+        return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
     except (ValueError, ImportError) as error:
         raise ConfigError(str(error)) from error
 
@@ -72,8 +73,8 @@ def steps_per_frame(run: RunConfig) -> int:
     return max(1, round(run.env.lidar.sensor.period_s / run.env.sim.control_dt))
 
 
-def learning_settings(run: RunConfig) -> dict:
-    """rsl_rl's configuration for a run."""
+def learning_settings(run: RunConfig, env: OmniEnv) -> dict:
+    """rsl_rl's configuration for a run in its environment."""
     observations = run.env.observations
     return runner_config(
         run.ppo,
@@ -82,6 +83,7 @@ def learning_settings(run: RunConfig) -> dict:
         observations.critic,
         steps_per_frame(run) if run.perception is not None else 1,
         run.env.rewards.avoidance.risk,
+        Mirror(env) if run.ppo.symmetry else None,
     )
 
 

@@ -31,7 +31,7 @@ LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
 
 
 def test_no_preset_is_missed():
-    assert len(PRESETS) == 90
+    assert len(PRESETS) == 91
     groups = {preset.split("/")[0] for preset in PRESETS}
     assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()}
     assert set(COMPANIONS) <= set(PRESETS)
@@ -242,3 +242,16 @@ def test_entry_points_take_their_own_arguments_out():
     assert own == {"run": "x", "steps": "5"} and overrides == ["num_envs=2", "-m"]
     with pytest.raises(ConfigError, match="'video' is not of the form key=value"):
         config.split_arguments(["video"], {"run": ""})
+
+
+VARIANTS = [name.removeprefix("perception/") for name in PRESETS if name.startswith("perception/")]
+
+
+@pytest.mark.parametrize("variant", [name for name in VARIANTS if name not in ("none", "direct_mlp")])
+def test_every_variant_of_perception_learns_to_avoid(variant):
+    """As scripts/ablation.py trains them: the same targets, and the base's motion whichever paths there are."""
+    overrides = ("experiment=avoid", f"perception={variant}", "init=unread", "num_envs=2")
+    runner = build_runner(config.assemble(config.compose(overrides)), None)
+    with torch.inference_mode():
+        actions = runner.get_inference_policy("cpu")(runner.env.get_observations())
+    assert actions.shape == (2, 12) and torch.isfinite(actions).all()

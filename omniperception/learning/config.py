@@ -86,8 +86,8 @@ class PerceptionConfig:
     def build_network(self) -> PerceptionNetwork:
         """The network that fits the sampler's points and the history."""
         sizes = dict(self.sampler().sizes)
-        if self.base_motion:
-            sizes[list(sizes)[-1]] += 1
+        if self.base_motion:  # one row more for the last half that there is
+            sizes[[name for name, number in sizes.items() if number][-1]] += 1
         try:
             return self.network(**sizes, history=self.history)
         except TypeError as error:
@@ -121,6 +121,7 @@ class PPOConfig:
         obs_normalization: whether observations are normalised by running statistics.
         mixed_precision: whether updates multiply matrices in bfloat16; None where the CPU has units for it (AMX), on
             a GPU not.
+        symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
         The others are rsl_rl's PPO arguments.
     """
 
@@ -146,6 +147,7 @@ class PPOConfig:
     init_std: float
     obs_normalization: bool
     mixed_precision: bool | None = False
+    symmetry: bool = False
 
     def __post_init__(self) -> None:
         for name in (
@@ -183,6 +185,7 @@ def runner_config(
     critic_groups: Sequence[str],
     steps_per_frame: int,
     velocity_risk: VelocityRisk | None = None,
+    mirror: Callable | None = None,
 ) -> dict:
     """rsl_rl's runner configuration.
 
@@ -193,6 +196,7 @@ def runner_config(
         critic_groups: observation groups of the critic.
         steps_per_frame: control steps between two LiDAR frames.
         velocity_risk: how the risk of velocities becomes an avoidance velocity, where the actor is supervised with it.
+        mirror: rsl_rl's `data_augmentation_func`, or None.
     """
     network = {"hidden_dims": list(ppo.hidden_dims), "activation": ppo.activation}
     network["obs_normalization"] = ppo.obs_normalization
@@ -238,6 +242,7 @@ def runner_config(
             "use_clipped_value_loss": ppo.use_clipped_value_loss,
             "entropy_coef": ppo.entropy_coef,
             "max_grad_norm": ppo.max_grad_norm,
+            "symmetry_cfg": {"data_augmentation_func": mirror, "use_data_augmentation": True} if mirror else None,
             "use_mixed_precision": multiplies_bfloat16() if ppo.mixed_precision is None else ppo.mixed_precision,
         },
         "console_metrics": [

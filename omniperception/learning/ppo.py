@@ -76,8 +76,8 @@ class PerceptivePpo(PPO):
         perceptive = isinstance(actor_class, type) and issubclass(actor_class, PerceptionActor)
         if perceptive and (alg_cfg.get("rnd_cfg") or alg_cfg.get("symmetry_cfg")):
             raise ValueError(
-                "rnd_cfg and symmetry_cfg work on one-dimensional observations only; leave them out with a"
-                " perceptive actor"
+                "ppo.symmetry (symmetry_cfg) and rnd_cfg work on one-dimensional observations only; with perception set"
+                " ppo.symmetry=false"
             )
         alg_cfg = resolve_rnd_config(alg_cfg, obs, cfg["obs_groups"], env)
         alg_cfg = resolve_symmetry_config(alg_cfg, env)

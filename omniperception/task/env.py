@@ -231,6 +231,10 @@ class OmniEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         return self.observations
 
+    def observation_widths(self, group: str) -> dict[str, int]:
+        """Numbers of each term of an observation group, in order, per control step."""
+        return {term: part.stop - part.start for term, part in self._groups[group].slices.items()}
+
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """One control step with actions (num_envs, num_actions); see rsl_rl.env.VecEnv."""
         self.metrics.record_clipped(actions.abs().amax(1) > MAX_ACTION)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from omniperception.task.mirror import JOINTS, ROTATION, VECTOR, mirrors
 from omniperception.task.state import checked_term, fields_read, reads
 
 if TYPE_CHECKING:
@@ -91,41 +92,49 @@ class GroupBuffer:
         return self.buffer.flatten(1)
 
 
+@mirrors(JOINTS)
 def joint_pos_offset(env: OmniEnv) -> torch.Tensor:
     """Joint position relative to the default pose, rad, as sensed (with latency when randomized)."""
     return env.sensed.joint_pos - env.default_joint_pos
 
 
+@mirrors(JOINTS)
 def joint_vel(env: OmniEnv, scale: float = 1.0) -> torch.Tensor:
     """Joint velocity, rad/s, times `scale`, as sensed."""
     return env.sensed.joint_vel * scale
 
 
+@mirrors(VECTOR)
 def base_lin_vel(env: OmniEnv) -> torch.Tensor:
     """Base linear velocity in the base frame, m/s, as sensed."""
     return env.sensed.base_lin_vel_b
 
 
+@mirrors(ROTATION)
 def base_ang_vel(env: OmniEnv, scale: float = 1.0) -> torch.Tensor:
     """Base angular velocity in the base frame, rad/s, times `scale`, as sensed."""
     return env.sensed.base_ang_vel_b * scale
 
 
+@mirrors(VECTOR)
 def projected_gravity(env: OmniEnv) -> torch.Tensor:
     """Unit vector of gravity in the base frame, as sensed."""
     return env.sensed.projected_gravity_b
 
 
+@mirrors((1.0, -1.0, -1.0))
 def command(env: OmniEnv) -> torch.Tensor:
     """v_x, v_y (m/s) and yaw rate (rad/s) in the base frame."""
     return env.command.value
 
 
+@mirrors(JOINTS)
 def previous_action(env: OmniEnv) -> torch.Tensor:
     """The action applied in the step that ended."""
     return env.actions[0]
 
 
+@mirrors(JOINTS, JOINTS, VECTOR, ROTATION, VECTOR)
 def true_proprioception(env: OmniEnv, joint_vel_scale: float = 1.0, ang_vel_scale: float = 1.0) -> torch.Tensor:
     """The 33 proprioceptive values without latency or noise: privileged."""
     k = env.kinematics
@@ -141,6 +150,7 @@ def true_proprioception(env: OmniEnv, joint_vel_scale: float = 1.0, ang_vel_scal
     )
 
 
+@mirrors((1.0,))
 def base_height(env: OmniEnv) -> torch.Tensor:
     """Height (m) of the base origin above the ground, less the default pose's: privileged."""
     return env.base_height[:, None] - env.robot.base_height
@@ -153,6 +163,7 @@ def heights(env: OmniEnv) -> torch.Tensor:
 
 
 @reads("obstacles")
+@mirrors((1.0, -1.0, 1.0, -1.0, 1.0, 1.0))
 def nearest_obstacles(env: OmniEnv, count: int, max_distance: float) -> torch.Tensor:
     """Relative position, relative velocity, radius and nearness of the nearest obstacles: privileged.
 
@@ -179,6 +190,7 @@ def nearest_obstacles(env: OmniEnv, count: int, max_distance: float) -> torch.Te
 
 
 @reads("sectors")
+@mirrors((1.0, -1.0))
 def avoidance_target(env: OmniEnv) -> torch.Tensor:
     """The avoidance velocity (m/s, yaw-aligned frame) that the reward asks for: privileged."""
     return env.avoidance_velocity
