@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 
 import pytest
 import torch
@@ -330,3 +331,14 @@ def test_several_sensors_see_one_scene_at_their_own_rates(pattern):
             assert torch.allclose(ahead, torch.tensor(4.0 - math.sqrt(0.25 - height**2)), atol=1e-4)
     single = Lidar(front.config, pattern, scene, 0, outputs=("ranges", "row")).cast(clock(2, 0.1))
     assert torch.equal(front.frame.ranges, single.ranges) and torch.equal(front.frame.row, single.row)
+
+
+def test_keeping_the_first_part_of_each_frame_is_told():
+    """Every second point would be of two lasers alone, so 10,000 of 20,000 are the first 10,000."""
+    angles = torch.linspace(-0.5, 0.5, 20_000).numpy()
+    pattern = ScanPattern.from_angles(angles, 2.0 * angles, 200_000.0, num_lasers=4)
+    with pytest.warns(UserWarning, match=r"num_rays=10000 keeps .* first 50% of each frame's 20000; num_rays=6666 or"):
+        assert pattern.stride(0.1, 10_000) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert [pattern.stride(0.1, n) for n in (1000, 2000, 4000, 6666, 20_000)] == [19, 9, 5, 3, 1]
