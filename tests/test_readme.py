@@ -128,7 +128,8 @@ def test_a_compiled_mujoco_model(run):
 def test_pose_tensors_of_a_simulator(run):
     names = run("simulators")
     time_s = torch.full((8,), 0.1, dtype=torch.float64)
-    names["link_pos_w"][..., 2] += 1.0
+    names["link_pos_w"][:, 0, 2] += 3.0  # the sensor, which must not be inside of a leg
+    names["link_pos_w"][:, 1:, 2] += 1.0
     ranges = names["observe"](time_s)
     assert ranges.data_ptr() == names["lidar"].frame.ranges.data_ptr()
     height = names["link_pos_w"][:, 0, 2]
