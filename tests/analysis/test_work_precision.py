@@ -236,6 +236,25 @@ def test_sectors_stay_near_the_front():
     within_margin(measured, 2.0)  # 1.2 to 1.5 when written: docs/work_precision.md says why the default stays
 
 
+@pytest.mark.parametrize(
+    ("paths", "labels"),
+    [
+        (["o/study/rings/seed1", "o/study/gru/seed1"], ["rings", "gru"]),
+        (["o/study/rings/seed1", "o/study/rings/seed2"], ["seed1", "seed2"]),
+        (["o/study/rings/seed1", "o/flat"], ["study/rings/seed1", "flat"]),
+        (["o/a/x/b", "o/a/b"], ["x/b", "b"]),
+        (["o/study/rings"], ["rings"]),
+        (["o/a", "o/a/a"], ["a", "a/a"]),
+    ],
+)
+def test_runs_are_named_by_what_tells_them_apart(tmp_path, paths, labels):
+    for path in paths:
+        (tmp_path / path).mkdir(parents=True, exist_ok=True)
+        (tmp_path / path / "config.yaml").write_text("")
+    found = [run.name for run in policy.trained_runs([str(tmp_path / path) for path in paths])]
+    assert found == labels
+
+
 def test_policies_are_judged_by_what_evaluation_wrote(tmp_path):
     run = policy.TrainedRun(tmp_path, "run")
     with pytest.raises(ConfigError, match=r"has not been evaluated; python scripts/evaluate.py run="):

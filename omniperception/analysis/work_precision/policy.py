@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -102,9 +103,21 @@ class TrainedRun:
 def trained_runs(names: Sequence[str]) -> list[TrainedRun]:
     """Run directories by path, named by what tells them apart."""
     paths = [config.find_run(name) for name in names]
-    shared = len([part for part in zip(*(p.resolve().parts for p in paths), strict=False) if len(set(part)) == 1])
-    labels = ["/".join(p.resolve().parts[min(shared, len(p.resolve().parts) - 1) :]) for p in paths]
+    labels = _told_apart([path.resolve().parts for path in paths])
     return [TrainedRun(path, label) for path, label in zip(paths, labels, strict=True)]
+
+
+def _told_apart(paths: Sequence[tuple[str, ...]]) -> list[str]:
+    """Paths without the parts that all of them begin and end with, but for one part of each."""
+    shortest = min((len(path) for path in paths), default=0)
+    first = min(_shared(paths), shortest - 1)
+    ends = min(_shared([path[::-1] for path in paths]), shortest - 1 - first)
+    return ["/".join(path[first : len(path) - ends]) for path in paths]
+
+
+def _shared(paths: Sequence[tuple[str, ...]]) -> int:
+    """How many parts all of them begin with."""
+    return len(list(itertools.takewhile(lambda parts: len(set(parts)) == 1, zip(*paths, strict=False))))
 
 
 def evaluated_runs() -> list[str]:
