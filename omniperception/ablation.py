@@ -127,7 +127,9 @@ def _row(study: Ablation, variant: str) -> dict:
 def _table(scenario: str, rows: dict, study: Ablation) -> str:
     names = ("success", "success_untouched", "collision", "fall", "time_out")
     paper = scenario == "corridor"
-    head = ["variant", *(name.replace("_", " ") + ", %" for name in names)] + ["paper: success | collision, %"] * paper
+    head = ["variant", *(name.replace("_", " ") + ", %" for name in names)] + [
+        "paper: success \\| collision, %"
+    ] * paper
     lines = [
         f"**{scenario}**, {study.trials} trials of each of {len(study.seeds)} seeds: rate [95 % interval]"
         " (least to most of the seeds)",

@@ -41,6 +41,19 @@ def test_a_table_of_what_has_not_been_evaluated_is_refused(tmp_path):
         write_tables(Ablation(**GIVEN | {"out": tmp_path}))
 
 
+def test_every_line_of_a_table_has_as_many_cells(tmp_path):
+    """Or it is not shown as one."""
+    study = Ablation(**GIVEN | {"out": tmp_path})
+    rates = {
+        name: {"count": 1, "rate": 0.5} for name in ("success", "success_untouched", "collision", "fall", "time_out")
+    }
+    file = study.run_dir("fps_gru", 1) / "evaluation" / "corridor.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps({"policies": {"run": {"rates": rates, "episodes": 2}}}))
+    lines = [line for line in write_tables(study).splitlines() if line.startswith("|")]
+    assert len(lines) == 3 and {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {8}
+
+
 @pytest.mark.slow
 def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path):
     arguments = [

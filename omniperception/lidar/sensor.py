@@ -1,6 +1,8 @@
 """The LiDAR: a scan pattern on a moving mount, cast through a scene at its own rate."""
 
+import itertools
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import get_args
@@ -21,6 +23,9 @@ from .patterns.selection import Strategy
 from .rows import ScanRows
 from .scene import POSE_TYPES, PlacedShapes, RayScene, View
 from .shapes import ShapeKind, finite_tuple
+
+_COVERED = 0.8
+"""Share of a frame that evenly kept points should span."""
 
 RAYS_PER_TASK = BLOCK
 """Rays of one environment that a CPU thread casts in one go."""
@@ -367,13 +372,26 @@ class Lidar:
         num_tasks = scene.num_envs * rays.num_blocks
         return SplitLaunch(scan_kernel(variant), num_tasks, (), args, scene.device, scene.num_threads, work)
 
+    def _stride(self) -> int:
+        """The pattern's; warns if the last fifth of a frame, or more, is then not seen."""
+        pattern, period_s, num_rays = self.pattern, self.config.period_s, self.config.num_rays
+        stride, points = pattern.stride(period_s, num_rays), pattern.points_per_frame(period_s)
+        if stride * num_rays < _COVERED * points:
+            wider = next(k for k in itertools.count(stride + 1) if math.gcd(k, pattern.num_lasers) == 1)
+            warnings.warn(
+                f"lidar.num_rays={num_rays} keeps 1 in {stride} of the first {stride * num_rays / points:.0%} of each"
+                f" frame's {points}; num_rays={points // wider} or selection=stratified see all of it",
+                stacklevel=4,
+            )
+        return stride
+
     def _lay_out_rays(self) -> Rays:
         """Brings the pattern onto the device."""
         pattern, config, scene = self.pattern, self.config, self.scene
         every_kth = self._selection.strategy == "every_kth"
         angles = bool(self.outputs & {"elevation", "azimuth"})
         rays = Rays()
-        rays.stride = pattern.stride(config.period_s, config.num_rays) if every_kth else 1
+        rays.stride = self._stride() if every_kth else 1
         self._rows = ScanRows(pattern, rays.stride, scene.num_envs, angles, scene.device)
         rays.directions = wp.from_torch(self._rows.directions, dtype=wp.vec3)
         if self._rows.origins is not None:

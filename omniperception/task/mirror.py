@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict
 
+from omniperception.task.state import Term, plain
 from omniperception.world import RobotConfig
 
 if TYPE_CHECKING:
@@ -22,8 +22,6 @@ VECTOR = (1.0, -1.0, 1.0)
 """Signs of x, y, z under the reflection that maps left to right."""
 ROTATION = (-1.0, 1.0, -1.0)
 """Likewise of an axial vector, such as an angular velocity."""
-
-Term = TypeVar("Term", bound=Callable)
 
 
 def mirrors(*parts: str | Sequence[float]) -> Callable[[Term], Term]:
@@ -122,9 +120,7 @@ def _parts(
     name: str, term: Callable, width: int, joints: tuple[np.ndarray, np.ndarray]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Index and sign of each part of a term."""
-    while isinstance(term, partial):
-        term = term.func
-    declared = getattr(term, "mirror", None)
+    declared = getattr(plain(term), "mirror", None)
     if declared is None:
         raise ValueError(
             f"ppo.symmetry=true: {name} does not say how it looks in the mirror; declare it with @mirrors(...), or set"

@@ -27,9 +27,14 @@ def reads(*fields: str) -> Callable[[Term], Term]:
 
 def fields_read(term: Callable) -> frozenset[str]:
     """The optional fields that a term (or a partial of one) declared."""
+    return getattr(plain(term), "reads", frozenset())
+
+
+def plain(term: Callable) -> Callable:
+    """The function below partials."""
     while isinstance(term, partial):
         term = term.func
-    return getattr(term, "reads", frozenset())
+    return term
 
 
 def checked_term(name: str, term: Term) -> Term:

@@ -1,8 +1,6 @@
 """A scan pattern as a table of directions, and which of its rows a frame holds."""
 
-import itertools
 import math
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +8,6 @@ import torch
 
 ROW_SLACK = 1e-3
 """Fraction of a row within which a time counts as that row's; float64 seconds are this exact after 10^6 s."""
-
-_COVERED = 0.8
-"""Share of a frame that evenly kept points should span."""
 
 
 @dataclass(frozen=True)
@@ -125,21 +120,11 @@ class ScanPattern:
     def stride(self, period_s: float, num_rays: int) -> int:
         """k, where every k-th point of a frame is kept to have ``num_rays`` of them evenly.
 
-        The largest k that fits and has no factor in common with ``num_lasers``, so that every laser takes part. Warns
-        if the last fifth of a frame, or more, is then not seen.
+        The largest k that fits and has no factor in common with ``num_lasers``, so that every laser takes part.
         """
-        points = self.check_num_rays(period_s, num_rays)
-        stride = points // num_rays
+        stride = self.check_num_rays(period_s, num_rays) // num_rays
         while math.gcd(stride, self.num_lasers) > 1:
             stride -= 1
-        if stride * num_rays < _COVERED * points:
-            wider = next(k for k in itertools.count(stride + 1) if math.gcd(k, self.num_lasers) == 1)
-            warnings.warn(
-                f"lidar.num_rays={num_rays} keeps every point of stride {stride} in the first"
-                f" {stride * num_rays / points:.0%} of each frame's {points}; num_rays={points // wider} or"
-                " selection=stratified see all of it",
-                stacklevel=2,
-            )
         return stride
 
     def first_rows(
