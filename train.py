@@ -31,8 +31,8 @@ def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
         runner.load(str(latest_checkpoint(run_dir)))
         tell(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
     else:
-        if run.init is not None:
-            runner.start_from(config.find_run(run.init, "init"))
+        for name in run.init:
+            runner.start_from(config.find_run(name, "init"))
         tell(f"run directory: {run_dir}")
     plan = describe(run, runner)
     if distributed.rank() == 0:

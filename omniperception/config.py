@@ -43,14 +43,14 @@ class RunConfig:
         env: the task.
         perception: the actor's view of the LiDAR, or None.
         ppo: the learning settings.
-        init: the run whose weights this one starts from, or None.
+        init: the runs whose weights this one starts from; where two have the same, the later one's.
         composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
     """
 
     env: EnvConfig
     perception: PerceptionConfig | None
     ppo: PPOConfig
-    init: str | None
+    init: tuple[str, ...]
     composed: dict
 
     def __post_init__(self) -> None:
@@ -93,11 +93,19 @@ def assemble(config: DictConfig) -> RunConfig:
             log_interval=ppo.num_steps_per_env,
             **parts,
         )
-        return RunConfig(env, perception, ppo, composed.get("init"), composed)
+        return RunConfig(env, perception, ppo, _names(composed.get("init")), composed)
     except (OmegaConfBaseException, InstantiationException) as error:
         raise ConfigError(_one_line(error)) from None
     except (TypeError, ValueError) as error:
         raise ConfigError(_one_line(error)) from None
+
+
+def _names(value: object) -> tuple[str, ...]:
+    """One name, several, or none."""
+    names = [] if value is None else value if isinstance(value, list) else [value]
+    if not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"init={value} must be a run directory, a list of them, or null")
+    return tuple(names)
 
 
 def check(overrides: Sequence[str]) -> None:
@@ -241,7 +249,7 @@ def _check_kinds(config: object, presets: object, key: str = "") -> None:
     """Every value must be of the kind that its preset has: a number for a number, a list for a list."""
     if isinstance(config, DictConfig) and isinstance(presets, DictConfig):
         for name in presets:
-            if name in config and not OmegaConf.is_interpolation(presets, name):
+            if name in config and name != "init" and not OmegaConf.is_interpolation(presets, name):
                 _check_kinds(config[name], presets[name], f"{key}.{name}" if key else str(name))
         return
     given, expected = _kind(config), _kind(presets)

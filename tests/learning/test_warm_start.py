@@ -47,6 +47,21 @@ def test_perception_comes_along_where_it_fits(make_config, tmp_path):
     assert not all(torch.equal(a, b) for a, b in zip(before, second.alg.actor.perception_parameters(), strict=True))
 
 
+def test_a_gait_and_perception_are_joined(make_config, walk, tmp_path):
+    run_dir, blind = walk
+    seeing = build_runner(make_config(*SEEING, "init=unread", "seed=9"), None)
+    seeing.save(str(checkpoint_path(tmp_path / "seeing", 1)))
+    run = make_config(*SEEING, f"init=[{tmp_path / 'seeing'},{run_dir}]", "seed=10")
+    joined = build_runner(run, None)
+    for name in run.init:
+        joined.start_from(config.find_run(name, "init"))
+    assert torch.equal(joined.alg.actor.mlp[2].weight, blind.alg.actor.mlp[2].weight)
+    assert torch.equal(joined.alg.actor.obs_normalizer._mean, blind.alg.actor.obs_normalizer._mean)
+    mine, theirs = joined.alg.actor.state_dict(), seeing.alg.actor.state_dict()
+    perceived = [name for name in theirs if name.startswith("perception.")]
+    assert perceived and all(torch.equal(mine[name], theirs[name]) for name in perceived)
+
+
 def test_other_observations_are_refused(make_config, walk):
     run_dir, _ = walk
     runner = build_runner(make_config(*SEEING, "init=unread", "observations.groups.proprioception.history=2"), None)
@@ -121,4 +136,11 @@ def test_a_gait_starts_from_a_walk_that_has_to_be_named(make_config):
     run = make_config("experiment=gait")
     message = r"init=<run of experiment=walk> does not exist; give a run directory or init=latest"
     with pytest.raises(config.ConfigError, match=message):
-        config.find_run(run.init, "init")
+        config.find_run(*run.init, "init")
+
+
+def test_init_is_a_run_or_several(make_config):
+    with pytest.raises(config.ConfigError, match=r"init=3 must be a run directory, a list of them, or null"):
+        make_config(*BLIND, "init=3")
+    assert make_config(*BLIND).init == ()
+    assert make_config(*BLIND, "init=[a,b]").init == ("a", "b")
