@@ -104,41 +104,49 @@ class PdSampler(CloudSampler):
     def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
         """See :meth:`CloudSampler.__call__`."""
         points = points[self._is_hit(points)]
-        theta, phi = angles_of(points)
-        near = theta > self.split
+        near = self._is_proximal(points)
         sampled = np.zeros((self.num_points, 3), np.float32)
-        scaled = points * np.float32(1.0 / self.max_range)
-        self._write_proximal(sampled, scaled[near], theta[near], phi[near])
-        far = ~near
-        self._write_distal(sampled[self.num_proximal :], points[far], scaled[far], theta[far], phi[far], attitude)
+        self._write_proximal(sampled, points[near])
+        self._write_distal(sampled[self.num_proximal :], points[~near], attitude)
         return sampled
 
-    def _write_proximal(self, out: np.ndarray, scaled: np.ndarray, theta: np.ndarray, phi: np.ndarray) -> None:
+    def _is_proximal(self, points: np.ndarray) -> np.ndarray:
+        """(n,) bool: the elevation is above the split. Angles, which are slow, decide only where rounding could."""
+        if self.split == -math.inf:
+            return np.ones(len(points), bool)
+        x, y, z = points.T
+        sin, cos = np.sin(self.split), np.cos(self.split)
+        above = z * cos - np.sqrt(x * x + y * y) * sin  # m, from the cone of this elevation
+        near = above > 0.0
+        doubtful = np.flatnonzero(abs(above) < np.float32(1e-6 * self.max_range))
+        near[doubtful] = angles_of(points[doubtful])[0] > self.split
+        return near
+
+    def _write_proximal(self, out: np.ndarray, points: np.ndarray) -> None:
         if not self.num_proximal:
             return
+        scaled = self._scaled(points)
         picked = farthest_points(scaled, self.num_proximal)
-        order = np.argsort(sort_keys(theta[picked], phi[picked], self.ring), kind="stable")
-        out[: len(picked)] = scaled[picked[order]]
+        out[: len(picked)] = scaled[picked[self._ring_order(points[picked])]]
 
-    def _write_distal(
-        self,
-        out: np.ndarray,
-        points: np.ndarray,
-        scaled: np.ndarray,
-        theta: np.ndarray,
-        phi: np.ndarray,
-        attitude: Attitude,
-    ) -> None:
-        bins = min(len(scaled), self.num_distal)
+    def _write_distal(self, out: np.ndarray, points: np.ndarray, attitude: Attitude) -> None:
+        bins = min(len(points), self.num_distal)
         if not bins:
             return
-        ordered = scaled[np.argsort(sort_keys(theta, phi, self.ring), kind="stable")]
-        edges = np.arange(bins + 1) * len(scaled) // bins
+        ordered = self._scaled(points)[self._ring_order(points)]
+        edges = np.arange(bins + 1) * len(points) // bins
         first, size = edges[:-1], np.diff(edges)
         if self.pick_middle:
             out[:bins] = ordered[first + size // 2]
         else:
             out[:bins] = np.add.reduceat(ordered, first, axis=0) / size[:, None].astype(np.float32)
+
+    def _scaled(self, points: np.ndarray) -> np.ndarray:
+        return points * np.float32(1.0 / self.max_range)
+
+    def _ring_order(self, points: np.ndarray) -> np.ndarray:
+        """(n,) indices that sort points by ring of elevation, then azimuth."""
+        return np.argsort(sort_keys(*angles_of(points), self.ring), kind="stable")
 
 
 class ProximitySampler(PdSampler):
@@ -173,15 +181,7 @@ class ProximitySampler(PdSampler):
         self.num_sectors, self.decay, self.blind = num_sectors, decay, blind
         self.edges, self.body = np.asarray(band_edges, np.float32), tuple(body)
 
-    def _write_distal(
-        self,
-        out: np.ndarray,
-        points: np.ndarray,
-        scaled: np.ndarray,
-        theta: np.ndarray,
-        phi: np.ndarray,
-        attitude: Attitude,
-    ) -> None:
+    def _write_distal(self, out: np.ndarray, points: np.ndarray, attitude: Attitude) -> None:
         level = _levelled(rotation_matrix(attitude.base_quat))
         turn = (level @ rotation_matrix(attitude.mount_quat)).astype(np.float32)
         offset = (level @ np.asarray(attitude.mount_pos, np.float64)).astype(np.float32)
@@ -191,12 +191,15 @@ class ProximitySampler(PdSampler):
         band = np.searchsorted(self.edges, z, side="right") - 1
         turned = (np.arctan2(y, x) + _PI) / (2 * _PI)
         sector = np.clip((turned * np.float32(self.num_sectors)).astype(np.int64), 0, self.num_sectors - 1)
+        cell = band * self.num_sectors + sector
         horizontal = np.sqrt(x * x + y * y)
+        least = np.full(self.num_distal, np.inf, np.float32)
+        np.minimum.at(least, cell, horizontal)
+        nearest = np.flatnonzero(horizontal == least[cell])[::-1]  # of equally near ones the first measured is kept
+        x, y, horizontal = x[nearest], y[nearest], horizontal[nearest]
         proximity = np.exp(-horizontal / np.float32(self.decay))
         bearing = proximity / np.maximum(horizontal, np.float32(1e-6))
-        # Written from the farthest to the nearest, so that the nearest stays; of equally near ones the first measured.
-        order = np.argsort(horizontal, kind="stable")[::-1]
-        out[(band * self.num_sectors + sector)[order]] = np.stack((bearing * x, bearing * y, proximity), 1)[order]
+        out[cell[nearest]] = np.stack((bearing * x, bearing * y, proximity), 1)
 
 
 _KINDS = {"raw": RawSampler, "pd": PdSampler, "proximity": ProximitySampler}

@@ -90,6 +90,19 @@ def test_robot_and_training_sample_alike(name, scene):
         np.testing.assert_allclose(got, expected, atol=1e-6)
 
 
+def test_points_on_the_split_go_where_their_elevation_says():
+    """To the last bit of a float32 angle, at all ranges, as in training."""
+    rng, sampler = np.random.default_rng(11), make_sampler(sampler_figures(SAMPLERS["pd"]()))
+    theta = math.radians(20.0) + rng.uniform(-3e-7, 3e-7, 20_000)
+    phi, far = rng.uniform(0.0, 2 * math.pi, (2, len(theta)))
+    unit = np.stack((np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.sin(theta)), 1)
+    points = (unit * far[:, None] ** 2 * MAX_RANGE / 40).astype(np.float32)
+    x, y, z = points.astype(np.float64).T
+    above = np.arctan2(z, np.hypot(x, y)).astype(np.float32) > np.float32(math.radians(20.0))
+    assert 0.3 < above.mean() < 0.7
+    np.testing.assert_array_equal(sampler._is_proximal(points), above)
+
+
 @pytest.mark.parametrize("count", [1, 2, 7, 40, 60])
 def test_farthest_points_by_brute_force(count):
     points = np.random.default_rng(count).normal(size=(50, 3)).astype(np.float32)
