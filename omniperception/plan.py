@@ -422,9 +422,9 @@ def _packages() -> Section:
 def _variants_kept() -> str:
     from omniperception.lidar.kernels.variants import MAX_VARIANTS, kept_variants, num_built
 
-    folder = sys.modules["warp"].config.kernel_cache_dir
+    folder = Path(sys.modules["warp"].config.kernel_cache_dir)
     kept = f"{len(kept_variants())} of at most {MAX_VARIANTS} kept in this process, {num_built()} built"
-    return f"{kept}; compiled code in {folder}"
+    return f"{kept}; compiled code of {sum(1 for _ in folder.glob('wp_*'))} modules in {folder}"
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------
