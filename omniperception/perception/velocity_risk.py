@@ -15,6 +15,9 @@ from omniperception.perception.sector_motion import sector_bearings
 _OUT_OF_REACH = 100.0
 """Distance (m) of an empty sector."""
 
+_SLOW = 0.1
+"""Commanded speed (m/s) below which the direction counts less."""
+
 _SMALLEST = 1e-6
 """Squared distance (m^2) below which a gradient would not exist."""
 
@@ -27,7 +30,8 @@ class VelocityRisk:
     of exp(-gap / decay - t / time_constant) over all obstacles and `times` t, where gap (m) lies between the
     obstacle's outline and a disc of `robot_radius` if both keep their velocities until then: a velocity obstacle
     (Fiorini and Shiller, 1998) with soft edges. The choice is the mean of the candidates under the weights
-    softmax(-(|v - v_cmd|^2 + weight * risk) / temperature).
+    softmax(-(along^2 + sideways * across^2 + weight * risk) / temperature), where along and across (m/s) are how much a
+    candidate deviates from the command in its direction and beside it.
 
     Beyond the paper, whose V_avoid sees distances alone; see docs/learning.md for what it brings.
 
@@ -41,6 +45,8 @@ class VelocityRisk:
         time_constant: (s).
         weight: of a risk of 1 against a squared deviation from the command ((m/s)^2).
         temperature: ((m/s)^2) of the choice; small ones take the best candidate alone.
+        sideways: what a squared deviation beside the command counts; at 1 it is better to stand before something wide
+            than to go round it.
     """
 
     max_speed: float
@@ -52,10 +58,12 @@ class VelocityRisk:
     time_constant: float
     weight: float
     temperature: float
+    sideways: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", tuple(float(time) for time in self.times))
-        for name in ("max_speed", "num_rings", "num_directions", "decay", "time_constant", "weight", "temperature"):
+        whole = ("num_rings", "num_directions")
+        for name in (*whole, "max_speed", "decay", "time_constant", "weight", "temperature", "sideways"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"rewards.avoidance.risk.{name}={getattr(self, name)} must be positive")
         if self.robot_radius < 0:
@@ -163,10 +171,17 @@ class VelocityRisk:
         Returns:
             (n, 2) m/s in the yaw-aligned frame.
         """
-        deviation = (command[:, None] - candidates).square().sum(-1)
+        deviation = self._deviation(command[:, None], candidates)
         wary = torch.softmax(-(deviation + self.weight * risk) / self.temperature, 1)
         free = torch.softmax(-deviation / self.temperature, 1)
         return (wary - free) @ candidates
+
+    def _deviation(self, command: torch.Tensor, velocities: torch.Tensor) -> torch.Tensor:
+        """(n, K) of velocities (K, 2) from commands (n, 1, 2); slow ones have less of a direction."""
+        away = command - velocities
+        heading = command / command.square().sum(-1, keepdim=True).clamp(min=_SLOW**2).sqrt()
+        across = away[..., 0] * heading[..., 1] - away[..., 1] * heading[..., 0]
+        return away.square().sum(-1) - (1.0 - self.sideways) * across.square()
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -51,6 +52,43 @@ def test_what_lies_ahead_is_passed_on_the_free_side():
     command = torch.tensor([[1.0, 0.0]])
     velocity = command + law.avoidance(risk, command, law.candidates())
     assert velocity[0, 1] < -0.1 and velocity[0, 0] < 0.3
+
+
+@pytest.mark.parametrize("sideways", [1.0, 0.3])
+def test_a_deviation_counts_by_its_direction(sideways):
+    law, rng = VelocityRisk(**GIVEN, sideways=sideways), np.random.default_rng(3)
+    for command in (*rng.normal(size=(20, 2)), np.array([0.0, 0.0]), np.array([0.0, -0.02])):
+        risk = rng.uniform(size=9)
+        heading = command / max(np.hypot(*command), 0.1)
+        cost = []
+        for candidate in law.candidates().numpy():
+            away = command - candidate
+            across = away - (away @ heading) * heading if np.hypot(*command) >= 0.1 else None
+            if across is not None:
+                cost.append((away @ heading) ** 2 + sideways * across @ across)
+            else:  # slow: the part beside counts less and less
+                cost.append(away @ away - (1.0 - sideways) * (away[0] * heading[1] - away[1] * heading[0]) ** 2)
+        wary, free = (np.exp(-np.array(cost + extra) / 0.05) for extra in (8.0 * risk, 0.0 * risk))
+        expected = (wary / wary.sum() - free / free.sum()) @ law.candidates().numpy()
+        given = (torch.tensor(x[None], dtype=torch.float32) for x in (risk, command))
+        assert law.avoidance(*given, law.candidates())[0].tolist() == pytest.approx(expected, abs=2e-5)
+
+
+def test_goes_round_something_wide_instead_of_standing_before_it():
+    """A wall 0.8 m ahead that reaches from 0.5 m on the right to 1.4 m on the left."""
+    angles = -math.pi + (torch.arange(36) + 0.5) * math.pi / 18
+    ahead = (angles > -math.pi / 6) & (angles < math.pi / 3)
+    sectors = torch.zeros(1, 36, 3)
+    sectors[0, :, 0] = torch.where(ahead, 0.8 / angles.cos(), math.inf)
+    times = (0.1, 0.3, 0.6, 0.9, 1.3, 1.8)
+    figures = GIVEN | {"num_rings": 4, "num_directions": 24, "times": times, "decay": 0.15, "max_speed": 1.4}
+    command, chosen = torch.tensor([[1.0, 0.0]]), {}
+    for sideways in (1.0, 0.15):
+        law = VelocityRisk(**figures, sideways=sideways)
+        risk = law.risk(sectors, law.candidates())
+        chosen[sideways] = (command + law.avoidance(risk, command, law.candidates()))[0]
+    assert chosen[1.0].norm() < 0.1
+    assert chosen[0.15][1] < -0.3 and chosen[0.15][0] > 0.1
 
 
 @pytest.mark.parametrize(
