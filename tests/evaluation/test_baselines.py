@@ -7,6 +7,7 @@ from omniperception import config
 from omniperception.assembly import build_runner
 from omniperception.evaluation.baselines import covered, steered
 from omniperception.perception import Attitude
+from omniperception.task.env import OmniEnv
 from omniperception.task.rewards import AvoidanceConfig
 
 BLIND = ("experiment=walk", "rewards=walk")
@@ -71,6 +72,19 @@ class TestCovered:
         for k in range(heard[0].shape[1]):
             torch.testing.assert_close(heard[0][:, k], expected)
         assert not torch.equal(heard[0][:, -1], env.sensing.frames[:, -1])
+
+    def test_how_the_base_moved_is_still_known(self):
+        given = ("experiment=avoid", "scenario=static", "num_envs=3", "lidar.sensor.num_rays=200")
+        env = OmniEnv(config.assemble(config.compose(given)).env)
+        for _ in range(12):
+            env.step(torch.randn(3, env.num_actions))
+        frames, heard = env.get_observations()["frames"].clone(), []
+        covered(env, lambda obs: heard.append(obs["frames"]))(env.get_observations())
+        points = env.config.sampler().num_points
+        assert frames.shape[2] == points + 1 and frames[:, -1, points].norm(dim=-1).min() > 0
+        assert torch.equal(heard[0][:, :, points], frames[:, :, points])
+        assert not heard[0][:, :, :points].any() and frames[:, :, :points].any()
+        assert torch.equal(env.get_observations()["frames"], frames)  # what the robot itself sees is what it was
 
     def test_what_is_around_does_not_matter_to_a_blind_policy(self, runner):
         env, seeing = runner.env, runner.get_inference_policy("cpu")
