@@ -21,8 +21,10 @@ Limits = tuple[tuple[float, float], tuple[float, float]]
 
 
 def covered(env: OmniEnv, policy: Policy) -> Policy:
-    """The policy with its LiDAR covered: every ray is a miss, and the points of all frames are what the sampler makes of
-    that. How the base moved, which stands behind the points, stays as it is."""
+    """The policy with its LiDAR covered: every ray is a miss, and the points of frames are what the sampler makes of that.
+
+    How the base moved, which stands behind the points, stays as it is.
+    """
     if env.sensing is None or env.sensing.frames is None:
         raise ValueError("this policy does not look at the LiDAR, there is nothing to cover; leave policy=blind out")
     nothing = _empty_points(env)
