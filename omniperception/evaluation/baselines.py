@@ -21,7 +21,7 @@ Limits = tuple[tuple[float, float], tuple[float, float]]
 
 
 def covered(env: OmniEnv, policy: Policy) -> Policy:
-    """The policy with its LiDAR covered: every ray is a miss, and the points of frames are what the sampler makes of that.
+    """The policy with its LiDAR covered: rays all miss, and the points of frames are what the sampler makes of it.
 
     How the base moved, which stands behind the points, stays as it is.
     """
