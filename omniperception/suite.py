@@ -145,7 +145,8 @@ def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolic
             policy = covered(trained.env, policy)
         if name == "scripted":
             avoidance = config.assemble(config.load(evaluation.run_dir)).env.rewards.avoidance
-            policy = steered(trained.env, policy, avoidance, _learned_commands(run_dir))
+            own_law = run_dir == evaluation.run_dir and avoidance.risk is not None  # what the run itself is told
+            policy = steered(trained.env, policy, avoidance, None if own_law else _learned_commands(run_dir))
         if name == "exported":
             exported = ExportedPolicies(trained.env, ExportedPolicy.load(run_dir / EXPORTED))
             return TrainedPolicy(trained.env, exported, run_dir / EXPORTED)

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from omniperception import config
+from omniperception import config, suite
 from omniperception.assembly import build_runner
 from omniperception.config import ConfigError
 from omniperception.evaluation import plots
+from omniperception.evaluation.baselines import steered
 from omniperception.suite import Evaluation, evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -85,6 +86,21 @@ def test_files_and_tables(walker, capsys):
         assert (folder / f"{scenario}.png").read_bytes()[:4] == b"\x89PNG"
     printed = capsys.readouterr().out
     assert "ending at the first contact" in printed and "scripted" in printed and "time out" in printed
+
+
+def test_only_a_law_that_the_policy_does_not_know_is_clipped(monkeypatch):
+    """To the walker's commands; a run whose own command follows from the law is told all that the law says."""
+    given = []
+
+    def spy(env, policy, avoidance, limits):
+        given.append(limits)
+        return steered(env, policy, avoidance, limits)
+
+    monkeypatch.setattr(suite, "steered", spy)
+    run, walker = ROOT / "pretrained/pd_risknet", ROOT / "pretrained/gait"
+    for walks in (None, walker):
+        suite._contender("scripted", Evaluation(run, ["static"], ["scripted"], trials=2, walker=walks), "static")
+    assert given == [None, ((-1.0, 1.5), (-1.0, 1.0))]
 
 
 def test_environments_default_to_even_rounds():
