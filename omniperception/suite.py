@@ -141,7 +141,7 @@ def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolic
     trained = load_policy(run, run_dir)
     policy = trained.policy
     try:
-        if name == "blind" or (name == "scripted" and run.perception is not None):
+        if name == "blind":
             policy = covered(trained.env, policy)
         if name == "scripted":
             avoidance = config.assemble(config.load(evaluation.run_dir)).env.rewards.avoidance

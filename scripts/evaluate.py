@@ -9,7 +9,7 @@ terminations=collision. The same seed, number of trials and of environments give
     run        the run's
     blind      the same, its LiDAR covered
     scripted   told V_cmd + V_avoid, by the run's law from true distances: the walker's policy, or without one the
-               run's own, LiDAR covered
+               run's own, which sees no frame
     command    the walker's, told V_cmd alone
     exported   the run's as scripts/export.py wrote it, on raw points, joint states and IMU
 Writes evaluation/<scenario>.json (summary), .csv (every trial) and .png (trajectories) into the run directory.

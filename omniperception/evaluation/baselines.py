@@ -42,6 +42,8 @@ def covered(env: OmniEnv, policy: Policy) -> Policy:
 def steered(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
     """The policy told V_cmd + V_avoid in place of V_cmd, with V_avoid from the obstacles' true distances.
 
+    To a policy that sees, too, it is always before the first frame, so that it adds no avoidance of its own.
+
     Args:
         env: where it walks.
         policy: follows velocity commands.
@@ -63,6 +65,8 @@ def steered(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Li
             velocity = velocity.clamp(low, high)
         observations = observations.clone(recurse=False)
         observations[COMMAND_GROUP] = torch.cat((velocity, env.command.value[:, 2:]), 1)
+        if "frame_count" in observations:
+            observations["frame_count"] = torch.zeros_like(observations["frame_count"])
         return policy(observations)
 
     return steer

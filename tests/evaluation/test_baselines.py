@@ -1,15 +1,18 @@
 """The blind and the scripted policy: what they see and what they are told."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from omniperception import config
-from omniperception.assembly import build_runner
+from omniperception.assembly import build_runner, load_policy
 from omniperception.evaluation.baselines import covered, steered
 from omniperception.perception import Attitude
 from omniperception.task.env import OmniEnv
 from omniperception.task.rewards import AvoidanceConfig
 
+ROOT = Path(__file__).resolve().parents[2]
 BLIND = ("experiment=walk", "rewards=walk")
 SEEING = ("experiment=quickstart", "scenario=static", "num_envs=3", "randomization=none")
 
@@ -38,6 +41,21 @@ class TestSteered:
         limited = self.told(env, ((-0.5, 1.0), (-0.5, 0.5)))
         assert limited[1, 1] == -0.5 and limited[0, 0] == given[0, 0].clamp(max=1.0)
         assert torch.equal(env.get_observations()["command"], given)  # the task's command is what it was
+
+    def test_what_the_policy_perceives_itself_does_not_matter(self):
+        run = config.load(ROOT / "pretrained/pd_risknet", ["scenario=corridor", "num_envs=4"])
+        trained = load_policy(config.assemble(run), ROOT / "pretrained/pd_risknet")
+        env, law = trained.env, trained.env.config.rewards.avoidance
+        told = steered(env, trained.policy, law, None)
+        with torch.no_grad():
+            for _ in range(30):
+                env.step(told(env.get_observations()))
+            seen = env.get_observations()
+            other = seen.clone()
+            other["frames"] = torch.rand_like(other["frames"])
+            assert torch.equal(told(seen), told(other))
+            other["frame_tick"] += 1  # a new frame, as the policy embeds each once
+            assert not torch.allclose(trained.policy(seen), trained.policy(other))
 
     def test_needs_a_command_to_add_to(self, make_env):
         env = make_env(*BLIND, "scenario=static", "num_envs=2", "observations.actor=[proprioception]")
