@@ -245,12 +245,17 @@ def _is_group(override: str) -> bool:
     return (CONFIG_DIR / override.split("=", 1)[0]).is_dir()
 
 
+_ONE_OR_SEVERAL = ("init",)
+"""Keys that take a name or a list of names, whichever the preset has; `_names` checks them."""
+
+
 def _check_kinds(config: object, presets: object, key: str = "") -> None:
     """Every value must be of the kind that its preset has: a number for a number, a list for a list."""
     if isinstance(config, DictConfig) and isinstance(presets, DictConfig):
         for name in presets:
-            if name in config and name != "init" and not OmegaConf.is_interpolation(presets, name):
-                _check_kinds(config[name], presets[name], f"{key}.{name}" if key else str(name))
+            path = f"{key}.{name}" if key else str(name)
+            if name in config and path not in _ONE_OR_SEVERAL and not OmegaConf.is_interpolation(presets, name):
+                _check_kinds(config[name], presets[name], path)
         return
     given, expected = _kind(config), _kind(presets)
     if None in (given, expected) or given == expected or (given, expected) == ("a whole number", "a number"):

@@ -18,6 +18,17 @@ _OUT_OF_REACH = 100.0
 _SLOW = 0.1
 """Commanded speed (m/s) below which the direction counts less."""
 
+_POSITIVE = (
+    "max_speed",
+    "num_rings",
+    "num_directions",
+    "decay",
+    "time_constant",
+    "weight",
+    "temperature",
+    "sideways",
+)
+
 _SMALLEST = 1e-6
 """Squared distance (m^2) below which a gradient would not exist."""
 
@@ -46,7 +57,7 @@ class VelocityRisk:
         weight: of a risk of 1 against a squared deviation from the command ((m/s)^2).
         temperature: ((m/s)^2) of the choice; small ones take the best candidate alone.
         sideways: what a squared deviation beside the command counts; at 1 it is better to stand before something wide
-            than to go round it.
+            than to go round it, as in runs saved before there was a choice.
     """
 
     max_speed: float
@@ -62,8 +73,7 @@ class VelocityRisk:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", tuple(float(time) for time in self.times))
-        whole = ("num_rings", "num_directions")
-        for name in (*whole, "max_speed", "decay", "time_constant", "weight", "temperature", "sideways"):
+        for name in _POSITIVE:
             if getattr(self, name) <= 0:
                 raise ValueError(f"rewards.avoidance.risk.{name}={getattr(self, name)} must be positive")
         if self.robot_radius < 0:
