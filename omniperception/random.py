@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import torch
 
+from omniperception.rows import put, take
+
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64
 _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
@@ -24,29 +26,30 @@ class EnvRandom:
         self._key = _mix(torch.arange(num_envs, device=device) + (seed + 1) * 1_000_003)
         self.counter = torch.zeros(num_envs, dtype=torch.int64, device=device)
 
-    def start_episode(self, env_ids: torch.Tensor) -> None:
-        """Goes on to the stretch of the stream that the next episode draws from.
+    def start_episode(self, envs: torch.Tensor) -> None:
+        """Goes on to the stretch of the stream that the next episode of `envs` (see `rows`) draws from.
 
         What an environment draws in its k-th episode then depends on k, not on how much it drew before.
         """
-        self.counter[env_ids] = (self.counter[env_ids] // _DRAWS_PER_EPISODE + 1) * _DRAWS_PER_EPISODE
+        put(self.counter, envs, (take(self.counter, envs) // _DRAWS_PER_EPISODE + 1) * _DRAWS_PER_EPISODE)
 
-    def uniform(self, env_ids: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
-        """Draws from [0, 1) for some environments.
+    def uniform(self, envs: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
+        """Draws from [0, 1) for some environments, see `rows`; the others' streams stay where they are.
 
         Returns:
-            (len(env_ids), *shape) float32.
+            (len(envs), *shape) float32.
         """
         size = math.prod(shape)
         draw = torch.arange(1, size + 1, device=self.counter.device)
-        state = self._key[env_ids, None] + (self.counter[env_ids, None] + draw) * _GOLDEN
-        self.counter[env_ids] += size
+        drawn = take(self.counter, envs)[:, None]
+        state = take(self._key, envs)[:, None] + (drawn + draw) * _GOLDEN
+        put(self.counter, envs, drawn[:, 0] + size)
         bits = _shift(_mix(state), 40)
         return (bits.float() * 2.0**-24).reshape(-1, *shape)
 
-    def range(self, env_ids: torch.Tensor, low: float, high: float, shape: Sequence[int] = ()) -> torch.Tensor:
-        """Draws from [low, high) for some environments; (len(env_ids), *shape) float32."""
-        return low + (high - low) * self.uniform(env_ids, shape)
+    def range(self, envs: torch.Tensor, low: float, high: float, shape: Sequence[int] = ()) -> torch.Tensor:
+        """Draws from [low, high) for some environments; (len(envs), *shape) float32."""
+        return low + (high - low) * self.uniform(envs, shape)
 
 
 def _shift(x: torch.Tensor, bits: int) -> torch.Tensor:

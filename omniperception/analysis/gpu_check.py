@@ -23,6 +23,7 @@ from omniperception.analysis.lidar_benchmark.peers import ONE_MESH
 from omniperception.analysis.lidar_benchmark.report import Table, machine, machine_line, write
 from omniperception.analysis.lidar_benchmark.timing import device_barrier
 from omniperception.analysis.step_errors import step_errors
+from omniperception.analysis.waits import find_waits
 from omniperception.assembly import build_runner, seed_everything
 from omniperception.sim.mujoco_warp import MujocoWarpSimulator
 from omniperception.task.env import OmniEnv
@@ -139,26 +140,41 @@ def _compare_replay(options: CheckOptions) -> Table:
 
 
 def check_waiting(options: CheckOptions) -> list[Table]:
-    """Where a control step of the environment waits for the GPU, as PyTorch tells."""
-    table = Table("waits", "Places of one control step that wait for the GPU", ("place", "times"))
-    if not options.on_gpu:
-        table.notes = ["left out: there is nothing to wait for on a CPU"]
-        return [table]
-    env = OmniEnv(replace(options.run("num_envs=256").env, initial_obstacle_level=1.0, log_interval=10**9))
-    actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
-    for _ in range(6):
-        env.step(actions)
+    """Where a control step of the environment waits for the GPU: as PyTorch tells, or on a CPU as `find_waits` finds."""
+    table = Table("waits", "Places of a control step that wait for the GPU", ("place", "times"))
+    sizes = () if options.small else ("num_envs=256",)
+    env = OmniEnv(replace(options.run(*sizes).env, initial_obstacle_level=1.0, log_interval=10**9))
+    actions, steps = torch.zeros(env.num_envs, env.num_actions, device=env.device), 6
+
+    def control_steps() -> None:
+        for _ in range(steps):
+            env.episode_length_buf[0] = env.max_episode_length  # an episode ends in every step
+            env.step(actions)
+
+    control_steps()  # kernels are compiled, graphs captured
+    if options.on_gpu:
+        places = _places_that_wait(control_steps)
+        table.notes = ["Warp's and the physics' own waits, of which there should be none, are not seen by this"]
+    else:
+        with find_waits() as waits:
+            control_steps()
+        places = waits.places()
+        table.notes = [f"{waits.operators / steps:.0f} operators of PyTorch in a control step"]
+    table.rows = sorted(places.items())
+    table.notes.append(f"in {steps} control steps")
+    return [_judged(table, not places)]
+
+
+def _places_that_wait(work: Callable[[], None]) -> dict[str, int]:
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            env.step(actions)
+            work()
     finally:
         torch.cuda.set_sync_debug_mode("default")
     places = [f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchroniz" in str(w.message)]
-    table.rows = [(place, places.count(place)) for place in sorted(set(places))]
-    table.notes = ["Warp's and the physics' own waits, of which there should be none, are not seen by this"]
-    return [table]
+    return {place: places.count(place) for place in places}
 
 
 def measure_rays(options: CheckOptions) -> list[Table]:

@@ -59,14 +59,20 @@ class PoseTrack:
         self._oldest.add_(1).remainder_(self.segments + 1)
         self._record()
 
-    def reset(self, env_ids: torch.Tensor | slice = slice(None)) -> None:
-        """Forgets how the bodies of some environments moved: they have always been where the scene has them now."""
-        bodies = slice(0, self._scene.num_bodies)
-        self._pos[:, env_ids, bodies] = self._scene.body_pos[env_ids].double()
-        xyzw = self._scene.body_quat[env_ids].double().roll(-1, -1)
-        self._quat[:, env_ids, bodies] = torch.nn.functional.normalize(xyzw, dim=-1)
-        self._turn[:, env_ids] = 0.0
-        self._turn[:, env_ids, bodies, 3] = self._scene.broken_poses()[env_ids].double() * float(BROKEN)
+    def reset(self, which: torch.Tensor | None = None) -> None:
+        """Forgets how the bodies of some environments moved: they have always been where the scene has them now.
+
+        Args:
+            which: (num_envs,) bool; None for all.
+        """
+        scene = self._scene
+        moved = scene.body_quat.new_ones(scene.num_envs, dtype=torch.bool) if which is None else which
+        xyzw = torch.nn.functional.normalize(scene.body_quat.double().roll(-1, -1), dim=-1)
+        turn = torch.zeros_like(xyzw)
+        turn[..., 3] = scene.broken_poses().double() * float(BROKEN)
+        for kept, now in ((self._pos, scene.body_pos.double()), (self._quat, xyzw), (self._turn, turn)):
+            kept = kept[:, :, : scene.num_bodies]
+            kept.copy_(torch.where(moved[:, None, None], now, kept))
         self._is_new = False
 
     def _as_arrays(self) -> Track:

@@ -127,8 +127,8 @@ class Simulator(Protocol):
                 each step; None leaves them where they are.
         """
 
-    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        """Puts some environments into a state, (n, nq) and (n, nv)."""
+    def reset(self, envs: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Puts some environments, see `rows`, into a state, (n, nq) and (n, nv)."""
 
     def joint_torque(self) -> torch.Tensor:
         """(num_envs, num_joints) actuator torque (N m) of the last physics step.
@@ -169,5 +169,5 @@ class Simulator(Protocol):
     def detect_failures(self) -> None:
         """Marks simulations whose state is no longer one that a robot can be in."""
 
-    def update_model(self, env_ids: torch.Tensor) -> None:
-        """Recomputes what the engine derives from model fields that were written for some environments."""
+    def update_model(self, envs: torch.Tensor) -> None:
+        """Recomputes what the engine derives from model fields that were written for some environments, see `rows`."""

@@ -24,7 +24,7 @@ _STAGE_POS = mujoco.mjtStage.mjSTAGE_POS.value
 class MujocoSimulator:
     """`num_envs` simulations on a native thread pool; only what is asked for is copied out of the engine.
 
-    State tensors are views of the engine's own memory. Contact sensors and torques describe the state before the last
+    It takes environments by their indices alone. State tensors are views of the engine's own memory. Contact sensors and torques describe the state before the last
     physics step, as `mj_step` leaves them; body poses are recomputed for the current state.
 
     The steps of one call are one native call: threads that sleep between calls cost more than the obstacles' motion.
@@ -129,18 +129,18 @@ class MujocoSimulator:
             self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
             self.mark_failed(warned, Failure.ENGINE)
 
-    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        kept = [poses[env_ids].clone() for poses in self._kinematic]
-        self.batch.reset(env_ids.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+    def reset(self, envs: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        kept = [poses[envs].clone() for poses in self._kinematic]
+        self.batch.reset(envs.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for poses, before in zip(self._kinematic, kept, strict=True):
-            poses[env_ids] = before
-        self.qpos[env_ids] = qpos.double()
-        self.qvel[env_ids] = qvel.double()
-        self.failure[env_ids] = Failure.NONE
+            poses[envs] = before
+        self.qpos[envs] = qpos.double()
+        self.qvel[envs] = qvel.double()
+        self.failure[envs] = Failure.NONE
         for values in self._records.values():
-            values[env_ids.numpy()] = 0.0
+            values[envs.numpy()] = 0.0
         if self._torque is not None:
-            self._torque[env_ids] = 0.0
+            self._torque[envs] = 0.0
 
     def joint_torque(self) -> torch.Tensor:
         if self._torque is None:
@@ -185,8 +185,8 @@ class MujocoSimulator:
             self._fields[name] = torch.from_numpy(self.batch.expand(name))
         return self._fields[name]
 
-    def update_model(self, env_ids: torch.Tensor) -> None:
-        self.batch.set_const(env_ids.numpy())
+    def update_model(self, envs: torch.Tensor) -> None:
+        self.batch.set_const(envs.numpy())
 
     def anomalies(self) -> dict[str, float]:
         return {}

@@ -14,6 +14,7 @@ import torch
 import warp as wp
 
 from omniperception.lidar.launch import wp_device
+from omniperception.rows import put
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, SimConfig
 from omniperception.sim.mujoco import apply_options
 from omniperception.world import World
@@ -189,12 +190,12 @@ class MujocoWarpSimulator:
         self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
         self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
 
-    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        self.qpos[env_ids] = qpos.float()
-        self.qvel[env_ids] = qvel.float()
-        self.failure[env_ids] = int(Failure.NONE)
+    def reset(self, envs: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        put(self.qpos, envs, qpos)
+        put(self.qvel, envs, qvel)
+        put(self.failure, envs, int(Failure.NONE))
         for values in (*self._forgotten, *self._records.values()):
-            values[env_ids] = 0.0
+            put(values, envs, 0.0)
 
     def joint_torque(self) -> torch.Tensor:
         return self._torque.clone()
@@ -224,7 +225,7 @@ class MujocoWarpSimulator:
                 self.update_model(torch.arange(self.num_envs, device=self.device))
         return self._fields[name]
 
-    def update_model(self, env_ids: torch.Tensor) -> None:
+    def update_model(self, envs: torch.Tensor) -> None:
         """Derives anew for all worlds, whose other constants come out as they were, in one launch for all."""
         self._launch("constants", self._constants)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from tensordict import TensorDict
 from omniperception.lidar import DEVICES, Noise
 from omniperception.perception.sector_motion import NEARNESS_RANGE, encode, nothing_near
 from omniperception.random import EnvRandom
+from omniperception.rows import chosen, put, replaced, take
 from omniperception.sim import SimConfig, Simulator
 from omniperception.task.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.task.heights import NUM_HEIGHTS, flat_heights
@@ -220,7 +222,7 @@ class OmniEnv(VecEnv):
         self._reset(self._all_envs)
         self._read_state()
         self._groups = {n: GroupBuffer(n, g, self) for n, g in config.observations.groups.items()}
-        self._fresh = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        self._fresh = self._all_envs  # those whose observations begin an episode, see `rows`
         if self.sensing is not None:
             self.sensing.start(self._all_envs, self.sensed)
         self._sense()
@@ -263,13 +265,12 @@ class OmniEnv(VecEnv):
             probe()
         with self.timer.stage("resets"):
             self.command.advance(self.control_dt, self.kinematics)
-            self._fresh = done
-            ids = done.nonzero().flatten()
-            if len(ids):
-                self._reset(ids)
+            self._fresh = ended = chosen(done, costly=self.obstacles is not None and self.obstacles.searches)
+            if len(ended):
+                self._reset(ended)
                 self._read_state()
                 if self.sensing is not None:
-                    self.sensing.start(ids, self.sensed)
+                    self.sensing.start(ended, self.sensed)
         with self.timer.stage("observations"):
             self.observations = self._observe()
         extras: dict = {"time_outs": outcomes["time_out"].float()}
@@ -489,48 +490,46 @@ class OmniEnv(VecEnv):
             return None
         return (self.sensing.sector_distance >= self.config.rewards.avoidance.threshold).all(1)
 
-    def _reset(self, env_ids: torch.Tensor) -> None:
-        """Starts a new episode in some environments; the others are not touched."""
-        self.random.start_episode(env_ids)
-        spawn = self.config.commands.spawn
-        low = torch.tensor([spawn.x[0], spawn.y[0], torch.pi / 180 * spawn.yaw_deg[0]], device=self.device)
-        high = torch.tensor([spawn.x[1], spawn.y[1], torch.pi / 180 * spawn.yaw_deg[1]], device=self.device)
-        pose = low + self.random.uniform(env_ids, (3,)) * (high - low)
-        height = torch.full((len(env_ids), 1), self.robot.base_height, device=self.device)
+    def _reset(self, envs: torch.Tensor) -> None:
+        """Starts a new episode in some environments, see `rows`; the others are not touched."""
+        self.random.start_episode(envs)
+        low, high = self._spawn
+        pose = low + self.random.uniform(envs, (3,)) * (high - low)
+        height = torch.full((len(envs), 1), self.robot.base_height, device=self.device)
         if self.ground is not None:
-            self.terrain_levels.start(env_ids, pose[:, :2], self._completed(env_ids))
-            height = height + self.ground.highest(pose[:, :2], FOOTING, env_ids)[:, None]
-        joints = self.default_joint_pos.expand(len(env_ids), -1)
+            self.terrain_levels.start(envs, pose[:, :2], self._completed(envs))
+            height = height + self.ground.highest(pose[:, :2], FOOTING, envs)[:, None]
+        joints = self.default_joint_pos.expand(len(envs), -1)
         qpos = torch.cat((pose[:, :2], height, yaw_quat(pose[:, 2]), joints), 1)
-        qvel = torch.zeros(len(env_ids), self.sim.qvel.shape[1], device=self.device)
-        self.sim.reset(env_ids, qpos, qvel)
-        self.randomizer.reset(env_ids)
+        qvel = torch.zeros(len(envs), self.sim.qvel.shape[1], device=self.device)
+        self.sim.reset(envs, qpos, qvel)
+        self.randomizer.reset(envs)
         if self._past is not None:
             for past, now in zip(self._past, (qpos, qvel), strict=True):
-                past[env_ids] = now.to(past.dtype)[:, None]
-        self.command.reset(env_ids, Kinematics.of(self.sim.qpos, self.sim.qvel))
+                put(past, envs, now[:, None])
+        self.command.reset(envs, Kinematics.of(self.sim.qpos, self.sim.qvel))
         if self.obstacles is not None:
-            commanded = rotate_yaw(pose[:, 2], self.command.value[env_ids, :2])
-            goal = None if self.command.goal_w is None else self.command.goal_w[env_ids]
-            self.obstacles.reset(env_ids, pose[:, :2], commanded, goal)
-        self.episode_length_buf[env_ids] = 0
-        self.actions = tuple(a.index_fill(0, env_ids, 0.0) for a in self.actions)
-        self.touching[env_ids] = False
+            commanded = rotate_yaw(pose[:, 2], take(self.command.value, envs)[:, :2])
+            goal = None if self.command.goal_w is None else take(self.command.goal_w, envs)
+            self.obstacles.reset(envs, pose[:, :2], commanded, goal)
+        put(self.episode_length_buf, envs, 0)
+        self.actions = tuple(replaced(action, envs, 0.0) for action in self.actions)
+        put(self.touching, envs, False)
         if self.sensing is not None:
-            self.sensing.reset(env_ids)
-            self.avoidance_velocity = self.avoidance_velocity.index_fill(0, env_ids, 0.0)
+            self.sensing.reset(envs)
+            self.avoidance_velocity = replaced(self.avoidance_velocity, envs, 0.0)
             if self.risk is not None:
-                self.risk = self.risk.index_fill(0, env_ids, 0.0)
+                self.risk = replaced(self.risk, envs, 0.0)
             if self.motion is not None:
-                self.motion[env_ids] = nothing_near(1, self.motion.shape[1], self.device)
+                put(self.motion, envs, nothing_near(1, self.motion.shape[1], self.device))
             if not self.heights_every_step:
-                self.heights = self.heights.index_fill(0, env_ids, 0.0)
+                self.heights = replaced(self.heights, envs, 0.0)
 
-    def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
+    def _completed(self, envs: torch.Tensor) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
         if self.step_count == 0:
             return None
-        return (self.outcomes["time_out"] | self.outcomes["goal"])[env_ids]
+        return take(self.outcomes["time_out"] | self.outcomes["goal"], envs)
 
     def _observe(self) -> TensorDict:
         return self._collect({name: buffer.update(self, self._fresh) for name, buffer in self._groups.items()})
@@ -631,6 +630,9 @@ class OmniEnv(VecEnv):
         joint_ids = [model.joint(name).id for name in robot.joints]
         limits = torch.tensor(model.jnt_range[joint_ids], dtype=torch.float32, device=self.device)
         self.joint_lower, self.joint_upper = limits[:, 0], limits[:, 1]
+        spawn = self.config.commands.spawn
+        bounds = (spawn.x, spawn.y, [math.radians(angle) for angle in spawn.yaw_deg])
+        self._spawn = torch.tensor(list(zip(*bounds, strict=True)), device=self.device)
         self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
         zero = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         self.actions: tuple[torch.Tensor, ...] = (zero,) * (1 + self._actions_before())

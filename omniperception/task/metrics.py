@@ -23,6 +23,7 @@ class EpisodeMetrics:
         self._errors = torch.zeros(5, device=device)
         self._healthy_steps, self._clipped = torch.zeros(2, device=device).unbind(0)
         self._failures = torch.zeros(len(Failure), dtype=torch.int64, device=device)
+        self._causes = torch.arange(len(Failure), device=device)
         self._outcomes = torch.zeros(len(OUTCOMES) + 2, device=device)
         self._steps = 0
         self.collided = torch.zeros(num_envs, dtype=torch.bool, device=device)
@@ -54,7 +55,7 @@ class EpisodeMetrics:
         self._outcomes += torch.stack(
             [outcomes[name].sum() for name in OUTCOMES] + [(done & self.collided).sum(), done.sum()]
         )
-        self._failures += torch.bincount(failure, minlength=len(Failure))
+        self._failures += (failure[:, None] == self._causes).sum(0)
         self.collided &= ~done
 
     def free_velocity_error(self) -> float:

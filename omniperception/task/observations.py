@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from omniperception.rows import put, take
 from omniperception.task.mirror import JOINTS, ROTATION, VECTOR, mirrors
 from omniperception.task.state import checked_term, fields_read, reads
 
@@ -78,7 +79,7 @@ class GroupBuffer:
             self.buffer = torch.zeros(env.num_envs, group.history, self.width, device=env.device)
 
     def update(self, env: OmniEnv, fresh: torch.Tensor) -> torch.Tensor:
-        """Appends the current observation; `fresh` (num_envs,) bool marks environments just reset.
+        """Appends the current observation, which is all that the history of `fresh` environments holds (see `rows`).
 
         Returns:
             (num_envs, history * width).
@@ -88,7 +89,7 @@ class GroupBuffer:
         if self.buffer is None:
             return value
         self.buffer = torch.cat((self.buffer[:, 1:], value[:, None]), 1)
-        self.buffer[fresh] = value[fresh][:, None]
+        put(self.buffer, fresh, take(value, fresh)[:, None])
         return self.buffer.flatten(1)
 
 
@@ -172,7 +173,7 @@ def nearest_obstacles(env: OmniEnv, count: int, max_distance: float) -> torch.Te
     """
     rel_pos = env.obstacle_rel_pos_yaw
     distance = rel_pos.norm(dim=-1) - env.obstacle_radius
-    distance = torch.where(env.obstacle_active, distance, distance.new_tensor(float("inf")))
+    distance = distance.masked_fill(~env.obstacle_active, float("inf"))
     nearest, index = distance.topk(min(count, distance.shape[1]), dim=1, largest=False)
     nearness = (1 - nearest / max_distance).clamp(min=0.0)
     gather = index[..., None].expand(-1, -1, 2)

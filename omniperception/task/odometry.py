@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from omniperception.rows import replaced, take
 from omniperception.task.rotations import rotate_yaw
 from omniperception.task.state import Kinematics
 
@@ -17,11 +18,11 @@ class Odometry:
         self._yaw = torch.zeros(num_envs, device=device)
         self._yaw_before = torch.zeros(num_envs, device=device)
 
-    def start(self, env_ids: torch.Tensor, sensed: Kinematics) -> None:
-        """Some robots stand elsewhere."""
-        self._yaw = self._yaw.index_copy(0, env_ids, sensed.yaw[env_ids])
-        self._yaw_before = self._yaw_before.index_copy(0, env_ids, sensed.yaw[env_ids])
-        self._travelled_w = self._travelled_w.index_fill(0, env_ids, 0.0)
+    def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
+        """The robots of `envs` (see `rows`) stand elsewhere; `sensed` of all."""
+        self._yaw = replaced(self._yaw, envs, take(sensed.yaw, envs))
+        self._yaw_before = replaced(self._yaw_before, envs, take(sensed.yaw, envs))
+        self._travelled_w = replaced(self._travelled_w, envs, 0.0)
 
     def advance(self, sensed: Kinematics) -> None:
         """One control step."""

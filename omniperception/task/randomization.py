@@ -11,6 +11,7 @@ import torch
 
 from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.random import EnvRandom
+from omniperception.rows import put
 from omniperception.sim import Simulator
 from omniperception.world.terrain import contact_solrefs
 
@@ -94,6 +95,7 @@ class Randomizer:
         self._mass = any(getattr(config, n) for n in ("added_mass", "payload_mass", "com_x", "com_y", "com_z"))
         self._nominal: dict[str, torch.Tensor] = {}  # of what is randomized, when it is first drawn
         self._check_mass()
+        self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
         self.joint_offset: torch.Tensor | None = None
         """(num_envs, num_joints) rad added to the joint targets; None when not randomized."""
         self.delay: torch.Tensor | None = None
@@ -115,26 +117,26 @@ class Randomizer:
         """The largest delay in physics steps that can be drawn."""
         return round(self.config.latency_s[1] / self._sim.world.model.opt.timestep) if self.config.latency_s else 0
 
-    def reset(self, env_ids: torch.Tensor) -> None:
+    def reset(self, envs: torch.Tensor) -> None:
         """Draws new parameters for some environments."""
         config = self.config
         if config.ground_friction:
-            self._write("geom_friction", (env_ids, self._ground, 0), self._draw(env_ids, "ground_friction"))
+            self._write("geom_friction", envs, self._draw(envs, "ground_friction"), self._ground, 0)
         if config.ground_restitution:
-            solref = contact_solrefs(self._draw(env_ids, "ground_restitution"))
-            self._write("geom_solref", (env_ids, self._ground), solref)
+            solref = contact_solrefs(self._draw(envs, "ground_restitution"))
+            self._write("geom_solref", envs, solref, self._ground)
         if config.motor_strength:
-            self._scale_motors(env_ids)
+            self._scale_motors(envs)
         if config.gravity_offset:
-            offset = self._draw(env_ids, "gravity_offset", (3,))
-            self._write("opt.gravity", env_ids, self._nominal_of("opt.gravity") + offset)
+            offset = self._draw(envs, "gravity_offset", (3,))
+            self._write("opt.gravity", envs, self._nominal_of("opt.gravity") + offset)
         if self.joint_offset is not None:
-            self.joint_offset[env_ids] = self._draw(env_ids, "joint_offset", self.joint_offset.shape[1:]).float()
+            put(self.joint_offset, envs, self._draw(envs, "joint_offset", self.joint_offset.shape[1:]))
         if self.delay is not None:
-            steps = self._draw(env_ids, "latency_s") / self._model.opt.timestep
-            self.delay[env_ids] = steps.round().long()
+            steps = self._draw(envs, "latency_s") / self._model.opt.timestep
+            put(self.delay, envs, steps.round())
         if self._mass:
-            self._set_masses(env_ids)
+            self._set_masses(envs)
 
     def state_dict(self) -> dict:
         """Parameters that live outside the physics model."""
@@ -145,10 +147,9 @@ class Randomizer:
             if mine is not None:
                 mine.copy_(saved)
 
-    def _write(self, field: str, index: object, values: torch.Tensor) -> None:
-        """Writes float64 values into a model field in the engine's precision."""
-        target = self._sim.model_field(field)
-        target[index] = values.to(target.dtype)
+    def _write(self, field: str, envs: torch.Tensor, values: torch.Tensor, *index: int) -> None:
+        """Writes float64 values into a model field of some environments, at an index, in the engine's precision."""
+        put(self._sim.model_field(field)[(slice(None), *index)], envs, values)
 
     def _check_mass(self) -> None:
         """Refuses ranges that can leave the base without mass, with which physics diverges at once."""
@@ -160,31 +161,31 @@ class Randomizer:
                 f" {base:g} kg with {lightest:g} kg; it must keep a positive mass"
             )
 
-    def _draw(self, env_ids: torch.Tensor, name: str, shape: Sequence[int] = ()) -> torch.Tensor:
+    def _draw(self, envs: torch.Tensor, name: str, shape: Sequence[int] = ()) -> torch.Tensor:
         low, high = getattr(self.config, name)
-        return self._random.range(env_ids, low, high, tuple(shape)).double()
+        return self._random.range(envs, low, high, tuple(shape)).double()
 
-    def _draw_or_zero(self, env_ids: torch.Tensor, name: str) -> torch.Tensor:
+    def _draw_or_zero(self, envs: torch.Tensor, name: str) -> torch.Tensor:
         if getattr(self.config, name) is None:
-            return torch.zeros(len(env_ids), dtype=torch.float64, device=env_ids.device)
-        return self._draw(env_ids, name)
+            return torch.zeros(len(envs), dtype=torch.float64, device=envs.device)
+        return self._draw(envs, name)
 
-    def _scale_motors(self, env_ids: torch.Tensor) -> None:
-        scale = self._draw(env_ids, "motor_strength", (self._model.nu, 1))
+    def _scale_motors(self, envs: torch.Tensor) -> None:
+        scale = self._draw(envs, "motor_strength", (self._model.nu, 1))
         for name in ("actuator_gainprm", "actuator_biasprm"):
-            self._write(name, env_ids, self._nominal_of(name) * scale)
+            self._write(name, envs, self._nominal_of(name) * scale)
 
-    def _set_masses(self, env_ids: torch.Tensor) -> None:
+    def _set_masses(self, envs: torch.Tensor) -> None:
         """Mass and centre of mass of base, added mass and payload together; the base's inertia stays nominal."""
         base_mass = float(self._model.body_mass[self._base])
-        body = base_mass + self._draw_or_zero(env_ids, "added_mass")
-        payload = self._draw_or_zero(env_ids, "payload_mass")
-        offset = torch.stack([self._draw_or_zero(env_ids, name) for name in ("com_x", "com_y", "com_z")], 1)
+        body = base_mass + self._draw_or_zero(envs, "added_mass")
+        payload = self._draw_or_zero(envs, "payload_mass")
+        offset = torch.stack([self._draw_or_zero(envs, name) for name in ("com_x", "com_y", "com_z")], 1)
         centre = self._nominal_of("body_ipos")[self._base] + offset
         total = body + payload
-        self._write("body_mass", (env_ids, self._base), total)
+        self._write("body_mass", envs, total, self._base)
         combined = (
-            body[:, None] * centre + payload[:, None] * centre.new_tensor(self.config.payload_position)
+            body[:, None] * centre + payload[:, None] * self._payload_position
         ) / total[:, None]
-        self._write("body_ipos", (env_ids, self._base), combined)
-        self._sim.update_model(env_ids)
+        self._write("body_ipos", envs, combined, self._base)
+        self._sim.update_model(envs)

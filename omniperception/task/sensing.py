@@ -19,6 +19,7 @@ from omniperception.lidar import (
     largest_lean,
 )
 from omniperception.perception import Attitude
+from omniperception.rows import put
 from omniperception.sim import Simulator
 from omniperception.task.odometry import Odometry
 from omniperception.task.state import Kinematics
@@ -153,10 +154,10 @@ class LidarSensing:
             )  # row 0 is a miss; all other shapes are one more obstacle, which is left out
             self.unseen = torch.full((sim.num_envs, len(needs.obstacles)), NEVER, device=sim.device)
 
-    def start(self, env_ids: torch.Tensor, sensed: Kinematics) -> None:
-        """Notes where the base of some environments starts; call after their reset."""
+    def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
+        """Notes where the base of some environments, see `rows`, starts; call after their reset."""
         if self.odometry is not None:
-            self.odometry.start(env_ids, sensed)
+            self.odometry.start(envs, sensed)
 
     def follow(self, sensed: Kinematics) -> None:
         """Notes how the base moves; call at every control step."""
@@ -173,7 +174,7 @@ class LidarSensing:
         self.scene.body_pos.copy_(pos)
         self.scene.body_quat.copy_(quat)
         if self.lidar.track is not None:
-            self.lidar.track.reset(self._placed_anew.nonzero().flatten())
+            self.lidar.track.reset(self._placed_anew)
             self._placed_anew.zero_()
         self.frame = self.lidar.cast(self._time.fill_(time_s))
         self.tick += 1
@@ -251,18 +252,18 @@ class LidarSensing:
             self.lidar.track.reset()
             self._placed_anew.copy_(placed_anew)
 
-    def reset(self, env_ids: torch.Tensor) -> None:
-        """Forgets what some environments have seen, and how their bodies moved."""
-        self._placed_anew[env_ids] = True
-        self.frame_count[env_ids] = 0
+    def reset(self, envs: torch.Tensor) -> None:
+        """Forgets what some environments, see `rows`, have seen, and how their bodies moved."""
+        put(self._placed_anew, envs, True)
+        put(self.frame_count, envs, 0)
         if self.frames is not None:
-            self.frames[env_ids] = 0.0
+            put(self.frames, envs, 0.0)
         if self.sector_distance is not None:
-            self.sector_distance[env_ids] = self.needs.sector_max
+            put(self.sector_distance, envs, self.needs.sector_max)
         if self.unseen is not None:
-            self.unseen[env_ids] = NEVER
+            put(self.unseen, envs, NEVER)
         for max_distance, mean in self._distal_range.items():
-            mean[env_ids] = max_distance
+            put(mean, envs, max_distance)
 
     def _last_poses(self) -> list[torch.Tensor] | None:
         """Where the next frame's motion starts, if it needs that."""

@@ -82,7 +82,8 @@ class Kinematics:
         qpos, qvel = qpos.float(), qvel.float()
         quat = qpos[:, 3:7]
         yaw = yaw_of(quat)
-        down = quat.new_tensor([0.0, 0.0, -1.0]).expand(len(quat), 3)
+        down = torch.zeros_like(qvel[:, :3])
+        down[:, 2] = -1.0
         in_base = rotate_inverse(quat.repeat(2, 1), torch.cat((qvel[:, :3], down)))
         return cls(
             base_pos_w=qpos[:, :3],

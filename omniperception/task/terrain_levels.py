@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from omniperception.random import EnvRandom
+from omniperception.rows import put, take
 from omniperception.task.state import Kinematics
 from omniperception.world.ground import Ground
 
@@ -45,34 +46,36 @@ class TerrainLevels:
         from_start = (kinematics.base_pos_w[:, :2] - self._start).norm(dim=1)
         torch.maximum(self.reach, torch.where(healthy, from_start, 0.0), out=self.reach)
 
-    def start(self, env_ids: torch.Tensor, xy_w: torch.Tensor, complete: torch.Tensor | None = None) -> None:
-        """Begins new episodes in environments (n,), whose robots stand at (n, 2) m, on the tiles that they deserve.
+    def start(self, envs: torch.Tensor, xy_w: torch.Tensor, complete: torch.Tensor | None = None) -> None:
+        """Begins new episodes in some environments, whose robots stand at (n, 2) m, on the tiles that they deserve.
 
         Args:
-            env_ids: (n,) environments.
+            envs: which, see `rows`.
             xy_w: (n, 2) m.
             complete: (n,) bool: whether the last episode ended as planned, so that it commanded no more; None before
                 the first episode.
         """
         config, ground = self._ground.config, self._ground
-        draw = self._random.uniform(env_ids)
+        draw = self._random.uniform(envs)
         if config.curriculum is None:
             level = (draw * config.levels).long()
         elif complete is None:
             level = (draw * (config.curriculum.start_level + 1)).long()
         else:
-            level = (ground.level[env_ids] + self.steps_up(env_ids, complete)).clamp(min=0)
+            level = (take(ground.level, envs) + self.steps_up(envs, complete)).clamp(min=0)
             level = torch.where(level < config.levels, level, (draw * config.levels).long())
-        ground.move(env_ids, level)
-        self._start[env_ids] = xy_w
+        ground.move(envs, level)
+        put(self._start, envs, xy_w)
         for total in (self.walked, self.commanded, self.reach, self._steps):
-            total[env_ids] = 0.0
+            put(total, envs, 0.0)
 
-    def steps_up(self, env_ids: torch.Tensor, complete: torch.Tensor) -> torch.Tensor:
+    def steps_up(self, envs: torch.Tensor, complete: torch.Tensor) -> torch.Tensor:
         """(n,) int64: 1 for environments that move up a level, -1 for those that move down; see `start`."""
         config, curriculum = self._ground.config, self._ground.config.curriculum
-        walked, commanded, reach = self.walked[env_ids], self.commanded[env_ids], self.reach[env_ids]
-        rest = (self._max_steps / self._steps[env_ids].clamp(min=1.0)).clamp(min=1.0)
+        walked, commanded, reach, steps = (
+            take(values, envs) for values in (self.walked, self.commanded, self.reach, self._steps)
+        )
+        rest = (self._max_steps / steps.clamp(min=1.0)).clamp(min=1.0)
         commanded = torch.where(complete, commanded, commanded * rest)
         far = reach > config.tile_size / 2
         well = (reach > config.platform / 2) & (walked >= curriculum.up_share * commanded)

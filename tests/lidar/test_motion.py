@@ -210,15 +210,15 @@ def test_a_reset_forgets_the_motion_of_its_environment_only():
     lidar.phase_rows.zero_()
     still.phase_rows.zero_()
     now = torch.full((2,), PERIOD, dtype=torch.float64)
-    for env_ids in (None, torch.tensor([1])):
+    for which in (None, torch.tensor([False, True])):
         scene.body_quat[:, 0] = yaw_quat(-0.5)
         lidar.cast(now)
         scene.body_quat[:, 0] = yaw_quat(0.5)
-        if env_ids is not None:
-            lidar.track.reset(env_ids)
+        if which is not None:
+            lidar.track.reset(which)
         ranges, flat = lidar.cast(now).ranges, still.cast(now).ranges
         bent = [not torch.allclose(ranges[env], flat[env], rtol=1e-5) for env in (0, 1)]
-        assert bent == [True, env_ids is None]
+        assert bent == [True, which is None]
 
 
 def test_without_motion_distortion_there_is_no_track():
