@@ -140,7 +140,7 @@ def _compare_replay(options: CheckOptions) -> Table:
 
 
 def check_waiting(options: CheckOptions) -> list[Table]:
-    """Where a control step of the environment waits for the GPU: as PyTorch tells, or on a CPU as `find_waits` finds."""
+    """Where a control step of the environment waits for the GPU: PyTorch tells, or on a CPU `find_waits` finds."""
     table = Table("waits", "Places of a control step that wait for the GPU", ("place", "times"))
     sizes = () if options.small else ("num_envs=256",)
     env = OmniEnv(replace(options.run(*sizes).env, initial_obstacle_level=1.0, log_interval=10**9))

@@ -24,8 +24,9 @@ _STAGE_POS = mujoco.mjtStage.mjSTAGE_POS.value
 class MujocoSimulator:
     """`num_envs` simulations on a native thread pool; only what is asked for is copied out of the engine.
 
-    It takes environments by their indices alone. State tensors are views of the engine's own memory. Contact sensors and torques describe the state before the last
-    physics step, as `mj_step` leaves them; body poses are recomputed for the current state.
+    State tensors are views of the engine's own memory. Contact sensors and torques describe the state before the last
+    physics step, as `mj_step` leaves them; body poses are recomputed for the current state. Environments are told by
+    their indices, not by a mask.
 
     The steps of one call are one native call: threads that sleep between calls cost more than the obstacles' motion.
     """
