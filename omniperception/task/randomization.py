@@ -184,8 +184,6 @@ class Randomizer:
         centre = self._nominal_of("body_ipos")[self._base] + offset
         total = body + payload
         self._write("body_mass", envs, total, self._base)
-        combined = (
-            body[:, None] * centre + payload[:, None] * self._payload_position
-        ) / total[:, None]
+        combined = (body[:, None] * centre + payload[:, None] * self._payload_position) / total[:, None]
         self._write("body_ipos", envs, combined, self._base)
         self._sim.update_model(envs)
