@@ -149,7 +149,7 @@ def test_tiled_ground_is_a_height_field_in_the_rays_and_their_kernel(make_env):
 
 def code_of_scan(env):
     """What the scan's kernel was compiled from."""
-    module = env.sensing.lidar._cast.kernel.module.get_module_identifier(1)  # one thread to a block, as on a CPU
+    module = env.sensing.lidar._casts[0].kernel.module.get_module_identifier(1)  # one thread to a block, as on a CPU
     lines = Path(wp.config.kernel_cache_dir, module, f"{module}.cpp").read_text().splitlines()
     return "\n".join(line for line in lines if not line.lstrip().startswith("//"))
 

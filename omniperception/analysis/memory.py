@@ -17,6 +17,7 @@ from omniperception.assembly import build_runner, steps_per_frame
 from omniperception.config import RunConfig
 from omniperception.learning import Runner
 from omniperception.learning.memory import FLOAT, footprint
+from omniperception.task.env import OmniEnv
 
 SMALL = (4, 8)
 """Environments of the two builds; all buffers grow evenly with their number."""
@@ -57,12 +58,19 @@ class Used:
 
 def predict(run: RunConfig) -> list[Part]:
     """Memory by part, whatever the run's number of environments; nothing of that size is allocated."""
-    few, more = (held_bytes(_build(run, num_envs)) for num_envs in SMALL)
     low, high = SMALL
+    whole = _build(run, low)
+    at_once = _clouds_at_once(whole.env, run.env.num_envs)
+    if at_once < run.env.num_envs:  # the two builds have one environment's cloud each
+        run = replace(run, env=replace(run.env, lidar=replace(run.env.lidar, cloud_mb=1e-6)))
+    few, more = held_bytes(_build(run, low)), held_bytes(_build(run, high))
     parts = []
     for name, size in few.items():
         per_env = (more[name] - size) / (high - low)
-        parts.append(Part(name, size - low * per_env, per_env))
+        shared = size - low * per_env
+        if name == "rays" and at_once < run.env.num_envs:
+            shared += (at_once - 1) * (held_bytes(whole)[name] - size) / (low - 1)
+        parts.append(Part(name, shared, per_env))
     return [*parts, Part("mini-batch", 0.0, _update_bytes(run) / run.env.num_envs)]
 
 
@@ -105,6 +113,16 @@ def table(parts: Sequence[Part], num_envs: int) -> list[tuple[str, float, float,
     """(part, MB shared, kB per environment, MB altogether) rows, the sum last."""
     rows = [(p.name, p.shared / 1e6, p.per_env / 1e3, p.total(num_envs) / 1e6) for p in parts]
     return [*rows, ("sum", *(sum(row[k] for row in rows) for k in (1, 2, 3)))]
+
+
+def _clouds_at_once(env: OmniEnv, num_envs: int) -> int:
+    """Environments of a run of `num_envs` whose clouds exist at the same time."""
+    sensing = env.sensing
+    if sensing is None or sensing.needs.whole:
+        return num_envs
+    from omniperception.task.sensing import envs_at_once
+
+    return -(-num_envs // -(-num_envs // envs_at_once(sensing.config, sensing.lidar.outputs)))
 
 
 def _build(run: RunConfig, num_envs: int) -> Runner:

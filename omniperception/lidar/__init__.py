@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from .mujoco import GeomShapes, MujocoScene, geom_shapes
     from .scene import RayHits, RayScene
     from .sectors import SectorDistances, sector_distances
-    from .sensor import OUTPUTS, Lidar, LidarConfig, LidarFrame, quat_from_rpy
+    from .sensor import OUTPUTS, Lidar, LidarConfig, LidarFrame, quat_from_rpy, ray_bytes
     from .shapes import Shape, ShapeKind
 
 _LOADED_WHEN_USED = {
@@ -64,7 +64,7 @@ _LOADED_WHEN_USED = {
     "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
     "scene": ("RayHits", "RayScene"),
     "sectors": ("SectorDistances", "sector_distances"),
-    "sensor": ("OUTPUTS", "Lidar", "LidarConfig", "LidarFrame", "quat_from_rpy"),
+    "sensor": ("OUTPUTS", "Lidar", "LidarConfig", "LidarFrame", "quat_from_rpy", "ray_bytes"),
     "shapes": ("Shape", "ShapeKind"),
 }
 
@@ -115,6 +115,7 @@ __all__ = [
     "os2",
     "ouster",
     "quat_from_rpy",
+    "ray_bytes",
     "sector_distances",
     "select_rows",
     "spinning",

@@ -41,7 +41,8 @@ def split(num_envs: int, work_per_env: int, num_threads: int) -> list[tuple[int,
 class SplitLaunch:
     """A kernel launch over ``(num_envs, *inner)`` recorded once and replayed by calling it.
 
-    The kernel's first argument must be its first environment (``env_offset``); ``args`` are the others. The
+    The launch begins with environment ``first``. The kernel's first argument must be its first environment
+    (``env_offset``); ``args`` are the others. The
     arrays are those given here: what they hold may change, where they lie may not.
     """
 
@@ -55,6 +56,7 @@ class SplitLaunch:
         num_threads: int,
         work_per_env: int = 1,
         block_dim: int = 256,
+        first: int = 0,
     ) -> None:
         self.kernel, self.name = kernel, kernel.key.rpartition("__")[2]
         self.cuda_device = device if device.type == "cuda" else None
@@ -64,12 +66,12 @@ class SplitLaunch:
             wp.launch(
                 kernel,
                 dim=(count, *inner),
-                inputs=[first, *args],
+                inputs=[first + low, *args],
                 device=wp_device(device),
                 record_cmd=True,
                 block_dim=block_dim,
             )
-            for first, count in chunks
+            for low, count in chunks
         ]
         self.pool = thread_pool(threads - 1) if len(chunks) > 1 else None
         self.width = min(threads, len(chunks))

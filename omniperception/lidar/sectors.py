@@ -30,6 +30,7 @@ class SectorDistances:
         max_distance: float,
         num_sectors: int = 36,
         num_threads: int | None = None,
+        out: torch.Tensor | None = None,
     ) -> None:
         """Records the launch.
 
@@ -45,6 +46,7 @@ class SectorDistances:
             max_distance: Value of a sector without such a hit, and the most that is reported, metres.
             num_sectors: n, the number of sectors.
             num_threads: CPU threads; None for all cores.
+            out: Memory for ``distances``; None allocates it.
         """
         num_envs, num_rays = true_ranges.shape
         if num_sectors < 1:
@@ -55,7 +57,10 @@ class SectorDistances:
             raise ValueError(
                 f"body_quat must be ({num_envs}, bodies, 4) with bodies > base={base}, got {tuple(body_quat.shape)}"
             )
-        self.distances = torch.full((num_envs, num_sectors), max_distance, device=true_ranges.device)
+        if out is not None and out.shape != (num_envs, num_sectors):
+            raise ValueError(f"out must be ({num_envs}, {num_sectors}), got {tuple(out.shape)}")
+        out = torch.empty(num_envs, num_sectors, device=true_ranges.device) if out is None else out
+        self.distances = out.fill_(max_distance)
         wp.init()  # from_torch does not, and no scene need have been built before
         args = [
             wp.from_torch(true_ranges),

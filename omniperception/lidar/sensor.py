@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import get_args
 
@@ -176,7 +176,8 @@ class Lidar:
     Attributes:
         config, pattern, scene: As given.
         outputs: Names of the fields of ``frame`` that are computed.
-        frame: The frame that ``cast`` fills and returns.
+        parts: Which environments are cast at the same time.
+        frame: The frame that ``cast`` fills and returns; with several ``parts``, that of the part cast last.
         phase_rows: Rows by which each environment's device is ahead, (num_envs,) int64, from the seed.
         variant: What the scan's kernel was compiled for.
         track: The poses that motion distortion needs; None without it. ``cast`` takes the scene's poses as those at
@@ -196,6 +197,7 @@ class Lidar:
         seed: int = 0,
         outputs: Sequence[str] = ("ranges",),
         reflectivity: Mapping[int, float] | None = None,
+        envs_at_once: int | None = None,
     ) -> None:
         """Sets up the sensor; casting allocates nothing more.
 
@@ -210,13 +212,18 @@ class Lidar:
             outputs: What to compute, names from ``OUTPUTS``.
             reflectivity: Of each class of shapes, 0 to 1 for matt surfaces; 1 for classes not named. Read by
                 the output ``intensity`` only.
+            envs_at_once: Environments whose frames exist at the same time; None for all. With fewer, ``cast_parts``
+                takes the place of ``cast``.
         """
         if not -1 <= mount_body < scene.num_bodies:
             raise ValueError(
                 f"lidar.mount_body={mount_body} must be in 0..{scene.num_bodies - 1}, or -1 (fixed sensor)"
             )
         self.config, self.pattern, self.scene = config, pattern, scene
+        if envs_at_once is not None and envs_at_once < 1:
+            raise ValueError(f"lidar.envs_at_once={envs_at_once} must be at least 1, or None for all")
         self.outputs = _known_outputs(outputs)
+        self.parts = _even_parts(scene.num_envs, envs_at_once or scene.num_envs)
         self._selection = make_selection(pattern, config.period_s, config.num_rays, config.selection, seed)
         generator = torch.Generator().manual_seed(seed)
         self.phase_rows = self._selection.draw_phases(scene.num_envs, generator).to(scene.device)
@@ -225,13 +232,14 @@ class Lidar:
         self.frame_count = torch.zeros(scene.num_envs, dtype=torch.int32, device=scene.device)
         self._noise = noise_by_name(noise)
         self.frame = self._allocate_frame()
+        self._frames = [self._first_rows(part.stop - part.start) for part in self.parts]
         self.track: PoseTrack | None = None
         self._rays = self._lay_out_rays()
         self._view, self._placed = self._place(mount_body, exclude_shapes)
         num_viewed = len(scene.shapes) - len(set(exclude_shapes))
         self._walked = self._meets_field_first(exclude_shapes)
         self._slots, self._pack = self._slots_of(num_viewed)
-        self._cast = self._record_cast(seed, reflectivity or {}, num_viewed)
+        self._casts = self._record_casts(seed, reflectivity or {}, num_viewed)
 
     def cast(self, time_s: torch.Tensor | np.ndarray | float) -> LidarFrame:
         """Casts the frame that ends at ``time_s`` from the bodies' current poses or, with a ``track``, along it.
@@ -241,6 +249,22 @@ class Lidar:
 
         Returns:
             ``self.frame``, every element of it rewritten.
+        """
+        if len(self.parts) > 1:
+            raise ValueError(
+                f"this lidar's frames come in {len(self.parts)} parts; use cast_parts, or envs_at_once=None"
+            )
+        for _ in self.cast_parts(time_s):
+            pass
+        return self.frame
+
+    def cast_parts(self, time_s: torch.Tensor | np.ndarray | float) -> Iterator[tuple[slice, LidarFrame]]:
+        """``cast``, some environments after the others, so that the frames of all never exist at the same time.
+
+        The iterator has to be run to its end; bodies stay where they are until then.
+
+        Yields:
+            Which environments, and their frame with as many rows. It lasts until the next part.
         """
         if not isinstance(time_s, torch.Tensor):
             time_s = torch.as_tensor(time_s, dtype=torch.float64, device=self.scene.device)
@@ -254,9 +278,10 @@ class Lidar:
             self.track.advance()
         if self._placed.refresh() and self._pack is not None:
             self._pack()
-        self._cast()
+        for part, cast, frame in zip(self.parts, self._casts, self._frames, strict=True):
+            cast()
+            yield part, frame
         self.frame_count.add_(1)
-        return self.frame
 
     def reset(self, env_ids: torch.Tensor | None = None) -> None:
         """Starts the random numbers of some environments, or of all, anew: they repeat from the first frame's."""
@@ -278,7 +303,8 @@ class Lidar:
             self._lag.copy_(lag.div_(rate))
 
     def _allocate_frame(self) -> LidarFrame:
-        shape, device = (self.scene.num_envs, self.config.num_rays), self.scene.device
+        most = max(part.stop - part.start for part in self.parts)
+        shape, device = (most, self.config.num_rays), self.scene.device
 
         def tensor(name: str) -> torch.Tensor:
             if name == "valid":
@@ -291,6 +317,10 @@ class Lidar:
         if not self._noise and {"ranges", "true_ranges"} <= self.outputs:
             tensors["true_ranges"] = tensors["ranges"]
         return LidarFrame(**tensors)
+
+    def _first_rows(self, count: int) -> LidarFrame:
+        """As many rows of ``frame``."""
+        return LidarFrame(**{name: getattr(self.frame, name)[:count] for name in self.outputs})
 
     def _place(self, mount_body: int, exclude_shapes: Sequence[int]) -> tuple[View, PlacedShapes | SweptShapes]:
         """Where the sensor looks from, and what places the shapes that it may see."""
@@ -341,7 +371,8 @@ class Lidar:
         slots.words = wp.zeros((self.scene.num_envs, num_words, 4 * WORD), wp.float32, device=self.scene.wp_device)
         return slots, self.scene.launch(pack_slots, (), [slots], work_per_env=2 * num_viewed)
 
-    def _record_cast(self, seed: int, reflectivity: Mapping[int, float], num_viewed: int) -> SplitLaunch:
+    def _record_casts(self, seed: int, reflectivity: Mapping[int, float], num_viewed: int) -> list[SplitLaunch]:
+        """A launch for each part."""
         config, scene, rays = self.config, self.scene, self._rays
         written = self.outputs - ({"true_ranges"} if self.frame.true_ranges is self.frame.ranges else set())
         args = [
@@ -354,7 +385,6 @@ class Lidar:
             self.track.arrays if self.track is not None else Track(),
             self._labels(reflectivity),
             noise_figures(self._noise, seed, config.min_range, config.max_range),
-            self._output_arrays(written),
         ]
         self.variant = variant = ScanVariant(
             kinds=scene.kinds,
@@ -369,8 +399,13 @@ class Lidar:
             pose_type=POSE_TYPES[scene.body_pos.dtype],
         )
         work = rays.block * (min(num_viewed, 64) + 4)
-        num_tasks = scene.num_envs * rays.num_blocks
-        return SplitLaunch(scan_kernel(variant), num_tasks, (), args, scene.device, scene.num_threads, work)
+
+        def record(part: slice) -> SplitLaunch:
+            given, tasks = [*args, self._output_arrays(written, part.start)], (part.stop - part.start) * rays.num_blocks
+            kernel, first = scan_kernel(variant), part.start * rays.num_blocks
+            return SplitLaunch(kernel, tasks, (), given, scene.device, scene.num_threads, work, first=first)
+
+        return [record(part) for part in self.parts]
 
     def _stride(self) -> int:
         """The pattern's; warns if the last fifth of a frame, or more, is then not seen."""
@@ -427,12 +462,25 @@ class Lidar:
             labels.reflectivity = wp.array(scaled, dtype=wp.float32, device=scene.wp_device)
         return labels
 
-    def _output_arrays(self, written: set[str] | frozenset[str]) -> ScanOutputs:
+    def _output_arrays(self, written: set[str] | frozenset[str], first_env: int) -> ScanOutputs:
         arrays = ScanOutputs()
+        arrays.first_env = first_env
         for name in written:
             tensor = getattr(self.frame, name)
             setattr(arrays, name, wp.from_torch(tensor, dtype=wp.vec3) if name in _VECTORS else wp.from_torch(tensor))
         return arrays
+
+
+def ray_bytes(outputs: Sequence[str]) -> int:
+    """Memory for one ray of a frame with these outputs, bytes."""
+    return sum(1 if name == "valid" else 12 if name in _VECTORS else 4 for name in outputs)
+
+
+def _even_parts(num_envs: int, most: int) -> tuple[slice, ...]:
+    """Runs of environments, none longer than ``most`` and all of nearly one length."""
+    count = -(-num_envs // most)
+    edges = [num_envs * k // count for k in range(count + 1)]
+    return tuple(slice(low, high) for low, high in itertools.pairwise(edges))
 
 
 def _known_outputs(outputs: Sequence[str]) -> frozenset[str]:

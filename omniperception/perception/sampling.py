@@ -177,8 +177,8 @@ class PdSampler(Sampler):
 
     def _scratch_for(self, n: int, r: int, device: torch.device) -> kernels.Scratch:
         """Work memory for N environments of R rays, allocated when the shape or device is new."""
-        if self._scratch_key == (n, r, device):
-            return self._scratch
+        if self._scratch_key is not None and n <= self._scratch_key[0] and self._scratch_key[1:] == (r, device):
+            return self._scratch  # of the largest part of the environments
         by_bucket = device.type == "cpu" and self.num_proximal and r >= self.buckets_from
         num_buckets = -(-r // kernels.BUCKET_SIZE) if by_bucket else 0
         sizes = {

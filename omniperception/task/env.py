@@ -21,9 +21,9 @@ from omniperception.task.heights import NUM_HEIGHTS, flat_heights
 from omniperception.task.metrics import EpisodeMetrics
 from omniperception.task.observations import GroupBuffer, ObservationsConfig
 from omniperception.task.randomization import RandomizationConfig, Randomizer
-from omniperception.task.rewards import RewardsConfig, avoidance_velocity
+from omniperception.task.rewards import RewardsConfig, avoidance_velocity, capped_ray_distance, distal_caps
 from omniperception.task.rotations import rotate_yaw, yaw_quat
-from omniperception.task.state import Kinematics
+from omniperception.task.state import Kinematics, fields_read, plain
 from omniperception.task.terminations import TerminationsConfig
 from omniperception.task.timing import StageTimer
 from omniperception.world import (
@@ -127,6 +127,11 @@ class EnvConfig:
                     f"rewards or observations read {', '.join(unmet)} from the LiDAR, but lidar=none;"
                     " use lidar=mid360 or rewards=walk observations=walk"
                 )
+
+    def terms(self) -> tuple[Callable, ...]:
+        """The functions of all rewards and observations."""
+        observed = (term for group in self.observations.groups.values() for term in group.terms.values())
+        return (*(term.func for term in self.rewards.terms.values()), *observed)
 
     def readers(self) -> dict[str, tuple[str, ...]]:
         """Optional fields of this task and the rewards, observations and targets that read each of them."""
@@ -409,14 +414,9 @@ class OmniEnv(VecEnv):
         """One frame of the LiDAR, which sleeps while the curriculum has not let the first obstacle in."""
         if self.sensing is None or (self.obstacles is not None and self.obstacles.level == 0.0):
             return
-        with self.timer.stage("rays"):
-            self.sensing.cast(self.step_count * self.control_dt)
-        if self.sensing.frames is not None:
-            with self.timer.stage("sampling"):
-                self.sensing.sample(self.sensed.base_quat_w)
+        self.sensing.take_frame(self.step_count * self.control_dt, self.sensed.base_quat_w, self.timer)
         if self.sensing.sector_distance is not None:
             with self.timer.stage("sectors"):
-                self.sensing.measure_sectors()
                 self._read_avoidance()
         if "heights" in self._reads and not self.heights_every_step:
             with self.timer.stage("heights"):
@@ -594,10 +594,12 @@ class OmniEnv(VecEnv):
         from omniperception.task.sensing import LidarSensing, SensingNeeds
 
         config = self.config
+        ray_terms = [term for term in config.terms() if "rays" in fields_read(term)]
         needs = SensingNeeds(
             sectors=config.rewards.avoidance.num_sectors if "sectors" in fields else 0,
             sector_max=config.lidar.sensor.max_range,
-            rays="rays" in fields,
+            distal_caps=distal_caps(ray_terms),
+            whole="rays" in fields and (not ray_terms or any(plain(t) is not capped_ray_distance for t in ray_terms)),
             obstacles=self.true_sectors.names if self.true_sectors is not None else (),
         )
         return LidarSensing(

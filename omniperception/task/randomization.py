@@ -95,7 +95,8 @@ class Randomizer:
         self._mass = any(getattr(config, n) for n in ("added_mass", "payload_mass", "com_x", "com_y", "com_z"))
         self._nominal: dict[str, torch.Tensor] = {}  # of what is randomized, when it is first drawn
         self._check_mass()
-        self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
+        if self._mass:
+            self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
         self.joint_offset: torch.Tensor | None = None
         """(num_envs, num_joints) rad added to the joint targets; None when not randomized."""
         self.delay: torch.Tensor | None = None

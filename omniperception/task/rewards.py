@@ -6,14 +6,14 @@ paper lists the eleven of `rewards=paper`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 
 from omniperception.perception.sector_motion import sector_bearings
-from omniperception.task.state import checked_term, fields_read, reads
+from omniperception.task.state import checked_term, fields_read, plain, reads
 
 if TYPE_CHECKING:
     from omniperception.perception import VelocityRisk
@@ -117,6 +117,12 @@ def yaw_rate_tracking(env: OmniEnv, beta: float) -> torch.Tensor:
 def capped_ray_distance(env: OmniEnv, max_distance: float) -> torch.Tensor:
     """r_rays = sum_i min(d_i, d_max) / (n d_max) over the distal LiDAR rays; a miss counts as d_max."""
     return env.sensing.mean_distal_range(max_distance) / max_distance
+
+
+def distal_caps(terms: Iterable[Callable]) -> tuple[float, ...]:
+    """The distances (m) at which `capped_ray_distance` caps ranges wherever it is one of the terms."""
+    capped = (term for term in terms if plain(term) is capped_ray_distance)
+    return tuple(sorted({float(term.keywords["max_distance"]) for term in capped}))
 
 
 def vertical_velocity_squared(env: OmniEnv) -> torch.Tensor:

@@ -17,12 +17,14 @@ from omniperception.lidar import (
     ScanPattern,
     SectorDistances,
     largest_lean,
+    ray_bytes,
 )
 from omniperception.perception import Attitude
 from omniperception.rows import put
 from omniperception.sim import Simulator
 from omniperception.task.odometry import Odometry
 from omniperception.task.state import Kinematics
+from omniperception.task.timing import StageTimer
 from omniperception.world.rays import HitClass, hidden_geoms, ray_shapes
 from omniperception.world.reach import FieldOfView
 
@@ -41,6 +43,8 @@ class SensorConfig:
         device: name in `omniperception.lidar.DEVICES` of the sensor whose own noise `randomization.lidar_device` puts
             on, or None.
         distal_below_deg: rays whose elevation in the sensor frame is below this count for `capped_ray_distance`.
+        cloud_mb: most memory (MB) for clouds that exist at the same time; where those of all environments take more,
+            environments are cast and sampled in parts.
     """
 
     sensor: LidarConfig
@@ -48,8 +52,11 @@ class SensorConfig:
     exclude_geoms: Sequence[str] = ()
     device: str | None = None
     distal_below_deg: float = 20.0
+    cloud_mb: float = 1000.0
 
     def __post_init__(self) -> None:
+        if not self.cloud_mb > 0:
+            raise ValueError(f"lidar.cloud_mb={self.cloud_mb} must be positive")
         if self.device is not None and self.device not in DEVICES:
             raise ValueError(f"lidar.device={self.device} is unknown; known: {', '.join(DEVICES)}, or null")
 
@@ -61,20 +68,29 @@ class SensingNeeds:
     Attributes:
         sectors: number of azimuth sectors of obstacle distances, or 0.
         sector_max: distance (m) of a sector without an obstacle.
-        rays: whether the mean distal range is read.
+        distal_caps: distances (m) at which ranges are capped whose mean is read.
+        whole: whether something reads `LidarSensing.frame`, the clouds of all environments.
         obstacles: geoms of the obstacles whose sightings are noted, none by default.
     """
 
     sectors: int
     sector_max: float
-    rays: bool
+    distal_caps: Sequence[float] = ()
+    whole: bool = False
     obstacles: Sequence[str] = ()
+
+    @property
+    def rays(self) -> bool:
+        """Whether ranges are read, beside what is sampled."""
+        return bool(self.distal_caps) or self.whole
 
 
 class LidarSensing:
     """Casts a frame every `period_steps` control steps, for all environments at the same moment.
 
-    A reset empties an environment's history; its next frame comes with the sensor's next tick.
+    Clouds are reduced to what is read of them as soon as they are cast, in as many parts as `cloud_mb` asks for: those
+    of all environments never have to exist at the same time. A reset empties an environment's history; its next frame
+    comes with the sensor's next tick.
 
     Attributes:
         hidden: geoms that are not in the ray scene because no ray meets them, and why.
@@ -121,6 +137,7 @@ class LidarSensing:
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
         )
+        outputs = _outputs_read(needs, sampler is not None)
         self.lidar = Lidar(
             config.sensor,
             pattern,
@@ -128,11 +145,11 @@ class LidarSensing:
             mount_body=self.base,
             noise=tuple(noise),
             seed=seed,
-            outputs=_outputs_read(needs, sampler is not None),
+            outputs=outputs,
+            envs_at_once=None if needs.whole else envs_at_once(config, outputs),
         )
         self._placed_anew = torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
         self._time = torch.zeros(sim.num_envs, dtype=torch.float64, device=sim.device)
-        self.frame: LidarFrame | None = None
         self.tick = 0
         self.frame_count = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
         self.frame_tick = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
@@ -143,9 +160,9 @@ class LidarSensing:
         self.odometry = Odometry(sim.num_envs, control_dt, sim.device) if base_motion else None
         self.sector_distance: torch.Tensor | None = None
         if needs.sectors:
+            self.sector_distance = torch.empty(sim.num_envs, needs.sectors, device=sim.device)
             self._measure_sectors = self._record_sectors(num_threads)
-            self.sector_distance = self._measure_sectors.distances
-        self._distal_range: dict[float, torch.Tensor] = {}
+        self._distal_range = {cap: torch.full((sim.num_envs,), cap, device=sim.device) for cap in needs.distal_caps}
         self.unseen: torch.Tensor | None = None
         if needs.obstacles:
             self._obstacle_of = torch.full((len(shapes.shapes) + 1,), len(needs.obstacles), device=sim.device)
@@ -153,6 +170,20 @@ class LidarSensing:
                 len(needs.obstacles), device=sim.device
             )  # row 0 is a miss; all other shapes are one more obstacle, which is left out
             self.unseen = torch.full((sim.num_envs, len(needs.obstacles)), NEVER, device=sim.device)
+
+    @property
+    def frame(self) -> LidarFrame | None:
+        """The newest clouds of all environments; None before the first.
+
+        Raises:
+            ValueError: they are cast in parts.
+        """
+        if len(self.lidar.parts) > 1:
+            raise ValueError(
+                f"the clouds of {self._sim.num_envs} environments take more than"
+                f" lidar.cloud_mb={self.config.cloud_mb:g} MB and are never there at once; raise it, or lower num_envs"
+            )
+        return self.lidar.frame if self.tick else None
 
     def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
         """Notes where the base of some environments, see `rows`, starts; call after their reset."""
@@ -168,55 +199,73 @@ class LidarSensing:
         """Whether a frame ends with control step number `step`."""
         return step % self.period_steps == 0
 
-    def cast(self, time_s: float) -> None:
-        """Casts the frame that ends at simulation time `time_s` from the current poses."""
-        pos, quat = self._sim.body_poses(self._bodies)
-        self.scene.body_pos.copy_(pos)
-        self.scene.body_quat.copy_(quat)
-        if self.lidar.track is not None:
-            self.lidar.track.reset(self._placed_anew)
-            self._placed_anew.zero_()
-        self.frame = self.lidar.cast(self._time.fill_(time_s))
-        self.tick += 1
-        self.frame_tick.fill_(self.tick)
-        self._distal_range.clear()
-        if self.unseen is not None:
-            self._note_sightings()
-
-    def _note_sightings(self) -> None:
-        hit = self._obstacle_of[self.frame.shape_id.long() + 1]
-        seen = torch.zeros(len(hit), self.unseen.shape[1] + 1, dtype=torch.bool, device=hit.device)
-        seen.scatter_(1, hit, True)
-        self.unseen = torch.where(seen[:, :-1], 0, self.unseen + 1)
-
-    def sample(self, base_quat: torch.Tensor) -> None:
-        """Appends the sampled points of the newest frame to the history; for a LiDAR with a sampler.
+    def take_frame(self, time_s: float, base_quat: torch.Tensor, timer: StageTimer) -> None:
+        """Casts the frame that ends at simulation time `time_s` from the current poses, and takes what is read from it.
 
         Args:
-            base_quat: (num_envs, 4) as sensed.
+            time_s: of all environments.
+            base_quat: (num_envs, 4) as sensed; samplers need it.
+            timer: of the stages "rays", "sampling" and "sectors".
         """
-        frame, sensor = self.frame, self.config.sensor
-        attitude = Attitude(base_quat.contiguous(), sensor.mount_pos, sensor.quat)
-        points = self._newest[:, : self.sampler.num_points]
+        with timer.stage("rays"):
+            pos, quat = self._sim.body_poses(self._bodies)
+            self.scene.body_pos.copy_(pos)
+            self.scene.body_quat.copy_(quat)
+            if self.lidar.track is not None:
+                self.lidar.track.reset(self._placed_anew)
+                self._placed_anew.zero_()
+        parts = self.lidar.cast_parts(self._time.fill_(time_s))
+        for index in range(len(self.lidar.parts)):
+            with timer.stage("rays"):
+                part, frame = next(parts)
+                if self.unseen is not None:
+                    self._note_sightings(part, frame)
+                for cap, mean in self._distal_range.items():
+                    mean[part] = self._mean_distal_range(frame, cap)
+            if self.frames is not None:
+                with timer.stage("sampling"):
+                    self._sample(part, frame, base_quat)
+            if self.sector_distance is not None:
+                with timer.stage("sectors"):
+                    self._measure_sectors[index]()
+        next(parts, None)  # the frame has been cast
+        self.tick += 1
+        self.frame_tick.fill_(self.tick)
+        if self.frames is not None:
+            self._append_newest()
+
+    def _note_sightings(self, part: slice, frame: LidarFrame) -> None:
+        hit = self._obstacle_of[frame.shape_id.long() + 1]
+        seen = torch.zeros(len(hit), self.unseen.shape[1] + 1, dtype=torch.bool, device=hit.device)
+        seen.scatter_(1, hit, True)
+        self.unseen[part] = torch.where(seen[:, :-1], 0, self.unseen[part] + 1)
+
+    def _sample(self, part: slice, frame: LidarFrame, base_quat: torch.Tensor) -> None:
+        sensor, points = self.config.sensor, self._newest[part, : self.sampler.num_points]
+        attitude = Attitude(base_quat[part].contiguous(), sensor.mount_pos, sensor.quat)
         self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
+
+    def _append_newest(self) -> None:
+        """Appends the sampled points to the history."""
         if self.odometry is not None:
             self._newest[:, -1] = self.odometry.since_last_frame()
         self.frames = torch.cat((self.frames[:, 1:], self._newest[:, None]), 1)
         self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
 
-    def measure_sectors(self) -> None:
-        """Distances to the nearest obstacle per azimuth sector, where somebody reads them."""
-        self._measure_sectors()
-
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
         """(num_envs,) mean of the noise-free distal ranges (m), each capped at `max_distance`."""
-        if max_distance not in self._distal_range:
-            if self.frame is None:
-                return torch.full((self._sim.num_envs,), max_distance, device=self._sim.device)
-            distal = self.frame.elevation < torch.pi / 180 * self.config.distal_below_deg
-            capped = self.frame.true_ranges.clamp(max=max_distance) * distal
-            self._distal_range[max_distance] = capped.sum(1) / distal.sum(1).clamp(min=1)
+        if max_distance not in self._distal_range:  # neither declared nor asked for before
+            nothing = torch.full((self._sim.num_envs,), max_distance, device=self._sim.device)
+            frame = self.frame
+            self._distal_range[max_distance] = (
+                nothing if frame is None else self._mean_distal_range(frame, max_distance)
+            )
         return self._distal_range[max_distance]
+
+    def _mean_distal_range(self, frame: LidarFrame, max_distance: float) -> torch.Tensor:
+        distal = frame.elevation < torch.pi / 180 * self.config.distal_below_deg
+        capped = frame.true_ranges.clamp(max=max_distance) * distal
+        return capped.sum(1) / distal.sum(1).clamp(min=1)
 
     def state_dict(self) -> dict:
         return {
@@ -225,9 +274,9 @@ class LidarSensing:
             "frame_count": self.frame_count,
             "frames": self.frames,
             "sector_distance": None if self.sector_distance is None else self.sector_distance.clone(),
-            "distal_range": {str(key): value for key, value in self._distal_range.items()},
+            "distal_range": {str(key): value.clone() for key, value in self._distal_range.items()},
             "motion": self._last_poses(),
-            "unseen": self.unseen,
+            "unseen": None if self.unseen is None else self.unseen.clone(),
             "odometry": self.odometry.state_dict() if self.odometry is not None else None,
         }
 
@@ -271,21 +320,26 @@ class LidarSensing:
             return None
         return [self.scene.body_pos.clone(), self.scene.body_quat.clone(), self._placed_anew.clone()]
 
-    def _record_sectors(self, num_threads: int | None) -> SectorDistances:
+    def _record_sectors(self, num_threads: int | None) -> list[SectorDistances]:
+        """A launch for each part."""
         frame, sensor = self.lidar.frame, self.config.sensor
-        return SectorDistances(
-            frame.true_ranges,
-            frame.directions_s,
-            frame.class_id,
-            self.scene.body_quat,
-            self.base,
-            sensor.mount_pos,
-            sensor.quat,
-            obstacle_class=int(HitClass.OBSTACLE),
-            max_distance=self.needs.sector_max,
-            num_sectors=self.needs.sectors,
-            num_threads=num_threads,
-        )
+        return [
+            SectorDistances(
+                frame.true_ranges[: part.stop - part.start],
+                frame.directions_s[: part.stop - part.start],
+                frame.class_id[: part.stop - part.start],
+                self.scene.body_quat[part],
+                self.base,
+                sensor.mount_pos,
+                sensor.quat,
+                obstacle_class=int(HitClass.OBSTACLE),
+                max_distance=self.needs.sector_max,
+                num_sectors=self.needs.sectors,
+                num_threads=num_threads,
+                out=self.sector_distance[part],
+            )
+            for part in self.lidar.parts
+        ]
 
 
 def field_of_view(sensor: LidarConfig, pattern: ScanPattern, noise: Sequence[Noise]) -> FieldOfView:
@@ -307,3 +361,8 @@ def _outputs_read(needs: SensingNeeds, sampled: bool) -> tuple[str, ...]:
     if needs.rays:
         outputs |= {"true_ranges", "elevation"}
     return tuple(sorted(outputs))
+
+
+def envs_at_once(config: SensorConfig, outputs: Sequence[str]) -> int:
+    """Environments whose clouds fit into `cloud_mb`, at least one."""
+    return max(int(min(1e6 * config.cloud_mb / (config.sensor.num_rays * ray_bytes(outputs)), 2**31)), 1)

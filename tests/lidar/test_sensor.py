@@ -346,3 +346,32 @@ def test_keeping_the_first_part_of_each_frame_is_told():
         warnings.simplefilter("error")
         for num_rays in (1000, 2000, 4000, 6666, 20_000):
             Lidar(LidarConfig(num_rays, 0.1), pattern, RayScene([], 1, 0), -1)
+
+
+class TestParts:
+    """Frames that come for some environments after the others'."""
+
+    @pytest.mark.parametrize("at_once", [1, 2, 3, 4])
+    def test_everything_is_what_all_at_once_give(self, pattern, at_once):
+        scene, config = crowd(5), LidarConfig(num_rays=777)
+        given = {"noise": [GaussianNoise()], "seed": 4, "outputs": OUTPUTS}
+        whole = Lidar(config, pattern, scene, 0, **given)
+        parts = Lidar(config, pattern, scene, 0, envs_at_once=at_once, **given)
+        for time in (0.1, 0.2):
+            expected, met = whole.cast(clock(5, time)), []
+            for envs, frame in parts.cast_parts(clock(5, time)):
+                met += range(envs.start, envs.stop)
+                assert len(frame.ranges) == envs.stop - envs.start <= at_once
+                for name in OUTPUTS:
+                    torch.testing.assert_close(
+                        getattr(frame, name), getattr(expected, name)[envs], rtol=0, atol=0, equal_nan=True
+                    )
+            assert met == [0, 1, 2, 3, 4]
+        assert parts.frame_count.tolist() == whole.frame_count.tolist() == [2] * 5
+
+    def test_one_frame_of_all_is_refused(self, pattern):
+        lidar = Lidar(LidarConfig(10), pattern, crowd(3), 0, envs_at_once=2)
+        with pytest.raises(ValueError, match="2 parts; use cast_parts, or envs_at_once=None"):
+            lidar.cast(0.1)
+        with pytest.raises(ValueError, match=r"lidar\.envs_at_once=0 must be at least 1"):
+            Lidar(LidarConfig(10), pattern, crowd(3), 0, envs_at_once=0)

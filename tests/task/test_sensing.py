@@ -1,11 +1,15 @@
 """The task's LiDAR: its ticks, its history of frames, and what a reset forgets."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from omniperception.lidar import OUTPUTS
+from omniperception.task.env import OmniEnv
+from omniperception.task.rewards import RewardTerm
+from omniperception.task.state import reads
 
 
 def still(env):
@@ -148,6 +152,10 @@ def test_nothing_is_computed_that_the_task_does_not_read(make_env):
     assert outputs("rewards=paper", "perception=none") == sectors | {"elevation"}
 
 
+def take_frame(env, time_s):
+    env.sensing.take_frame(time_s, env.sensed.base_quat_w, env.timer)
+
+
 def test_motion_distortion_forgets_the_last_episode(make_env):
     """A robot that is placed anew has not swept there; a robot that turns has."""
     env = make_env("obstacles=static", "lidar.sensor.motion_segments=1", "lidar.sensor.motion_jump=100.0", num_envs=2)
@@ -155,7 +163,7 @@ def test_motion_distortion_forgets_the_last_episode(make_env):
     for each in (env, still_env):
         each.sim.qpos[:, :2] += 3.0
         each.sensing.reset(torch.tensor([0]))
-        each.sensing.cast(0.1)
+        take_frame(each, 0.1)
     moving, still = env.sensing.frame.true_ranges, still_env.sensing.frame.true_ranges
     torch.testing.assert_close(moving[0], still[0], rtol=1e-6, atol=1e-6)
     assert not torch.allclose(moving[1], still[1], rtol=1e-3)
@@ -165,18 +173,63 @@ def test_a_saved_state_goes_on_with_its_motion(make_env):
     """The frame after a resumption starts where the frame before it ended."""
     whole, resumed = (make_env("obstacles=static", "lidar.sensor.motion_segments=1", num_envs=2) for _ in range(2))
     whole.sim.qpos[:, :2] += 0.3
-    whole.sensing.cast(0.1)
+    take_frame(whole, 0.1)
     resumed.sensing.load_state_dict(whole.sensing.state_dict())
     for env in (whole, resumed):
         env.sim.qpos[:, :2] = 0.5
-        env.sensing.cast(0.2)
+        take_frame(env, 0.2)
     assert torch.equal(whole.sensing.frame.true_ranges, resumed.sensing.frame.true_ranges)
     still = make_env("obstacles=static", num_envs=2)
     still.sim.qpos[:, :2] = 0.5
-    still.sensing.cast(0.2)
+    take_frame(still, 0.2)
     assert not torch.allclose(whole.sensing.frame.true_ranges, still.sensing.frame.true_ranges, rtol=1e-3)
 
 
 def test_more_pieces_than_the_task_knows_poses_for_are_refused(make_env):
     with pytest.raises(ValueError, match=r"lidar\.sensor\.motion_segments=2 must be 0 or 1"):
         make_env("lidar.sensor.motion_segments=2")
+
+
+class TestParts:
+    """Clouds of some environments after those of others give what all at once give."""
+
+    TASKS = (
+        ("rewards=paper", "obstacles=moving"),
+        ("experiment=avoid", "terrain=flat", "obstacles=crowd", "randomization=device"),
+        ("obstacles=static", "perception=fps_gru_small", "lidar.sensor.motion_segments=1"),
+    )
+
+    @pytest.mark.parametrize("task", TASKS)
+    def test_bit_for_bit(self, make_env, task):
+        whole, parts = (make_env(*task, f"lidar.cloud_mb={mb}", num_envs=5) for mb in ("1000.0", "0.1"))
+        sizes = [part.stop - part.start for part in parts.sensing.lidar.parts]
+        assert len(whole.sensing.lidar.parts) == 1 < len(sizes) and sum(sizes) == 5 and max(sizes) - min(sizes) <= 1
+        assert len(parts.sensing.lidar.frame.ranges) == max(sizes)
+        for step in range(23):
+            for env in (whole, parts):
+                env.episode_length_buf[step % 5] = env.max_episode_length - 1 if step % 4 == 1 else 5
+            actions = 0.3 * torch.sin(torch.arange(60.0).reshape(5, 12) + step)
+            expected, found = whole.step(actions), parts.step(actions)
+            assert torch.equal(expected[1], found[1])
+            for key, value in expected[0].items():
+                assert torch.equal(value, found[0][key]), (step, key)
+        if whole.sensing.unseen is not None:
+            assert torch.equal(whole.sensing.unseen, parts.sensing.unseen)
+
+    def test_what_reads_whole_clouds_is_told(self, make_env):
+        env = make_env("obstacles=static", "lidar.cloud_mb=0.1", num_envs=5)
+        with pytest.raises(ValueError, match=r"5 environments take more than lidar\.cloud_mb=0\.1"):
+            _ = env.sensing.frame
+        with pytest.raises(ValueError, match=r"lidar\.cloud_mb"):
+            make_env("obstacles=static", "lidar.cloud_mb=0.0")
+
+    def test_a_term_of_ones_own_that_reads_rays_gets_whole_clouds(self, make_env):
+        @reads("rays")
+        def nearest(env):
+            return env.sensing.frame.true_ranges.amin(1)
+
+        config = make_env("obstacles=static", "lidar.cloud_mb=0.1", num_envs=5).config
+        terms = {**config.rewards.terms, "nearest": RewardTerm(1.0, nearest)}
+        env = OmniEnv(replace(config, rewards=replace(config.rewards, terms=terms)))
+        env.step(torch.zeros(5, 12))
+        assert len(env.sensing.lidar.parts) == 1 and env.weighted_rewards["nearest"].min() > 0
