@@ -71,9 +71,9 @@ class StepwiseStorage(PerceptiveStorage):
         shape = (self.num_transitions_per_env, self.num_envs, self.history, *self.frames.shape[2:])
         self.windows = torch.zeros(shape, device=self.device)
 
-    def record_frames(self, obs: TensorDict, state: torch.Tensor | None = None) -> None:
+    def record_frames(self, obs: TensorDict, tick: int, state: torch.Tensor | None = None) -> None:
         """Copy the current window."""
-        super().record_frames(obs, state)
+        super().record_frames(obs, tick, state)
         self.windows[self.step].copy_(obs["frames"])
 
     def observations_of(self, env_ids: torch.Tensor) -> WindowedObservations:

@@ -18,6 +18,7 @@ class RolloutEmbedding:
     start anew is told by their count of frames, so nobody has to report resets.
 
     Attributes:
+        tick: number of the newest frame that is embedded; None before the first call.
         before: (N, D) embedding before the newest frame, of a network that carries its state, else None.
     """
 
@@ -30,7 +31,7 @@ class RolloutEmbedding:
         self.before: torch.Tensor | None = None
         self._after: torch.Tensor | None = None
         self._empty: torch.Tensor | None = None
-        self._tick: int | None = None
+        self.tick: int | None = None
         self._made_with: tuple | None = None
         self._seen: tuple[torch.Tensor, torch.Tensor] | None = None
 
@@ -53,13 +54,13 @@ class RolloutEmbedding:
         """What a resumed run goes on from; None for a network without a carried state."""
         if self.before is None:
             return None
-        return {"tick": self._tick, "before": self.before, "after": self._after}
+        return {"tick": self.tick, "before": self.before, "after": self._after}
 
     def load_state_dict(self, state: dict | None) -> None:
         """Restore what :meth:`state_dict` returned."""
         self._made_with = self._seen = None
         if state is not None:
-            self._tick, self.before, self._after = state["tick"], state["before"].clone(), state["after"].clone()
+            self.tick, self.before, self._after = state["tick"], state["before"].clone(), state["after"].clone()
 
     def _follow(self, obs: TensorDict) -> None:
         """Brings the embeddings up to the observations."""
@@ -72,9 +73,9 @@ class RolloutEmbedding:
             torch.is_inference_mode_enabled(),
             tuple((id(p), p._version) for p in self._network.parameters()),
         )
-        if tick == self._tick and not changed and made_with == self._made_with:
+        if tick == self.tick and not changed and made_with == self._made_with:
             return
-        if self._network.carried and (tick != self._tick or self.before is None):
+        if self._network.carried and (tick != self.tick or self.before is None):
             known = self._after is not None and len(self._after) == len(frames)
             self.before = self._after if known else frames.new_zeros(len(frames), self._network.feature_dim)
         self._after = self._network(frames, count, self.before)[:, 0]
@@ -82,7 +83,7 @@ class RolloutEmbedding:
         self._acted_on = self._after
         if self._extend is not None:
             self._acted_on, self._empty = self._extend(self._after), self._extend(self._empty)
-        self._tick, self._made_with, self._seen = tick, made_with, (probe, count.squeeze(-1).clone())
+        self.tick, self._made_with, self._seen = tick, made_with, (probe, count.squeeze(-1).clone())
 
     def _tick_and_change(self, ticks: torch.Tensor, probe: torch.Tensor, count: torch.Tensor) -> tuple[int, bool]:
         """The newest tick, and whether an environment that has a frame has another one than before.

@@ -27,6 +27,7 @@ class CompactLogger(Logger):
         """Open the TensorBoard file; scalars of iterations that will be repeated after a resume are
         dropped."""
         self._recent = deque(maxlen=20)
+        self._ended: list[torch.Tensor] = []  # by step: whether episodes ended, their returns and lengths
         if self.log_dir is None or self.disable_logs:
             return
         from torch.utils.tensorboard import SummaryWriter
@@ -34,10 +35,31 @@ class CompactLogger(Logger):
         purge = first_iteration if first_iteration > 0 else None
         self.writer = SummaryWriter(log_dir=self.log_dir, flush_secs=10, purge_step=purge)  # type: ignore
 
+    def process_env_step(
+        self,
+        rewards: torch.Tensor,
+        dones: torch.Tensor,
+        extras: dict,
+        intrinsic_rewards: torch.Tensor | None = None,
+    ) -> None:
+        """As rsl_rl's, but that finished episodes are read out by `log`: a step does not wait for a GPU."""
+        if self.writer is None or intrinsic_rewards is not None:
+            super().process_env_step(rewards, dones, extras, intrinsic_rewards)
+            return
+        if "log" in extras:
+            self.ep_extras.append(extras["log"])
+        self.cur_reward_sum += rewards
+        self.cur_episode_length += 1
+        done = dones > 0
+        self._ended.append(torch.stack((done.float(), self.cur_reward_sum, self.cur_episode_length)))
+        self.cur_reward_sum.masked_fill_(done, 0.0)
+        self.cur_episode_length.masked_fill_(done, 0.0)
+
     def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **values) -> None:
         """Write the scalars and print the line; ``values`` are rsl_rl's other arguments."""
         if self.writer is None:
             return
+        self._read_out_episodes()
         metrics = self._mean_metrics()
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, **values)
@@ -68,6 +90,14 @@ class CompactLogger(Logger):
         if len(state["reward_sum"]) == self.num_envs:
             self.cur_reward_sum.copy_(state["reward_sum"])
             self.cur_episode_length.copy_(state["episode_length"])
+
+    def _read_out_episodes(self) -> None:
+        """Returns and lengths of the episodes that ended in the iteration, in their order."""
+        if self._ended:
+            done, total, length = torch.stack(self._ended, 1).cpu()
+            self.rewbuffer.extend(total[done > 0].tolist())
+            self.lenbuffer.extend(length[done > 0].tolist())
+            self._ended.clear()
 
     def _mean_metrics(self) -> dict[str, float]:
         """Means over the iteration of the entries under "Metrics/" that the console shows."""

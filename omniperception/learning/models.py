@@ -122,6 +122,11 @@ class PerceptionActor(MLPModel):
         return self.rollout.before
 
     @property
+    def tick(self) -> int:
+        """Number of the newest LiDAR frame acted on."""
+        return self.rollout.tick
+
+    @property
     def extra_groups(self) -> list[str]:
         """Observation groups that the actor's losses read besides its inputs."""
         return list(self.supervision)

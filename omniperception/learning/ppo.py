@@ -106,7 +106,8 @@ class PerceptivePpo(PPO):
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Sample actions; LiDAR frames are copied now because the environment may reuse their memory."""
         actions = super().act(obs) if self.learns_policy else self._follow(obs)
-        self.storage.record_frames(obs, self._raw_actor.carried_state if self.storage.has_frames else None)
+        if self.storage.has_frames:
+            self.storage.record_frames(obs, self._raw_actor.tick, self._raw_actor.carried_state)
         return actions
 
     def train_mode(self) -> None:

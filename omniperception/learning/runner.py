@@ -251,10 +251,11 @@ class Runner(OnPolicyRunner):
 
     def _check_step(self, obs: TensorDict, rewards: torch.Tensor) -> None:
         """Stop on non-finite rewards or one-dimensional observations that a model reads."""
-        for name, tensor in (("rewards", rewards), *((g, obs[g]) for g in self.alg.storage.stored_groups)):
-            finite = torch.isfinite(tensor)
-            if not finite.all():
-                env = int((~finite).flatten(1).any(1).nonzero()[0]) if tensor.dim() > 1 else int((~finite).nonzero()[0])
+        checked = {"rewards": rewards, **{group: obs[group] for group in self.alg.storage.stored_groups}}
+        finite = torch.stack([torch.isfinite(tensor).all() for tensor in checked.values()])
+        for (name, tensor), good in zip(checked.items(), finite.tolist(), strict=True):  # a GPU is waited for once
+            if not good:
+                env = int((~torch.isfinite(tensor)).reshape(len(tensor), -1).any(1).nonzero()[0])
                 terms = self.env.terms_not_finite(name, env) if hasattr(self.env, "terms_not_finite") else []
                 blamed = f" ({', '.join(terms)})" if terms else ""
                 raise TrainingDiverged(

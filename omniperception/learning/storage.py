@@ -152,11 +152,12 @@ class PerceptiveStorage(RolloutStorage):
         """The first control step of this rollout at which each window is the newest."""
         return [self._step_windows.index(window) for window in range(self.num_windows)]
 
-    def record_frames(self, obs: TensorDict, state: torch.Tensor | None = None) -> None:
+    def record_frames(self, obs: TensorDict, tick: int, state: torch.Tensor | None = None) -> None:
         """Copy what is new in the observations of the current step; call before the environment moves on.
 
         Args:
             obs: observations of the step.
+            tick: number of their newest frame, which is the same in all environments.
             state: (N, D) embedding before the newest frame, of a network that carries its state.
         """
         if not self.has_frames:
@@ -166,7 +167,6 @@ class PerceptiveStorage(RolloutStorage):
                 f"storage: frames recorded for {len(self._step_windows)} steps, transitions for"
                 f" {self.step}; call record_frames once before each add_transition"
             )
-        tick = int(obs["frame_tick"].flatten()[0])
         if not self._ticks:
             self.frames[:, : self.history].copy_(obs["frames"])
             if self.initial_state is not None:

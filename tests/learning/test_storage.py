@@ -79,9 +79,9 @@ def test_too_many_frames_and_missing_calls_are_reported():
     with pytest.raises(ValueError, match="set it to the environment's value"):
         rollout(env, storage_for(env, 8, steps_per_frame=5), 8)
     storage = storage_for(env, 8)
-    storage.record_frames(env.get_observations())
+    storage.record_frames(env.get_observations(), env.tick)
     with pytest.raises(RuntimeError, match="once before each"):
-        storage.record_frames(env.get_observations())
+        storage.record_frames(env.get_observations(), env.tick)
     with pytest.raises(ValueError, match="no observations"):
         PerceptiveStorage(2, 4, ToyEnv(2, frames=False).get_observations(), ["policy"], 2, frames=True)
 

@@ -126,7 +126,7 @@ def rollout(env, storage, num_steps):
     obs = env.get_observations()
     for step in range(num_steps):
         seen.append(obs.clone())
-        storage.record_frames(obs)
+        storage.record_frames(obs, env.tick)
         transition = RolloutStorage.Transition()
         transition.observations = obs
         transition.actions = torch.randn(env.num_envs, 2)

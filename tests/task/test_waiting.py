@@ -1,10 +1,13 @@
 """A control step waits for a GPU nowhere, and masks of environments give what indices give."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from omniperception import config, rows
 from omniperception.analysis.waits import find_waits
+from omniperception.assembly import build_runner
 from omniperception.task.env import OmniEnv
 
 pytest.importorskip("mujoco_warp")
@@ -61,6 +64,23 @@ def test_a_step_waits_for_nothing(task):
         seen = rollout(env, steps - 3)
     assert sum(int(dones.sum()) for *_, dones in seen) >= 5
     assert not waits.places()
+
+
+def test_a_step_of_training_waits_for_its_check_and_for_the_newest_tick(tmp_path):
+    run = config.assemble(config.compose([*TASKS["paper"], *ON_WARP, "ppo.num_mini_batches=1"]))
+    runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0, log_interval=10**9)), tmp_path)
+    runner.alg.train_mode()
+    runner.logger.init_logging_writer()
+    obs, steps = runner.env.get_observations(), 12
+    with torch.inference_mode():
+        obs = runner._step(obs)
+        with find_waits() as waits:
+            for step in range(steps):
+                wear_out(runner.env, step)
+                obs = runner._step(obs)
+    runner.logger.stop_logging_writer()
+    found = {place.partition(":")[0]: times for place, times in waits.places().items()}
+    assert found == {"omniperception/learning/runner.py": steps, "omniperception/learning/embedding.py": steps}
 
 
 @pytest.mark.parametrize("task", TASKS)
