@@ -124,6 +124,7 @@ WRONG = [
     (["ppo.learning_rate=fast"], "ppo.learning_rate=fast must be a number"),
     (["commands.lin_vel_x=1.0"], "commands.lin_vel_x=1.0 must be a list"),
     (["terminations.on_collision=3"], "terminations.on_collision=3 must be true or false"),
+    (["experiment=avoid", "rewards=paper"], "rewards.terms.closing_speed=null"),
     (["rewards.terms.yaw_rate.weight=heavy"], "rewards.terms.yaw_rate.weight=heavy must be a number"),
     (["sim.timestep=nan"], "sim.timestep=nan must be positive"),
     (["+rewards.terms.yaw_rate.func.sigma=1.0"], "yaw_rate"),

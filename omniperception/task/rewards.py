@@ -41,6 +41,12 @@ class RewardsConfig:
     avoidance: AvoidanceConfig
 
     def __post_init__(self) -> None:
+        for name, term in self.terms.items():
+            if not isinstance(term, RewardTerm | None):
+                raise ValueError(
+                    f"terms.{name}={dict(term)} is no term, and these rewards have none of that name; use others, or"
+                    f" rewards.terms.{name}=null"
+                )
         used = {name: term for name, term in self.terms.items() if term is not None and term.weight != 0}
         checked = {name: replace(t, func=checked_term(f"terms.{name}.func", t.func)) for name, t in used.items()}
         object.__setattr__(self, "terms", checked)
