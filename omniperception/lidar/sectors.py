@@ -3,8 +3,11 @@
 import torch
 import warp as wp
 
-from .kernels.sectors import sector_minima
+from .kernels.sectors import sector_minima, sector_minima_by_ray
 from .launch import SplitLaunch, default_num_threads
+
+BY_RAY_ON = ("cuda",)
+"""Kinds of devices on which each ray has a thread; elsewhere each environment has one."""
 
 
 class SectorDistances:
@@ -71,14 +74,16 @@ class SectorDistances:
             wp.vec3(*mount_pos),
             wp.vec4(*mount_quat),
             obstacle_class,
-            max_distance,
             wp.from_torch(self.distances),
         ]
-        threads = num_threads or default_num_threads()
-        self._launch = SplitLaunch(sector_minima, num_envs, (), args, true_ranges.device, threads, 16 * num_rays)
+        self._max_distance, threads, device = max_distance, num_threads or default_num_threads(), true_ranges.device
+        by_ray = device.type in BY_RAY_ON
+        kernel, inner = (sector_minima_by_ray, (num_rays,)) if by_ray else (sector_minima, ())
+        self._launch = SplitLaunch(kernel, num_envs, inner, args, device, threads, 16 * num_rays)
 
     def __call__(self) -> torch.Tensor:
         """Measures the tensors' present contents; returns ``distances``."""
+        self.distances.fill_(self._max_distance)
         self._launch()
         return self.distances
 

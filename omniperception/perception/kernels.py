@@ -575,6 +575,35 @@ def write_distal(
         points_out[env, first_slot + b] = wp.vec3(0.0, 0.0, 0.0)
 
 
+@wp.func
+def level_of(base_quat: wp.vec4):
+    """The base's orientation without its yaw."""
+    q_base = to_quat(base_quat)
+    forward = wp.quat_rotate(q_base, wp.vec3(1.0, 0.0, 0.0))
+    return wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -wp.atan2(forward[1], forward[0])) * q_base
+
+
+@wp.func
+def proximity_cell(p: wp.vec3, body: wp.vec2, band_edges: wp.array(dtype=wp.float32), num_sectors: int) -> int:
+    """Band and sector of a point around the levelled base; -1 on the body and outside of all bands."""
+    num_bands = band_edges.shape[0] - 1
+    on_body = wp.abs(p[0]) < body[0] and wp.abs(p[1]) < body[1]
+    if on_body or p[2] < band_edges[0] or p[2] >= band_edges[num_bands]:
+        return -1
+    band = wp.int32(0)
+    while p[2] >= band_edges[band + 1]:
+        band += 1
+    turned = (wp.atan2(p[1], p[0]) + _PI) / (2.0 * _PI)
+    return band * num_sectors + wp.clamp(int(turned * float(num_sectors)), 0, num_sectors - 1)
+
+
+@wp.func
+def proximity_point(p: wp.vec3, proximity: float) -> wp.vec3:
+    """Bearing of a point times its proximity, and that itself."""
+    bearing = proximity / wp.max(wp.sqrt(p[0] * p[0] + p[1] * p[1]), 1.0e-6)
+    return wp.vec3(bearing * p[0], bearing * p[1], proximity)
+
+
 @wp.kernel(module="unique", enable_backward=False)
 def proximity_grid(
     env_offset: int,
@@ -598,25 +627,15 @@ def proximity_grid(
     num_bands = band_edges.shape[0] - 1
     for cell in range(num_bands * num_sectors):
         points_out[env, first_slot + cell] = wp.vec3(0.0, 0.0, 0.0)
-    q_base = to_quat(base_quat[env])
-    forward = wp.quat_rotate(q_base, wp.vec3(1.0, 0.0, 0.0))
-    level = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -wp.atan2(forward[1], forward[0])) * q_base
+    level = level_of(base_quat[env])
     offset = wp.quat_rotate(level, mount_pos)
     turn = wp.quat_to_matrix(level * to_quat(mount_quat))
     for ray in range(ranges.shape[1]):
         distance = ranges[env, ray]
         if elevation[env, ray] <= split and is_hit(distance) and distance >= blind:
             p = offset + distance * (turn * directions[env, ray])
-            on_body = wp.abs(p[0]) < body[0] and wp.abs(p[1]) < body[1]
-            if not on_body and p[2] >= band_edges[0] and p[2] < band_edges[num_bands]:
-                band = wp.int32(0)
-                while p[2] >= band_edges[band + 1]:
-                    band += 1
-                turned = (wp.atan2(p[1], p[0]) + _PI) / (2.0 * _PI)
-                sector = wp.clamp(int(turned * float(num_sectors)), 0, num_sectors - 1)
-                horizontal = wp.sqrt(p[0] * p[0] + p[1] * p[1])
-                proximity = wp.exp(-horizontal / decay)
-                slot = first_slot + band * num_sectors + sector
-                if proximity > points_out[env, slot][2]:
-                    bearing = proximity / wp.max(horizontal, 1.0e-6)
-                    points_out[env, slot] = wp.vec3(bearing * p[0], bearing * p[1], proximity)
+            cell = proximity_cell(p, body, band_edges, num_sectors)
+            if cell >= 0:
+                proximity = wp.exp(-wp.sqrt(p[0] * p[0] + p[1] * p[1]) / decay)
+                if proximity > points_out[env, first_slot + cell][2]:
+                    points_out[env, first_slot + cell] = proximity_point(p, proximity)

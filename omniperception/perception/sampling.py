@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import torch
 
-from omniperception.perception import kernels
+from omniperception.perception import by_ray, kernels
 from omniperception.perception.launch import launch_over_envs, view
-from omniperception.perception.sampler import Sampler
+from omniperception.perception.sampler import Attitude, Sampler
 
 _FPS_LANES = 128
 """CUDA threads that share one environment's farthest point sampling."""
@@ -122,6 +122,9 @@ class PdSampler(Sampler):
         return (*proximal, "write_distal") if self.num_distal else proximal
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
+        if ranges.device.type in by_ray.USED_ON:
+            self._sample_by_ray(ranges, directions_s, elevation, azimuth, out)
+            return
         n, r = ranges.shape
         scratch = self._scratch_for(n, r, ranges.device)
         ranges_v, directions_v = view(ranges, float32), view(directions_s, vec3)
@@ -132,7 +135,6 @@ class PdSampler(Sampler):
             launch_over_envs(kernel, n, list(inputs), ranges.device, num_threads=self.num_threads, **options)
 
         if self.num_proximal:
-            lanes = _FPS_LANES if ranges.device.type == "cuda" else 1
             launch(
                 kernels.gather_proximal,
                 ranges_v,
@@ -143,10 +145,7 @@ class PdSampler(Sampler):
                 scratch,
                 block_dim=32,
             )
-            if self.grid:
-                launch(kernels.thin_proximal, self.grid, self.num_proximal, scratch, block_dim=32)
-            picks = (self.num_proximal, lanes, self.buckets_from, scratch)
-            launch(kernels.pick_farthest, *picks, inner=lanes, block_dim=lanes)
+            self._pick(n, scratch, ranges.device)
             launch(
                 kernels.write_proximal,
                 theta,
@@ -175,6 +174,51 @@ class PdSampler(Sampler):
                 block_dim=32,
             )
 
+    def _sample_by_ray(self, ranges, directions_s, elevation, azimuth, out) -> None:
+        n, r = ranges.shape
+        scratch, device = self._scratch_for(n, r, ranges.device), ranges.device
+        cloud = view(ranges, float32), view(directions_s, vec3)
+        theta, phi, points = view(elevation, float32), view(azimuth, float32), view(out, vec3)
+        scale, first_bin = 1.0 / self.max_range, self.num_proximal
+
+        def launch(kernel, inner, *inputs) -> None:
+            launch_over_envs(kernel, n, list(inputs), device, inner=inner, num_threads=self.num_threads)
+
+        rays = by_ray.SortedRays(self._tensors, n, r)
+        launch(by_ray.key_rays, r, cloud[0], theta, phi, self.split, self.ring, rays.keys, rays.items)
+        rays.sort()
+        launch(by_ray.find_parts, 0, r, rays.keys, rays.parts, scratch.num_proximal)
+        if self.num_distal:
+            bins = (first_bin, self.num_distal, self.pick_middle, rays.items, rays.parts)
+            launch(by_ray.write_bins, self.num_distal, *cloud, scale, *bins, points)
+        if self.num_proximal:
+            launch(by_ray.gather_ranked, r, *cloud, scale, rays.items, rays.parts, scratch)
+            self._pick(n, scratch, device)
+            picks = by_ray.SortedRays(self._tensors, n, self.num_proximal)
+            launch(
+                by_ray.key_picks,
+                self.num_proximal,
+                theta,
+                phi,
+                self.ring,
+                self.num_proximal,
+                scratch,
+                picks.keys,
+                picks.items,
+            )
+            picks.sort()
+            launch(by_ray.write_picks, self.num_proximal, self.num_proximal, picks.items, scratch, points)
+
+    def _pick(self, n: int, scratch: kernels.Scratch, device: torch.device) -> None:
+        """Thins the proximal hits, if asked for, and picks from them."""
+        threads = {"num_threads": self.num_threads}
+        if self.grid:
+            thinning = [self.grid, self.num_proximal, scratch]
+            launch_over_envs(kernels.thin_proximal, n, thinning, device, block_dim=32, **threads)
+        lanes = _FPS_LANES if device.type == "cuda" else 1
+        picks = [self.num_proximal, lanes, self.buckets_from, scratch]
+        launch_over_envs(kernels.pick_farthest, n, picks, device, inner=lanes, block_dim=lanes, **threads)
+
     def _scratch_for(self, n: int, r: int, device: torch.device) -> kernels.Scratch:
         """Work memory for N environments of R rays, allocated when the shape or device is new."""
         if self._scratch_key is not None and n <= self._scratch_key[0] and self._scratch_key[1:] == (r, device):
@@ -184,8 +228,9 @@ class PdSampler(Sampler):
         sizes = {
             "picked": (n, max(self.num_proximal, 1)),
             "num_proximal": (n,),
-            "keys": (2, n, r),
-            "items": (2, n, r),
+            "parts": (n, 2),
+            "keys": (2, n, max(r, self.num_proximal)),
+            "items": (2, n, max(r, self.num_proximal)),
             "histogram": (n, kernels.RADIX_SIZE),
             "ray": (n, r),
             "distance": (n, num_buckets * kernels.BUCKET_SIZE or r),
@@ -198,7 +243,8 @@ class PdSampler(Sampler):
         self._tensors |= {name: torch.empty(size, device=device) for name, size in real.items()}
         scratch = kernels.Scratch()
         for name, tensor in self._tensors.items():
-            setattr(scratch, name, view(tensor, float32 if name in real else int32))
+            if name != "parts":
+                setattr(scratch, name, view(tensor, float32 if name in real else int32))
         self._scratch, self._scratch_key = scratch, (n, r, device)
         return scratch
 
@@ -269,25 +315,32 @@ class ProximitySampler(PdSampler):
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         super()._sample(ranges, directions_s, elevation, azimuth, out, attitude)
         self.edges = self.edges.to(ranges.device)
-        inputs = [
-            view(ranges, float32),
-            view(directions_s, vec3),
-            view(elevation, float32),
-            self.split,
-            self.blind,
-            view(attitude.base_quat, vec4),
-            vec3(*attitude.mount_pos),
-            vec4(*attitude.mount_quat),
-            kernels.wp.vec2(*self.body),
-            view(self.edges, float32),
-            self.num_sectors,
-            self.decay,
-            self.num_proximal,
-            view(out, vec3),
-        ]
-        launch_over_envs(
-            kernels.proximity_grid, ranges.shape[0], inputs, ranges.device, num_threads=self.num_threads, block_dim=32
+        cloud, stands = (view(ranges, float32), view(directions_s, vec3)), self._views_of(attitude)
+        looks = (view(elevation, float32), self.split, self.blind, *stands, kernels.wp.vec2(*self.body))
+        cells = (view(self.edges, float32), self.num_sectors, self.decay)
+        written = (self.num_proximal, view(out, vec3))
+        n, r = ranges.shape
+
+        def launch(kernel, inner, *inputs) -> None:
+            options = {"num_threads": self.num_threads, "block_dim": 256 if inner else 32}
+            launch_over_envs(kernel, n, list(inputs), ranges.device, inner=inner, **options)
+
+        if ranges.device.type not in by_ray.USED_ON:
+            launch(kernels.proximity_grid, 0, *cloud, *looks, *cells, *written)
+            return
+        scratch, num_cells = self._scratch_for(n, r, ranges.device), self.num_points - self.num_proximal
+        nearest, first = (
+            ranges.new_zeros(n, num_cells),
+            torch.full((n, num_cells), r, dtype=torch.int32, device=out.device),
         )
+        found = view(nearest, float32), view(first, int32)
+        launch(by_ray.find_nearest, r, *cloud, *looks, *cells, scratch, found[0])
+        launch(by_ray.find_first, r, scratch, *found)
+        launch(by_ray.write_nearest, num_cells, *cloud, *stands, *found, *written)
+
+    @staticmethod
+    def _views_of(attitude: Attitude) -> tuple:
+        return view(attitude.base_quat, vec4), vec3(*attitude.mount_pos), vec4(*attitude.mount_quat)
 
 
 class FpsSampler(PdSampler):

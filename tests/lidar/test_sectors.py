@@ -6,9 +6,17 @@ import pytest
 import torch
 
 from omniperception.lidar import quat_from_rpy, sector_distances
+from omniperception.lidar import sectors as module
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 OBSTACLE = 2
+
+
+@pytest.fixture(params=["a thread per environment", "a thread per ray"], autouse=True)
+def each_way(request, monkeypatch):
+    """With the kernel of a CPU and, on the CPU, too, with that of a GPU."""
+    if request.param == "a thread per ray":
+        monkeypatch.setattr(module, "BY_RAY_ON", ("cpu",))
 
 
 def sectors(points_s, classes, base_quat=UPRIGHT, mount_pos=(0.0, 0.0, 0.0), mount_quat=UPRIGHT, **options):

@@ -6,13 +6,17 @@ import torch
 import warp as wp
 from clouds import MAX_RANGE, random_rays, sample
 
-from omniperception.perception import PdSampler, kernels
+from omniperception.lidar import sector_distances
+from omniperception.lidar.kernels.sectors import sector_minima_by_ray
+from omniperception.perception import FpsSampler, PdSampler, by_ray, kernels
 from omniperception.perception.motion_match import match_motion
 from omniperception.perception.rings import write_rings
 from omniperception.perception.velocity_risk import worst_sectors
 
+MODULES = [kernels, by_ray, *(k.module for k in (match_motion, write_rings, worst_sectors, sector_minima_by_ray))]
 
-@pytest.mark.parametrize("module", [kernels, match_motion.module, write_rings.module, worst_sectors.module])
+
+@pytest.mark.parametrize("module", MODULES)
 def test_kernels_compile_for_cuda(module, tmp_path):
     wp.init()
     try:
@@ -24,10 +28,31 @@ def test_kernels_compile_for_cuda(module, tmp_path):
     assert files and all(path.stat().st_size > 0 for path in files)
 
 
+SAMPLERS = [
+    PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0),
+    PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0, reduce="pick", grid=8),
+    FpsSampler(70, max_range=MAX_RANGE),
+]
+
+
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_cuda_equals_cpu():
-    rays = random_rays(37, 500, seed=1)
-    sampler = PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0)
-    on_gpu = torch.empty(37, 96, 3, device="cuda")
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("num_rays", [1, 500, 20_000])
+def test_cuda_samples_what_the_cpu_does(sampler, num_rays):
+    rays = random_rays(37, num_rays, seed=1)
+    on_gpu = torch.empty(37, sampler.num_points, 3, device="cuda")
     sampler(*(t.cuda() for t in rays), on_gpu)
     assert torch.allclose(on_gpu.cpu(), sample(sampler, rays), atol=1e-5)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_measures_the_sectors_that_the_cpu_does():
+    ranges, directions, _, _ = random_rays(37, 500, seed=2)
+    classes = torch.randint(-1, 3, ranges.shape, dtype=torch.int32)
+    upright = (1.0, 0.0, 0.0, 0.0)
+    given = {"mount_pos": (0.3, 0.0, 0.0), "mount_quat": upright, "obstacle_class": 2, "max_distance": 6.0}
+    tensors = (ranges, directions, classes, torch.tensor([upright]).repeat(37, 1))
+    on_gpu = sector_distances(*(t.cuda() for t in tensors), **given)
+    assert torch.allclose(on_gpu.cpu(), sector_distances(*tensors, **given), atol=1e-5)

@@ -5,6 +5,22 @@ import warp as wp
 from .geometry import PI, to_quat
 
 
+@wp.func
+def levelled(base_quat: wp.vec4):
+    """The base's orientation without its yaw."""
+    q_base = to_quat(base_quat)
+    forward = wp.quat_rotate(q_base, wp.vec3(1.0, 0.0, 0.0))
+    return wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -wp.atan2(forward[1], forward[0])) * q_base
+
+
+@wp.func
+def sector_of(p: wp.vec3, num_sectors: int) -> int:
+    sector = int(wp.floor((wp.atan2(p[1], p[0]) + PI) * float(num_sectors) / (2.0 * PI)))
+    if sector >= num_sectors:
+        sector = 0
+    return wp.max(sector, 0)
+
+
 @wp.kernel(module="unique", enable_backward=False)
 def sector_minima(
     env_offset: int,
@@ -16,27 +32,41 @@ def sector_minima(
     mount_pos: wp.vec3,
     mount_quat: wp.vec4,
     wanted_class: int,
-    max_distance: float,
-    # out
-    distances_out: wp.array2d(dtype=wp.float32),
+    # in and out
+    distances: wp.array2d(dtype=wp.float32),
 ):
-    """Nearest horizontal distance of one environment's hits of a class, per azimuth sector."""
+    """Nearest horizontal distance of one environment's hits of a class, per azimuth sector, and what was there."""
     env = wp.tid() + env_offset
-    num_sectors = distances_out.shape[1]
-    for k in range(num_sectors):
-        distances_out[env, k] = max_distance
-    q_base = to_quat(base_quat[env, base])
-    forward = wp.quat_rotate(q_base, wp.vec3(1.0, 0.0, 0.0))
-    yaw = wp.atan2(forward[1], forward[0])
-    level = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -yaw) * q_base
+    num_sectors = distances.shape[1]
+    level = levelled(base_quat[env, base])
     offset = wp.quat_rotate(level, mount_pos)
     turn = wp.quat_to_matrix(level * to_quat(mount_quat))
     for ray in range(ranges.shape[1]):
         if class_id[env, ray] == wanted_class:
             p = offset + ranges[env, ray] * (turn * directions[env, ray])
-            distance = wp.sqrt(p[0] * p[0] + p[1] * p[1])
-            sector = int(wp.floor((wp.atan2(p[1], p[0]) + PI) * float(num_sectors) / (2.0 * PI)))
-            if sector >= num_sectors:
-                sector = 0
-            sector = wp.max(sector, 0)
-            distances_out[env, sector] = wp.min(distances_out[env, sector], distance)
+            sector = sector_of(p, num_sectors)
+            distances[env, sector] = wp.min(distances[env, sector], wp.sqrt(p[0] * p[0] + p[1] * p[1]))
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def sector_minima_by_ray(
+    env_offset: int,
+    ranges: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.vec3),
+    class_id: wp.array2d(dtype=wp.int32),
+    base_quat: wp.array2d(dtype=wp.vec4),
+    base: int,
+    mount_pos: wp.vec3,
+    mount_quat: wp.vec4,
+    wanted_class: int,
+    # in and out
+    distances: wp.array2d(dtype=wp.float32),
+):
+    """The same with a thread for each ray, for GPUs."""
+    thread, ray = wp.tid()
+    env = thread + env_offset
+    if class_id[env, ray] == wanted_class:
+        level = levelled(base_quat[env, base])
+        turn = wp.quat_to_matrix(level * to_quat(mount_quat))
+        p = wp.quat_rotate(level, mount_pos) + ranges[env, ray] * (turn * directions[env, ray])
+        wp.atomic_min(distances, env, sector_of(p, distances.shape[1]), wp.sqrt(p[0] * p[0] + p[1] * p[1]))
