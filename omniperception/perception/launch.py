@@ -12,9 +12,9 @@ from omniperception.lidar.launch import SplitLaunch, default_num_threads
 _WORK_PER_ENV = 16384
 """Sampling one environment's cloud is worth a thread from a handful of environments on."""
 
-_VIEW_CACHE_SIZE = 64
+_VIEW_CACHE_SIZE = 512
 _views: OrderedDict[tuple, wp.array] = OrderedDict()
-_LAUNCH_CACHE_SIZE = 64
+_LAUNCH_CACHE_SIZE = 512
 _launches: OrderedDict[tuple, tuple[SplitLaunch, list]] = OrderedDict()
 
 

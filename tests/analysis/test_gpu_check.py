@@ -52,6 +52,7 @@ def test_everything_runs_tiny_on_a_cpu(tmp_path):
     pytest.importorskip("mujoco_warp")
     assert execute(CheckOptions("cpu", True, tmp_path))
     names = {"tests", "lidar_accuracy", "step_errors", "waits", "paper_table", "paper_table_peers", "env_stages"}
+    names |= {"env_stages_whole_clouds"}
     assert names | {"training", "memory", "summary"} <= {path.stem for path in tmp_path.glob("*.csv")}
 
 
