@@ -75,4 +75,4 @@ def test_memory_of_clouds_that_are_cast_in_parts(make_config):
     predicted = {part.name: part.total(24) for part in memory.predict(run)}
     assert predicted["rays"] == pytest.approx(memory.held_bytes(runner)["rays"], rel=0.01)
     whole = replace(run, env=replace(run.env, lidar=replace(run.env.lidar, cloud_mb=1000.0)))
-    assert predicted["rays"] < {part.name: part.total(24) for part in memory.predict(whole)}["rays"] - 16 * 500 * 80
+    assert predicted["rays"] < {part.name: part.total(24) for part in memory.predict(whole)}["rays"] - 16 * 500 * 60
