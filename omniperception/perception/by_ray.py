@@ -11,15 +11,9 @@ from functools import cache
 import torch
 import warp as wp
 
-from omniperception.perception.kernels import (
-    Scratch,
-    is_hit,
-    level_of,
-    proximity_cell,
-    proximity_point,
-    sort_key,
-    to_quat,
-)
+from omniperception.lidar.kernels.geometry import to_quat
+from omniperception.lidar.kernels.sectors import levelled
+from omniperception.perception.kernels import Scratch, is_hit, proximity_cell, proximity_point, sort_key
 from omniperception.perception.launch import view
 
 wp.set_module_options({"enable_backward": False})
@@ -253,7 +247,7 @@ def find_nearest(
     cell = wp.int32(-1)
     proximity = wp.float32(0.0)
     if elevation[env, ray] <= split and is_hit(distance) and distance >= blind:
-        level = level_of(base_quat[env])
+        level = levelled(base_quat[env])
         turn = wp.quat_to_matrix(level * to_quat(mount_quat))
         p = wp.quat_rotate(level, mount_pos) + distance * (turn * directions[env, ray])
         cell = proximity_cell(p, body, band_edges, num_sectors)
@@ -301,7 +295,7 @@ def write_nearest(
     point = wp.vec3(0.0, 0.0, 0.0)
     if nearest[env, cell] > 0.0:
         ray = first[env, cell]
-        level = level_of(base_quat[env])
+        level = levelled(base_quat[env])
         turn = wp.quat_to_matrix(level * to_quat(mount_quat))
         p = wp.quat_rotate(level, mount_pos) + ranges[env, ray] * (turn * directions[env, ray])
         point = proximity_point(p, nearest[env, cell])

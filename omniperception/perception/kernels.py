@@ -3,6 +3,9 @@ all devices."""
 
 import warp as wp
 
+from omniperception.lidar.kernels.geometry import to_quat
+from omniperception.lidar.kernels.sectors import levelled
+
 wp.set_module_options({"enable_backward": False})
 
 RADIX_BITS = 8
@@ -332,11 +335,6 @@ def farthest_points(
 
 
 @wp.func
-def to_quat(wxyz: wp.vec4):
-    return wp.normalize(wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
-
-
-@wp.func
 def is_hit(distance: float) -> bool:
     """A miss is infinite; a non-finite range is never a point."""
     return wp.isfinite(distance)
@@ -576,14 +574,6 @@ def write_distal(
 
 
 @wp.func
-def level_of(base_quat: wp.vec4):
-    """The base's orientation without its yaw."""
-    q_base = to_quat(base_quat)
-    forward = wp.quat_rotate(q_base, wp.vec3(1.0, 0.0, 0.0))
-    return wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -wp.atan2(forward[1], forward[0])) * q_base
-
-
-@wp.func
 def proximity_cell(p: wp.vec3, body: wp.vec2, band_edges: wp.array(dtype=wp.float32), num_sectors: int) -> int:
     """Band and sector of a point around the levelled base; -1 on the body and outside of all bands."""
     num_bands = band_edges.shape[0] - 1
@@ -627,7 +617,7 @@ def proximity_grid(
     num_bands = band_edges.shape[0] - 1
     for cell in range(num_bands * num_sectors):
         points_out[env, first_slot + cell] = wp.vec3(0.0, 0.0, 0.0)
-    level = level_of(base_quat[env])
+    level = levelled(base_quat[env])
     offset = wp.quat_rotate(level, mount_pos)
     turn = wp.quat_to_matrix(level * to_quat(mount_quat))
     for ray in range(ranges.shape[1]):
