@@ -466,11 +466,11 @@ class OmniEnv(VecEnv):
         """Weighted sum times the control step; a diverged environment's step counts nothing."""
         healthy = ~self.sim.failed
         total = torch.zeros(self.num_envs, device=self.device)
-        for index, (name, term) in enumerate(self.config.rewards.terms.items()):
+        for name, term in self.config.rewards.terms.items():
             weighted = torch.where(healthy, term.func(self), 0.0) * (term.weight * self.control_dt)
-            self.metrics.record_rewards(index, weighted)
             self.weighted_rewards[name] = weighted
             total += weighted
+        self.metrics.record_rewards(tuple(self.weighted_rewards.values()))
         return total
 
     def _record(self, done: torch.Tensor, outcomes: dict[str, torch.Tensor]) -> None:

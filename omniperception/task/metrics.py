@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from omniperception.sim import Failure
@@ -28,8 +30,10 @@ class EpisodeMetrics:
         self._steps = 0
         self.collided = torch.zeros(num_envs, dtype=torch.bool, device=device)
 
-    def record_rewards(self, index: int, weighted: torch.Tensor) -> None:
-        self._rewards[index] += weighted.mean()
+    def record_rewards(self, weighted: Sequence[torch.Tensor]) -> None:
+        """The weighted rewards (num_envs,) of all terms."""
+        if weighted:
+            self._rewards += torch.stack(tuple(weighted)).mean(1)
 
     def record_tracking(
         self, lin_error: torch.Tensor, yaw_error: torch.Tensor, healthy: torch.Tensor, free: torch.Tensor | None

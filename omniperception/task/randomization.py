@@ -17,6 +17,22 @@ from omniperception.world.terrain import contact_solrefs
 
 Range = Sequence[float] | None
 
+_MASSES = {"added_mass", "payload_mass", "com_x", "com_y", "com_z"}
+_DRAWN = (
+    "ground_friction",
+    "ground_restitution",
+    "motor_strength",
+    "gravity_offset",
+    "joint_offset",
+    "latency_s",
+    "added_mass",
+    "payload_mass",
+    "com_x",
+    "com_y",
+    "com_z",
+)
+"""What is drawn at a reset, in this order."""
+
 
 @dataclass(frozen=True)
 class RandomizationConfig:
@@ -92,9 +108,14 @@ class Randomizer:
         self._model = model = sim.world.model
         self._base = sim.world.base_body
         self._ground = model.geom("ground").id
-        self._mass = any(getattr(config, n) for n in ("added_mass", "payload_mass", "com_x", "com_y", "com_z"))
         self._nominal: dict[str, torch.Tensor] = {}  # of what is randomized, when it is first drawn
         self._check_mass()
+        self._shapes = self._drawn_shapes()
+        if self._shapes:
+            bounds = [getattr(config, name) for name, shape in self._shapes.items() for _ in range(math.prod(shape))]
+            low, high = torch.tensor(bounds, dtype=torch.float64, device=sim.device).unbind(1)
+            self._low, self._span = low.float(), (high - low).float()
+        self._mass = bool(_MASSES & self._shapes.keys())
         if self._mass:
             self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
         self.joint_offset: torch.Tensor | None = None
@@ -119,25 +140,25 @@ class Randomizer:
         return round(self.config.latency_s[1] / self._sim.world.model.opt.timestep) if self.config.latency_s else 0
 
     def reset(self, envs: torch.Tensor) -> None:
-        """Draws new parameters for some environments."""
-        config = self.config
-        if config.ground_friction:
-            self._write("geom_friction", envs, self._draw(envs, "ground_friction"), self._ground, 0)
-        if config.ground_restitution:
-            solref = contact_solrefs(self._draw(envs, "ground_restitution"))
-            self._write("geom_solref", envs, solref, self._ground)
-        if config.motor_strength:
-            self._scale_motors(envs)
-        if config.gravity_offset:
-            offset = self._draw(envs, "gravity_offset", (3,))
-            self._write("opt.gravity", envs, self._nominal_of("opt.gravity") + offset)
+        """Draws new parameters for some environments, see `rows`."""
+        if not self._shapes:
+            return
+        drawn = self._draw(envs)
+        if "ground_friction" in drawn:
+            self._write("geom_friction", envs, drawn["ground_friction"], self._ground, 0)
+        if "ground_restitution" in drawn:
+            self._write("geom_solref", envs, contact_solrefs(drawn["ground_restitution"]), self._ground)
+        if "motor_strength" in drawn:
+            for name in ("actuator_gainprm", "actuator_biasprm"):
+                self._write(name, envs, self._nominal_of(name) * drawn["motor_strength"])
+        if "gravity_offset" in drawn:
+            self._write("opt.gravity", envs, self._nominal_of("opt.gravity") + drawn["gravity_offset"])
         if self.joint_offset is not None:
-            put(self.joint_offset, envs, self._draw(envs, "joint_offset", self.joint_offset.shape[1:]))
+            put(self.joint_offset, envs, drawn["joint_offset"])
         if self.delay is not None:
-            steps = self._draw(envs, "latency_s") / self._model.opt.timestep
-            put(self.delay, envs, steps.round())
+            put(self.delay, envs, (drawn["latency_s"] / self._model.opt.timestep).round())
         if self._mass:
-            self._set_masses(envs)
+            self._set_masses(envs, drawn)
 
     def state_dict(self) -> dict:
         """Parameters that live outside the physics model."""
@@ -162,26 +183,27 @@ class Randomizer:
                 f" {base:g} kg with {lightest:g} kg; it must keep a positive mass"
             )
 
-    def _draw(self, envs: torch.Tensor, name: str, shape: Sequence[int] = ()) -> torch.Tensor:
-        low, high = getattr(self.config, name)
-        return self._random.range(envs, low, high, tuple(shape)).double()
+    def _drawn_shapes(self) -> dict[str, tuple[int, ...]]:
+        """What is drawn for one environment, in the order of the draws."""
+        joints, config = self._sim.world.robot.num_joints, self.config
+        shapes = {"motor_strength": (self._model.nu, 1), "gravity_offset": (3,), "joint_offset": (joints,)}
+        return {name: shapes.get(name, ()) for name in _DRAWN if getattr(config, name) is not None}
 
-    def _draw_or_zero(self, envs: torch.Tensor, name: str) -> torch.Tensor:
-        if getattr(self.config, name) is None:
-            return torch.zeros(len(envs), dtype=torch.float64, device=envs.device)
-        return self._draw(envs, name)
+    def _draw(self, envs: torch.Tensor) -> dict[str, torch.Tensor]:
+        """All parameters of some environments, float64, at once."""
+        u = self._random.uniform(envs, (len(self._low),))
+        values = (self._low + self._span * u).double()
+        parts = values.split([math.prod(shape) for shape in self._shapes.values()], 1)
+        shapes = self._shapes.items()
+        return {name: part.reshape(-1, *shape) for (name, shape), part in zip(shapes, parts, strict=True)}
 
-    def _scale_motors(self, envs: torch.Tensor) -> None:
-        scale = self._draw(envs, "motor_strength", (self._model.nu, 1))
-        for name in ("actuator_gainprm", "actuator_biasprm"):
-            self._write(name, envs, self._nominal_of(name) * scale)
-
-    def _set_masses(self, envs: torch.Tensor) -> None:
+    def _set_masses(self, envs: torch.Tensor, drawn: dict[str, torch.Tensor]) -> None:
         """Mass and centre of mass of base, added mass and payload together; the base's inertia stays nominal."""
+        nothing = torch.zeros(len(envs), dtype=torch.float64, device=envs.device)
         base_mass = float(self._model.body_mass[self._base])
-        body = base_mass + self._draw_or_zero(envs, "added_mass")
-        payload = self._draw_or_zero(envs, "payload_mass")
-        offset = torch.stack([self._draw_or_zero(envs, name) for name in ("com_x", "com_y", "com_z")], 1)
+        body = base_mass + drawn.get("added_mass", nothing)
+        payload = drawn.get("payload_mass", nothing)
+        offset = torch.stack([drawn.get(name, nothing) for name in ("com_x", "com_y", "com_z")], 1)
         centre = self._nominal_of("body_ipos")[self._base] + offset
         total = body + payload
         self._write("body_mass", envs, total, self._base)
