@@ -44,7 +44,7 @@ class _Calls(TorchFunctionMode):
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         name = getattr(func, "__name__", "")
-        sends = name in _SENDS and not (name == "as_tensor" and isinstance(args[0], torch.Tensor))
+        sends = name in _SENDS and not (name == "as_tensor" and args and isinstance(args[0], torch.Tensor))
         if name in _READS or sends:
             self._found[name, _place()] += 1
         return func(*args, **(kwargs or {}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import lru_cache
 
 import torch
 import warp as wp
@@ -49,6 +50,13 @@ def view(tensor: torch.Tensor, dtype: type) -> wp.array:
     while len(_views) > _VIEW_CACHE_SIZE:
         _views.popitem(last=False)
     return cached
+
+
+@lru_cache(64)
+def constant(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
+    """Numbers (n,) float32 on a device, sent there once: a GPU is waited for whenever numbers of the host are sent."""
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=torch.float32, device=device)
 
 
 def launch_over_envs(

@@ -12,7 +12,7 @@ import warp as wp
 from torch import nn
 from torch.nn import functional
 
-from omniperception.perception.launch import launch_over_envs, view
+from omniperception.perception.launch import constant, launch_over_envs, view
 from omniperception.perception.motion_match import NOTHING, MotionMatch
 from omniperception.perception.windows import valid_frames, window_count
 
@@ -58,7 +58,7 @@ def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, s
     cells, count = cells.contiguous(), count.contiguous()
     origin, yaw = _poses(moved)
     scratch = cells.new_empty(batch, bands, shape.num_sectors)
-    decays = cells.new_tensor(shape.decays)
+    decays = constant(shape.decays, cells.device)
     inputs = [
         view(cells, wp.vec3),
         view(origin, wp.vec2),

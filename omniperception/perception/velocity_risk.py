@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from omniperception.perception.launch import launch_over_envs, view
+from omniperception.perception.launch import constant, launch_over_envs, view
 from omniperception.perception.sector_motion import sector_bearings
 
 _OUT_OF_REACH = 100.0
@@ -126,7 +126,7 @@ class VelocityRisk:
         place, velocity = place.contiguous(), velocity.contiguous()
         sector = torch.zeros(len(place), len(candidates), dtype=torch.int64, device=place.device)
         when = place.new_zeros(sector.shape)
-        times = place.new_tensor(self.times)
+        times = constant(tuple(self.times), place.device)
         points, least = torch.empty_like(place), place.new_empty(sector.shape)
         sectors = torch.empty(place.shape[:2], dtype=torch.int32, device=place.device)
         inputs = [

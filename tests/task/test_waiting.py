@@ -66,8 +66,9 @@ def test_a_step_waits_for_nothing(task):
     assert not waits.places()
 
 
-def test_a_step_of_training_waits_for_its_check_and_for_the_newest_tick(tmp_path):
-    run = config.assemble(config.compose([*TASKS["paper"], *ON_WARP, "ppo.num_mini_batches=1"]))
+@pytest.mark.parametrize("task", ["paper", "crowd"])
+def test_a_step_of_training_waits_for_its_check_and_for_the_newest_tick(task, tmp_path):
+    run = config.assemble(config.compose([*TASKS[task], *ON_WARP, "ppo.num_mini_batches=1"]))
     runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0, log_interval=10**9)), tmp_path)
     runner.alg.train_mode()
     runner.logger.init_logging_writer()
