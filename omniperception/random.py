@@ -47,10 +47,6 @@ class EnvRandom:
         bits = _shift(_mix(state), 40)
         return (bits.float() * 2.0**-24).reshape(-1, *shape)
 
-    def range(self, envs: torch.Tensor, low: float, high: float, shape: Sequence[int] = ()) -> torch.Tensor:
-        """Draws from [low, high) for some environments; (len(envs), *shape) float32."""
-        return low + (high - low) * self.uniform(envs, shape)
-
 
 def _shift(x: torch.Tensor, bits: int) -> torch.Tensor:
     """Logical right shift of int64."""

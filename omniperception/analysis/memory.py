@@ -59,18 +59,17 @@ class Used:
 def predict(run: RunConfig) -> list[Part]:
     """Memory by part, whatever the run's number of environments; nothing of that size is allocated."""
     low, high = SMALL
-    whole = _build(run, low)
-    at_once = _clouds_at_once(whole.env, run.env.num_envs)
-    if at_once < run.env.num_envs:  # the two builds have one environment's cloud each
-        run = replace(run, env=replace(run.env, lidar=replace(run.env.lidar, cloud_mb=1e-6)))
-    few, more = held_bytes(_build(run, low)), held_bytes(_build(run, high))
-    parts = []
+    build = _build(run, low)
+    few, clouds = held_bytes(build), 0.0
+    at_once = _clouds_at_once(build.env, run.env.num_envs)
+    if at_once < run.env.num_envs:  # both builds get one environment's cloud, and the others are shared
+        whole, run = few, replace(run, env=replace(run.env, lidar=replace(run.env.lidar, cloud_mb=1e-6)))
+        few = held_bytes(_build(run, low))
+        clouds = (at_once - 1) * (whole["rays"] - few["rays"]) / (low - 1)
+    more, parts = held_bytes(_build(run, high)), []
     for name, size in few.items():
         per_env = (more[name] - size) / (high - low)
-        shared = size - low * per_env
-        if name == "rays" and at_once < run.env.num_envs:
-            shared += (at_once - 1) * (held_bytes(whole)[name] - size) / (low - 1)
-        parts.append(Part(name, shared, per_env))
+        parts.append(Part(name, size - low * per_env + (clouds if name == "rays" else 0.0), per_env))
     return [*parts, Part("mini-batch", 0.0, _update_bytes(run) / run.env.num_envs)]
 
 
@@ -120,9 +119,11 @@ def _clouds_at_once(env: OmniEnv, num_envs: int) -> int:
     sensing = env.sensing
     if sensing is None or sensing.needs.whole:
         return num_envs
+    from omniperception.lidar.sensor import even_parts
     from omniperception.task.sensing import envs_at_once
 
-    return -(-num_envs // -(-num_envs // envs_at_once(sensing.config, sensing.lidar.outputs)))
+    parts = even_parts(num_envs, envs_at_once(sensing.config, sensing.lidar.outputs))
+    return max(part.stop - part.start for part in parts)
 
 
 def _build(run: RunConfig, num_envs: int) -> Runner:

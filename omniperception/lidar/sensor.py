@@ -177,6 +177,7 @@ class Lidar:
         config, pattern, scene: As given.
         outputs: Names of the fields of ``frame`` that are computed.
         parts: Which environments are cast at the same time.
+        part_frames: Of each part, as many rows of ``frame``.
         frame: The frame that ``cast`` fills and returns; with several ``parts``, that of the part cast last.
         phase_rows: Rows by which each environment's device is ahead, (num_envs,) int64, from the seed.
         variant: What the scan's kernel was compiled for.
@@ -223,7 +224,7 @@ class Lidar:
         if envs_at_once is not None and envs_at_once < 1:
             raise ValueError(f"lidar.envs_at_once={envs_at_once} must be at least 1, or None for all")
         self.outputs = _known_outputs(outputs)
-        self.parts = _even_parts(scene.num_envs, envs_at_once or scene.num_envs)
+        self.parts = even_parts(scene.num_envs, envs_at_once or scene.num_envs)
         self._selection = make_selection(pattern, config.period_s, config.num_rays, config.selection, seed)
         generator = torch.Generator().manual_seed(seed)
         self.phase_rows = self._selection.draw_phases(scene.num_envs, generator).to(scene.device)
@@ -232,7 +233,7 @@ class Lidar:
         self.frame_count = torch.zeros(scene.num_envs, dtype=torch.int32, device=scene.device)
         self._noise = noise_by_name(noise)
         self.frame = self._allocate_frame()
-        self._frames = [self._first_rows(part.stop - part.start) for part in self.parts]
+        self.part_frames = tuple(self._first_rows(part.stop - part.start) for part in self.parts)
         self.track: PoseTrack | None = None
         self._rays = self._lay_out_rays()
         self._view, self._placed = self._place(mount_body, exclude_shapes)
@@ -278,7 +279,7 @@ class Lidar:
             self.track.advance()
         if self._placed.refresh() and self._pack is not None:
             self._pack()
-        for part, cast, frame in zip(self.parts, self._casts, self._frames, strict=True):
+        for part, cast, frame in zip(self.parts, self._casts, self.part_frames, strict=True):
             cast()
             yield part, frame
         self.frame_count.add_(1)
@@ -476,7 +477,7 @@ def ray_bytes(outputs: Sequence[str]) -> int:
     return sum(1 if name == "valid" else 12 if name in _VECTORS else 4 for name in outputs)
 
 
-def _even_parts(num_envs: int, most: int) -> tuple[slice, ...]:
+def even_parts(num_envs: int, most: int) -> tuple[slice, ...]:
     """Runs of environments, none longer than ``most`` and all of nearly one length."""
     count = -(-num_envs // most)
     edges = [num_envs * k // count for k in range(count + 1)]

@@ -6,7 +6,7 @@ distal hits by (theta ring, phi). The points are those of `kernels`, bit for bit
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 
 import torch
 import warp as wp
@@ -54,7 +54,7 @@ class SortedRays:
             wp.utils.segmented_sort_pairs(self.keys, self.items, self.count, starts)
 
 
-@cache
+@lru_cache(64)
 def _starts(num_envs: int, length: int, device: torch.device) -> torch.Tensor:
     """Where the runs begin, and where the last one ends."""
     return torch.arange(num_envs + 1, dtype=torch.int32, device=device) * length

@@ -108,7 +108,7 @@ class PdSampler(Sampler):
         self.ring = math.radians(ring_deg)
         self.pick_middle = int(reduce == "pick")
         self._scratch: kernels.Scratch | None = None
-        self._scratch_key: tuple | None = None
+        self._scratch_key: tuple[int, tuple | None] = (0, None)
         self._tensors: dict[str, torch.Tensor] = {}
 
     @property
@@ -221,16 +221,18 @@ class PdSampler(Sampler):
 
     def _scratch_for(self, n: int, r: int, device: torch.device) -> kernels.Scratch:
         """Work memory for N environments of R rays, allocated when the shape or device is new."""
-        if self._scratch_key is not None and n <= self._scratch_key[0] and self._scratch_key[1:] == (r, device):
+        per_ray = device.type in by_ray.USED_ON
+        most, fits = self._scratch_key
+        if n <= most and fits == (r, device, per_ray):
             return self._scratch  # of the largest part of the environments
+        longest = max(r, self.num_proximal) if per_ray else r
         by_bucket = device.type == "cpu" and self.num_proximal and r >= self.buckets_from
         num_buckets = -(-r // kernels.BUCKET_SIZE) if by_bucket else 0
         sizes = {
             "picked": (n, max(self.num_proximal, 1)),
             "num_proximal": (n,),
-            "parts": (n, 2),
-            "keys": (2, n, max(r, self.num_proximal)),
-            "items": (2, n, max(r, self.num_proximal)),
+            "keys": (2, n, longest),
+            "items": (2, n, longest),
             "histogram": (n, kernels.RADIX_SIZE),
             "ray": (n, r),
             "distance": (n, num_buckets * kernels.BUCKET_SIZE or r),
@@ -243,9 +245,13 @@ class PdSampler(Sampler):
         self._tensors |= {name: torch.empty(size, device=device) for name, size in real.items()}
         scratch = kernels.Scratch()
         for name, tensor in self._tensors.items():
-            if name != "parts":
-                setattr(scratch, name, view(tensor, float32 if name in real else int32))
-        self._scratch, self._scratch_key = scratch, (n, r, device)
+            setattr(scratch, name, view(tensor, float32 if name in real else int32))
+        if per_ray:
+            num_cells = self.num_points - self.num_proximal
+            self._tensors["parts"] = torch.empty(n, 2, dtype=torch.int32, device=device)
+            self._tensors["first"] = torch.empty(n, num_cells, dtype=torch.int32, device=device)
+            self._tensors["nearest"] = torch.empty(n, num_cells, device=device)
+        self._scratch, self._scratch_key = scratch, (n, (r, device, per_ray))
         return scratch
 
 
@@ -329,10 +335,7 @@ class ProximitySampler(PdSampler):
             launch(kernels.proximity_grid, 0, *cloud, *looks, *cells, *written)
             return
         scratch, num_cells = self._scratch_for(n, r, ranges.device), self.num_points - self.num_proximal
-        nearest, first = (
-            ranges.new_zeros(n, num_cells),
-            torch.full((n, num_cells), r, dtype=torch.int32, device=out.device),
-        )
+        nearest, first = self._tensors["nearest"][:n].zero_(), self._tensors["first"][:n].fill_(r)
         found = view(nearest, float32), view(first, int32)
         launch(by_ray.find_nearest, r, *cloud, *looks, *cells, scratch, found[0])
         launch(by_ray.find_first, r, scratch, *found)

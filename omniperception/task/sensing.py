@@ -150,7 +150,7 @@ class LidarSensing:
         )
         self._placed_anew = torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
         self._time = torch.zeros(sim.num_envs, dtype=torch.float64, device=sim.device)
-        self.tick = 0
+        self.tick, self._is_cast = 0, False
         self.frame_count = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
         self.frame_tick = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
         self.frames: torch.Tensor | None = None
@@ -183,7 +183,7 @@ class LidarSensing:
                 f"the clouds of {self._sim.num_envs} environments take more than"
                 f" lidar.cloud_mb={self.config.cloud_mb:g} MB and are never there at once; raise it, or lower num_envs"
             )
-        return self.lidar.frame if self.tick else None
+        return self.lidar.frame if self._is_cast else None
 
     def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
         """Notes where the base of some environments, see `rows`, starts; call after their reset."""
@@ -229,7 +229,7 @@ class LidarSensing:
                 with timer.stage("sectors"):
                     self._measure_sectors[index]()
         next(parts, None)  # the frame has been cast
-        self.tick += 1
+        self.tick, self._is_cast = self.tick + 1, True
         self.frame_tick.fill_(self.tick)
         if self.frames is not None:
             self._append_newest()
@@ -322,12 +322,12 @@ class LidarSensing:
 
     def _record_sectors(self, num_threads: int | None) -> list[SectorDistances]:
         """A launch for each part."""
-        frame, sensor = self.lidar.frame, self.config.sensor
+        sensor = self.config.sensor
         return [
             SectorDistances(
-                frame.true_ranges[: part.stop - part.start],
-                frame.directions_s[: part.stop - part.start],
-                frame.class_id[: part.stop - part.start],
+                frame.true_ranges,
+                frame.directions_s,
+                frame.class_id,
                 self.scene.body_quat[part],
                 self.base,
                 sensor.mount_pos,
@@ -338,7 +338,7 @@ class LidarSensing:
                 num_threads=num_threads,
                 out=self.sector_distance[part],
             )
-            for part in self.lidar.parts
+            for part, frame in zip(self.lidar.parts, self.lidar.part_frames, strict=True)
         ]
 
 

@@ -91,7 +91,7 @@ def test_an_episode_draws_the_same_whatever_was_drawn_before():
 
 def test_range_and_shapes():
     random = EnvRandom(1, 4)
-    draws = random.range(torch.tensor([1, 3]), -2.0, 3.0, (1000, 2))
+    draws = -2.0 + 5.0 * random.uniform(torch.tensor([1, 3]), (1000, 2))
     assert draws.shape == (2, 1000, 2) and draws.dtype == torch.float32
     assert -2 <= draws.min() < -1.98 and 2.98 < draws.max() < 3
     assert random.uniform(torch.tensor([0])).shape == (1,)

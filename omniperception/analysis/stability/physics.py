@@ -306,8 +306,8 @@ def widened(config: RandomizationConfig, factor: float, sim: MujocoSimulator) ->
 class Corners(EnvRandom):
     """Draws the ends of ranges only."""
 
-    def uniform(self, env_ids: torch.Tensor, shape: tuple[int, ...] = ()) -> torch.Tensor:
-        return super().uniform(env_ids, shape).round()
+    def uniform(self, envs: torch.Tensor, shape: tuple[int, ...] = ()) -> torch.Tensor:
+        return super().uniform(envs, shape).round()
 
 
 FRONT = 0.335

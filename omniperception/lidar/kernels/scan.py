@@ -152,6 +152,7 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
         """Casts a block of one environment's rays in the sensor's frame."""
         task = wp.tid() + task_offset
         env = task // rays.num_blocks
+        out_env = env - out.first_env
         first = (task - env * rays.num_blocks) * rays.block
         last = wp.min(first + rays.block, rays.count)
         cycle = rays.start[env, 0]
@@ -235,38 +236,38 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
                             measured = mixed(figures, measured, second.t)
                     measured = disturb(figures, measured, true_range, key)
             if wp.static(writes_ranges):
-                out.ranges[env - out.first_env, ray] = measured
+                out.ranges[out_env, ray] = measured
             if wp.static(writes_truth):
-                out.true_ranges[env - out.first_env, ray] = true_range
+                out.true_ranges[out_env, ray] = true_range
             if wp.static(writes_valid):
-                out.valid[env - out.first_env, ray] = measured < INF
+                out.valid[out_env, ray] = measured < INF
             point = wp.vec3(NAN, NAN, NAN)
             if measured < INF:
                 point = measured * d
                 if wp.static(displaced):
                     point = point + moment.origin
             if wp.static(writes_points):
-                out.points_s[env - out.first_env, ray] = point
+                out.points_s[out_env, ray] = point
             if wp.static(in_base):
-                out.points_b[env - out.first_env, ray] = p_mount + turn_mount * point
+                out.points_b[out_env, ray] = p_mount + turn_mount * point
             if wp.static(in_world):
                 away = wp.vec3d(turn_view * point)
-                out.points_w[env - out.first_env, ray] = wp.vec3(wp.transform_get_translation(moment.view) + away)
+                out.points_w[out_env, ray] = wp.vec3(wp.transform_get_translation(moment.view) + away)
             shape = wp.int32(-1)
             if is_hit:
                 shape = slots.shape[env, met.slot]
             if wp.static(writes_shape):
-                out.shape_id[env - out.first_env, ray] = shape
+                out.shape_id[out_env, ray] = shape
             if wp.static(writes_class):
                 class_id = wp.int32(-1)
                 if is_hit:
                     class_id = geometry.class_id[shape]
-                out.class_id[env - out.first_env, ray] = class_id
+                out.class_id[out_env, ray] = class_id
             if wp.static(writes_body):
                 body_id = wp.int32(NO_BODY)
                 if is_hit:
                     body_id = labels.body[shape]
-                out.body_id[env - out.first_env, ray] = body_id
+                out.body_id[out_env, ray] = body_id
             if wp.static(faces):
                 normal = wp.vec3(0.0, 0.0, 0.0)
                 cosine = float(0.0)
@@ -276,26 +277,26 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
                     normal = wp.transpose(met_at.axes) * normal_of(geometry, shape, env, met.face, at_shape)
                     cosine = wp.min(wp.abs(wp.dot(normal, cast_d)), 1.0)
                 if wp.static(writes_normals):
-                    out.normals_w[env - out.first_env, ray] = turn_view * normal
+                    out.normals_w[out_env, ray] = turn_view * normal
                 if wp.static(writes_incidence):
-                    out.incidence[env - out.first_env, ray] = wp.where(is_hit, wp.acos(cosine), NAN)
+                    out.incidence[out_env, ray] = wp.where(is_hit, wp.acos(cosine), NAN)
                 if wp.static(writes_intensity):
                     intensity = float(0.0)
                     if is_hit:
                         intensity = labels.reflectivity[geometry.class_id[shape]] * cosine / (true_range * true_range)
-                    out.intensity[env - out.first_env, ray] = intensity
+                    out.intensity[out_env, ray] = intensity
             if wp.static(writes_time):
-                out.time_s[env - out.first_env, ray] = time
+                out.time_s[out_env, ray] = time
             if wp.static(writes_direction):
-                out.directions_s[env - out.first_env, ray] = d
+                out.directions_s[out_env, ray] = d
             if wp.static(writes_elevation):
-                out.elevation[env - out.first_env, ray] = rays.angles[at][0]
+                out.elevation[out_env, ray] = rays.angles[at][0]
             if wp.static(writes_azimuth):
-                out.azimuth[env - out.first_env, ray] = rays.angles[at][1]
+                out.azimuth[out_env, ray] = rays.angles[at][1]
             if wp.static(writes_row):
                 row = int(rays.first_row[env]) + ray * rays.stride
                 if wp.static(selected):
                     row = int(rays.first_row[env]) + rays.offsets[listed, ray]
-                out.row[env - out.first_env, ray] = row % rays.num_rows
+                out.row[out_env, ray] = row % rays.num_rows
 
     return cast_scan
