@@ -299,9 +299,9 @@ def _rays(run: RunConfig, env: OmniEnv) -> Section:
     triangles = sum(len(shape.asset.faces) for shape in scene.shapes if hasattr(shape.asset, "faces"))
     heights = scene.geometry.field_height.size
     section.add("rays", f"{lidar.num_rays} a frame, every {lidar.period_s:g} s", _readers_of_rays(run))
-    parts = len(env.sensing.lidar.parts)
-    fit = f"the clouds of all environments fit into lidar.cloud_mb={env.sensing.config.cloud_mb:g}"
-    section.either(parts > 1, "parts of a frame", f"{parts}", "clouds of all environments never exist at once", fit)
+    parts, limit = len(env.sensing.parts_of(run.env.num_envs)), f"lidar.cloud_mb={env.sensing.config.cloud_mb:g}"
+    never = f"{limit}: the clouds of all environments never exist at once; scripts/memory.py reckons with that"
+    section.either(parts > 1, "parts of a frame", f"{parts}", never, f"{limit} is enough, or whole clouds are read")
     section.add("shapes", f"{len(scene.shapes)}: " + ", ".join(f"{n} {kind}" for kind, n in sorted(kinds.items())))
     moving = f"{scene.num_bodies}"
     section.either(scene.num_bodies > 0, "moving bodies", moving, "poses copied each frame", "nothing moves")

@@ -18,7 +18,7 @@ import yaml
 from omniperception import config
 from omniperception.assembly import build_runner
 from omniperception.inventory import walk
-from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid
+from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid, ray_bytes
 from omniperception.lidar.kernels import variants
 from omniperception.lidar.launch import SplitLaunch
 from omniperception.plan import PLAN_FILE, contact_pairs, describe
@@ -393,6 +393,16 @@ def test_memory_counts_every_byte_once_and_grows_with_the_environments():
     assert few == pytest.approx(many)
     frames = next(b for b in plans[0].buffers if b.name.endswith("storage.frames"))
     assert frames.num_bytes == 13 * (5 - 1 + 2) * (64 + 36 * 6) * 3 * 4
+
+
+def test_a_plan_tells_the_parts_of_the_run_not_of_what_was_built_to_describe_it():
+    run, runner = build("experiment=quickstart", "num_envs=8", "ppo.num_steps_per_env=4", "lidar.sensor.num_rays=500")
+    bytes_per_env = 500 * ray_bytes(runner.env.sensing.lidar.outputs)
+    fitting = int(1e9 / bytes_per_env)
+    for num_envs, exists in ((fitting, False), (fitting + 1, True)):
+        plan = describe(replace(run, env=replace(run.env, num_envs=num_envs)), runner)
+        parts = {entry.name: entry.detail for entry in plan["ray geometry"].has}.get("parts of a frame")
+        assert parts == ("2" if exists else None)
 
 
 def test_contact_pairs_are_those_that_the_engine_finds(make_env):

@@ -116,13 +116,7 @@ def table(parts: Sequence[Part], num_envs: int) -> list[tuple[str, float, float,
 
 def _clouds_at_once(env: OmniEnv, num_envs: int) -> int:
     """Environments of a run of `num_envs` whose clouds exist at the same time."""
-    sensing = env.sensing
-    if sensing is None or sensing.needs.whole:
-        return num_envs
-    from omniperception.lidar.sensor import even_parts
-    from omniperception.task.sensing import envs_at_once
-
-    parts = even_parts(num_envs, envs_at_once(sensing.config, sensing.lidar.outputs))
+    parts = [slice(0, num_envs)] if env.sensing is None else env.sensing.parts_of(num_envs)
     return max(part.stop - part.start for part in parts)
 
 

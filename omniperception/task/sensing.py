@@ -16,6 +16,7 @@ from omniperception.lidar import (
     RayScene,
     ScanPattern,
     SectorDistances,
+    even_parts,
     largest_lean,
     ray_bytes,
 )
@@ -184,6 +185,11 @@ class LidarSensing:
                 f" lidar.cloud_mb={self.config.cloud_mb:g} MB and are never there at once; raise it, or lower num_envs"
             )
         return self.lidar.frame if self._is_cast else None
+
+    def parts_of(self, num_envs: int) -> tuple[slice, ...]:
+        """The parts in which the clouds of a run with so many environments are cast."""
+        most = num_envs if self.needs.whole else envs_at_once(self.config, self.lidar.outputs)
+        return even_parts(num_envs, most)
 
     def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
         """Notes where the base of some environments, see `rows`, starts; call after their reset."""
