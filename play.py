@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from omniperception import config
-from omniperception.assembly import load_policy
+from omniperception import build, config
+from omniperception.build import load_policy
+from omniperception.env.env import OmniEnv
 from omniperception.evaluation.episodes import Episodes, Policy, run_episodes
 from omniperception.evaluation.report import provenance, table, times_line
 from omniperception.learning import CheckpointError
-from omniperception.task.env import OmniEnv
 
 ARGUMENTS = {"run": "latest", "viewer": "video", "episodes": "200", "video_s": "20"}
 VIEWERS = ("video", "none")
@@ -54,12 +54,12 @@ class Replay:
         video_s = config.positive("video_s", own["video_s"], float)
         return cls(config.find_run(own["run"]), own["viewer"], episodes, video_s, tuple(overrides))
 
-    def configuration(self) -> config.RunConfig:
+    def configuration(self) -> build.RunConfig:
         """The run's configuration as it is replayed."""
         composed = config.load(self.run_dir, self.overrides)
         if not any(override.startswith("num_envs=") for override in self.overrides):
             composed.num_envs = min(composed.num_envs, self.episodes)
-        return config.assemble(composed)
+        return build.assemble(composed)
 
 
 def play(replay: Replay) -> None:

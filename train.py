@@ -11,8 +11,8 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from omniperception import config
-from omniperception.assembly import build_runner
+from omniperception import build, config
+from omniperception.build import build_runner
 from omniperception.learning import (
     CheckpointError,
     RolloutTooSmall,
@@ -24,7 +24,7 @@ from omniperception.learning import (
 from omniperception.plan import describe
 
 
-def learn(run: config.RunConfig, run_dir: Path, resume: bool) -> None:
+def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
     """Trains a run to its end in `run_dir`; of several processes the first one tells how it goes."""
     runner = build_runner(run, run_dir)
     if resume:
@@ -51,7 +51,7 @@ def tell(text: str) -> None:
 @hydra.main(config_path="conf", config_name="config", version_base="1.3")
 def train(composed: DictConfig) -> None:
     with config.one_line_errors(CheckpointError, RolloutTooSmall, TrainingDiverged):
-        run = config.assemble(composed)
+        run = build.assemble(composed)
         distributed.connect(run.env.sim.torch_device)
         run_dir = distributed.of_first(Path(os.path.relpath(HydraConfig.get().runtime.output_dir)))
         begun = distributed.of_first(config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir)))
@@ -62,7 +62,7 @@ def train(composed: DictConfig) -> None:
 
 def resume(name: str, overrides: list[str]) -> None:
     run_dir = config.find_run(name)
-    learn(config.assemble(config.load(run_dir, overrides)), run_dir, resume=True)
+    learn(build.assemble(config.load(run_dir, overrides)), run_dir, resume=True)
 
 
 def main() -> None:
@@ -75,7 +75,7 @@ def main() -> None:
         if own["run"]:
             resume(own["run"], overrides)
             return
-        config.check(overrides)
+        build.check(overrides)
     train()
 
 

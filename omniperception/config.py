@@ -1,26 +1,19 @@
-"""The package's only module that knows Hydra: compose, validate, instantiate, save and load configurations."""
+"""Configurations as text: compose, check, save and load."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, InstantiationException
-from hydra.utils import instantiate
+from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-
-from omniperception.learning.config import PerceptionConfig, PPOConfig
-from omniperception.task.env import EnvConfig
 
 CONFIG_DIR = Path(__file__).resolve().parents[1] / "conf"
 CONFIG_FILE = "config.yaml"
@@ -35,33 +28,6 @@ class ConfigError(ValueError):
     """A configuration that cannot run; the message is one line that says what to change."""
 
 
-@dataclass(frozen=True)
-class RunConfig:
-    """A run, assembled from its composed configuration.
-
-    Attributes:
-        env: the task.
-        perception: the actor's view of the LiDAR, or None.
-        ppo: the learning settings.
-        init: the runs whose weights this one starts from; where two have the same, the later one's.
-        composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
-    """
-
-    env: EnvConfig
-    perception: PerceptionConfig | None
-    ppo: PPOConfig
-    init: tuple[str, ...]
-    composed: dict
-
-    def __post_init__(self) -> None:
-        supervised = self.perception is not None and self.perception.supervised_epochs > 0
-        if self.ppo.num_learning_epochs == 0 and not supervised:
-            raise ValueError(
-                "ppo.num_learning_epochs=0 keeps the policy as it is, and nothing else learns; set it to at least 1, or"
-                " perception.supervised_epochs"
-            )
-
-
 def compose(overrides: Sequence[str]) -> DictConfig:
     """Composes `conf/config.yaml` with overrides as on the command line."""
     _check_scenario(overrides)
@@ -71,56 +37,9 @@ def compose(overrides: Sequence[str]) -> DictConfig:
             config = hydra_compose("config", overrides=list(overrides))
             presets = hydra_compose("config", overrides=[o for o in overrides if _is_group(o)])
     except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise ConfigError(_one_line(error)) from None
+        raise ConfigError(one_line(error)) from None
     _check_kinds(config, presets)
     return config
-
-
-def assemble(config: DictConfig) -> RunConfig:
-    """Instantiates and validates every part of a composed configuration."""
-    try:
-        _check_groups(config)
-        composed = OmegaConf.to_container(config, resolve=True)
-        parts = {key: _instantiate(key, value) for key, value in composed.items() if isinstance(value, dict)}
-        perception, ppo = parts.pop("perception"), parts.pop("ppo")
-        env = EnvConfig(
-            num_envs=composed["num_envs"],
-            seed=composed["seed"],
-            sampler=perception.sampler if perception else None,
-            frame_history=perception.history if perception else 0,
-            base_motion=perception.base_motion if perception else False,
-            targets=tuple(perception.supervision) if perception else (),
-            log_interval=ppo.num_steps_per_env,
-            **parts,
-        )
-        return RunConfig(env, perception, ppo, _names(composed.get("init")), composed)
-    except (OmegaConfBaseException, InstantiationException) as error:
-        raise ConfigError(_one_line(error)) from None
-    except (TypeError, ValueError) as error:
-        raise ConfigError(_one_line(error)) from None
-
-
-def _names(value: object) -> tuple[str, ...]:
-    """One name, several, or none."""
-    names = [] if value is None else value if isinstance(value, list) else [value]
-    if not all(isinstance(name, str) for name in names):
-        raise ConfigError(f"init={value} must be a run directory, a list of them, or null")
-    return tuple(names)
-
-
-def check(overrides: Sequence[str]) -> None:
-    """Composes and validates every job that command-line overrides (with sweeps) stand for, before any is started."""
-    values = [o for o in overrides if not o.startswith("-")]
-    try:
-        parsed = OverridesParser.create().parse_overrides(values)
-    except HydraException as error:
-        raise ConfigError(_one_line(error)) from None
-    if "-m" in overrides or "--multirun" in overrides:
-        jobs = [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
-    else:
-        jobs = [values]
-    for job in jobs:
-        assemble(compose([o for o in job if not o.startswith("hydra")]))
 
 
 def save(composed: dict, run_dir: Path) -> None:
@@ -216,7 +135,7 @@ def one_line_errors(*also: type[Exception]) -> Iterator[None]:
     try:
         yield
     except (ConfigError, *also) as error:
-        print(f"error: {_one_line(error)}", file=sys.stderr, flush=True)
+        print(f"error: {one_line(error)}", file=sys.stderr, flush=True)
         sys.exit(2)
 
 
@@ -233,11 +152,6 @@ def _check_scenario(overrides: Sequence[str]) -> None:
 
 
 _EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
-
-
-def _check_groups(config: DictConfig) -> None:
-    if config.perception and not config.lidar:
-        raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
 
 
 def _is_group(override: str) -> bool:
@@ -269,16 +183,6 @@ def _kind(value: object) -> str | None:
     return kinds.get(type(value))
 
 
-def _instantiate(key: str, value: dict) -> object | None:
-    if not value:
-        return None
-    try:
-        return instantiate(value, _convert_="all")
-    except InstantiationException as error:
-        cause = error.__cause__ or error
-        raise ConfigError(f"{key}: {_one_line(cause)}") from None
-
-
 def _set(config: DictConfig, override: str) -> None:
     key, separator, value = override.partition("=")
     if not separator:
@@ -295,6 +199,6 @@ def _set(config: DictConfig, override: str) -> None:
 _MISSING = object()
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines) or type(error).__name__

@@ -13,15 +13,15 @@ import mujoco
 import torch
 import yaml
 
-from omniperception.config import RunConfig
+from omniperception.build import RunConfig
+from omniperception.env.env import OmniEnv
+from omniperception.env.state import fields_read
 from omniperception.inventory import Buffer, buffers_of, is_launch, walk
 from omniperception.learning import Runner
 from omniperception.learning.models import MOTION
-from omniperception.task.env import OmniEnv
-from omniperception.task.state import fields_read
 
 if TYPE_CHECKING:
-    from omniperception.task.sensing import LidarSensing
+    from omniperception.env.sensing import LidarSensing
 
 PLAN_FILE = "plan.yaml"
 OPTIONAL_PACKAGES = {

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from omniperception import config
-from omniperception.ablation import Ablation, evaluate_all, train, write_tables
+from omniperception.evaluation.ablation import Ablation, evaluate_all, train, write_tables
 from omniperception.learning import CheckpointError
 
 STAGES = ("train", "evaluate", "table")

@@ -23,11 +23,11 @@ import omniperception  # noqa: F401  before torch, whose threads it sets up
 import torch
 from mujoco.batch import Batch
 
-from omniperception import config
-from omniperception.assembly import build_runner, seed_everything
+from omniperception import build, config
+from omniperception.build import build_runner, seed_everything
+from omniperception.common.timing import StageTimer
+from omniperception.env.env import OmniEnv
 from omniperception.sim import SimConfig
-from omniperception.task.env import OmniEnv
-from omniperception.task.timing import StageTimer
 
 BLOCK = 25
 """Control steps per timed block: a multiple of the LiDAR's period."""
@@ -78,7 +78,7 @@ def report(name: str, num_envs: int, seconds: list[float], bare: list[float], st
     )
 
 
-def benchmark_step(run: config.RunConfig, repeats: int) -> None:
+def benchmark_step(run: build.RunConfig, repeats: int) -> None:
     seed_everything(run.env.seed)
     # No report drains the stages' times meanwhile, and all obstacles are there, so that the LiDAR is awake.
     env = OmniEnv(replace(run.env, log_interval=10**9, initial_obstacle_level=1.0))
@@ -92,7 +92,7 @@ def benchmark_step(run: config.RunConfig, repeats: int) -> None:
         print(f"  {stage:<17} {1e6 * seconds / total:8.2f} us per env step")
 
 
-def benchmark_against(runs: list[config.RunConfig], repeats: int, clock: Callable[[], float]) -> None:
+def benchmark_against(runs: list[build.RunConfig], repeats: int, clock: Callable[[], float]) -> None:
     """Time by stage of two tasks, the second the baseline, in alternating blocks."""
     tasks = []
     for run in runs:
@@ -121,7 +121,7 @@ def benchmark_against(runs: list[config.RunConfig], repeats: int, clock: Callabl
     print(f"ratio {statistics.median(ratios):22.2f} (median of {repeats} pairs, {spread})")
 
 
-def benchmark_iteration(run: config.RunConfig, repeats: int) -> None:
+def benchmark_iteration(run: build.RunConfig, repeats: int) -> None:
     runner = build_runner(run, None)
     env, rollout = runner.env, run.ppo.num_steps_per_env
     bare = bare_physics(env)
@@ -140,7 +140,7 @@ def main() -> None:
         defaults = {"what": "step", "repeats": "7", "against": "", "clock": "wall"}
         own, overrides = config.split_arguments(sys.argv[1:], defaults)
         overrides = overrides or ["experiment=quickstart"]
-        run, repeats = config.assemble(config.compose(overrides)), int(own["repeats"])
+        run, repeats = build.assemble(config.compose(overrides)), int(own["repeats"])
         if own["what"] not in ("step", "iteration"):
             raise config.ConfigError(f"what={own['what']} must be step or iteration")
         if type(run.env.sim) is not SimConfig:
@@ -150,7 +150,7 @@ def main() -> None:
             raise config.ConfigError(f"clock={own['clock']} must be wall or cpu")
         print(f"{run.env.num_envs} environments, {torch.get_num_threads()} torch threads, {' '.join(overrides)}")
         if own["against"]:
-            baseline = config.assemble(config.compose([*overrides, *own["against"].split(",")]))
+            baseline = build.assemble(config.compose([*overrides, *own["against"].split(",")]))
             benchmark_against([run, baseline], repeats, clocks[own["clock"]])
         else:
             {"step": benchmark_step, "iteration": benchmark_iteration}[own["what"]](run, repeats)

@@ -21,13 +21,13 @@ from pathlib import Path
 
 import torch
 
-from omniperception import config
+from omniperception import build, config
 from omniperception.deploy import DeployError, ExportedPolicy
+from omniperception.deploy.export import FOLDER
 from omniperception.deploy.latency import PERCENTILES, Latency, Reading, measure
+from omniperception.env.env import OmniEnv
 from omniperception.evaluation.exported import record
 from omniperception.evaluation.report import provenance
-from omniperception.export import FOLDER
-from omniperception.task.env import OmniEnv
 
 ARGUMENTS = {"run": "latest", "steps": "5000", "out": ""}
 RECORDED = 250
@@ -36,7 +36,7 @@ RECORDED = 250
 
 def readings_of(run_dir: Path, policy: ExportedPolicy, whole_frames: bool) -> list[Reading]:
     """Recorded in an environment of the run with one robot and all obstacles."""
-    run = config.assemble(config.load(run_dir, ["num_envs=1"]))
+    run = build.assemble(config.load(run_dir, ["num_envs=1"]))
     return record(OmniEnv(replace(run.env, initial_obstacle_level=1.0)), policy, RECORDED, whole_frames)
 
 

@@ -28,9 +28,9 @@ from pathlib import Path
 import omniperception  # noqa: F401  before torch, whose threads it sets up
 
 # isort: split
+from benchmarks.figures import PlotsUnavailable
+from benchmarks.lidar_benchmark.run import RUNS, ArgumentError, RunOptions, execute
 from omniperception import config
-from omniperception.analysis.figures import PlotsUnavailable
-from omniperception.analysis.lidar_benchmark.run import RUNS, ArgumentError, RunOptions, execute
 
 DEFAULTS = {
     "what": "peers",

@@ -12,8 +12,8 @@ from __future__ import annotations
 import sys
 
 import omniperception  # noqa: F401  before torch, whose threads it sets up
-from omniperception import config
-from omniperception.analysis.sampling_benchmark import clouds, hits_per_environment, measure, pareto
+from benchmarks.sampling_benchmark import clouds, hits_per_environment, measure, pareto
+from omniperception import build, config
 
 OWN = {"points": "256", "repeats": "11", "threads": "1", "rays": "1000,20000"}
 
@@ -27,7 +27,7 @@ def main() -> None:
         for rays in own["rays"].split(","):
             num_rays = int(config.positive("rays", rays, int))
             given = ["num_envs=64", "perception=pd_risknet", f"lidar.sensor.num_rays={num_rays}", *overrides]
-            run = config.assemble(config.compose(given))
+            run = build.assemble(config.compose(given))
             frame, max_range = clouds(run), run.env.lidar.sensor.max_range
             print(
                 f"\n{len(frame.ranges)} environments x {num_rays} rays, {hits_per_environment(frame, max_range):.0f}"

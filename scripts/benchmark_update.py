@@ -18,8 +18,7 @@ import omniperception  # noqa: F401  before torch, whose threads it sets up
 # isort: split
 import torch
 
-from omniperception import config
-from omniperception.analysis.update_benchmark import (
+from benchmarks.update_benchmark import (
     UpdateCase,
     UpdatePair,
     build,
@@ -28,6 +27,7 @@ from omniperception.analysis.update_benchmark import (
     rollout_bytes,
     seconds,
 )
+from omniperception import config
 from omniperception.learning import PerceptivePpo
 
 POLICIES = {"small": (256, 128, 64), "paper": (1024, 512, 256, 128)}

@@ -22,8 +22,8 @@ from collections.abc import Sequence
 
 from omniperception import config
 from omniperception.evaluation.plots import PlotsUnavailable
+from omniperception.evaluation.suite import Evaluation, evaluate
 from omniperception.learning import CheckpointError
-from omniperception.suite import Evaluation, evaluate
 
 ARGUMENTS = {
     "run": "latest",

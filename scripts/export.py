@@ -17,9 +17,9 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.deploy import Description
-from omniperception.export import FORMATS, Export, export
+from omniperception.deploy.export import FORMATS, Export, export
+from omniperception.deploy.modules import ExportUnavailable
 from omniperception.learning import CheckpointError
-from omniperception.learning.export import ExportUnavailable
 
 ARGUMENTS = {"run": "latest", "out": "", "formats": ",".join(FORMATS)}
 

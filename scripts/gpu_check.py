@@ -26,8 +26,8 @@ import omniperception  # noqa: F401  before torch, whose threads it sets up
 # isort: split
 import torch
 
+from benchmarks.gpu_check import PARTS, CheckOptions, execute
 from omniperception import config
-from omniperception.analysis.gpu_check import PARTS, CheckOptions, execute
 
 DEFAULTS = {"device": "cuda:0", "size": "full", "only": "", "minutes": "8", "out": "outputs/gpu_check"}
 

@@ -13,12 +13,12 @@ import json
 import sys
 from dataclasses import asdict
 
-from omniperception import config
-from omniperception.assembly import build_runner
+from omniperception import build, config
+from omniperception.build import build_runner
 from omniperception.evaluation.heights import HeightErrors, height_errors
 from omniperception.evaluation.report import provenance
+from omniperception.evaluation.suite import FOLDER
 from omniperception.learning import CheckpointError, latest_checkpoint
-from omniperception.suite import FOLDER
 
 ARGUMENTS = {"run": "latest", "num_envs": "128", "steps": "500"}
 HELD_OUT = (
@@ -51,7 +51,7 @@ def main() -> None:
         if not config.load(run_dir).perception:
             raise config.ConfigError(f"run={own['run']} sees nothing; give a run with perception")
         num_envs, steps = (config.positive(key, own[key], int) for key in ("num_envs", "steps"))
-        run = config.assemble(
+        run = build.assemble(
             config.load(run_dir, [*HELD_OUT, MEASURED, "seed=1000", *overrides, f"num_envs={num_envs}"])
         )
         runner = build_runner(run, None)

@@ -14,7 +14,7 @@ import sys
 import mujoco
 import warp as wp
 
-from omniperception.analysis.lidar_accuracy import cases, compare, leaks
+from benchmarks.lidar_accuracy import cases, compare, leaks
 
 OPTIONS = {"rays": "1000000", "seed": "0", "only": ""}
 BAR = 0.9999

@@ -14,8 +14,8 @@ import sys
 import omniperception  # noqa: F401  before torch, whose threads it sets up
 
 # isort: split
-from omniperception import config
-from omniperception.analysis.memory import measure, predict, table
+from benchmarks.memory import measure, predict, table
+from omniperception import build, config
 from omniperception.learning.memory import device_bytes
 
 
@@ -24,7 +24,7 @@ def main() -> None:
         own, overrides = config.split_arguments(sys.argv[1:], {"measure": "false"})
         if own["measure"] not in ("true", "false"):
             raise config.ConfigError(f"measure={own['measure']} must be true or false")
-        run = config.assemble(config.compose(overrides or ["experiment=paper"]))
+        run = build.assemble(config.compose(overrides or ["experiment=paper"]))
         rows = table(predict(run), run.env.num_envs)
         used = measure(run) if own["measure"] == "true" else None
     device = run.env.sim.torch_device

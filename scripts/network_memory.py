@@ -11,8 +11,8 @@ from __future__ import annotations
 import sys
 
 import omniperception  # noqa: F401  before torch, whose threads it sets up
-from omniperception import config
-from omniperception.assembly import steps_per_frame
+from omniperception import build, config
+from omniperception.build import steps_per_frame
 from omniperception.learning.memory import GB, Footprint, footprint, largest_cloud
 
 COLUMNS = ("parameters", "weights, Adam", "sensor", "rollout", "mini-batch", "total", "verdict")
@@ -43,7 +43,7 @@ def main() -> None:
         overrides = overrides or ["experiment=paper"]
         lines, largest = [], []
         for name in presets():
-            run = config.assemble(config.compose([*overrides, f"perception={name}"]))
+            run = build.assemble(config.compose([*overrides, f"perception={name}"]))
             sizes = (run.perception, run.ppo, run.env.num_envs, steps_per_frame(run))
             lines.append(row(name, footprint(*sizes), budget))
             if name == "direct_mlp":

@@ -12,8 +12,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from benchmarks.figures import PlotsUnavailable, new_figure
 from omniperception import config
-from omniperception.analysis.figures import PlotsUnavailable, new_figure
 from omniperception.lidar import DEVICES, LIVOX, ScanPattern
 from omniperception.lidar.patterns.coverage import DURATIONS_S, angle_to_table, compare, strategy_coverage
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-from omniperception import config
-from omniperception.assembly import build_runner
+from omniperception import build, config
+from omniperception.build import build_runner
 from omniperception.plan import Plan, describe
 
 BUILT_ENVS = 13
@@ -22,14 +22,14 @@ BUILT_ENVS = 13
 
 def plan_of(overrides: list[str]) -> Plan:
     """The plan of a command line."""
-    run = config.assemble(config.compose(overrides))
+    run = build.assemble(config.compose(overrides))
     built = replace(run, env=replace(run.env, num_envs=min(run.env.num_envs, BUILT_ENVS)))
     return describe(run, build_runner(built, None))
 
 
 def print_gain(arguments: list[str]) -> None:
     """Tables of what forcing things in costs, each scene's as soon as it is measured."""
-    from omniperception.analysis import pruning_benchmark as benchmark
+    from benchmarks import pruning_benchmark as benchmark
 
     own, rest = config.split_arguments(arguments, {"scene": "all", "num_envs": "256", "repeats": "9"})
     if rest:

@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 from omniperception import config
+from omniperception.deploy.publish import publish
 from omniperception.learning import CheckpointError
-from omniperception.publish import publish
 
 ARGUMENTS = {"run": "latest", "to": "", "precision": "float32"}
 

@@ -25,9 +25,9 @@ from pathlib import Path
 import omniperception  # noqa: F401  before torch, whose threads it sets up
 
 # isort: split
+from benchmarks.figures import PlotsUnavailable
+from benchmarks.stability.run import SUBJECTS, Options, execute
 from omniperception import config
-from omniperception.analysis.figures import PlotsUnavailable
-from omniperception.analysis.stability.run import SUBJECTS, Options, execute
 
 NUMBERS = {"size": "12", "num_envs": "32", "rays": "2000", "many": "1000000", "iterations": "3", "frames": "1000000"}
 ARGUMENTS = {"subject": "", "out": "", "only": "", "seconds": "4", **NUMBERS}

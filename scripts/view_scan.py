@@ -17,10 +17,10 @@ from pathlib import Path
 import omniperception  # noqa: F401  before torch, whose threads it sets up
 
 # isort: split
-from omniperception import config
-from omniperception.analysis.demo_scene import demo_scene
-from omniperception.analysis.figures import PlotsUnavailable
-from omniperception.analysis.view_scan import draw_comparison, summary, take_scan, write_scan
+from benchmarks.figures import PlotsUnavailable
+from benchmarks.view_scan import draw_comparison, summary, take_scan, write_scan
+from omniperception import build, config
+from omniperception.lidar.demo_scene import demo_scene
 
 DEFAULTS = {"out": "", "seed": "0", "rays": "all", "seconds": "", "colour": "class"}
 COLOURS = ("class", "height")
@@ -45,7 +45,7 @@ def main() -> None:
         scans = []
         for name in names:
             others = [o for o in overrides if not o.startswith("lidar=")]
-            env = config.assemble(config.compose([*NO_TASK, f"lidar={name}", *others])).env
+            env = build.assemble(config.compose([*NO_TASK, f"lidar={name}", *others])).env
             demo = demo_scene(env.robot)
             scans.append(take_scan(name, env.lidar, demo, seconds, rays, seed))
             folder = out if own["out"] and len(names) == 1 else out / name

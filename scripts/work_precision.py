@@ -25,9 +25,9 @@ from pathlib import Path
 import omniperception  # noqa: F401  before torch, whose threads it sets up
 
 # isort: split
+from benchmarks.figures import PlotsUnavailable
+from benchmarks.work_precision.run import SIZES, SUBJECTS, Options, execute
 from omniperception import config
-from omniperception.analysis.figures import PlotsUnavailable
-from omniperception.analysis.work_precision.run import SIZES, SUBJECTS, Options, execute
 from omniperception.deploy import DeployError
 from omniperception.learning import CheckpointError
 

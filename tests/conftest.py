@@ -2,8 +2,8 @@
 
 import pytest
 
-from omniperception import config
-from omniperception.task.env import OmniEnv
+from omniperception import build, config
+from omniperception.env.env import OmniEnv
 
 BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
 """Overrides of a run without LiDAR."""
@@ -15,7 +15,7 @@ def make_env():
 
     def make(*overrides: str, num_envs: int = 4, blind: bool = False) -> OmniEnv:
         given = (*(BLIND if blind else ()), *overrides, f"num_envs={num_envs}")
-        return OmniEnv(config.assemble(config.compose(given)).env)
+        return OmniEnv(build.assemble(config.compose(given)).env)
 
     return make
 
@@ -23,4 +23,4 @@ def make_env():
 @pytest.fixture(scope="session")
 def make_config():
     """Assembles a configuration from overrides on the command line."""
-    return lambda *overrides: config.assemble(config.compose(overrides))
+    return lambda *overrides: build.assemble(config.compose(overrides))

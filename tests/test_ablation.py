@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from omniperception.ablation import Ablation, pooled, write_tables
 from omniperception.config import ConfigError
+from omniperception.evaluation.ablation import Ablation, pooled, write_tables
 
 ROOT = Path(__file__).resolve().parents[1]
 GIVEN = {"out": Path("x"), "experiment": "avoid", "variants": ["fps_gru"], "seeds": [1], "scenarios": ["corridor"]}

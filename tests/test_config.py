@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from omniperception import config
-from omniperception.assembly import build_runner
+from omniperception import build, config
+from omniperception.build import build_runner
 from omniperception.config import ConfigError
-from omniperception.task.env import OmniEnv
+from omniperception.env.env import OmniEnv
 
 ROOT = Path(__file__).resolve().parents[1]
 PRESETS = sorted(
@@ -42,7 +42,7 @@ def test_every_preset_composes_builds_and_steps(preset):
     group, name = preset.split("/")
     if preset == "sim/mujoco_warp":
         pytest.importorskip("mujoco_warp")
-    run = config.assemble(config.compose([*COMPANIONS.get(preset, []), f"{group}={name}", "num_envs=2"]))
+    run = build.assemble(config.compose([*COMPANIONS.get(preset, []), f"{group}={name}", "num_envs=2"]))
     if preset.startswith(LEARNING):
         runner = build_runner(run, None)
         env = runner.env
@@ -134,7 +134,7 @@ WRONG = [
 @pytest.mark.parametrize(("overrides", "named"), WRONG)
 def test_wrong_configurations_name_the_key_in_one_line(overrides, named):
     with pytest.raises(ConfigError) as error:
-        config.check(overrides)
+        build.check(overrides)
     assert named in str(error.value) and "\n" not in str(error.value)
 
 
@@ -170,40 +170,40 @@ def test_the_program_tells_what_is_wrong_in_one_line(tmp_path, overrides, named)
     ],
 )
 def test_what_only_the_compiled_world_can_judge_is_a_config_error_too(override, named):
-    run = config.assemble(config.compose([override, "num_envs=1"]))
+    run = build.assemble(config.compose([override, "num_envs=1"]))
     with pytest.raises(ConfigError) as error:
         build_runner(run, None)
     assert named in str(error.value)
 
 
 def test_every_job_of_a_sweep_is_checked_before_the_first_starts():
-    config.check(["-m", "num_envs=2,4", "obstacles=static,moving"])
+    build.check(["-m", "num_envs=2,4", "obstacles=static,moving"])
     with pytest.raises(ConfigError, match="num_envs=0"):
-        config.check(["--multirun", "num_envs=2,0"])
+        build.check(["--multirun", "num_envs=2,0"])
 
 
 class TestRunDirectories:
     @pytest.fixture
     def run_dir(self, tmp_path):
         overrides = ["experiment=walk", "num_envs=7", "rewards.terms.tilt.weight=-3"]
-        run = config.assemble(config.compose(overrides))
+        run = build.assemble(config.compose(overrides))
         config.save(run.composed, tmp_path)
         return tmp_path
 
     def test_a_saved_configuration_is_the_run(self, run_dir):
-        run = config.assemble(config.load(run_dir))
+        run = build.assemble(config.load(run_dir))
         assert run.env.num_envs == 7 and run.env.lidar is None and run.perception is None
         assert run.env.rewards.terms["tilt"].weight == -3
 
     def test_interpolations_are_saved_as_values(self, run_dir):
-        run = config.assemble(config.compose(["lidar.sensor.max_range=9.0"]))
+        run = build.assemble(config.compose(["lidar.sensor.max_range=9.0"]))
         config.save(run.composed, run_dir)
         assert "${" not in (run_dir / config.CONFIG_FILE).read_text()
         assert config.load(run_dir).perception.sampler.max_range == 9.0
 
     def test_overrides_of_values_and_of_groups(self, run_dir):
         loaded = config.load(run_dir, ["num_envs=3", "obstacles=static", "ppo.max_iterations=5"])
-        run = config.assemble(loaded)
+        run = build.assemble(loaded)
         assert run.env.num_envs == 3 and run.ppo.max_iterations == 5
         assert run.env.obstacles.num_obstacles == 8
         assert run.env.rewards.terms["tilt"].weight == -3  # what is not overridden stays the run's
@@ -252,7 +252,7 @@ VARIANTS = [name.removeprefix("perception/") for name in PRESETS if name.startsw
 def test_every_variant_of_perception_learns_to_avoid(variant):
     """As scripts/ablation.py trains them: the same targets, and the base's motion whichever paths there are."""
     overrides = ("experiment=avoid", f"perception={variant}", "init=unread", "num_envs=2")
-    runner = build_runner(config.assemble(config.compose(overrides)), None)
+    runner = build_runner(build.assemble(config.compose(overrides)), None)
     with torch.inference_mode():
         actions = runner.get_inference_policy("cpu")(runner.env.get_observations())
     assert actions.shape == (2, 12) and torch.isfinite(actions).all()

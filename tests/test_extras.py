@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from omniperception.analysis.figures import PlotsUnavailable, new_figure
+from benchmarks.figures import PlotsUnavailable, new_figure
 from omniperception.lidar import TriangleMesh, mid360
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -15,39 +15,39 @@ import torch
 import warp as wp
 import yaml
 
-from omniperception import config
-from omniperception.assembly import build_runner
+from omniperception import build, config
+from omniperception.build import build_runner
+from omniperception.env import sensing as sensing_module
+from omniperception.env.heights import NUM_HEIGHTS
 from omniperception.inventory import walk
 from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid, ray_bytes
 from omniperception.lidar.kernels import variants
 from omniperception.lidar.launch import SplitLaunch
 from omniperception.plan import PLAN_FILE, contact_pairs, describe
-from omniperception.task import sensing as sensing_module
-from omniperception.task.heights import NUM_HEIGHTS
-from omniperception.world import build_world, ray_shapes
-from omniperception.world.rays import hidden_geoms
-from omniperception.world.reach import FieldOfView, unreachable_geoms
+from omniperception.scene import build_world, ray_shapes
+from omniperception.scene.rays import hidden_geoms
+from omniperception.scene.reach import FieldOfView, unreachable_geoms
 
 ROOT = Path(__file__).resolve().parents[1]
 WALK = ("experiment=walk", "num_envs=13")
 QUICKSTART = ("experiment=quickstart", "num_envs=13", "obstacles.curriculum=null", "ppo.num_steps_per_env=4")
-NO_LIDAR_MODULES = ("warp", "omniperception.lidar.scene", "omniperception.perception.sampling")
+NO_LIDAR_MODULES = ("warp", "omniperception.lidar.scene", "omniperception.perception.samplers.sampling")
 HEADLESS = ("matplotlib", "trimesh", "viser", "onnx", "onnxruntime", "imageio_ffmpeg", "mujoco_lidar", "mujoco_warp")
 
 
-def build(*overrides):
-    run = config.assemble(config.compose(overrides))
+def built(*overrides):
+    run = build.assemble(config.compose(overrides))
     return run, build_runner(run, None)
 
 
 @pytest.fixture(scope="module")
 def walk_run():
-    return build(*WALK)
+    return built(*WALK)
 
 
 @pytest.fixture(scope="module")
 def quick_run():
-    return build(*QUICKSTART)
+    return built(*QUICKSTART)
 
 
 def arrays_of(env):
@@ -362,7 +362,7 @@ def test_the_cache_of_variants_is_bounded_and_a_forgotten_variant_still_casts(mo
     ],
 )
 def test_stages_and_kernels_are_those_that_run(overrides, launched):
-    run, runner = build(*overrides, "num_envs=13", "ppo.num_steps_per_env=4")
+    run, runner = built(*overrides, "num_envs=13", "ppo.num_steps_per_env=4")
     plan, env = describe(run, runner), runner.env
     env.timer.drain()
     launched.clear()
@@ -388,7 +388,7 @@ def test_readers_and_reasons_are_named(quick_run, walk_run):
 
 
 def test_memory_counts_every_byte_once_and_grows_with_the_environments():
-    plans = [describe(*build("experiment=quickstart", f"num_envs={n}", "ppo.num_steps_per_env=4")) for n in (13, 29)]
+    plans = [describe(*built("experiment=quickstart", f"num_envs={n}", "ppo.num_steps_per_env=4")) for n in (13, 29)]
     few, many = ({b.name: b.num_bytes / p.built_envs for b in p.buffers if b.per_env} for p in plans)
     assert few == pytest.approx(many)
     frames = next(b for b in plans[0].buffers if b.name.endswith("storage.frames"))
@@ -396,7 +396,7 @@ def test_memory_counts_every_byte_once_and_grows_with_the_environments():
 
 
 def test_a_plan_tells_the_parts_of_the_run_not_of_what_was_built_to_describe_it():
-    run, runner = build("experiment=quickstart", "num_envs=8", "ppo.num_steps_per_env=4", "lidar.sensor.num_rays=500")
+    run, runner = built("experiment=quickstart", "num_envs=8", "ppo.num_steps_per_env=4", "lidar.sensor.num_rays=500")
     bytes_per_env = 500 * ray_bytes(runner.env.sensing.lidar.outputs)
     fitting = int(1e9 / bytes_per_env)
     for num_envs, exists in ((fitting, False), (fitting + 1, True)):

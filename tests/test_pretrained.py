@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from omniperception import config, publish
-from omniperception.assembly import load_policy
+from omniperception import build, config
+from omniperception.build import load_policy
+from omniperception.deploy import publish
 from omniperception.learning import latest_checkpoint
 
 RUNS = sorted((Path(__file__).resolve().parents[1] / "pretrained").iterdir())
@@ -15,7 +16,7 @@ RUNS = sorted((Path(__file__).resolve().parents[1] / "pretrained").iterdir())
 
 @pytest.mark.parametrize("run_dir", RUNS, ids=lambda path: path.name)
 def test_a_pretrained_policy_walks_on(run_dir):
-    trained = load_policy(config.assemble(config.load(run_dir, ["num_envs=4", "terrain=flat"])), run_dir)
+    trained = load_policy(build.assemble(config.load(run_dir, ["num_envs=4", "terrain=flat"])), run_dir)
     env = trained.env
     with torch.inference_mode():
         for _ in range(100):  # 2 s

@@ -5,8 +5,9 @@ import json
 import pytest
 import torch
 
-from omniperception import config, publish
-from omniperception.assembly import build_runner, load_policy
+from omniperception import build, config
+from omniperception.build import build_runner, load_policy
+from omniperception.deploy import publish
 from omniperception.learning.checkpoint import checkpoint_path, latest_checkpoint
 
 
@@ -23,7 +24,7 @@ def test_the_published_policy_acts_alike(run, tmp_path):
     record = publish.publish(run, tmp_path / "published")
     assert json.loads((tmp_path / "published" / publish.PROVENANCE).read_text()) == record
     assert latest_checkpoint(tmp_path / "published").stat().st_size < latest_checkpoint(run).stat().st_size
-    replays = [load_policy(config.assemble(config.load(folder)), folder) for folder in (run, tmp_path / "published")]
+    replays = [load_policy(build.assemble(config.load(folder)), folder) for folder in (run, tmp_path / "published")]
     obs = [trained.env.get_observations() for trained in replays]
     with torch.no_grad():
         assert torch.equal(*(trained.policy(o) for trained, o in zip(replays, obs, strict=True)))
@@ -31,7 +32,7 @@ def test_the_published_policy_acts_alike(run, tmp_path):
 
 def test_another_run_starts_from_it(run, tmp_path, make_config):
     publish.publish(run, tmp_path / "published")
-    runner = build_runner(config.assemble(config.load(run, ["seed=8"])), None)
+    runner = build_runner(build.assemble(config.load(run, ["seed=8"])), None)
     runner.start_from(tmp_path / "published")
     weights = torch.load(latest_checkpoint(run), weights_only=True)["actor_state_dict"]
     assert all(torch.equal(value, weights[name]) for name, value in runner.alg.actor.state_dict().items())
@@ -49,7 +50,7 @@ def test_half_precision_is_half_as_large_and_acts_nearly_alike(run, tmp_path):
         folder = tmp_path / precision
         assert publish.publish(run, folder, precision)["precision"] == precision
         sizes.append(latest_checkpoint(folder).stat().st_size)
-        trained = load_policy(config.assemble(config.load(folder)), folder)
+        trained = load_policy(build.assemble(config.load(folder)), folder)
         with torch.no_grad():
             actions.append(trained.policy(trained.env.get_observations()))
     assert sizes[1] < 0.55 * sizes[0]

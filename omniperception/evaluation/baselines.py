@@ -7,11 +7,11 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDict
 
+from omniperception.avoidance.true_sectors import TrueSectors
+from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.rewards import AvoidanceConfig, avoidance_velocity
 from omniperception.evaluation.episodes import Policy
 from omniperception.perception import Attitude
-from omniperception.task.env import OmniEnv
-from omniperception.task.rewards import AvoidanceConfig, avoidance_velocity
-from omniperception.task.true_sectors import TrueSectors
 
 COMMAND_GROUP = "command"
 """The observation group that begins with the commanded velocity (v_x, v_y)."""

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import torch
 
-from omniperception.task.env import OmniEnv
+from omniperception.env.env import OmniEnv
 
 CAPSULE, CYLINDER, BOX = range(3)
 """Kinds of shapes about the local z axis; a sphere is a capsule of length 0."""

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict
 
+from omniperception.env.env import OmniEnv
+from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.clearance import Clearance
 from omniperception.evaluation.statistics import quantiles, rate
 from omniperception.evaluation.tracks import TrackRecorder, Tracks
-from omniperception.task.env import OmniEnv
-from omniperception.task.metrics import OUTCOMES
 
 Policy = Callable[[TensorDict], torch.Tensor]
 """From observations to actions (num_envs, num_actions), without exploration noise."""
@@ -29,7 +29,7 @@ class Episodes:
 
     Attributes:
         length_s: duration (s).
-        outcome: int64 index into `omniperception.task.metrics.OUTCOMES`: how it ended.
+        outcome: int64 index into `omniperception.env.metrics.OUTCOMES`: how it ended.
         contacts: int64 number of times that the robot began to touch obstacles.
         first_contact_s: time (s) of the first touch, infinite without one.
         clearance: smallest distance (m) in space between any link and any obstacle, at the end of every control step;

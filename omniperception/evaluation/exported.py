@@ -10,8 +10,8 @@ from tensordict import TensorDict
 
 from omniperception.deploy import DeployError, ExportedPolicy, RobotState
 from omniperception.deploy.latency import Reading
+from omniperception.env.env import OmniEnv
 from omniperception.lidar import Lidar, LidarFrame
-from omniperception.task.env import OmniEnv
 
 
 class ExportedPolicies:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import torch
 
+from omniperception.env.env import HEIGHT_TARGET, OmniEnv
+from omniperception.env.heights import height_grid
 from omniperception.evaluation.episodes import Policy
 from omniperception.learning.models import PerceptionActor
-from omniperception.task.env import HEIGHT_TARGET, OmniEnv
-from omniperception.task.heights import height_grid
 
 
 @dataclass(frozen=True)

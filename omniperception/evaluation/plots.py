@@ -11,8 +11,8 @@ import torch
 
 from omniperception.evaluation.episodes import VERDICTS, Episodes
 from omniperception.evaluation.tracks import Tracks
-from omniperception.world.obstacle_field import PARKED_HEIGHT
-from omniperception.world.obstacles import Obstacle, ObstaclesConfig
+from omniperception.scene.obstacle_field import PARKED_HEIGHT
+from omniperception.scene.obstacles import Obstacle, ObstaclesConfig
 
 COLOURS = dict(zip(VERDICTS, ("#2a9d5c", "#e0a100", "#3b6fb6", "#c0392b", "#8e44ad", "#555555"), strict=True))
 SHOWN = 300

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from omniperception.lidar import RayScene
-from omniperception.world.rays import HitClass, RayShapes
+from omniperception.scene.rays import HitClass, RayShapes
 
 COLOURS = {
     HitClass.TERRAIN: (0.60, 0.61, 0.62),

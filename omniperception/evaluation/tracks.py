@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from omniperception.task.env import OmniEnv
+from omniperception.env.env import OmniEnv
 
 PERIOD_S = 0.1
 """Time between two points of a way."""

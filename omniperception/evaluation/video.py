@@ -10,12 +10,12 @@ from pathlib import Path
 import imageio_ffmpeg
 import torch
 
+from omniperception.common.rotations import rotate_inverse, rotate_yaw
+from omniperception.env.env import OmniEnv
 from omniperception.evaluation.render import COMMAND, VELOCITY, Arrow, Renderer, View
 from omniperception.perception import PdSampler
-from omniperception.task.env import OmniEnv
-from omniperception.task.rotations import rotate_inverse, rotate_yaw
-from omniperception.world import ray_shapes
-from omniperception.world.rays import HitClass
+from omniperception.scene import ray_shapes
+from omniperception.scene.rays import HitClass
 
 FPS = 25
 BEHIND_M, ABOVE_M, AHEAD_M = 2.4, 1.45, 1.0

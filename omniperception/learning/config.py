@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from omniperception.env.env import AVOIDANCE_TARGET, HEIGHT_TARGET, MOTION_TARGET, SECTOR_TARGET
 from omniperception.perception import PerceptionNetwork, Sampler
-from omniperception.task.env import AVOIDANCE_TARGET, HEIGHT_TARGET, MOTION_TARGET, SECTOR_TARGET
 
 if TYPE_CHECKING:
-    from omniperception.perception import VelocityRisk
+    from omniperception.avoidance.velocity_risk import VelocityRisk
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 
+from omniperception.avoidance.sector_motion import decode, motion_error
 from omniperception.learning.embedding import RolloutEmbedding
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
-from omniperception.perception.sector_motion import decode, motion_error
 
 if TYPE_CHECKING:
-    from omniperception.perception import VelocityRisk
+    from omniperception.avoidance.velocity_risk import VelocityRisk
 
 
 class _AddLoss(torch.autograd.Function):

@@ -6,21 +6,19 @@ What needs Warp is loaded when it is first used.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from omniperception.perception.networks import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
-from omniperception.perception.pd_risknet import CarriedPdRiskNet, PdRiskNet
-from omniperception.perception.sampler import Attitude, Sampler
+from omniperception.perception.networks.base import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
+from omniperception.perception.networks.pd_risknet import CarriedPdRiskNet, PdRiskNet
+from omniperception.perception.samplers.base import Attitude, Sampler
 
 if TYPE_CHECKING:
-    from omniperception.perception.motion_match import MotionMatch
-    from omniperception.perception.rings import RingPath
-    from omniperception.perception.sampling import FpsSampler, PdSampler, ProximitySampler, RawSampler
-    from omniperception.perception.velocity_risk import VelocityRisk
+    from omniperception.perception.networks.motion_match import MotionMatch
+    from omniperception.perception.networks.rings import RingPath
+    from omniperception.perception.samplers.sampling import FpsSampler, PdSampler, ProximitySampler, RawSampler
 
 _LOADED_WHEN_USED = {
-    "motion_match": ("MotionMatch",),
-    "rings": ("RingPath",),
-    "sampling": ("FpsSampler", "PdSampler", "ProximitySampler", "RawSampler"),
-    "velocity_risk": ("VelocityRisk",),
+    "networks.motion_match": ("MotionMatch",),
+    "networks.rings": ("RingPath",),
+    "samplers.sampling": ("FpsSampler", "PdSampler", "ProximitySampler", "RawSampler"),
 }
 
 __all__ = [
@@ -38,7 +36,6 @@ __all__ = [
     "RawSampler",
     "RingPath",
     "Sampler",
-    "VelocityRisk",
 ]
 
 

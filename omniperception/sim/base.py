@@ -8,7 +8,7 @@ from typing import Protocol
 
 import torch
 
-from omniperception.world import World
+from omniperception.scene import World
 
 _INTEGRATORS = ("euler", "implicitfast", "implicit", "rk4")
 _CONES = ("pyramidal", "elliptic")

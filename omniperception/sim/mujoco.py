@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from mujoco.batch import Batch, SimulationError
 
+from omniperception.scene import World
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, SimConfig
-from omniperception.world import World
 
 _INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,

@@ -13,11 +13,11 @@ import mujoco
 import torch
 import warp as wp
 
+from omniperception.common.rows import put
 from omniperception.lidar.launch import wp_device
-from omniperception.rows import put
+from omniperception.scene import World
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, SimConfig
 from omniperception.sim.mujoco import apply_options
-from omniperception.world import World
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 """Model fields that the engine derives from masses and inertias."""

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception import config
-from omniperception.assembly import build_runner, load_policy
+from omniperception import build, config
+from omniperception.build import build_runner, load_policy
+from omniperception.deploy.export import Export, describe, export
+from omniperception.deploy.modules import ExportUnavailable, exportable
+from omniperception.env.env import OmniEnv
 from omniperception.evaluation.episodes import run_episodes
-from omniperception.export import Export, describe, export
 from omniperception.learning import CheckpointError
 from omniperception.learning.checkpoint import checkpoint_path
-from omniperception.learning.export import ExportUnavailable, exportable
-from omniperception.task.env import OmniEnv
 
 pytest.importorskip("onnxruntime", reason="extra deploy")
 pytest.importorskip("onnx", reason="extra export")
@@ -76,7 +76,7 @@ def exported_run(tmp_path_factory):
     @functools.cache
     def make(recipe: str) -> Path:
         run_dir = tmp_path_factory.mktemp(recipe)
-        run = config.assemble(config.compose([*RECIPES[recipe], *SMALL]))
+        run = build.assemble(config.compose([*RECIPES[recipe], *SMALL]))
         config.save(run.composed, run_dir)
         runner = build_runner(run, run_dir)
         stir(runner.alg.actor)
@@ -89,7 +89,7 @@ def exported_run(tmp_path_factory):
 
 def trained(run_dir, *overrides):
     """Torch's policy in a fresh environment."""
-    return load_policy(config.assemble(config.load(run_dir, overrides)), run_dir)
+    return load_policy(build.assemble(config.load(run_dir, overrides)), run_dir)
 
 
 def test_every_preset_is_tried():
@@ -99,7 +99,7 @@ def test_every_preset_is_tried():
 
 @pytest.mark.parametrize("preset", CARRIED)
 def test_a_carried_state_is_refused(preset):
-    run = config.assemble(config.compose(["num_envs=2", f"perception={preset}"]))
+    run = build.assemble(config.compose(["num_envs=2", f"perception={preset}"]))
     with pytest.raises(ExportUnavailable, match="carries its state from frame to frame"):
         exportable(build_runner(run, None).alg.actor, {})
 
@@ -315,6 +315,6 @@ def test_what_cannot_be_exported_is_named(exported_run, tmp_path):
     with pytest.raises(config.ConfigError, match="pickle is unknown; known: onnx, torchscript"):
         Export(tmp_path, formats=("pickle",))
     privileged = ("experiment=walk", "observations.actor=[privileged,command]", "num_envs=1")
-    run = config.assemble(config.compose(privileged))
+    run = build.assemble(config.compose(privileged))
     with pytest.raises(config.ConfigError, match=r"privileged\.terms\.proprioception cannot be exported"):
         describe(run, OmniEnv(run.env))

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from omniperception.deploy import DeployError
+from omniperception.deploy.export import sampler_figures
 from omniperception.deploy.sampling import Attitude, farthest_points, make_sampler
-from omniperception.export import sampler_figures
 from omniperception.lidar.sensor import quat_from_rpy
 from omniperception.perception import Attitude as TorchAttitude
 from omniperception.perception import FpsSampler, PdSampler, ProximitySampler, RawSampler

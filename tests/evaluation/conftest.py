@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from omniperception import config
-from omniperception.task.env import OmniEnv
+from omniperception.env.env import OmniEnv
 
 MakeEnv = Callable[..., OmniEnv]
 
@@ -26,7 +26,7 @@ def make_env() -> MakeEnv:
     """Builds an environment from command-line overrides, with all obstacles."""
 
     def build(*overrides: str) -> OmniEnv:
-        run = config.assemble(config.compose(["rewards=default", "perception=none", *overrides]))
+        run = build.assemble(config.compose(["rewards=default", "perception=none", *overrides]))
         return OmniEnv(replace(run.env, initial_obstacle_level=1.0))
 
     return build

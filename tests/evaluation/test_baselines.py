@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from omniperception import config
-from omniperception.assembly import build_runner, load_policy
+from omniperception import build, config
+from omniperception.build import build_runner, load_policy
+from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.rewards import AvoidanceConfig
 from omniperception.evaluation.baselines import covered, steered
 from omniperception.perception import Attitude
-from omniperception.task.env import OmniEnv
-from omniperception.task.rewards import AvoidanceConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 BLIND = ("experiment=walk", "rewards=walk")
@@ -44,7 +44,7 @@ class TestSteered:
 
     def test_what_the_policy_perceives_itself_does_not_matter(self):
         run = config.load(ROOT / "pretrained/pd_risknet", ["scenario=corridor", "num_envs=4"])
-        trained = load_policy(config.assemble(run), ROOT / "pretrained/pd_risknet")
+        trained = load_policy(build.assemble(run), ROOT / "pretrained/pd_risknet")
         env, law = trained.env, trained.env.config.rewards.avoidance
         told = steered(env, trained.policy, law, None)
         with torch.no_grad():
@@ -67,7 +67,7 @@ class TestSteered:
 @pytest.fixture(scope="module")
 def runner():
     """An untrained policy to which its embedding counts."""
-    run = config.assemble(config.compose([*SEEING, "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1"]))
+    run = build.assemble(config.compose([*SEEING, "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1"]))
     torch.manual_seed(3)
     runner = build_runner(run, None)
     with torch.no_grad():
@@ -93,7 +93,7 @@ class TestCovered:
 
     def test_how_the_base_moved_is_still_known(self):
         given = ("experiment=avoid", "scenario=static", "num_envs=3", "lidar.sensor.num_rays=200")
-        env = OmniEnv(config.assemble(config.compose(given)).env)
+        env = OmniEnv(build.assemble(config.compose(given)).env)
         for _ in range(12):
             env.step(torch.randn(3, env.num_actions))
         frames, heard = env.get_observations()["frames"].clone(), []

@@ -5,10 +5,10 @@ import csv
 import pytest
 import torch
 
+from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.episodes import Episodes
 from omniperception.evaluation.report import table, write_trials
 from omniperception.evaluation.statistics import quantiles
-from omniperception.task.metrics import OUTCOMES
 
 # outcome, contacts, first contact (s), length (s)
 TRIALS = [

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation import run_episodes
 from omniperception.evaluation.report import table, times_line
-from omniperception.task.metrics import OUTCOMES
 
 SHORT = "terminations.episode_length_s=0.4"  # 20 control steps
 BLIND = ("lidar=none", "obstacles=none", "rewards=walk", "observations=walk")

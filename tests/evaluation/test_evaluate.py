@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from omniperception import config, suite
-from omniperception.assembly import build_runner
+from omniperception import build, config
+from omniperception.build import build_runner
 from omniperception.config import ConfigError
-from omniperception.evaluation import plots
+from omniperception.evaluation import plots, suite
 from omniperception.evaluation.baselines import steered
-from omniperception.suite import Evaluation, evaluate
+from omniperception.evaluation.suite import Evaluation, evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1")
@@ -22,7 +22,7 @@ SHORT = "terminations.episode_length_s=0.3"
 
 
 def make_run(path: Path, *overrides: str) -> Path:
-    run = config.assemble(config.compose([*overrides, *SMALL]))
+    run = build.assemble(config.compose([*overrides, *SMALL]))
     config.save(run.composed, path)
     build_runner(run, path).learn(1)
     return path
@@ -138,7 +138,7 @@ def test_missing_matplotlib_is_told_first(walker, monkeypatch):
 
 
 def test_only_plots_import_matplotlib():
-    code = "import sys, omniperception.suite; assert 'matplotlib' not in sys.modules"
+    code = "import sys, omniperception.evaluation.suite; assert 'matplotlib' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=120).returncode == 0
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from omniperception.env.heights import NUM_HEIGHTS, height_grid
 from omniperception.evaluation.heights import height_errors
-from omniperception.task.heights import NUM_HEIGHTS, height_grid
 
 
 class Environment:

@@ -9,8 +9,8 @@ import imageio_ffmpeg
 import pytest
 import torch
 
-from omniperception import config
-from omniperception.assembly import build_runner
+from omniperception import build, config
+from omniperception.build import build_runner
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("experiment=walk", "num_envs=4", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1")
@@ -30,7 +30,7 @@ def play(*arguments: str) -> subprocess.CompletedProcess:
 def run_dir(tmp_path_factory):
     """A run of one iteration."""
     path = tmp_path_factory.mktemp("run")
-    run = config.assemble(config.compose(SMALL))
+    run = build.assemble(config.compose(SMALL))
     config.save(run.composed, path)
     build_runner(run, path).learn(1)
     return path
@@ -68,7 +68,7 @@ def test_mistakes_are_one_line(run_dir, arguments, message):
 
 
 def test_replaying_does_not_change_the_policy(run_dir):
-    run = config.assemble(config.compose(SMALL))
+    run = build.assemble(config.compose(SMALL))
     runner = build_runner(run, None)
     runner.load(str(run_dir / "checkpoints" / "model_1.pt"), load_cfg={"actor": True})
     policy = runner.get_inference_policy("cpu")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from omniperception import config
+from omniperception import build, config
 from omniperception.config import ConfigError
 from omniperception.evaluation import run_episodes
 from omniperception.evaluation.episodes import CLEARANCE_CAP
@@ -28,7 +28,7 @@ def run_dir(tmp_path_factory):
     """A run with some settings of its own."""
     path = tmp_path_factory.mktemp("run")
     given = ["experiment=quickstart", "rewards.avoidance.alpha=1.7", "seed=5", "lidar.sensor.max_range=5.0"]
-    config.save(config.assemble(config.compose(given)).composed, path)
+    config.save(build.assemble(config.compose(given)).composed, path)
     return path
 
 
@@ -38,14 +38,14 @@ class TestOverlay:
         fresh = config.compose(["scenario=abs_hard"])
         for key in loaded:
             assert loaded[key] == (fresh if key in config.FIXED_BY_SCENARIO else before)[key], key
-        run = config.assemble(loaded).env
+        run = build.assemble(loaded).env
         assert run.seed == 1007 and run.terminations.episode_length_s == 9.0 and run.obstacles.num_obstacles == 8
         assert run.rewards.avoidance.alpha == 1.7 and run.lidar.sensor.max_range == 5.0
         assert run.obstacles.curriculum is None and before.obstacles.curriculum is not None
 
     def test_overrides_go_on_top(self, run_dir):
         overrides = ["scenario=corridor", "commands.speed=0.7", "terminations=collision", "seed=9", "num_envs=3"]
-        run = config.assemble(config.load(run_dir, overrides)).env
+        run = build.assemble(config.load(run_dir, overrides)).env
         assert run.commands.speed == 0.7 and run.commands.goal_x == (11.5, 11.5)
         assert run.terminations.on_collision and run.terminations.episode_length_s == 30.0
         assert run.seed == 9 and run.num_envs == 3
@@ -96,7 +96,7 @@ class TestScenes:
         run = config.compose(["experiment=walk", "scenario=abs_hard"])
         run.commands = config.compose(["experiment=walk"]).commands
         with pytest.raises(ConfigError, match="commands=goal"):
-            config.assemble(run)
+            build.assemble(run)
 
 
 class TestMeasures:

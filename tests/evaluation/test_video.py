@@ -11,7 +11,7 @@ import torch
 from omniperception.evaluation.render import Arrow, Renderer, View
 from omniperception.evaluation.video import FollowCamera, Recorder, write_png
 from omniperception.lidar import Shape, ShapeKind
-from omniperception.world.rays import HitClass, RayShapes
+from omniperception.scene.rays import HitClass, RayShapes
 
 WIDTH, HEIGHT = 64, 36
 BALL = Shape(ShapeKind.SPHERE, (0.5,), body=0, class_id=HitClass.ROBOT)

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from omniperception import config
-from omniperception.assembly import build_runner
+from omniperception.build import build_runner
+from omniperception.env.env import HEIGHT_TARGET
 from omniperception.learning import CheckpointError
 from omniperception.learning.checkpoint import checkpoint_path
-from omniperception.task.env import HEIGHT_TARGET
 
 SMALL = ("num_envs=8", "ppo.hidden_dims=[32,16]", "ppo.num_mini_batches=2", "ppo.num_steps_per_env=10")
 BLIND = ("experiment=walk", *SMALL)

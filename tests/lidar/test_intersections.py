@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.analysis.lidar_accuracy import cases, compare
+from benchmarks.lidar_accuracy import cases, compare
 from omniperception.lidar import RayScene, Shape, ShapeKind
 
 K = ShapeKind

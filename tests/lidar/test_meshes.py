@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.analysis.lidar_accuracy import random_mesh
+from benchmarks.lidar_accuracy import random_mesh
 from omniperception.lidar import RayScene, Shape, ShapeKind, TriangleMesh
 from omniperception.lidar.kernels.mesh import STACK_SIZE
 from omniperception.lidar.meshes import _build_tree

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.analysis.lidar_accuracy import mj_ray
+from benchmarks.lidar_accuracy import mj_ray
 from omniperception.lidar import MujocoScene, RayScene, ShapeKind, geom_shapes
 
 XML = """

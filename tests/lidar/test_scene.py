@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.analysis.lidar_accuracy import random_mesh
+from benchmarks.lidar_accuracy import random_mesh
 from omniperception.lidar import (
     HeightField,
     Lidar,

@@ -7,7 +7,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import pytest
 
-from omniperception.perception import by_ray
+from omniperception.perception.samplers import by_ray
 
 
 @pytest.fixture(params=["a thread per environment", "a thread per ray"])

@@ -6,7 +6,8 @@ import pytest
 import torch
 from clouds import MAX_RANGE, random_rays, sample
 
-from omniperception.perception import Attitude, FpsSampler, PdSampler, ProximitySampler, by_ray
+from omniperception.perception import Attitude, FpsSampler, PdSampler, ProximitySampler
+from omniperception.perception.samplers import by_ray
 
 SPLIT = {"max_range": MAX_RANGE, "split_deg": 10.0}
 PROXIMITY = {**SPLIT, "band_edges": (-1.0, -0.2, 0.3, 2.0), "decay": 0.6, "blind": 0.4, "body": (0.5, 0.3)}

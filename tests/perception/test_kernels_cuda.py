@@ -6,12 +6,13 @@ import torch
 import warp as wp
 from clouds import MAX_RANGE, random_rays, sample
 
+from omniperception.avoidance.velocity_risk import worst_sectors
 from omniperception.lidar import sector_distances
 from omniperception.lidar.kernels.sectors import sector_minima_by_ray
-from omniperception.perception import FpsSampler, PdSampler, by_ray, kernels
-from omniperception.perception.motion_match import match_motion
-from omniperception.perception.rings import write_rings
-from omniperception.perception.velocity_risk import worst_sectors
+from omniperception.perception import FpsSampler, PdSampler
+from omniperception.perception.networks.motion_match import match_motion
+from omniperception.perception.networks.rings import write_rings
+from omniperception.perception.samplers import by_ray, kernels
 
 MODULES = [kernels, by_ray, *(k.module for k in (match_motion, write_rings, worst_sectors, sector_minima_by_ray))]
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from omniperception.perception import MotionMatch, RingPath
-from omniperception.perception.motion_match import NOTHING
+from omniperception.perception.networks.motion_match import NOTHING
 
 SECTORS, HISTORY = 36, 5
 MATCH = MotionMatch(speeds=(0.75, 1.5), num_directions=12, width=0.4, period_s=0.1)

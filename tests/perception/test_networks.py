@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from omniperception.perception import CarriedPdRiskNet, DirectMlp, FpsGru, FpsMlp, PdRiskNet
-from omniperception.perception.windows import CarriedGru, WindowedGru, WindowedLinear
+from omniperception.perception.networks.windows import CarriedGru, WindowedGru, WindowedLinear
 
 H, W, B = 5, 4, 3
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from omniperception.perception import MotionMatch, RingPath
-from omniperception.perception.rings import RingShape, _moved_rings, moved_rings
+from omniperception.perception.networks.rings import RingShape, _moved_rings, moved_rings
 
 SECTORS, BANDS, DECAY = 36, 2, 0.5
 MATCH = MotionMatch(speeds=(1.0,), num_directions=8, width=0.4, period_s=0.1)

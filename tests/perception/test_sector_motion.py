@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from omniperception.perception.sector_motion import decode, encode, motion_error, nothing_near
+from omniperception.avoidance.sector_motion import decode, encode, motion_error, nothing_near
 
 
 def test_encoding_by_hand():

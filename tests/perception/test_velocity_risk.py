@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.perception import VelocityRisk
+from omniperception.avoidance.velocity_risk import VelocityRisk
 
 GIVEN = {
     "max_speed": 1.0,

@@ -6,9 +6,9 @@ import pytest
 import torch
 from robots import stand, targets
 
+from omniperception.scene import build_world
 from omniperception.sim import MujocoSimulator, SimConfig
 from omniperception.sim.mujoco import apply_options
-from omniperception.world import build_world
 
 DEFAULT = SimConfig()
 

@@ -8,9 +8,9 @@ import torch
 
 pytest.importorskip("mujoco_warp")
 
-from omniperception.analysis.step_errors import step_errors
+from benchmarks.step_errors import step_errors
+from omniperception.scene import build_world
 from omniperception.sim.mujoco_warp import Capacity, MujocoWarpConfig
-from omniperception.world import build_world
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import pytest
 import torch
 from robots import default_joints, stand, targets
 
+from omniperception.scene import build_world
 from omniperception.sim import SimConfig
 from omniperception.sim.mujoco_warp import MujocoWarpConfig
-from omniperception.world import build_world
 
 SENSORS = ("foot_force", "obstacle_contact")
 

@@ -1,0 +1,1 @@
+"""Studies and benchmarks: error against run time, stability, accuracy, speed beside other libraries."""

@@ -1,0 +1,141 @@
+"""What memory a run needs, by part: predicted from two small builds, and what a run of the real size uses."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import warp as wp
+from tensordict import TensorDictBase
+
+from benchmarks.lidar_benchmark.memory import buffer_bytes
+from benchmarks.resident import resident_bytes
+from omniperception.build import RunConfig, build_runner, steps_per_frame
+from omniperception.env.env import OmniEnv
+from omniperception.learning import Runner
+from omniperception.learning.memory import FLOAT, footprint
+
+SMALL = (4, 8)
+"""Environments of the two builds; all buffers grow evenly with their number."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part's memory.
+
+    Attributes:
+        name: physics, rays, task, rollout, networks or mini-batch.
+        shared: bytes that do not depend on the number of environments.
+        per_env: bytes that every environment adds.
+    """
+
+    name: str
+    shared: float
+    per_env: float
+
+    def total(self, num_envs: int) -> float:
+        return self.shared + self.per_env * num_envs
+
+
+@dataclass(frozen=True)
+class Used:
+    """Bytes that a run took.
+
+    Attributes:
+        held: by tensors and engines between two iterations.
+        peak: at most, an update included.
+        source: what was asked.
+    """
+
+    held: int
+    peak: int
+    source: str
+
+
+def predict(run: RunConfig) -> list[Part]:
+    """Memory by part, whatever the run's number of environments; nothing of that size is allocated."""
+    low, high = SMALL
+    build = _build(run, low)
+    few, clouds = held_bytes(build), 0.0
+    at_once = _clouds_at_once(build.env, run.env.num_envs)
+    if at_once < run.env.num_envs:  # both builds get one environment's cloud, and the others are shared
+        whole, run = few, replace(run, env=replace(run.env, lidar=replace(run.env.lidar, cloud_mb=1e-6)))
+        few = held_bytes(_build(run, low))
+        clouds = (at_once - 1) * (whole["rays"] - few["rays"]) / (low - 1)
+    more, parts = held_bytes(_build(run, high)), []
+    for name, size in few.items():
+        per_env = (more[name] - size) / (high - low)
+        parts.append(Part(name, size - low * per_env + (clouds if name == "rays" else 0.0), per_env))
+    return [*parts, Part("mini-batch", 0.0, _update_bytes(run) / run.env.num_envs)]
+
+
+def held_bytes(runner: Runner) -> dict[str, int]:
+    """Bytes of the buffers that a runner and its environment hold, by part; what two parts share counts for the first.
+
+    Gradients and Adam's moments are counted as if they existed already.
+    """
+    env, storage = runner.env, vars(runner.alg.storage)
+    rollout = [dict(v.items()) if isinstance(v, TensorDictBase) else v for v in storage.values()]
+    physics = buffer_bytes(env.sim) + _native_bytes(env.sim)
+    rays = buffer_bytes(env.sim, env.sensing) - buffer_bytes(env.sim)
+    task = buffer_bytes(env) - buffer_bytes(env.sim, env.sensing)
+    models = (runner.alg._raw_actor, runner.alg._raw_critic)
+    weights = sum(p.numel() * p.element_size() for model in models for p in model.parameters())
+    return {"physics": physics, "rays": rays, "task": task, "rollout": buffer_bytes(*rollout), "networks": 4 * weights}
+
+
+def measure(run: RunConfig) -> Used:
+    """Builds the run at its real size and trains it for two iterations."""
+    before, device = resident_bytes(), run.env.sim.torch_device
+    on_gpu = device.type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats(device)
+    runner = build_runner(run, None)
+    runner.learn(2)
+    gc.collect()
+    if on_gpu:
+        torch.cuda.synchronize(device)
+        engine = wp.get_device(str(device))
+        pool, most = wp.get_mempool_used_mem_current(engine), wp.get_mempool_used_mem_high(engine)
+        held, peak = torch.cuda.memory_allocated(device) + pool, torch.cuda.max_memory_allocated(device) + most
+        return Used(held, peak, "PyTorch's and Warp's allocators")
+    return Used(
+        resident_bytes() - before, resident_bytes(peak=True) - before, "growth of the process's resident memory"
+    )
+
+
+def table(parts: Sequence[Part], num_envs: int) -> list[tuple[str, float, float, float]]:
+    """(part, MB shared, kB per environment, MB altogether) rows, the sum last."""
+    rows = [(p.name, p.shared / 1e6, p.per_env / 1e3, p.total(num_envs) / 1e6) for p in parts]
+    return [*rows, ("sum", *(sum(row[k] for row in rows) for k in (1, 2, 3)))]
+
+
+def _clouds_at_once(env: OmniEnv, num_envs: int) -> int:
+    """Environments of a run of `num_envs` whose clouds exist at the same time."""
+    parts = [slice(0, num_envs)] if env.sensing is None else env.sensing.parts_of(num_envs)
+    return max(part.stop - part.start for part in parts)
+
+
+def _build(run: RunConfig, num_envs: int) -> Runner:
+    return build_runner(replace(run, env=replace(run.env, num_envs=num_envs, initial_obstacle_level=1.0)), None)
+
+
+def _native_bytes(sim: object) -> int:
+    """Bytes of the CPU engine's state rows and bound arrays, which lie outside of PyTorch."""
+    batch = getattr(sim, "batch", None)
+    if batch is None:
+        return 0
+    bound = [value for value in vars(sim).values() if isinstance(value, np.ndarray)]
+    return batch.state.nbytes + sum(array.nbytes for array in bound)
+
+
+def _update_bytes(run: RunConfig) -> int:
+    """What one mini-batch of the update holds: the perception network's part and two copies of the hidden layers."""
+    steps = run.env.num_envs * run.ppo.num_steps_per_env // run.ppo.num_mini_batches
+    layers = 2 * 2 * FLOAT * sum(run.ppo.hidden_dims) * steps
+    if run.perception is None:
+        return layers
+    return layers + footprint(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run)).mini_batch

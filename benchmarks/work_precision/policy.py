@@ -1,0 +1,177 @@
+"""Work and precision of trained policies: how often they arrive untouched, against the time of a control step."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from benchmarks.lidar_benchmark.timing import paired_timings
+from omniperception import build, config
+from omniperception.deploy import ExportedPolicy
+from omniperception.deploy.export import FOLDER as EXPORTED
+from omniperception.env.env import OmniEnv
+from omniperception.evaluation.exported import record
+from omniperception.evaluation.suite import FOLDER as EVALUATION
+from omniperception.learning import latest_checkpoint
+from omniperception.learning.checkpoint import load_checkpoint
+
+from .pareto import Choice, Study, least_s
+
+COST = "CPU time of a control step, exported (us)"
+FAILED = "trials without success or with a touch (%)"
+RECORDED = 50
+"""Control steps whose readings are used for timing, a multiple of a frame's."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Attributes:
+        rounds: How often each policy is timed, in turn.
+        block_s: About how long at once, s.
+    """
+
+    rounds: int = 7
+    block_s: float = 0.1
+
+
+SMALL = Sizes(2, 0.002)
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A run directory whose policy has been evaluated and exported.
+
+    Attributes:
+        path: The directory.
+        name: What tables call it.
+    """
+
+    path: Path
+    name: str
+
+    def scenarios(self) -> dict[str, dict]:
+        """What scripts/evaluate.py measured of the run's own policy, by scenario."""
+        found = {}
+        for file in sorted((self.path / EVALUATION).glob("*.json")):
+            report = json.loads(file.read_text())
+            if "run" in report.get("policies", {}):
+                found[report["scenario"]] = report["policies"]["run"]
+        if not found:
+            raise config.ConfigError(
+                f"runs: {self.path} has not been evaluated; python scripts/evaluate.py run={self.path} scenario=all"
+            )
+        return found
+
+    @cached_property
+    def exported(self) -> ExportedPolicy:
+        """What scripts/export.py wrote."""
+        folder = self.path / EXPORTED
+        if not folder.is_dir():
+            raise config.ConfigError(
+                f"runs: {self.path} has not been exported; python scripts/export.py run={self.path}"
+            )
+        return ExportedPolicy.load(folder)
+
+    def facts(self) -> dict[str, float]:
+        """Weights of the actor, and how long its training took."""
+        state = load_checkpoint(latest_checkpoint(self.path), "cpu")
+        weights = (v for k, v in state["actor_state_dict"].items() if "normalizer" not in k)
+        return {
+            "parameters": float(sum(tensor.numel() for tensor in weights)),
+            "training (min)": state["total_time"] / 60.0,
+        }
+
+    def stepper(self) -> Callable[[int], None]:
+        """Control steps through readings recorded in an environment of the run; called with their number."""
+        run = build.assemble(config.load(self.path, ["num_envs=1"]))
+        env = OmniEnv(replace(run.env, initial_obstacle_level=1.0))
+        policy, readings = self.exported, record(env, self.exported, RECORDED, whole_frames=False)
+
+        def step(number: int) -> None:
+            reading = readings[number % RECORDED]
+            policy.step(reading.state, reading.command, reading.points)
+
+        return step
+
+
+def trained_runs(names: Sequence[str]) -> list[TrainedRun]:
+    """Run directories by path, named by what tells them apart."""
+    paths = [config.find_run(name) for name in names]
+    labels = _told_apart([path.resolve().parts for path in paths])
+    return [TrainedRun(path, label) for path, label in zip(paths, labels, strict=True)]
+
+
+def _told_apart(paths: Sequence[tuple[str, ...]]) -> list[str]:
+    """Paths without the parts that all of them begin and end with, but for one part of each."""
+    shortest = min((len(path) for path in paths), default=0)
+    first = min(_shared(paths), shortest - 1)
+    ends = min(_shared([path[::-1] for path in paths]), shortest - 1 - first)
+    return ["/".join(path[first : len(path) - ends]) for path in paths]
+
+
+def _shared(paths: Sequence[tuple[str, ...]]) -> int:
+    """How many parts all of them begin with."""
+    return len(list(itertools.takewhile(lambda parts: len(set(parts)) == 1, zip(*paths, strict=False))))
+
+
+def evaluated_runs() -> list[str]:
+    """All run directories under outputs/ with an evaluation and an exported policy."""
+    runs = sorted(file.parent for file in config.OUTPUTS.glob(f"**/{config.CONFIG_FILE}"))
+    return [str(run) for run in runs if (run / EVALUATION).is_dir() and (run / EXPORTED).is_dir()]
+
+
+def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> Iterator[Study]:
+    """One study per scenario that some run has been evaluated in.
+
+    Args:
+        names: Run directories; all that are evaluated and exported if empty.
+        sizes: How much is measured.
+        default: The run directory that counts as the default, or none.
+    """
+    runs = trained_runs(names or evaluated_runs())
+    if not runs:
+        raise config.ConfigError(
+            "runs= names no run, and outputs/ has none that is evaluated and exported; python scripts/evaluate.py and"
+            " scripts/export.py prepare one"
+        )
+    reports, facts = {run.name: run.scenarios() for run in runs}, {run.name: run.facts() for run in runs}
+    timings = paired_timings({run.name: run.stepper() for run in runs}, sizes.rounds, block_s=sizes.block_s)
+    chosen = config.find_run(default).resolve() if default else None
+    for scenario in sorted({name for report in reports.values() for name in report}):
+        choices = [
+            Choice(
+                run.name,
+                1e6 * least_s(timings[run.name]),
+                rates_of(reports[run.name][scenario]),
+                run.path.resolve() == chosen,
+                facts={**facts[run.name], "trials": reports[run.name][scenario]["episodes"]},
+            )
+            for run in runs
+            if scenario in reports[run.name]
+        ]
+        notes = (
+            "Rates by scripts/evaluate.py; low and high are the ends of Wilson's 95 % interval of the deciding rate."
+            " Time: mean over control steps, least of the rounds, with and without a frame, sampling included.",
+        )
+        title = f"Trained policies: {scenario}"
+        yield Study(f"policy_{scenario}", title, COST, FAILED, choices, 0.1, notes)
+
+
+def rates_of(summary: dict) -> dict[str, float]:
+    """Errors, in percent, of an evaluation's summary of one policy."""
+    rates = summary["rates"]
+    untouched = rates["success_untouched"]
+    return {
+        FAILED: 100.0 * (1.0 - untouched["rate"]),
+        "low (%)": 100.0 * (1.0 - untouched["high"]),
+        "high (%)": 100.0 * (1.0 - untouched["low"]),
+        "no success (%)": 100.0 * (1.0 - rates["success"]["rate"]),
+        "collision (%)": 100.0 * rates["collision"]["rate"],
+        "fall (%)": 100.0 * rates["fall"]["rate"],
+    }

@@ -1,1 +1,0 @@
-"""The evidence: speed against error, and what features cost."""

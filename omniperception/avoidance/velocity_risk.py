@@ -1,0 +1,243 @@
+"""Velocity risk: how near and how soon each velocity would lead past an obstacle, and the velocity that follows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from omniperception.avoidance.sector_motion import sector_bearings
+from omniperception.common.launch import constant, launch_over_envs, view
+
+_OUT_OF_REACH = 100.0
+"""Distance (m) of an empty sector."""
+
+_SLOW = 0.1
+"""Commanded speed (m/s) below which the direction counts less."""
+
+_POSITIVE = (
+    "max_speed",
+    "num_rings",
+    "num_directions",
+    "decay",
+    "time_constant",
+    "weight",
+    "temperature",
+    "sideways",
+)
+
+_SMALLEST = 1e-6
+"""Squared distance (m^2) below which a gradient would not exist."""
+
+
+@dataclass(frozen=True)
+class VelocityRisk:
+    """Candidate velocities, their risk and the choice between them.
+
+    The candidates lie on rings around standing still, in the yaw-aligned frame. The risk of one, 0 to 1, is the largest
+    of exp(-gap / decay - t / time_constant) over all obstacles and `times` t, where gap (m) lies between the
+    obstacle's outline and a disc of `robot_radius` if both keep their velocities until then: a velocity obstacle
+    (Fiorini and Shiller, 1998) with soft edges. The choice is the mean of the candidates under the weights
+    softmax(-(along^2 + sideways * across^2 + weight * risk) / temperature), where along and across (m/s) are how much a
+    candidate deviates from the command in its direction and beside it.
+
+    Beyond the paper, whose V_avoid sees distances alone; see docs/learning.md for what it brings.
+
+    Attributes:
+        max_speed: of the outermost ring (m/s).
+        num_rings: equally spaced speeds.
+        num_directions: candidates on each ring.
+        times: when the gap is looked at (s).
+        robot_radius: (m).
+        decay: (m).
+        time_constant: (s).
+        weight: of a risk of 1 against a squared deviation from the command ((m/s)^2).
+        temperature: ((m/s)^2) of the choice; small ones take the best candidate alone.
+        sideways: what a squared deviation beside the command counts; at 1 it is better to stand before something wide
+            than to go round it, as in runs saved before there was a choice.
+    """
+
+    max_speed: float
+    num_rings: int
+    num_directions: int
+    times: Sequence[float]
+    robot_radius: float
+    decay: float
+    time_constant: float
+    weight: float
+    temperature: float
+    sideways: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", tuple(float(time) for time in self.times))
+        for name in _POSITIVE:
+            if getattr(self, name) <= 0:
+                raise ValueError(f"rewards.avoidance.risk.{name}={getattr(self, name)} must be positive")
+        if self.robot_radius < 0:
+            raise ValueError(f"rewards.avoidance.risk.robot_radius={self.robot_radius} must not be negative")
+        if not self.times or min(self.times) < 0:
+            raise ValueError(f"rewards.avoidance.risk.times={list(self.times)} must be times (s) of at least 0")
+
+    @property
+    def num_candidates(self) -> int:
+        """K, standing still included."""
+        return 1 + self.num_rings * self.num_directions
+
+    def candidates(self, device: torch.device | str = "cpu") -> torch.Tensor:
+        """(K, 2) m/s in the yaw-aligned frame: standing still, then the rings from the inside, counter-clockwise."""
+        speed = self.max_speed * torch.arange(1, self.num_rings + 1, device=device) / self.num_rings
+        angle = 2 * math.pi * torch.arange(self.num_directions, device=device) / self.num_directions
+        ring = torch.stack((angle.cos(), angle.sin()), -1)
+        return torch.cat((ring.new_zeros(1, 2), (speed[:, None, None] * ring).flatten(0, 1)))
+
+    def risk(self, sectors: torch.Tensor, candidates: torch.Tensor) -> torch.Tensor:
+        """Risks of the candidates among obstacles that are known by azimuth sector.
+
+        An obstacle's outline is what it is in the sectors: a point at the centre of each sector that it is in, which
+        moves at the obstacle's velocity.
+
+        Args:
+            sectors: (n, S, 3) distance (m, infinite without an obstacle) and velocity (m/s, yaw-aligned frame).
+            candidates: those of :meth:`candidates`.
+
+        Returns:
+            (n, K).
+        """
+        bearings = sector_bearings(sectors.shape[1], sectors.device)
+        place = sectors[..., :1].clamp(max=_OUT_OF_REACH) * bearings
+        velocity = sectors[..., 1:]
+        with torch.no_grad():
+            if torch.jit.is_tracing() or torch.onnx.is_in_onnx_export():
+                sector, time = self._worst(place, velocity, candidates)
+            else:
+                sector, time = self._worst_by_kernel(place, velocity, candidates)
+        sector = sector[..., None].expand(-1, -1, 2)
+        meeting = place.gather(1, sector) + time[..., None] * (velocity.gather(1, sector) - candidates)
+        distance = meeting.square().sum(-1).clamp(min=_SMALLEST).sqrt()
+        return (-self._exponent(distance, time)).exp()
+
+    def _worst_by_kernel(
+        self, place: torch.Tensor, velocity: torch.Tensor, candidates: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """As :meth:`_worst`."""
+        place, velocity = place.contiguous(), velocity.contiguous()
+        sector = torch.zeros(len(place), len(candidates), dtype=torch.int64, device=place.device)
+        when = place.new_zeros(sector.shape)
+        times = constant(tuple(self.times), place.device)
+        points, least = torch.empty_like(place), place.new_empty(sector.shape)
+        sectors = torch.empty(place.shape[:2], dtype=torch.int32, device=place.device)
+        inputs = [
+            view(place, wp.vec2),
+            view(velocity, wp.vec2),
+            view(candidates, wp.vec2),
+            view(times, wp.float32),
+            self.robot_radius,
+            self.decay,
+            self.time_constant,
+            _OUT_OF_REACH,
+            view(points, wp.vec2),
+            view(sectors, wp.int32),
+            view(least, wp.float32),
+            view(sector, wp.int64),
+            view(when, wp.float32),
+        ]
+        launch_over_envs(worst_sectors, len(place), inputs, place.device)
+        return sector, when
+
+    def _worst(
+        self, place: torch.Tensor, velocity: torch.Tensor, candidates: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(n, K) which sector's obstacle makes each candidate's risk, and when (s)."""
+        least = sector = when = None
+        for time in self.times:  # the squared distance is |p|^2 - 2 p.c t + |c t|^2, the middle term a matrix product
+            point, goal = place + time * velocity, time * candidates
+            squared, nearest = (point.square().sum(-1, keepdim=True) - 2.0 * point @ goal.T).min(1)
+            distance = (squared + goal.square().sum(-1)).clamp(min=0.0).sqrt()
+            now = 0.0 * distance + time  # not full_like, which an exporter takes for a constant
+            exponent = self._exponent(distance, now)
+            if least is None:
+                least, sector, when = exponent, nearest, now
+                continue
+            worse = exponent < least
+            least, sector = torch.where(worse, exponent, least), torch.where(worse, nearest, sector)
+            when = torch.where(worse, now, when)
+        return sector, when
+
+    def _exponent(self, distance: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        """Minus the logarithm of the risk of passing an obstacle at a distance (m) after a time (s)."""
+        return (distance - self.robot_radius).clamp(min=0.0) / self.decay + time / self.time_constant
+
+    def avoidance(self, risk: torch.Tensor, command: torch.Tensor, candidates: torch.Tensor) -> torch.Tensor:
+        """V_avoid: the choice under the risks less the choice without any, so that no risk changes nothing.
+
+        Args:
+            risk: (n, K).
+            command: (n, 2) commanded velocity (m/s).
+            candidates: those of :meth:`candidates`.
+
+        Returns:
+            (n, 2) m/s in the yaw-aligned frame.
+        """
+        deviation = self._deviation(command[:, None], candidates)
+        wary = torch.softmax(-(deviation + self.weight * risk) / self.temperature, 1)
+        free = torch.softmax(-deviation / self.temperature, 1)
+        return (wary - free) @ candidates
+
+    def _deviation(self, command: torch.Tensor, velocities: torch.Tensor) -> torch.Tensor:
+        """(n, K) of velocities (K, 2) from commands (n, 1, 2); slow ones have less of a direction."""
+        away = command - velocities
+        heading = command / command.square().sum(-1, keepdim=True).clamp(min=_SLOW**2).sqrt()
+        across = away[..., 0] * heading[..., 1] - away[..., 1] * heading[..., 0]
+        return away.square().sum(-1) - (1.0 - self.sideways) * across.square()
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def worst_sectors(
+    env_offset: int,
+    place: wp.array2d(dtype=wp.vec2),
+    velocity: wp.array2d(dtype=wp.vec2),
+    candidates: wp.array(dtype=wp.vec2),
+    times: wp.array(dtype=wp.float32),
+    robot_radius: float,
+    decay: float,
+    time_constant: float,
+    out_of_reach: float,
+    # work memory
+    points: wp.array2d(dtype=wp.vec2),
+    sectors: wp.array2d(dtype=wp.int32),
+    least: wp.array2d(dtype=wp.float32),
+    # out
+    sector_out: wp.array2d(dtype=wp.int64),
+    time_out: wp.array2d(dtype=wp.float32),
+):
+    """Of one environment, the sector and the time that make each candidate's risk; see `VelocityRisk`."""
+    env = wp.tid() + env_offset
+    for k in range(candidates.shape[0]):
+        least[env, k] = wp.inf
+    for t in range(times.shape[0]):
+        time = times[t]
+        present = wp.int32(0)
+        for s in range(place.shape[1]):
+            p = place[env, s]
+            if wp.abs(p[0]) + wp.abs(p[1]) < out_of_reach:
+                points[env, present] = p + time * velocity[env, s]
+                sectors[env, present] = s
+                present += 1
+        for k in range(candidates.shape[0]):
+            goal = time * candidates[k]
+            nearest = float(wp.inf)
+            at = wp.int32(0)
+            for j in range(present):
+                squared = wp.length_sq(points[env, j] - goal)
+                if squared < nearest:
+                    nearest = squared
+                    at = j
+            if present > 0:
+                exponent = wp.max(wp.sqrt(nearest) - robot_radius, 0.0) / decay + time / time_constant
+                if exponent < least[env, k]:
+                    least[env, k] = exponent
+                    sector_out[env, k] = wp.int64(sectors[env, at])
+                    time_out[env, k] = time

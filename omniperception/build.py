@@ -1,0 +1,190 @@
+"""Puts a run together: the parts of a composed configuration, then environment, networks and runner."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from omniperception.config import ConfigError, compose, one_line
+from omniperception.env.env import EnvConfig, OmniEnv
+from omniperception.env.mirror import Mirror
+from omniperception.learning import Runner, distributed, latest_checkpoint
+from omniperception.learning.config import PerceptionConfig, PPOConfig, runner_config
+from omniperception.learning.memory import check_fits
+
+if TYPE_CHECKING:
+    from omniperception.evaluation.episodes import Policy
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """A run, assembled from its composed configuration.
+
+    Attributes:
+        env: the task.
+        perception: the actor's view of the LiDAR, or None.
+        ppo: the learning settings.
+        init: the runs whose weights this one starts from; where two have the same, the later one's.
+        composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
+    """
+
+    env: EnvConfig
+    perception: PerceptionConfig | None
+    ppo: PPOConfig
+    init: tuple[str, ...]
+    composed: dict
+
+    def __post_init__(self) -> None:
+        supervised = self.perception is not None and self.perception.supervised_epochs > 0
+        if self.ppo.num_learning_epochs == 0 and not supervised:
+            raise ValueError(
+                "ppo.num_learning_epochs=0 keeps the policy as it is, and nothing else learns; set it to at least 1, or"
+                " perception.supervised_epochs"
+            )
+
+
+def assemble(config: DictConfig) -> RunConfig:
+    """Instantiates and validates every part of a composed configuration."""
+    try:
+        _check_groups(config)
+        composed = OmegaConf.to_container(config, resolve=True)
+        parts = {key: _instantiate(key, value) for key, value in composed.items() if isinstance(value, dict)}
+        perception, ppo = parts.pop("perception"), parts.pop("ppo")
+        env = EnvConfig(
+            num_envs=composed["num_envs"],
+            seed=composed["seed"],
+            sampler=perception.sampler if perception else None,
+            frame_history=perception.history if perception else 0,
+            base_motion=perception.base_motion if perception else False,
+            targets=tuple(perception.supervision) if perception else (),
+            log_interval=ppo.num_steps_per_env,
+            **parts,
+        )
+        return RunConfig(env, perception, ppo, _names(composed.get("init")), composed)
+    except (OmegaConfBaseException, InstantiationException) as error:
+        raise ConfigError(one_line(error)) from None
+    except (TypeError, ValueError) as error:
+        raise ConfigError(one_line(error)) from None
+
+
+def _names(value: object) -> tuple[str, ...]:
+    """One name, several, or none."""
+    names = [] if value is None else value if isinstance(value, list) else [value]
+    if not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"init={value} must be a run directory, a list of them, or null")
+    return tuple(names)
+
+
+def check(overrides: Sequence[str]) -> None:
+    """Composes and validates every job that command-line overrides (with sweeps) stand for, before any is started."""
+    values = [o for o in overrides if not o.startswith("-")]
+    try:
+        parsed = OverridesParser.create().parse_overrides(values)
+    except HydraException as error:
+        raise ConfigError(one_line(error)) from None
+    if "-m" in overrides or "--multirun" in overrides:
+        jobs = [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
+    else:
+        jobs = [values]
+    for job in jobs:
+        assemble(compose([o for o in job if not o.startswith("hydra")]))
+
+
+def _check_groups(config: DictConfig) -> None:
+    if config.perception and not config.lidar:
+        raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
+
+
+def _instantiate(key: str, value: dict) -> object | None:
+    if not value:
+        return None
+    try:
+        return instantiate(value, _convert_="all")
+    except InstantiationException as error:
+        cause = error.__cause__ or error
+        raise ConfigError(f"{key}: {one_line(cause)}") from None
+
+
+def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
+    """The environment and everything that learns in it, seeded; each process of several with a seed of its own.
+
+    A setting that only the compiled world can judge, such as a geom's name, is a ConfigError here.
+
+    Args:
+        run: the assembled configuration.
+        log_dir: where TensorBoard files and checkpoints go; None writes nothing.
+    """
+    run = replace(run, env=replace(run.env, seed=run.env.seed + distributed.SEED_STRIDE * distributed.rank()))
+    seed_everything(run.env.seed)
+    try:
+        if run.perception is not None:
+            check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), run.env.sim.torch_device)
+        env = OmniEnv(run.env)
+        return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
+    except (ValueError, ImportError) as error:
+        raise ConfigError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A run's newest policy and the environment to try it in.
+
+    Attributes:
+        env: at the start of its first episodes, with all obstacles.
+        policy: from observations to actions, without exploration noise.
+        checkpoint: where the weights came from.
+    """
+
+    env: OmniEnv
+    policy: Policy
+    checkpoint: Path
+
+
+def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
+    """The policy of the newest checkpoint in `run_dir`, in the environment of `run`.
+
+    Raises:
+        CheckpointError: there is none, or it does not fit.
+    """
+    checkpoint = latest_checkpoint(run_dir)
+    runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0)), None)
+    runner.load(str(checkpoint), load_cfg={"actor": True})
+    return TrainedPolicy(runner.env, runner.get_inference_policy(str(runner.env.device)), checkpoint)
+
+
+def steps_per_frame(run: RunConfig) -> int:
+    """Control steps between two LiDAR frames."""
+    return max(1, round(run.env.lidar.sensor.period_s / run.env.sim.control_dt))
+
+
+def learning_settings(run: RunConfig, env: OmniEnv) -> dict:
+    """rsl_rl's configuration for a run in its environment."""
+    observations = run.env.observations
+    return runner_config(
+        run.ppo,
+        run.perception,
+        observations.actor,
+        observations.critic,
+        steps_per_frame(run) if run.perception is not None else 1,
+        run.env.rewards.avoidance.risk,
+        Mirror(env) if run.ppo.symmetry else None,
+    )
+
+
+def seed_everything(seed: int) -> None:
+    """Seeds the global generators; the task's own streams come from its configuration."""
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)
+    random.seed(seed)

@@ -1,0 +1,59 @@
+"""Counter-based random numbers: every environment draws from a stream of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from omniperception.common.rows import put, take
+
+_GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64
+_MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
+_MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
+_DRAWS_PER_EPISODE = 1 << 20
+
+
+class EnvRandom:
+    """Uniform numbers that depend on (seed, environment, how often that environment has drawn) and nothing else.
+
+    What one environment draws, or when it is reset, never changes what another sees, and the whole state is one
+    counter per environment. The mixing function is SplitMix64's (Steele, Lea and Flood, OOPSLA 2014).
+    """
+
+    def __init__(self, seed: int, num_envs: int, device: torch.device | str = "cpu") -> None:
+        self._key = _mix(torch.arange(num_envs, device=device) + (seed + 1) * 1_000_003)
+        self.counter = torch.zeros(num_envs, dtype=torch.int64, device=device)
+
+    def start_episode(self, envs: torch.Tensor) -> None:
+        """Goes on to the stretch of the stream that the next episode of `envs` (see `rows`) draws from.
+
+        What an environment draws in its k-th episode then depends on k, not on how much it drew before.
+        """
+        put(self.counter, envs, (take(self.counter, envs) // _DRAWS_PER_EPISODE + 1) * _DRAWS_PER_EPISODE)
+
+    def uniform(self, envs: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
+        """Draws from [0, 1) for some environments, see `rows`; the others' streams stay where they are.
+
+        Returns:
+            (len(envs), *shape) float32.
+        """
+        size = math.prod(shape)
+        draw = torch.arange(1, size + 1, device=self.counter.device)
+        drawn = take(self.counter, envs)[:, None]
+        state = take(self._key, envs)[:, None] + (drawn + draw) * _GOLDEN
+        put(self.counter, envs, drawn[:, 0] + size)
+        bits = _shift(_mix(state), 40)
+        return (bits.float() * 2.0**-24).reshape(-1, *shape)
+
+
+def _shift(x: torch.Tensor, bits: int) -> torch.Tensor:
+    """Logical right shift of int64."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _mix(x: torch.Tensor) -> torch.Tensor:
+    x = (x ^ _shift(x, 30)) * _MIX_1
+    x = (x ^ _shift(x, 27)) * _MIX_2
+    return x ^ _shift(x, 31)

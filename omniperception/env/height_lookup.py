@@ -1,0 +1,42 @@
+"""Heights of the robots above a ground that is not flat, looked up by Warp kernels."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from omniperception.common.launch import view
+from omniperception.env.heights import MAX_HEIGHT, NUM_HEIGHTS, footprint_grid, height_grid
+from omniperception.env.state import Kinematics
+from omniperception.scene import Ground
+from omniperception.scene.ground_kernels import base_heights, heights_around
+
+
+class HeightLookup:
+    """Heights of the robots above the ground around them, each kind in one launch over all environments."""
+
+    def __init__(self, ground: Ground, num_envs: int, device: torch.device) -> None:
+        self._ground, self._num_envs = ground, num_envs
+        self._grid, self._footprint = height_grid(device), footprint_grid(device)
+        self._base_pos_w, self._yaw = torch.zeros(num_envs, 3, device=device), torch.zeros(num_envs, device=device)
+        self._base_height = torch.zeros(num_envs, device=device)
+        self._heights = torch.zeros(num_envs, NUM_HEIGHTS, device=device)
+
+    def place(self, kinematics: Kinematics) -> None:
+        """Where the robots are, for the look-ups that follow."""
+        self._base_pos_w.copy_(kinematics.base_pos_w)
+        self._yaw.copy_(kinematics.yaw)
+
+    def base_height(self) -> torch.Tensor:
+        """(num_envs,) height (m) of the base's origin above the mean of the ground at `footprint_grid`."""
+        self._launch(base_heights, self._footprint, [view(self._base_height, wp.float32)])
+        return self._base_height.clone()
+
+    def around(self) -> torch.Tensor:
+        """(num_envs, 187) height (m) of the base's origin above the ground at `height_grid`, clipped to +-1 m."""
+        self._launch(heights_around, self._grid, [MAX_HEIGHT, view(self._heights, wp.float32)])
+        return self._heights.clone()
+
+    def _launch(self, kernel: wp.Kernel, points: torch.Tensor, outputs: list) -> None:
+        robots = [view(self._base_pos_w, wp.float32), view(self._yaw, wp.float32), view(points, wp.vec2)]
+        self._ground.launch(kernel, [*robots, *outputs], self._num_envs, len(points))

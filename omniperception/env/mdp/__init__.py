@@ -1,0 +1,1 @@
+"""The terms of the task: commands, observations, rewards, terminations, randomization."""

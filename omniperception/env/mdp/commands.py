@@ -1,0 +1,211 @@
+"""Velocity commands: sampled, or steering to a goal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+
+from omniperception.common.random import EnvRandom
+from omniperception.common.rotations import rotate_yaw
+from omniperception.common.rows import chosen, put
+from omniperception.env.state import Kinematics
+
+
+def _check_range(key: str, bounds: Sequence[float]) -> tuple[float, float]:
+    if len(bounds) != 2 or bounds[0] > bounds[1]:
+        raise ValueError(f"commands.{key}={list(bounds)} must be [low, high] with low <= high")
+    return float(bounds[0]), float(bounds[1])
+
+
+@dataclass(frozen=True)
+class SpawnConfig:
+    """Where a robot starts, in its environment's frame.
+
+    Attributes:
+        x: range (m).
+        y: range (m).
+        yaw_deg: range (deg).
+    """
+
+    x: Sequence[float] = (0.0, 0.0)
+    y: Sequence[float] = (0.0, 0.0)
+    yaw_deg: Sequence[float] = (-180.0, 180.0)
+
+    def __post_init__(self) -> None:
+        for key in ("x", "y", "yaw_deg"):
+            object.__setattr__(self, key, _check_range(f"spawn.{key}", getattr(self, key)))
+
+
+@dataclass(frozen=True)
+class VelocityCommandConfig:
+    """Velocities drawn uniformly in the base frame.
+
+    Attributes:
+        lin_vel_x: range (m/s).
+        lin_vel_y: range (m/s).
+        ang_vel_z: range (rad/s).
+        resample_s: time (s) between draws.
+        standing: share of the draws that command to stand still.
+        spawn: where the robot starts.
+    """
+
+    lin_vel_x: Sequence[float]
+    lin_vel_y: Sequence[float]
+    ang_vel_z: Sequence[float]
+    resample_s: float
+    standing: float
+    spawn: SpawnConfig
+
+    def __post_init__(self) -> None:
+        for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z"):
+            object.__setattr__(self, key, _check_range(key, getattr(self, key)))
+        if self.resample_s <= 0:
+            raise ValueError(f"commands.resample_s={self.resample_s} must be positive")
+        if not 0 <= self.standing <= 1:
+            raise ValueError(f"commands.standing={self.standing} must lie in [0, 1]")
+
+    def build(self, num_envs: int, device: torch.device, random: EnvRandom) -> VelocityCommand:
+        return VelocityCommand(self, num_envs, device, random)
+
+
+@dataclass(frozen=True)
+class GoalCommandConfig:
+    """Walk to a goal: the command points along the way there, and turns the robot to face it.
+
+    Attributes:
+        goal_x: range (m, environment frame) from which the goal's x is drawn at every reset.
+        goal_y: range (m) of its y.
+        radius: the goal is reached within this distance (m, horizontal, of the base's origin); None: beyond the line
+            x = goal_x, wherever. The command then aims one metre beyond it, so that it never turns around.
+        speed: commanded speed (m/s).
+        yaw_gain: yaw rate per heading error (1/s).
+        max_ang_vel_z: bound of the commanded yaw rate (rad/s).
+        spawn: where the robot starts.
+    """
+
+    goal_x: Sequence[float]
+    goal_y: Sequence[float]
+    radius: float | None
+    speed: float
+    yaw_gain: float
+    max_ang_vel_z: float
+    spawn: SpawnConfig
+
+    def __post_init__(self) -> None:
+        for key in ("goal_x", "goal_y"):
+            object.__setattr__(self, key, _check_range(key, getattr(self, key)))
+        for key in ("speed", "yaw_gain", "max_ang_vel_z"):
+            if getattr(self, key) <= 0:
+                raise ValueError(f"commands.{key}={getattr(self, key)} must be positive")
+        if self.radius is not None and self.radius <= 0:
+            raise ValueError(f"commands.radius={self.radius} must be positive, or null for a line to cross")
+
+    def build(self, num_envs: int, device: torch.device, random: EnvRandom) -> GoalCommand:
+        return GoalCommand(self, num_envs, device, random)
+
+
+class Command(Protocol):
+    """A source of commands.
+
+    Attributes:
+        value: (num_envs, 3): v_x, v_y (m/s) and yaw rate (rad/s) in the base frame.
+        goal_w: (num_envs, 2) the goal (m, environment frame), or None for commands without one.
+    """
+
+    value: torch.Tensor
+    goal_w: torch.Tensor | None
+
+    def reset(self, envs: torch.Tensor, kinematics: Kinematics) -> None:
+        """Draws anew for some environments, see `rows`; `kinematics` of all."""
+
+    def advance(self, dt: float, kinematics: Kinematics) -> None: ...
+
+    def reached(self, kinematics: Kinematics) -> torch.Tensor | None:
+        """(num_envs,) bool whether the goal is reached, or None for commands without one."""
+
+    def state_dict(self) -> dict: ...
+
+    def load_state_dict(self, state: dict) -> None: ...
+
+
+class VelocityCommand:
+    """Draws a new velocity at every reset and every `resample_s`."""
+
+    def __init__(self, config: VelocityCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
+        self.config = config
+        self.value = torch.zeros(num_envs, 3, device=device)
+        self.goal_w = None
+        self.time_left = torch.zeros(num_envs, device=device)
+        self._random = random
+        ranges = (config.lin_vel_x, config.lin_vel_y, config.ang_vel_z)
+        self._low = torch.tensor([r[0] for r in ranges], device=device)
+        self._high = torch.tensor([r[1] for r in ranges], device=device)
+
+    def reset(self, envs: torch.Tensor, kinematics: Kinematics) -> None:
+        self._draw(envs)
+
+    def advance(self, dt: float, kinematics: Kinematics) -> None:
+        self.time_left -= dt
+        expired = chosen(self.time_left <= 0)
+        if len(expired):
+            self._draw(expired)
+
+    def reached(self, kinematics: Kinematics) -> None:
+        return None
+
+    def state_dict(self) -> dict:
+        return {"value": self.value, "time_left": self.time_left}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.value.copy_(state["value"])
+        self.time_left.copy_(state["time_left"])
+
+    def _draw(self, envs: torch.Tensor) -> None:
+        u = self._random.uniform(envs, (4,))
+        velocity = self._low + u[:, :3] * (self._high - self._low)
+        put(self.value, envs, velocity * (u[:, 3:] >= self.config.standing))
+        put(self.time_left, envs, self.config.resample_s)
+
+
+class GoalCommand:
+    """Points to the goal from wherever the robot is."""
+
+    def __init__(self, config: GoalCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
+        self.config = config
+        self.value = torch.zeros(num_envs, 3, device=device)
+        self.goal_w = torch.zeros(num_envs, 2, device=device)
+        self._random = random
+        ranges = (config.goal_x, config.goal_y)
+        self._low = torch.tensor([r[0] for r in ranges], device=device)
+        self._high = torch.tensor([r[1] for r in ranges], device=device)
+
+    def reset(self, envs: torch.Tensor, kinematics: Kinematics) -> None:
+        put(self.goal_w, envs, self._low + self._random.uniform(envs, (2,)) * (self._high - self._low))
+        self.advance(0.0, kinematics)
+
+    def advance(self, dt: float, kinematics: Kinematics) -> None:
+        config = self.config
+        ahead, aside = (self.goal_w - kinematics.base_pos_w[:, :2]).unbind(1)
+        if config.radius is None:
+            ahead = (ahead + 1.0).clamp(min=0.5)
+        bearing = torch.atan2(aside, ahead)
+        to_goal = torch.stack((bearing.cos(), bearing.sin()), -1)
+        self.value[:, :2] = rotate_yaw(-kinematics.yaw, to_goal) * config.speed
+        error = torch.remainder(bearing - kinematics.yaw + math.pi, 2 * math.pi) - math.pi
+        self.value[:, 2] = (config.yaw_gain * error).clamp(-config.max_ang_vel_z, config.max_ang_vel_z)
+
+    def reached(self, kinematics: Kinematics) -> torch.Tensor:
+        if self.config.radius is None:
+            return kinematics.base_pos_w[:, 0] >= self.goal_w[:, 0]
+        return (self.goal_w - kinematics.base_pos_w[:, :2]).norm(dim=1) <= self.config.radius
+
+    def state_dict(self) -> dict:
+        return {"value": self.value, "goal_w": self.goal_w}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.value.copy_(state["value"])
+        self.goal_w.copy_(state["goal_w"])

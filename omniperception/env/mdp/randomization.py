@@ -1,0 +1,212 @@
+"""Domain randomization: the thirteen rows of the paper's table and the LiDAR's own noise, each absent when null."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from operator import attrgetter
+
+import torch
+
+from omniperception.common.random import EnvRandom
+from omniperception.common.rows import put
+from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
+from omniperception.scene.terrain import contact_solrefs
+from omniperception.sim import Simulator
+
+Range = Sequence[float] | None
+
+_MASSES = {"added_mass", "payload_mass", "com_x", "com_y", "com_z"}
+_DRAWN = (
+    "ground_friction",
+    "ground_restitution",
+    "motor_strength",
+    "gravity_offset",
+    "joint_offset",
+    "latency_s",
+    "added_mass",
+    "payload_mass",
+    "com_x",
+    "com_y",
+    "com_z",
+)
+"""What is drawn at a reset, in this order."""
+
+
+@dataclass(frozen=True)
+class RandomizationConfig:
+    """Ranges (low, high) drawn uniformly per environment at every reset; null leaves a row out altogether.
+
+    Attributes:
+        lidar_device: whether ranges and directions have the noise that the maker of the LiDAR in use states.
+        lidar_mask: points replaced by short distances.
+        lidar_distance: multiplicative noise of the measured distances.
+        lidar_gaussian: normal noise of the measured distances.
+        lidar_jitter: noise of the rays' directions.
+        lidar_dropout: points lost.
+        lidar_mixed: points between foreground and background at depth edges.
+        added_mass: mass (kg) added to the base at its centre of mass.
+        payload_mass: mass (kg) carried at `payload_position`.
+        com_x, com_y, com_z: displacement (m) of the base's centre of mass.
+        ground_friction: sliding friction coefficient.
+        ground_restitution: coefficient of restitution.
+        motor_strength: factor on the PD torque; the torque limit stays.
+        joint_offset: calibration error (rad) of every joint, added to the joint targets.
+        gravity_offset: acceleration (m/s^2) added to each axis of gravity.
+        latency_s: age (s) of the proprioception that the actor sees.
+        payload_position: where the payload sits in the base frame (m).
+    """
+
+    lidar_device: bool = False
+    lidar_mask: MaskNoise | None = None
+    lidar_distance: DistanceNoise | None = None
+    lidar_gaussian: GaussianNoise | None = None
+    lidar_jitter: AngularJitter | None = None
+    lidar_dropout: Dropout | None = None
+    lidar_mixed: MixedPixels | None = None
+    added_mass: Range = None
+    payload_mass: Range = None
+    com_x: Range = None
+    com_y: Range = None
+    com_z: Range = None
+    ground_friction: Range = None
+    ground_restitution: Range = None
+    motor_strength: Range = None
+    joint_offset: Range = None
+    gravity_offset: Range = None
+    latency_s: Range = None
+    payload_position: Sequence[float] = (0.0, 0.0, 0.1)
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name.startswith("lidar_") or item.name == "payload_position" or value is None:
+                continue
+            if len(value) != 2 or not -math.inf < value[0] <= value[1] < math.inf:
+                raise ValueError(f"randomization.{item.name}={list(value)} must be [low, high] or null")
+            object.__setattr__(self, item.name, (float(value[0]), float(value[1])))
+        for name in ("ground_friction", "ground_restitution", "motor_strength", "latency_s"):
+            value = getattr(self, name)
+            if value is not None and value[0] < 0:
+                raise ValueError(f"randomization.{name}={list(value)} must not be negative")
+        if self.ground_restitution is not None and self.ground_restitution[1] > 1:
+            raise ValueError(f"randomization.ground_restitution={list(self.ground_restitution)} must not exceed 1")
+
+    @property
+    def noise(self) -> tuple[Noise, ...]:
+        """The LiDAR noise models, but for the device's own."""
+        models = (getattr(self, item.name) for item in fields(self) if item.name.startswith("lidar_"))
+        return tuple(model for model in models if not isinstance(model, bool | None))
+
+
+class Randomizer:
+    """Draws each environment's physical parameters at its resets and writes them into the simulator's model."""
+
+    def __init__(self, config: RandomizationConfig, sim: Simulator, random: EnvRandom) -> None:
+        self.config, self._sim, self._random = config, sim, random
+        self._model = model = sim.world.model
+        self._base = sim.world.base_body
+        self._ground = model.geom("ground").id
+        self._nominal: dict[str, torch.Tensor] = {}  # of what is randomized, when it is first drawn
+        self._check_mass()
+        self._shapes = self._drawn_shapes()
+        if self._shapes:
+            bounds = [getattr(config, name) for name, shape in self._shapes.items() for _ in range(math.prod(shape))]
+            low, high = torch.tensor(bounds, dtype=torch.float64, device=sim.device).unbind(1)
+            self._low, self._span = low.float(), (high - low).float()
+        self._mass = bool(_MASSES & self._shapes.keys())
+        if self._mass:
+            self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
+        self.joint_offset: torch.Tensor | None = None
+        """(num_envs, num_joints) rad added to the joint targets; None when not randomized."""
+        self.delay: torch.Tensor | None = None
+        """(num_envs,) int64 physics steps by which proprioception is late; None when not randomized."""
+        if config.joint_offset:
+            self.joint_offset = torch.zeros(sim.num_envs, sim.world.robot.num_joints, device=sim.device)
+        if config.latency_s:
+            self.delay = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
+
+    def _nominal_of(self, name: str) -> torch.Tensor:
+        """A field of the model as compiled."""
+        if name not in self._nominal:
+            value = attrgetter(name)(self._model)
+            self._nominal[name] = torch.tensor(value, device=self._sim.device)
+        return self._nominal[name]
+
+    @property
+    def max_delay(self) -> int:
+        """The largest delay in physics steps that can be drawn."""
+        return round(self.config.latency_s[1] / self._sim.world.model.opt.timestep) if self.config.latency_s else 0
+
+    def reset(self, envs: torch.Tensor) -> None:
+        """Draws new parameters for some environments, see `rows`."""
+        if not self._shapes:
+            return
+        drawn = self._draw(envs)
+        if "ground_friction" in drawn:
+            self._write("geom_friction", envs, drawn["ground_friction"], self._ground, 0)
+        if "ground_restitution" in drawn:
+            self._write("geom_solref", envs, contact_solrefs(drawn["ground_restitution"]), self._ground)
+        if "motor_strength" in drawn:
+            for name in ("actuator_gainprm", "actuator_biasprm"):
+                self._write(name, envs, self._nominal_of(name) * drawn["motor_strength"])
+        if "gravity_offset" in drawn:
+            self._write("opt.gravity", envs, self._nominal_of("opt.gravity") + drawn["gravity_offset"])
+        if self.joint_offset is not None:
+            put(self.joint_offset, envs, drawn["joint_offset"])
+        if self.delay is not None:
+            put(self.delay, envs, (drawn["latency_s"] / self._model.opt.timestep).round())
+        if self._mass:
+            self._set_masses(envs, drawn)
+
+    def state_dict(self) -> dict:
+        """Parameters that live outside the physics model."""
+        return {"joint_offset": self.joint_offset, "delay": self.delay}
+
+    def load_state_dict(self, state: dict) -> None:
+        for mine, saved in ((self.joint_offset, state["joint_offset"]), (self.delay, state["delay"])):
+            if mine is not None:
+                mine.copy_(saved)
+
+    def _write(self, field: str, envs: torch.Tensor, values: torch.Tensor, *index: int) -> None:
+        """Writes float64 values into a model field of some environments, at an index, in the engine's precision."""
+        put(self._sim.model_field(field)[(slice(None), *index)], envs, values)
+
+    def _check_mass(self) -> None:
+        """Refuses ranges that can leave the base without mass, with which physics diverges at once."""
+        config, base = self.config, float(self._model.body_mass[self._base])
+        lightest = base + sum(bounds[0] for bounds in (config.added_mass, config.payload_mass) if bounds)
+        if lightest <= 0:
+            raise ValueError(
+                f"randomization.added_mass={config.added_mass} and payload_mass={config.payload_mass} leave a base of"
+                f" {base:g} kg with {lightest:g} kg; it must keep a positive mass"
+            )
+
+    def _drawn_shapes(self) -> dict[str, tuple[int, ...]]:
+        """What is drawn for one environment, in the order of the draws."""
+        joints, config = self._sim.world.robot.num_joints, self.config
+        shapes = {"motor_strength": (self._model.nu, 1), "gravity_offset": (3,), "joint_offset": (joints,)}
+        return {name: shapes.get(name, ()) for name in _DRAWN if getattr(config, name) is not None}
+
+    def _draw(self, envs: torch.Tensor) -> dict[str, torch.Tensor]:
+        """All parameters of some environments, float64, at once."""
+        u = self._random.uniform(envs, (len(self._low),))
+        values = (self._low + self._span * u).double()
+        parts = values.split([math.prod(shape) for shape in self._shapes.values()], 1)
+        shapes = self._shapes.items()
+        return {name: part.reshape(-1, *shape) for (name, shape), part in zip(shapes, parts, strict=True)}
+
+    def _set_masses(self, envs: torch.Tensor, drawn: dict[str, torch.Tensor]) -> None:
+        """Mass and centre of mass of base, added mass and payload together; the base's inertia stays nominal."""
+        nothing = torch.zeros(len(envs), dtype=torch.float64, device=envs.device)
+        base_mass = float(self._model.body_mass[self._base])
+        body = base_mass + drawn.get("added_mass", nothing)
+        payload = drawn.get("payload_mass", nothing)
+        offset = torch.stack([drawn.get(name, nothing) for name in ("com_x", "com_y", "com_z")], 1)
+        centre = self._nominal_of("body_ipos")[self._base] + offset
+        total = body + payload
+        self._write("body_mass", envs, total, self._base)
+        combined = (body[:, None] * centre + payload[:, None] * self._payload_position) / total[:, None]
+        self._write("body_ipos", envs, combined, self._base)
+        self._sim.update_model(envs)

@@ -1,0 +1,137 @@
+"""Left-right mirror images of actions and observations, of a robot that is its own mirror image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from omniperception.env.state import Term, plain
+from omniperception.scene import RobotConfig
+
+if TYPE_CHECKING:
+    from omniperception.env.env import OmniEnv
+
+JOINTS = "joints"
+"""A part of a term that has a number for each joint."""
+VECTOR = (1.0, -1.0, 1.0)
+"""Signs of x, y, z under the reflection that maps left to right."""
+ROTATION = (-1.0, 1.0, -1.0)
+"""Likewise of an axial vector, such as an angular velocity."""
+
+
+def mirrors(*parts: str | Sequence[float]) -> Callable[[Term], Term]:
+    """Declares how an observation term looks in the mirror: JOINTS, or signs, part by part. A part that is the only one
+    is repeated as often as the term is wide."""
+
+    def mark(term: Term) -> Term:
+        term.mirror = parts
+        return term
+
+    return mark
+
+
+class Mirror:
+    """Adds mirror images to samples; rsl_rl's `data_augmentation_func`."""
+
+    def __init__(self, env: OmniEnv) -> None:
+        """Args: env: whose groups and robot to mirror.
+
+        Raises:
+            ValueError: a joint or a term has no mirror image.
+        """
+        joints = mirrored_joints(env.robot)
+        self._joints = tuple(torch.as_tensor(part, device=env.device) for part in joints)
+        self._groups = {}
+        for name, group in env.config.observations.groups.items():
+            parts, widths = [], env.observation_widths(name)
+            for term_name, term in group.terms.items():
+                parts += _parts(f"observations.groups.{name}.terms.{term_name}", term, widths[term_name], joints)
+            index, sign, start = [], [], 0
+            for part_index, part_sign in parts:
+                index.append(part_index + start)
+                sign.append(part_sign)
+                start += len(part_index)
+            self._groups[name] = (
+                torch.as_tensor(np.concatenate(index), device=env.device),
+                torch.as_tensor(np.concatenate(sign), device=env.device),
+            )
+
+    def __call__(
+        self, env: OmniEnv, obs: TensorDict | None, actions: torch.Tensor | None
+    ) -> tuple[TensorDict | None, torch.Tensor | None]:
+        """Samples (B, ...), then their mirror images: (2 B, ...)."""
+        if obs is not None:
+            images = {name: self._with_image(value, *self._groups[name]) for name, value in obs.items()}
+            obs = TensorDict(images, batch_size=[2 * len(obs)])
+        if actions is not None:
+            actions = self._with_image(actions, *self._joints)
+        return obs, actions
+
+    def _with_image(self, value: torch.Tensor, index: torch.Tensor, sign: torch.Tensor) -> torch.Tensor:
+        """(B, history * width) -> (2 B, history * width)."""
+        steps = value.unflatten(1, (-1, len(index)))
+        return torch.cat((value, (steps[..., index] * sign).flatten(1)))
+
+
+def mirrored_joints(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
+    """For each joint the one that is its mirror image (index), and the sign of its angle in the mirror.
+
+    Found at joint angles of 0 from the joints' anchors and axes: an axis is axial, (x, y, z) -> (-x, y, -z).
+
+    Raises:
+        ValueError: a joint has no mirror image, or the default pose is not its own.
+    """
+    model = robot.spec().compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0
+    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model, data)
+    ids = [model.joint(name).id for name in robot.joints]
+    anchor, axis = data.xanchor[ids] - data.body(robot.base).xpos, data.xaxis[ids]
+    default = np.array([robot.default_joint_pos[name] for name in robot.joints])
+    index, sign = np.zeros(len(ids), np.int64), np.zeros(len(ids), np.float32)
+    for j, name in enumerate(robot.joints):
+        there = np.linalg.norm(anchor - anchor[j] * VECTOR, axis=1) < _SAME
+        along = axis @ (axis[j] * ROTATION)
+        twins = np.flatnonzero(there & (np.abs(along) > 1 - _SAME))
+        if len(twins) != 1:
+            raise ValueError(
+                f"ppo.symmetry=true: no single joint of robot.joints is the mirror image of {name} at angles of 0;"
+                " set ppo.symmetry=false"
+            )
+        index[j], sign[j] = twins[0], np.sign(along[twins[0]])
+    if not np.allclose(default[index] * sign, default, atol=_SAME):
+        raise ValueError(
+            "ppo.symmetry=true: robot.default_joint_pos is not its own mirror image; set ppo.symmetry=false"
+        )
+    return index, sign
+
+
+_SAME = 1e-3
+"""Difference (m, rad, cosine) up to which two joints are mirror images."""
+
+
+def _parts(
+    name: str, term: Callable, width: int, joints: tuple[np.ndarray, np.ndarray]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Index and sign of each part of a term."""
+    declared = getattr(plain(term), "mirror", None)
+    if declared is None:
+        raise ValueError(
+            f"ppo.symmetry=true: {name} does not say how it looks in the mirror; declare it with @mirrors(...), or set"
+            " ppo.symmetry=false"
+        )
+    parts = []
+    for part in declared:
+        parts.append(joints if part == JOINTS else (np.arange(len(part)), np.asarray(part, np.float32)))
+    total = sum(len(index) for index, _ in parts)
+    if len(parts) == 1 and width % total == 0:
+        parts, total = parts * (width // total), width
+    if total != width:
+        raise ValueError(f"ppo.symmetry=true: {name} declares the mirror image of {total} numbers, but has {width}")
+    return parts

@@ -1,0 +1,44 @@
+"""How the base has moved since the last LiDAR frame, as a state estimator tells it."""
+
+from __future__ import annotations
+
+import torch
+
+from omniperception.common.rotations import rotate_yaw
+from omniperception.common.rows import replaced, take
+from omniperception.env.state import Kinematics
+
+
+class Odometry:
+    """Adds up the sensed velocity from one frame to the next; the heading is the IMU's."""
+
+    def __init__(self, num_envs: int, control_dt: float, device: torch.device) -> None:
+        self._dt = control_dt
+        self._travelled_w = torch.zeros(num_envs, 2, device=device)
+        self._yaw = torch.zeros(num_envs, device=device)
+        self._yaw_before = torch.zeros(num_envs, device=device)
+
+    def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
+        """The robots of `envs` (see `rows`) stand elsewhere; `sensed` of all."""
+        self._yaw = replaced(self._yaw, envs, take(sensed.yaw, envs))
+        self._yaw_before = replaced(self._yaw_before, envs, take(sensed.yaw, envs))
+        self._travelled_w = replaced(self._travelled_w, envs, 0.0)
+
+    def advance(self, sensed: Kinematics) -> None:
+        """One control step."""
+        self._yaw = sensed.yaw
+        self._travelled_w = self._travelled_w + rotate_yaw(sensed.yaw, sensed.base_lin_vel_yaw) * self._dt
+
+    def since_last_frame(self) -> torch.Tensor:
+        """(num_envs, 3) x, y (m) and yaw (rad) since the call before, in the levelled base of then."""
+        turned = torch.remainder(self._yaw - self._yaw_before + torch.pi, 2 * torch.pi) - torch.pi
+        moved = torch.cat((rotate_yaw(-self._yaw_before, self._travelled_w), turned[:, None]), 1)
+        self._yaw_before = self._yaw
+        self._travelled_w = torch.zeros_like(self._travelled_w)
+        return moved
+
+    def state_dict(self) -> dict:
+        return {"travelled": self._travelled_w, "yaw": self._yaw, "yaw_before": self._yaw_before}
+
+    def load_state_dict(self, state: dict) -> None:
+        self._travelled_w, self._yaw, self._yaw_before = state["travelled"], state["yaw"], state["yaw_before"]

@@ -1,0 +1,101 @@
+"""Curriculum over terrain: environments move to harder or easier tiles by how far their robots walked."""
+
+from __future__ import annotations
+
+import torch
+
+from omniperception.common.random import EnvRandom
+from omniperception.common.rows import put, take
+from omniperception.env.state import Kinematics
+from omniperception.scene.ground import Ground
+
+_MIN_SPEED = 1e-3
+"""Commands slower than this (m/s) command no way."""
+
+
+class TerrainLevels:
+    """Follows each environment's episode and chooses the tile of its next one; see `TerrainCurriculumConfig`.
+
+    Attributes:
+        walked: (num_envs,) way (m) along the commanded direction in this episode.
+        commanded: (num_envs,) way (m) that was commanded.
+        reach: (num_envs,) largest horizontal distance (m) from where the episode started.
+    """
+
+    def __init__(self, ground: Ground, random: EnvRandom, control_dt: float, max_episode_length: int) -> None:
+        """`control_dt` (s) and `max_episode_length` (control steps) are those of the environment."""
+        self._ground, self._random = ground, random
+        self._dt, self._max_steps = control_dt, max_episode_length
+        num_envs, device = len(ground.level), ground.level.device
+        self.walked, self.commanded, self.reach, self._steps = torch.zeros(4, num_envs, device=device).unbind(0)
+        self._start = torch.zeros(num_envs, 2, device=device)
+
+    def record(self, kinematics: Kinematics, command: torch.Tensor, healthy: torch.Tensor) -> None:
+        """Takes in a control step.
+
+        Args:
+            kinematics: state at its end.
+            command: (num_envs, 3) v_x, v_y (m/s) and yaw rate in the base frame.
+            healthy: (num_envs,) bool: whose physics is sound; the others have walked nowhere.
+        """
+        speed = command[:, :2].norm(dim=1)
+        along = (kinematics.base_lin_vel_yaw * command[:, :2]).sum(1) / speed.clamp(min=_MIN_SPEED)
+        self.walked += torch.where((speed > _MIN_SPEED) & healthy, along, 0.0) * self._dt
+        self.commanded += speed * self._dt
+        self._steps += 1.0
+        from_start = (kinematics.base_pos_w[:, :2] - self._start).norm(dim=1)
+        torch.maximum(self.reach, torch.where(healthy, from_start, 0.0), out=self.reach)
+
+    def start(self, envs: torch.Tensor, xy_w: torch.Tensor, complete: torch.Tensor | None = None) -> None:
+        """Begins new episodes in some environments, whose robots stand at (n, 2) m, on the tiles that they deserve.
+
+        Args:
+            envs: which, see `rows`.
+            xy_w: (n, 2) m.
+            complete: (n,) bool: whether the last episode ended as planned, so that it commanded no more; None before
+                the first episode.
+        """
+        config, ground = self._ground.config, self._ground
+        draw = self._random.uniform(envs)
+        if config.curriculum is None:
+            level = (draw * config.levels).long()
+        elif complete is None:
+            level = (draw * (config.curriculum.start_level + 1)).long()
+        else:
+            level = (take(ground.level, envs) + self.steps_up(envs, complete)).clamp(min=0)
+            level = torch.where(level < config.levels, level, (draw * config.levels).long())
+        ground.move(envs, level)
+        put(self._start, envs, xy_w)
+        for total in (self.walked, self.commanded, self.reach, self._steps):
+            put(total, envs, 0.0)
+
+    def steps_up(self, envs: torch.Tensor, complete: torch.Tensor) -> torch.Tensor:
+        """(n,) int64: 1 for environments that move up a level, -1 for those that move down; see `start`."""
+        config, curriculum = self._ground.config, self._ground.config.curriculum
+        walked, commanded, reach, steps = (
+            take(values, envs) for values in (self.walked, self.commanded, self.reach, self._steps)
+        )
+        rest = (self._max_steps / steps.clamp(min=1.0)).clamp(min=1.0)
+        commanded = torch.where(complete, commanded, commanded * rest)
+        far = reach > config.tile_size / 2
+        well = (reach > config.platform / 2) & (walked >= curriculum.up_share * commanded)
+        up = far | well
+        return up.long() - (~up & (walked < curriculum.down_share * commanded)).long()
+
+    def report(self) -> dict[str, float]:
+        """Mean levels for the log."""
+        kinds = self._ground.mean_level_by_kind()
+        return {
+            "Metrics/terrain_level": self._ground.mean_level(),
+            **{f"Terrain/level_{kind}": level for kind, level in kinds.items()},
+        }
+
+    def state_dict(self) -> dict:
+        """What `load_state_dict` needs to go on exactly; the levels are the ground's."""
+        totals = torch.stack((self.walked, self.commanded, self.reach, self._steps))
+        return {"totals": totals, "start": self._start.clone()}
+
+    def load_state_dict(self, state: dict) -> None:
+        for total, saved in zip((self.walked, self.commanded, self.reach, self._steps), state["totals"], strict=True):
+            total.copy_(saved)
+        self._start.copy_(state["start"])

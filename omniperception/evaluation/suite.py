@@ -1,0 +1,182 @@
+"""Evaluates a run in scenarios, beside baselines; what scripts/evaluate.py and larger studies call."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from omniperception import build, config
+from omniperception.build import TrainedPolicy, load_policy
+from omniperception.config import ConfigError
+from omniperception.deploy import ExportedPolicy
+from omniperception.deploy.export import FOLDER as EXPORTED
+from omniperception.evaluation.baselines import Limits, covered, steered
+from omniperception.evaluation.episodes import Episodes, run_episodes
+from omniperception.evaluation.exported import ExportedPolicies
+from omniperception.evaluation.report import DEFINITIONS, provenance, table, times_line, write_trials
+
+FOLDER = "evaluation"
+"""Where in a run directory the results go."""
+
+POLICIES = {
+    "run": "the run's policy",
+    "blind": "the same policy, its LiDAR covered: every ray a miss",
+    "scripted": "a walking policy told V_cmd + V_avoid, V_avoid by the run's own law from true distances",
+    "command": "a walking policy told V_cmd alone",
+    "exported": "the run's exported policy on what a robot senses: scripts/export.py, onnxruntime",
+}
+"""What can be evaluated; the walking policy is the one of `walker`, or for `scripted` the run's own, LiDAR covered."""
+
+ENVS = 256
+"""Most environments at a time, unless told otherwise."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What to evaluate and how.
+
+    Attributes:
+        run_dir: the run.
+        scenarios: names from conf/scenario.
+        policies: names from POLICIES.
+        trials: at least so many trials of each policy in each scenario.
+        num_envs: environments at a time; None: as few rounds of at most ENVS as the trials need.
+        walker: run directory of a policy that follows velocity commands, for the policies that walk; or None.
+        plots: whether to draw the trajectories.
+        overrides: changes to the configuration, on top of the scenario's.
+    """
+
+    run_dir: Path
+    scenarios: Sequence[str]
+    policies: Sequence[str] = ("run",)
+    trials: int = 1000
+    num_envs: int | None = None
+    walker: Path | None = None
+    plots: bool = True
+    overrides: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        _check_known("scenario", self.scenarios, config.scenarios())
+        _check_known("policy", self.policies, tuple(POLICIES))
+        if "command" in self.policies and self.walker is None:
+            raise ConfigError(
+                "policy=command needs a policy that walks without avoiding: walker=<run directory of experiment=walk>;"
+                " the run's own without its LiDAR is policy=blind"
+            )
+        for override in self.overrides:
+            if override.split("=", 1)[0] in ("scenario", "num_envs"):
+                raise ConfigError(f"{override} is not an override here; it is an argument of its own")
+
+    @property
+    def envs(self) -> int:
+        """Environments at a time."""
+        if self.num_envs is not None:
+            return self.num_envs
+        return math.ceil(self.trials / math.ceil(self.trials / ENVS))
+
+
+def evaluate(evaluation: Evaluation) -> dict[str, dict]:
+    """Evaluates every policy in every scenario, prints tables and writes the run's evaluation folder.
+
+    Returns:
+        What <scenario>.json holds, by scenario.
+    """
+    if evaluation.plots:
+        from omniperception.evaluation import plots
+
+        plots.check_available()
+    folder = evaluation.run_dir / FOLDER
+    folder.mkdir(exist_ok=True)
+    reports = {}
+    for scenario in evaluation.scenarios:
+        report, episodes = evaluate_scenario(evaluation, scenario)
+        (folder / f"{scenario}.json").write_text(json.dumps(report, indent=2) + "\n")
+        write_trials(folder / f"{scenario}.csv", episodes)
+        written = [f"{scenario}.json", f"{scenario}.csv"]
+        if evaluation.plots:
+            obstacles = build.assemble(_configuration(evaluation, scenario, evaluation.run_dir)).env.obstacles
+            plots.draw_tracks(folder / f"{scenario}.png", scenario, episodes, obstacles)
+            written.append(f"{scenario}.png")
+        print(f"{scenario}, {report['num_envs']} environments, seed {report['seed']}:")
+        print(table(report["policies"]))
+        print(f"wrote {', '.join(str(folder / name) for name in written)}", flush=True)
+        reports[scenario] = report
+    return reports
+
+
+def evaluate_scenario(evaluation: Evaluation, scenario: str) -> tuple[dict, dict[str, Episodes]]:
+    """The report of one scenario and the episodes it was made from, by policy."""
+    episodes, summaries = {}, {}
+    for name in evaluation.policies:
+        trained = _contender(name, evaluation, scenario)
+        episodes[name] = run_episodes(trained.env, trained.policy, evaluation.trials, keep_tracks=evaluation.plots)
+        summaries[name] = {
+            "what": POLICIES[name],
+            "checkpoint": str(trained.checkpoint),
+            **episodes[name].summary(),
+        }
+        print(f"{scenario} {name}:{times_line(summaries[name])}", flush=True)
+    report = {
+        "scenario": scenario,
+        "run": str(evaluation.run_dir),
+        "overrides": list(evaluation.overrides),
+        "seed": trained.env.config.seed,
+        "num_envs": trained.env.num_envs,
+        "time_limit_s": trained.env.config.terminations.episode_length_s,
+        "policies": summaries,
+        "definitions": DEFINITIONS,
+        **provenance(trained.env.device),
+    }
+    return report, episodes
+
+
+def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolicy:
+    """One of POLICIES in a fresh environment of the scenario."""
+    walks = name in ("scripted", "command")
+    run_dir = evaluation.walker if walks and evaluation.walker is not None else evaluation.run_dir
+    run = build.assemble(_configuration(evaluation, scenario, run_dir))
+    trained = load_policy(run, run_dir)
+    policy = trained.policy
+    try:
+        if name == "blind":
+            policy = covered(trained.env, policy)
+        if name == "scripted":
+            avoidance = build.assemble(config.load(evaluation.run_dir)).env.rewards.avoidance
+            own_law = run_dir == evaluation.run_dir and avoidance.risk is not None  # what the run itself is told
+            policy = steered(trained.env, policy, avoidance, None if own_law else _learned_commands(run_dir))
+        if name == "exported":
+            exported = ExportedPolicies(trained.env, ExportedPolicy.load(run_dir / EXPORTED))
+            return TrainedPolicy(trained.env, exported, run_dir / EXPORTED)
+    except ValueError as error:
+        raise ConfigError(f"policy={name}: {error}") from None
+    return TrainedPolicy(trained.env, policy, trained.checkpoint)
+
+
+def _configuration(evaluation: Evaluation, scenario: str, run_dir: Path):
+    """The run's configuration with the scenario's scene; a walker takes the overrides that change the scene."""
+    overrides = list(evaluation.overrides)
+    if run_dir != evaluation.run_dir:
+        scene = (*config.FIXED_BY_SCENARIO, "sim")
+        overrides = [o for o in overrides if o.split("=", 1)[0].split(".", 1)[0] in scene]
+    return config.load(run_dir, [f"scenario={scenario}", *overrides, f"num_envs={evaluation.envs}"])
+
+
+def _learned_commands(run_dir: Path) -> Limits | None:
+    """The ranges of v_x and v_y (m/s) that a run has been trained with, or None where it was given goals."""
+    commands = config.load(run_dir).commands
+    if "lin_vel_x" not in commands:
+        return None
+    return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)
+
+
+def _check_known(key: str, names: Sequence[str], known: Sequence[str]) -> None:
+    if not names:
+        raise ConfigError(f"{key}= names nothing; known: {', '.join(known)}")
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{key}={name} is unknown; known: {', '.join(known)}")
+        if list(names).count(name) > 1:
+            raise ConfigError(f"{key}={','.join(names)} names {name} twice")

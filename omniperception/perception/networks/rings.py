@@ -1,0 +1,297 @@
+"""Rings: what is around the levelled base by azimuth sector and band of height, seen over several frames from where the
+base is now, and convolutions around the azimuth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import nn
+from torch.nn import functional
+
+from omniperception.common.launch import constant, launch_over_envs, view
+from omniperception.perception.networks.motion_match import NOTHING, MotionMatch
+from omniperception.perception.networks.windows import valid_frames, window_count
+
+MOTION_CHANNELS = 3
+"""Per sector: nearness, radial and tangential velocity of the nearest obstacle (:mod:`sector_motion`)."""
+
+_FAINT = 1e-6
+"""Proximity below which a cell counts as empty; with a decay of 0.5 m that is a distance of 6.9 m."""
+
+_NOTHING = 1e3
+"""Distance (m) of an empty cell."""
+
+_GAIN = 8.0
+"""Of all inputs, which are small because most of what is around is far or empty; learning is several times faster."""
+
+_REACH, _NEARNESS = 6.0, 2.0
+"""Distance (m) from which on the nearest hit counts as nothing, and the number of one at the base."""
+
+_LATERAL = 5.0
+"""Scale of the sine of the bearing within a sector, which is at most 0.09 for 36 of them."""
+
+
+def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape) -> torch.Tensor:
+    """The frames of every window as seen from the base at the window's newest frame.
+
+    Args:
+        cells: (B, F, bands * S, 3) cells of :class:`ProximitySampler`.
+        moved: (B, F, 3) how the base moved since the frame before, in the levelled base of that one: x, y (m), yaw
+            (rad).
+        count: (B, W) valid frames of each window; the others are empty.
+        shape: of the rings.
+
+    Returns:
+        (B, W, H * bands * (len(decays) + 1), S), oldest frame first: for each band the proximities of the nearest hit
+        that is in the cell now, exp(-d / decay), and its bearing within the sector times the last of them; empty cells
+        are 0.
+    """
+    if torch.jit.is_tracing() or torch.onnx.is_in_onnx_export() or cells.is_meta:
+        return _moved_rings(cells, moved, count, shape)
+    batch, windows = count.shape
+    bands = cells.shape[2] // shape.num_sectors
+    rings = cells.new_zeros(batch, windows, shape.history * bands * shape.channels, shape.num_sectors)
+    cells, count = cells.contiguous(), count.contiguous()
+    origin, yaw = _poses(moved)
+    scratch = cells.new_empty(batch, bands, shape.num_sectors)
+    decays = constant(shape.decays, cells.device)
+    inputs = [
+        view(cells, wp.vec3),
+        view(origin, wp.vec2),
+        view(yaw, wp.float32),
+        view(count, wp.int64),
+        shape.decay,
+        view(decays, wp.float32),
+        shape.history,
+        bands,
+        view(scratch, wp.float32),
+        view(rings, wp.float32),
+    ]
+    launch_over_envs(write_rings, batch, inputs, cells.device)
+    return rings
+
+
+def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape) -> torch.Tensor:
+    """As :func:`moved_rings`, of operations that can be exported."""
+    bearing, proximity = cells[..., :2], cells[..., 2]
+    hit = proximity > _FAINT
+    known = proximity.clamp(min=_FAINT)
+    places = bearing / known[..., None] * (-shape.decay * known.log())[..., None]
+    places, hit = places.unflatten(2, (-1, shape.num_sectors)), hit.unflatten(2, (-1, shape.num_sectors))
+    origin, yaw = _poses(moved)
+    fixed = _turned(yaw[:, :, None, None], places) + origin[:, :, None, None]
+    windows = _windows(fixed, shape.history)  # (B, W, H, bands, S, 2)
+    newest = slice(shape.history - 1, None)
+    here = _turned(-yaw[:, newest, None, None, None], windows - origin[:, newest, None, None, None])
+    hit = _windows(hit, shape.history) & valid_frames(count, shape.history)[..., None, None]
+    x, y = here.unbind(-1)
+    distance = torch.where(hit, (x * x + y * y).sqrt(), _NOTHING)
+    turned = (torch.atan2(y, x) + math.pi) * (shape.num_sectors / (2 * math.pi))
+    sector = turned.long().clamp(0, shape.num_sectors - 1)
+    empty = 0.0 * distance  # not zeros_like, whose shape an exporter takes for a constant
+    nearest = (empty + _NOTHING).scatter_reduce(-1, sector, distance, "amin")
+    is_nearest = (distance <= nearest.gather(-1, sector)) & hit
+    within = (turned - sector - 0.5) * (2 * math.pi / shape.num_sectors)
+    lateral = empty.scatter_reduce(-1, sector, torch.where(is_nearest, within, 0.0), "sum")
+    proximities = [torch.exp(-nearest / decay) for decay in shape.decays]
+    return torch.stack((*proximities, _LATERAL * lateral * proximities[-1]), -2).flatten(2, 4)
+
+
+def _windows(frames: torch.Tensor, history: int) -> torch.Tensor:
+    """(B, F, ...) -> (B, F - H + 1, H, ...)."""
+    count = frames.shape[1] - history + 1
+    return torch.stack([frames[:, k : k + count] for k in range(history)], 2)
+
+
+def _poses(moved: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Places (B, F, 2) and headings (B, F) of the base at each frame, from how it moved from frame to frame."""
+    yaw = moved[..., 2].cumsum(1)
+    step = _turned(yaw - moved[..., 2], moved[..., :2])  # given in the base of the frame before
+    return step.cumsum(1), yaw
+
+
+@dataclass(frozen=True)
+class RingShape:
+    """Sizes and lengths of rings.
+
+    Attributes:
+        num_sectors: S.
+        history: H, frames per window.
+        decay: m, of the sampler's proximities.
+        decays: m, of the rings' proximities.
+    """
+
+    num_sectors: int
+    history: int
+    decay: float
+    decays: tuple[float, ...]
+
+    @property
+    def channels(self) -> int:
+        """Numbers per cell."""
+        return len(self.decays) + 1
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def write_rings(
+    env_offset: int,
+    cells: wp.array3d(dtype=wp.vec3),
+    origin: wp.array2d(dtype=wp.vec2),
+    yaw: wp.array2d(dtype=wp.float32),
+    count: wp.array2d(dtype=wp.int64),
+    decay: float,
+    decays: wp.array(dtype=wp.float32),
+    history: int,
+    bands: int,
+    nearest: wp.array3d(dtype=wp.float32),  # work memory
+    # out
+    rings_out: wp.array4d(dtype=wp.float32),
+):
+    """The windows of one environment; see `moved_rings`."""
+    env = wp.tid() + env_offset
+    num_sectors = rings_out.shape[3]
+    per_cell = decays.shape[0] + 1
+    for window in range(rings_out.shape[1]):
+        newest = window + history - 1
+        for k in range(history - int(count[env, window]), history):
+            frame = window + k
+            step = origin[env, frame] - origin[env, newest]
+            back = -yaw[env, newest]
+            cos_back = wp.cos(back)
+            sin_back = wp.sin(back)
+            shift = wp.vec2(cos_back * step[0] - sin_back * step[1], sin_back * step[0] + cos_back * step[1])
+            cos = wp.cos(yaw[env, frame] + back)
+            sin = wp.sin(yaw[env, frame] + back)
+            for band in range(bands):
+                for sector in range(num_sectors):
+                    nearest[env, band, sector] = wp.static(_NOTHING)
+            for cell in range(bands * num_sectors):
+                c = cells[env, frame, cell]
+                if c[2] > wp.static(_FAINT):
+                    far = -decay * wp.log(c[2]) / c[2]
+                    x = far * (cos * c[0] - sin * c[1]) + shift[0]
+                    y = far * (sin * c[0] + cos * c[1]) + shift[1]
+                    distance = wp.sqrt(x * x + y * y)
+                    turned = (wp.atan2(y, x) + wp.static(math.pi)) * float(num_sectors) / wp.static(2.0 * math.pi)
+                    sector = wp.clamp(int(turned), 0, num_sectors - 1)
+                    band = cell / num_sectors
+                    if distance < nearest[env, band, sector]:
+                        nearest[env, band, sector] = distance
+                        first = (k * bands + band) * per_cell
+                        for j in range(decays.shape[0]):
+                            rings_out[env, window, first + j, sector] = wp.exp(-distance / decays[j])
+                        within = (turned - float(sector) - 0.5) * wp.static(2.0 * math.pi) / float(num_sectors)
+                        last = rings_out[env, window, first + decays.shape[0] - 1, sector]
+                        rings_out[env, window, first + decays.shape[0], sector] = wp.static(_LATERAL) * within * last
+
+
+class RingPath(nn.Module):
+    """A window's rings, one beside the other as channels, through convolutions around the azimuth.
+
+    Nothing tells one azimuth from another, so what is learned about an obstacle ahead holds on either side as well, and
+    where an obstacle stood still all frames agree, because they are looked at from the same place.
+    """
+
+    def __init__(
+        self,
+        num_distal: int,
+        history: int,
+        num_sectors: int = 36,
+        decay: float = 0.5,
+        decays: Sequence[float] = (0.5, 2.0),
+        channels: Sequence[int] = (96, 64, 64, 64),
+        kernel_sizes: Sequence[int] = (1, 5, 5, 1),
+        match: MotionMatch | None = None,
+        ground_bands: int = 0,
+    ) -> None:
+        """Configure the path.
+
+        Args:
+            num_distal: cells of :class:`ProximitySampler`, bands x sectors.
+            history: H, frames per window.
+            num_sectors: S.
+            decay: m, the sampler's.
+            decays: m, of the proximities that the convolutions see.
+            channels: of the hidden layers.
+            kernel_sizes: sectors that each of them spans, odd.
+            match: velocities to try on the nearest hits; None leaves it to the convolutions to find motion.
+            ground_bands: lowest bands whose hits are not matched, because ground is in them.
+        """
+        super().__init__()
+        if num_distal % num_sectors:
+            raise ValueError(f"rings: num_distal={num_distal} must be a multiple of num_sectors={num_sectors}")
+        if len(kernel_sizes) != len(channels) or any(size % 2 == 0 for size in kernel_sizes):
+            raise ValueError(
+                f"rings: kernel_sizes={list(kernel_sizes)} must be one odd number for each of the {len(channels)}"
+                " channels"
+            )
+        num_bands = num_distal // num_sectors
+        if not 0 <= ground_bands < num_bands:
+            raise ValueError(f"rings: ground_bands={ground_bands} must be less than the {num_bands} bands")
+        if match is not None and history < 2:
+            raise ValueError(
+                f"perception.history={history} shows no motion; take 2 or more, or perception.network.rings.match=null"
+            )
+        self.shape = RingShape(num_sectors, history, decay, tuple(decays))
+        self.match, self.ground_bands = match, ground_bands
+        width = history * num_bands * self.shape.channels
+        if match is not None:
+            width += (history - 1) * match.num_velocities + 2 * history
+            self.register_buffer("_velocities", match.velocities(), persistent=False)
+        layers: list[nn.Module] = []
+        for size, span in zip(channels, kernel_sizes, strict=True):
+            layers += [_ring_conv(width, size, span), nn.ELU()]
+            width = size
+        last = nn.Conv1d(width, MOTION_CHANNELS, 1)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.layers = nn.Sequential(*layers, last)
+
+    @property
+    def feature_dim(self) -> int:
+        """Numbers per window: MOTION_CHANNELS of each sector in turn."""
+        return MOTION_CHANNELS * self.shape.num_sectors
+
+    def forward(self, cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        """(B, F, bands * S, 3) cells, (B, F, 3) motion, (B, W) valid frames -> (B, W, S * 3)."""
+        window_count(cells, count, self.shape.history)
+        rings = moved_rings(cells, moved, count, self.shape).flatten(0, 1)
+        if self.match is not None:
+            rings = torch.cat((rings, self._matched(rings)), 1)
+        motion = self.layers(_GAIN * rings)  # (B * W, 3, S)
+        return motion.transpose(1, 2).flatten(1).unflatten(0, count.shape)
+
+    def _matched(self, rings: torch.Tensor) -> torch.Tensor:
+        """(n, (H - 1) * K + 2 H, S): what moved how, and by frame the nearness and bearing of the nearest hit."""
+        cells = rings.unflatten(1, (self.shape.history, -1, self.shape.channels))[:, :, self.ground_bands :]
+        proximity, band = cells[:, :, :, -2].max(2)
+        bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (_LATERAL * proximity.clamp(min=_FAINT))
+        reach = -self.shape.decays[-1] * proximity.clamp(min=_FAINT).log()
+        distance = torch.where(proximity > _FAINT, reach, NOTHING)
+        nearness = _NEARNESS * (1.0 - distance / _REACH).clamp(min=0.0)
+        return torch.cat(
+            (self.match(distance, bearing[:, -1], self._velocities), nearness, 2.0 * _LATERAL * bearing), 1
+        )
+
+
+class _RingConv(nn.Conv1d):
+    """A convolution whose ends meet."""
+
+    def forward(self, ring: torch.Tensor) -> torch.Tensor:
+        reach = self.kernel_size[0] // 2
+        return functional.conv1d(torch.cat((ring[..., -reach:], ring, ring[..., :reach]), -1), self.weight, self.bias)
+
+
+def _ring_conv(inputs: int, outputs: int, kernel_size: int) -> nn.Module:
+    return _RingConv(inputs, outputs, kernel_size) if kernel_size > 1 else nn.Conv1d(inputs, outputs, 1)
+
+
+def _turned(yaw: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """Vectors (..., 2) turned by angles (...) counter-clockwise."""
+    cos, sin = yaw.cos(), yaw.sin()
+    x, y = vectors.unbind(-1)
+    return torch.stack((cos * x - sin * y, sin * x + cos * y), -1)

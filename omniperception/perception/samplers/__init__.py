@@ -1,0 +1,1 @@
+"""Samplers: from a LiDAR frame to a fixed number of points."""

@@ -1,0 +1,165 @@
+"""Terrain of square tiles as one height field: levels of growing difficulty along x, kinds along y."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from omniperception.scene.terrain import GROUND, check_contact, set_contact
+from omniperception.scene.tiles import Tile, TileGrid
+
+_BASE = 0.5
+"""Thickness (m) of the solid under the lowest point."""
+
+
+@dataclass(frozen=True)
+class TerrainCurriculumConfig:
+    """When an environment moves to a harder or an easier tile, judged at the end of every episode.
+
+    Up: it got farther from its start than half a tile, or it left the platform and walked at least `up_share` of what
+    was commanded. Otherwise down: it walked less than `down_share` of that. Walked is the way along the commanded
+    direction; in an episode that ended early, what was commanded counts as if it had gone on to the time limit.
+    Beyond the hardest level any level is drawn.
+
+    Attributes:
+        start_level: environments begin on any level up to this one.
+        up_share: see above.
+        down_share: see above.
+    """
+
+    start_level: int = 0
+    up_share: float = 0.8
+    down_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.start_level < 0:
+            raise ValueError(f"terrain.curriculum.start_level={self.start_level} must not be negative")
+        if not 0 <= self.down_share <= self.up_share:
+            raise ValueError(
+                f"terrain.curriculum.down_share={self.down_share} must lie between 0 and up_share={self.up_share}"
+            )
+
+
+@dataclass(frozen=True)
+class TiledTerrainConfig:
+    """Square tiles in rows of equal difficulty and columns of one kind, with a flat border around them.
+
+    An environment has a column for good and a level that may change at its resets. It starts in the middle of its tile,
+    which is the origin of its frame, and may walk on to the tiles beside. At a metre from the border's outer edge its
+    episode ends as a time-out.
+
+    Attributes:
+        tiles: kinds of tiles by name.
+        levels: number of rows; their difficulty rises evenly through `difficulty`.
+        columns: number of columns; the kinds have as many as their shares say, at least one each.
+        tile_size: side of a tile (m).
+        platform: side of the flat square in its middle (m).
+        cell: side of a cell of the height field (m).
+        border: width (m) of the flat border.
+        seed: of the tiles' random parts.
+        difficulty: of the lowest and of the highest level, 0 to 1.
+        curriculum: None: every episode starts on any level.
+        friction: sliding friction coefficient of the ground; it holds for every contact with the ground.
+        restitution: coefficient of restitution e in [0, 1].
+    """
+
+    tiles: Mapping[str, Tile]
+    levels: int = 10
+    columns: int = 10
+    tile_size: float = 8.0
+    platform: float = 2.0
+    cell: float = 0.1
+    border: float = 10.0
+    seed: int = 0
+    difficulty: Sequence[float] = (0.0, 1.0)
+    curriculum: TerrainCurriculumConfig | None = None
+    friction: float = 0.8
+    restitution: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tiles", {name: tile for name, tile in self.tiles.items() if tile is not None})
+        object.__setattr__(self, "difficulty", tuple(float(d) for d in self.difficulty))
+        check_contact(self.friction, self.restitution)
+        if not self.tiles:
+            raise ValueError("terrain.tiles is empty; name a kind of tile, or use terrain=flat")
+        for key in ("levels", "columns"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"terrain.{key}={getattr(self, key)} must be at least 1")
+        if len(self.difficulty) != 2 or not 0 <= self.difficulty[0] <= self.difficulty[1] <= 1:
+            raise ValueError(
+                f"terrain.difficulty={list(self.difficulty)} must be [low, high] with 0 <= low <= high <= 1"
+            )
+        if not 0 < self.cell <= 0.5:
+            raise ValueError(f"terrain.cell={self.cell} must lie in (0, 0.5]")
+        if abs(self.tile_size / self.cell / 2 - self.grid.half) > 1e-6 or self.grid.half < 2:
+            raise ValueError(f"terrain.tile_size={self.tile_size} must be an even number of cells of {self.cell} m")
+        if not 1.0 <= self.platform < self.tile_size:
+            raise ValueError(
+                f"terrain.platform={self.platform} must be at least 1, where a robot fits, and fit the tile"
+            )
+        if self.border < 2.0:
+            raise ValueError(f"terrain.border={self.border} must be at least 2: an episode ends 1 m before its edge")
+        if self.curriculum is not None and self.curriculum.start_level >= self.levels:
+            raise ValueError(
+                f"terrain.curriculum.start_level={self.curriculum.start_level} must be below"
+                f" terrain.levels={self.levels}"
+            )
+        idle = sorted(set(self.tiles) - set(self.column_kinds()))
+        if idle:
+            raise ValueError(
+                f"terrain.columns={self.columns} leaves none to {', '.join(idle)}; use more columns or larger shares"
+            )
+
+    @property
+    def grid(self) -> TileGrid:
+        """The points of one tile."""
+        half = round(self.tile_size / self.cell / 2)
+        return TileGrid(half, round(self.platform / self.cell / 2), self.cell)
+
+    @property
+    def border_cells(self) -> int:
+        return round(self.border / self.cell)
+
+    def column_kinds(self) -> tuple[str, ...]:
+        """Name of the kind of tile in each column."""
+        names, shares = list(self.tiles), np.array([tile.share for tile in self.tiles.values()])
+        middles = (np.arange(self.columns) + 0.5) / self.columns
+        chosen = np.searchsorted(np.cumsum(shares) / shares.sum(), middles)
+        return tuple(names[min(k, len(names) - 1)] for k in chosen)
+
+    def level_difficulty(self, level: int) -> float:
+        low, high = self.difficulty
+        return low + (high - low) * level / max(self.levels - 1, 1)
+
+    def height_map(self) -> np.ndarray:
+        """(rows, cols) float64 heights (m), x along columns, y along rows; the border and the tiles' edges are at 0."""
+        grid, border, side = self.grid, self.border_cells, 2 * self.grid.half
+        heights = np.zeros((self.columns * side + 2 * border + 1, self.levels * side + 2 * border + 1))
+        seeds = np.random.SeedSequence(self.seed).spawn(self.columns * self.levels)
+        for column, kind in enumerate(self.column_kinds()):
+            for level in range(self.levels):
+                rng = np.random.default_rng(seeds[column * self.levels + level])
+                row, col = border + column * side, border + level * side
+                tile = self.tiles[kind].heights(grid, self.level_difficulty(level), rng)
+                heights[row : row + side + 1, col : col + side + 1] += tile
+        return heights
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Adds the height field on a kinematic body, so that every environment can have its own tile at its origin."""
+        heights = self.height_map()
+        low, span = heights.min(), max(np.ptp(heights), 1e-3)
+        rows, cols = heights.shape
+        half_x, half_y = (cols - 1) * self.cell / 2, (rows - 1) * self.cell / 2
+        spec.add_hfield(
+            name=GROUND,
+            size=[half_x, half_y, span, _BASE],
+            nrow=rows,
+            ncol=cols,
+            userdata=((heights - low) / span).astype(np.float32).ravel(),
+        )
+        body = spec.worldbody.add_body(name=GROUND, mocap=True)
+        geom = body.add_geom(name=GROUND, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=GROUND, pos=[0, 0, low])
+        set_contact(geom, self.friction, self.restitution)

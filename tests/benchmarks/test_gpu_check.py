@@ -1,0 +1,78 @@
+"""The GPU's check and the memory command at tiny size on a CPU, and what they say without a GPU."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks import memory
+from benchmarks.gpu_check import CheckOptions, Table, execute
+from omniperception.build import build_runner
+
+ROOT = Path(__file__).parents[2]
+TINY = ("experiment=walk", "ppo.num_steps_per_env=4", "ppo.hidden_dims=[32,16]", "ppo.num_mini_batches=2")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_it_says_so_in_one_line(tmp_path):
+    command = [sys.executable, str(ROOT / "scripts" / "gpu_check.py"), f"out={tmp_path}"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].startswith("error: device=cuda:0")
+    assert "device=cpu size=small" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_part_that_fails_is_told_and_the_others_run(tmp_path, monkeypatch):
+    def fails(options):
+        raise RuntimeError("out of order")
+
+    def runs(options):
+        return [Table("fine", "All is well", ("n",), [(1,)])]
+
+    monkeypatch.setattr("benchmarks.gpu_check.PARTS", {"first": fails, "second": runs})
+    assert not execute(CheckOptions("cpu", True, tmp_path))
+    summary = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    assert [row["result"] for row in summary] == ["FAILED: RuntimeError: out of order", "done"]
+    assert (tmp_path / "fine.csv").is_file()
+
+
+def test_parts_that_would_begin_too_late_are_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmarks.gpu_check.PARTS", {"late": None})
+    assert execute(CheckOptions("cpu", True, tmp_path, minutes=-1.0))
+    (row,) = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    assert row["result"].startswith("left out")
+
+
+@pytest.mark.slow
+def test_everything_runs_tiny_on_a_cpu(tmp_path):
+    pytest.importorskip("mujoco_warp")
+    assert execute(CheckOptions("cpu", True, tmp_path))
+    names = {"tests", "lidar_accuracy", "step_errors", "waits", "paper_table", "paper_table_peers", "env_stages"}
+    names |= {"env_stages_whole_clouds"}
+    assert names | {"training", "memory", "summary"} <= {path.stem for path in tmp_path.glob("*.csv")}
+
+
+def test_memory_is_predicted_from_few_environments(make_config):
+    """What is predicted for 24 environments from 4 and 8 is what a run of 24 holds."""
+    run = make_config(*TINY, "num_envs=24")
+    predicted = {part.name: part.total(24) for part in memory.predict(run)}
+    held = memory.held_bytes(build_runner(run, None))
+    for name, size in held.items():
+        assert predicted[name] == pytest.approx(size, rel=0.01), name
+    assert predicted["rollout"] > 24 * 4 * 33 * 4 and predicted["networks"] > 0
+
+
+def test_memory_of_clouds_that_are_cast_in_parts(make_config):
+    """24 environments whose clouds exist 8 at a time; the samplers' memory goes with them."""
+    run = make_config("obstacles=static", "num_envs=24", "lidar.sensor.num_rays=500", "lidar.cloud_mb=0.13", *TINY[1:])
+    runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0)), None)
+    assert len(runner.env.sensing.lidar.parts) == 3
+    predicted = {part.name: part.total(24) for part in memory.predict(run)}
+    assert predicted["rays"] == pytest.approx(memory.held_bytes(runner)["rays"], rel=0.01)
+    whole = replace(run, env=replace(run.env, lidar=replace(run.env.lidar, cloud_mb=1000.0)))
+    assert predicted["rays"] < {part.name: part.total(24) for part in memory.predict(whole)}["rays"] - 16 * 500 * 60

@@ -1,0 +1,169 @@
+"""Velocity and goal commands."""
+
+import math
+
+import pytest
+import torch
+
+from omniperception.common.random import EnvRandom
+from omniperception.common.rotations import yaw_quat
+from omniperception.env.mdp.commands import GoalCommandConfig, SpawnConfig, VelocityCommandConfig
+from omniperception.env.state import Kinematics
+
+N = 4000
+
+
+def velocity_command(**settings):
+    config = VelocityCommandConfig(
+        **{
+            "lin_vel_x": (-0.5, 1.0),
+            "lin_vel_y": (-0.3, 0.3),
+            "ang_vel_z": (0.2, 0.8),
+            "resample_s": 1.0,
+            "standing": 0.0,
+            "spawn": SpawnConfig(),
+            **settings,
+        }
+    )
+    command = config.build(N, torch.device("cpu"), EnvRandom(0, N))
+    command.reset(torch.arange(N), None)
+    return command
+
+
+def test_commands_fill_their_ranges():
+    value = velocity_command().value
+    low, high = torch.tensor([-0.5, -0.3, 0.2]), torch.tensor([1.0, 0.3, 0.8])
+    assert (value >= low).all() and (value <= high).all()
+    torch.testing.assert_close(value.amin(0), low, atol=0.01, rtol=0)
+    torch.testing.assert_close(value.amax(0), high, atol=0.01, rtol=0)
+    torch.testing.assert_close(value.mean(0), (low + high) / 2, atol=0.03, rtol=0)
+
+
+def test_standing_share():
+    value = velocity_command(standing=0.3).value
+    assert (value == 0).all(1).float().mean().item() == pytest.approx(0.3, abs=0.03)
+    assert ((value == 0).all(1) | (value != 0).all(1)).all()
+
+
+def test_resampled_after_its_time_and_not_before():
+    command = velocity_command()
+    first = command.value.clone()
+    for _ in range(49):
+        command.advance(0.02, None)
+    assert torch.equal(command.value, first)
+    command.advance(0.02 + 1e-4, None)
+    assert (command.value != first).any(1).all()
+
+
+def test_a_reset_draws_for_those_environments_only():
+    command = velocity_command()
+    first = command.value.clone()
+    command.advance(0.5, None)
+    command.reset(torch.tensor([3, 5]), None)
+    changed = (command.value != first).any(1).nonzero().flatten()
+    assert changed.tolist() == [3, 5]
+    command.advance(0.51, None)
+    assert torch.equal(command.time_left[[3, 5]], torch.full((2,), 1.0 - 0.51))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"lin_vel_x": (1.0, -1.0)}, r"commands\.lin_vel_x=\[1\.0, -1\.0\]"),
+        ({"resample_s": 0.0}, r"commands\.resample_s"),
+        ({"standing": 1.5}, r"commands\.standing"),
+    ],
+)
+def test_wrong_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        velocity_command(**settings)
+
+
+def robots(positions, yaws):
+    n = len(positions)
+    qpos = torch.zeros(n, 19)
+    qpos[:, :2] = torch.tensor(positions)
+    qpos[:, 3:7] = yaw_quat(torch.tensor(yaws))
+    return Kinematics.of(qpos, torch.zeros(n, 18))
+
+
+class TestGoal:
+    line = GoalCommandConfig((10.0, 10.0), (0.0, 0.0), None, 0.8, 2.0, 1.0, SpawnConfig())
+    point = GoalCommandConfig((3.0, 3.0), (4.0, 4.0), 0.5, 0.8, 2.0, 1.0, SpawnConfig())
+
+    def command(self, positions, yaws, config=line):
+        kinematics = robots(positions, yaws)
+        n, device = len(positions), torch.device("cpu")
+        command = config.build(n, device, EnvRandom(0, n, device))
+        command.reset(torch.arange(len(positions)), kinematics)
+        return command.value, command.reached(kinematics)
+
+    def test_points_to_the_goal_in_the_base_frame(self):
+        value, _ = self.command([[0.0, 0.0], [0.0, 0.0], [0.0, 11.0]], [0.0, math.pi / 2, 0.0])
+        assert value[0].tolist() == pytest.approx([0.8, 0, 0], abs=1e-6)
+        assert value[1].tolist() == pytest.approx([0, -0.8, -1.0], abs=1e-6)  # goal to its right, turns right
+        down = 0.8 * math.sqrt(0.5)  # the aim lies 1 m beyond the line: 11 m ahead and 11 m aside
+        assert value[2].tolist() == pytest.approx([down, -down, -1.0], abs=1e-6)
+
+    def test_yaw_rate_is_proportional_and_takes_the_short_way(self):
+        value, _ = self.command([[0.0, 0.0]] * 3, [0.1, 3.1, -3.1])
+        assert value[:, 2].tolist() == pytest.approx([-0.2, -1.0, 1.0], abs=1e-6)
+
+    def test_reached(self):
+        _, reached = self.command([[9.99, 0.0], [10.01, 3.0]], [0.0, 0.0])
+        assert reached.tolist() == [False, True]
+
+    def test_speed_is_kept_everywhere(self):
+        value, _ = self.command([[9.9, 3.0], [12.0, -1.0], [-20.0, 0.5]], [0.3, -2.0, 1.0])
+        torch.testing.assert_close(value[:, :2].norm(dim=1), torch.full((3,), 0.8))
+
+    def test_a_point_is_aimed_at_and_reached_within_its_radius(self):
+        value, reached = self.command(
+            [[0.0, 0.0], [3.0, 9.0], [3.3, 4.39], [3.3, 4.41]], [0.0, 0.0, 0.0, 0.0], self.point
+        )
+        assert value[0].tolist() == pytest.approx([0.48, 0.64, 1.0], abs=1e-6)  # 3-4-5
+        assert value[1, :2].tolist() == pytest.approx([0.0, -0.8], abs=1e-6)
+        assert reached.tolist() == [False, False, True, False]
+
+    def test_goals_fill_their_box_and_change_with_the_episode(self):
+        box = GoalCommandConfig([6.0, 7.5], [-1.5, 1.5], 0.5, 0.8, 2.0, 1.0, SpawnConfig())
+        kinematics = robots([[0.0, 0.0]] * N, [0.0] * N)
+        command = box.build(N, torch.device("cpu"), EnvRandom(0, N))
+        command.reset(torch.arange(N), kinematics)
+        goal = command.goal_w.clone()
+        torch.testing.assert_close(goal.amin(0), torch.tensor([6.0, -1.5]), atol=0.01, rtol=0)
+        torch.testing.assert_close(goal.amax(0), torch.tensor([7.5, 1.5]), atol=0.01, rtol=0)
+        torch.testing.assert_close(goal.mean(0), torch.tensor([6.75, 0.0]), atol=0.05, rtol=0)
+        command.reset(torch.tensor([2]), kinematics)
+        assert (command.goal_w != goal).any(1).nonzero().flatten().tolist() == [2]
+
+    def test_a_saved_goal_goes_on(self):
+        box = GoalCommandConfig([6.0, 7.5], [-1.5, 1.5], 0.5, 0.8, 2.0, 1.0, SpawnConfig())
+        kinematics = robots([[0.0, 0.0]] * 3, [0.0] * 3)
+        first, second = (box.build(3, torch.device("cpu"), EnvRandom(seed, 3)) for seed in (1, 2))
+        for command in (first, second):
+            command.reset(torch.arange(3), kinematics)
+        assert not torch.equal(first.goal_w, second.goal_w)
+        second.load_state_dict(first.state_dict())
+        second.advance(0.02, kinematics)
+        assert torch.equal(first.goal_w, second.goal_w) and torch.equal(first.value, second.value)
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            (([10.0, 10.0], [0.0, 0.0], None, 0.0), r"commands\.speed=0"),
+            (([7.0, 6.0], [0.0, 0.0], None, 1.0), r"commands\.goal_x=\[7\.0, 6\.0\]"),
+            (([7.0, 7.0], [0.0, 0.0], 0.0, 1.0), r"commands\.radius=0"),
+        ],
+    )
+    def test_wrong_settings_are_refused(self, settings, message):
+        with pytest.raises(ValueError, match=message):
+            GoalCommandConfig(*settings, 2.0, 1.0, SpawnConfig())
+
+
+def test_robots_start_where_the_preset_says(make_env):
+    env = make_env("commands=corridor", "obstacles=corridor", blind=True, num_envs=200)
+    pos = env.sim.qpos
+    assert (pos[:, 0] == -0.5).all() and (env.kinematics.yaw.abs() < 1e-6).all()
+    assert pos[:, 1].min() < -0.45 and pos[:, 1].max() > 0.45 and pos[:, 1].abs().max() <= 0.5
+    assert torch.equal(pos[:, 2], torch.full((200,), 0.33, dtype=torch.float32).double())

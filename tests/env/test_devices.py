@@ -1,0 +1,125 @@
+"""The whole task on a device: on the CPU in every run of the tests, on a GPU where there is one."""
+
+import copy
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from omniperception import build, config
+from omniperception.build import build_runner
+from omniperception.env.env import OmniEnv
+
+pytest.importorskip("mujoco_warp")
+
+TASKS = {
+    "paper": ("experiment=paper",),
+    "avoid": ("experiment=avoid", "terrain=mixed", "randomization=paper", "lidar.cloud_mb=0.02"),
+}
+SIZES = ("num_envs=6", "lidar.sensor.num_rays=200", "ppo.num_steps_per_env=6", "ppo.num_mini_batches=2", "seed=3")
+OTHERS = [0, 1, 3, 4, 5]
+
+
+@pytest.fixture(
+    params=[
+        "cpu",
+        pytest.param(
+            "cuda:0",
+            marks=(pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")),
+        ),
+    ]
+)
+def device(request):
+    return request.param
+
+
+@pytest.fixture(params=TASKS)
+def run(request, device):
+    overrides = ("sim=mujoco_warp", f"sim.device={device}", "sim.deterministic=true", *SIZES)
+    run = build.assemble(config.compose([*TASKS[request.param], *overrides]))
+    return replace(run, env=replace(run.env, initial_obstacle_level=1.0))
+
+
+def actions(env, steps):
+    generator = torch.Generator().manual_seed(4)
+    return (0.3 * torch.randn(steps, env.num_envs, env.num_actions, generator=generator)).to(env.device)
+
+
+def seen(env, action):
+    observations, rewards, dones, _ = env.step(action)
+    return {**{name: observations[name].cpu() for name in sorted(observations.keys())}, "r": rewards.cpu(), "d": dones}
+
+
+def test_it_is_all_there(run, device):
+    env = OmniEnv(run.env)
+    for action in actions(env, 6):
+        observations, rewards, dones, extras = env.step(action)
+    tensors = [*observations.values(), rewards, dones, extras["time_outs"], env.sim.qpos]
+    assert {str(tensor.device) for tensor in tensors} == {device}
+
+
+def test_a_step_that_resets_is_that_of_the_cpu(run):
+    """Two control steps; afterwards, rounding makes robots in contact part."""
+    env = OmniEnv(run.env)
+    reference = OmniEnv(replace(run.env, sim=replace(run.env.sim, device="cpu")))
+    for step, action in enumerate(actions(env, 2)):
+        for each in (env, reference):
+            each.episode_length_buf[step] = each.max_episode_length - 1
+        found, expected = seen(env, action), seen(reference, action.cpu())
+        for name, value in expected.items():
+            if name == "frames":  # which point is the farthest can hang on the last bit
+                near = (found[name] - value).abs().amax(-1) < 5e-3
+                assert near.float().mean() > 0.9
+                continue
+            tolerance = {"rtol": 1e-3, "atol": 5e-3} if value.is_floating_point() else {"rtol": 0, "atol": 0}
+            torch.testing.assert_close(found[name].cpu(), value, **tolerance)
+
+
+def test_a_broken_environment_changes_nothing_in_the_others(run):
+    quiet, disturbed = OmniEnv(run.env), OmniEnv(run.env)
+    for step, action in enumerate(actions(quiet, 8)):
+        if step == 3:
+            disturbed.sim.qvel[2, 4] = math.nan
+        expected, found = seen(quiet, action), seen(disturbed, action)
+        for name, value in expected.items():
+            assert torch.equal(value[OTHERS], found[name][OTHERS]), (step, name)
+    assert disturbed.episode_length_buf.tolist()[2] == 4
+
+
+def test_a_saved_state_goes_on_bit_for_bit(run):
+    whole, resumed = OmniEnv(run.env), OmniEnv(run.env)
+    given = actions(whole, 13)
+    for action in given[:6]:
+        whole.step(action)
+    resumed.load_state_dict(copy.deepcopy(whole.state_dict()))
+    for step, action in enumerate(given[6:]):
+        expected, found = seen(whole, action), seen(resumed, action)
+        for name, value in expected.items():
+            assert torch.equal(value, found[name]), (step, name)
+
+
+def test_it_learns(run, device, tmp_path):
+    runner = build_runner(run, tmp_path)
+    before = [p.detach().clone() for p in runner.alg._raw_actor.parameters()]
+    runner.learn(2)
+    after = list(runner.alg._raw_actor.parameters())
+    assert all(torch.isfinite(p).all() for p in after) and {str(p.device) for p in after} == {device}
+    assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("task", TASKS)
+def test_a_step_waits_for_nothing_as_pytorch_sees_it(task):
+    overrides = (*TASKS[task], "sim=mujoco_warp", "sim.device=cuda:0", *SIZES)
+    env = OmniEnv(replace(build.assemble(config.compose(overrides)).env, log_interval=10**9))
+    given = actions(env, 20)
+    for action in given[:10]:
+        env.step(action)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for action in given[10:]:
+            env.step(action)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

@@ -1,0 +1,235 @@
+"""Reward terms on numbers worked out by hand, the paper's table, and what a weight of 0 leaves out."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from omniperception.env.mdp import rewards
+from omniperception.env.mdp.rewards import AvoidanceConfig, avoidance_velocity, sector_bearings
+
+PAPER_WEIGHTS = {
+    "velocity_avoid": 2.0,
+    "ray_distance": 1.5,
+    "vertical_velocity": -3e-4,
+    "foot_stumble": -2e-2,
+    "link_collision": -2e-2,
+    "joint_limits": -0.2,
+    "joint_torques": -1e-6,
+    "joint_velocities": -1e-6,
+    "joint_accelerations": -2.5e-7,
+    "action_rate": -5e-3,
+    "action_acceleration": -5e-3,
+}
+"""Table 'Reward structure for Omni-Perception'."""
+
+
+def tensor(*rows):
+    return torch.tensor(rows, dtype=torch.float32)
+
+
+def given(**fields):
+    """The documented inputs of a term: attributes of the environment."""
+    kinematics = SimpleNamespace(**fields.pop("kinematics", {}))
+    return SimpleNamespace(kinematics=kinematics, **fields)
+
+
+class TestAvoidanceVelocity:
+    config = AvoidanceConfig(num_sectors=36, threshold=1.0, alpha=2.0)
+
+    def velocity(self, near: dict[int, float], **settings):
+        distance = torch.full((1, 36), 6.0)
+        for sector, value in near.items():
+            distance[0, sector] = value
+        config = AvoidanceConfig(**{"num_sectors": 36, "threshold": 1.0, "alpha": 2.0, **settings})
+        return avoidance_velocity(distance, config)[0]
+
+    def test_no_obstacle(self):
+        assert self.velocity({}).tolist() == [0.0, 0.0]
+
+    @pytest.mark.parametrize("sector", [0, 8, 17, 18, 35])
+    def test_one_sector_pushes_away_with_exp(self, sector):
+        bearing = math.radians(-180 + 10 * sector + 5)
+        expected = -math.exp(-2 * 0.4) * torch.tensor([math.cos(bearing), math.sin(bearing)])
+        torch.testing.assert_close(self.velocity({sector: 0.4}), expected)
+
+    def test_front_and_left(self):
+        ahead = self.velocity({17: 0.5, 18: 0.5})  # the two sectors beside straight ahead
+        assert ahead.tolist() == pytest.approx([-2 * math.exp(-1) * math.cos(math.radians(5)), 0], abs=1e-6)
+        left = self.velocity({26: 0.5, 27: 0.5})
+        assert left[1] < -0.7 and abs(left[0]) < 1e-6
+
+    def test_surrounded_pushes_nowhere(self):
+        assert self.velocity({sector: 0.3 for sector in range(36)}).norm() < 1e-5
+
+    def test_two_opposite_sectors_cancel(self):
+        assert self.velocity({3: 0.3, 21: 0.3}).norm() < 1e-6
+        unequal = self.velocity({3: 0.3, 21: 0.6}).norm().item()
+        assert unequal == pytest.approx(math.exp(-0.6) - math.exp(-1.2))
+
+    def test_threshold(self):
+        assert self.velocity({5: 1.0}).norm() == 0
+        assert self.velocity({5: 0.999}).norm().item() == pytest.approx(math.exp(-2 * 0.999))
+        assert self.velocity({5: 1.4}, threshold=1.5).norm().item() == pytest.approx(math.exp(-2.8))
+
+    def test_max_speed_bounds_the_sum_and_keeps_its_direction(self):
+        near = {sector: 0.1 for sector in range(14, 22)}
+        free, bounded = self.velocity(near), self.velocity(near, max_speed=0.5)
+        assert free.norm() > 1 and bounded.norm().item() == pytest.approx(0.5)
+        torch.testing.assert_close(bounded / bounded.norm(), free / free.norm())
+        torch.testing.assert_close(self.velocity({5: 0.9}, max_speed=0.5), self.velocity({5: 0.9}))
+
+    def test_bearings_turn_left_from_behind(self):
+        bearings = sector_bearings(4)
+        half = math.sqrt(0.5)
+        expected = tensor([-half, -half], [half, -half], [half, half], [-half, half])
+        torch.testing.assert_close(bearings, expected)
+
+    @pytest.mark.parametrize("key", ["alpha", "threshold", "num_sectors", "max_speed"])
+    def test_wrong_settings_are_refused(self, key):
+        with pytest.raises(ValueError, match=rf"rewards\.avoidance\.{key}=0"):
+            AvoidanceConfig(**{"num_sectors": 36, "threshold": 1.0, "alpha": 1.0, key: 0})
+
+
+class TestTerms:
+    def test_velocity_tracking_with_avoidance(self):
+        env = given(
+            kinematics={"base_lin_vel_yaw": tensor([0.5, 0.0], [0.2, -0.3])},
+            command=SimpleNamespace(value=tensor([1.0, 0.0, 9.0], [0.0, 0.0, 9.0])),
+            avoidance_velocity=tensor([-0.5, 0.0], [0.0, 0.1]),
+        )
+        got = rewards.velocity_tracking_with_avoidance(env, beta=4.0)
+        assert got.tolist() == pytest.approx([1.0, math.exp(-4 * (0.04 + 0.16))])
+
+    def test_velocity_and_yaw_tracking(self):
+        env = given(
+            kinematics={"base_lin_vel_yaw": tensor([0.7, 0.4]), "base_ang_vel_b": tensor([5.0, 6.0, 0.1])},
+            command=SimpleNamespace(value=tensor([1.0, 0.0, 0.6])),
+        )
+        assert rewards.velocity_tracking(env, beta=2.0).item() == pytest.approx(math.exp(-0.5))
+        assert rewards.yaw_rate_tracking(env, beta=2.0).item() == pytest.approx(math.exp(-0.5))
+
+    def test_capped_ray_distance_is_a_share(self):
+        sensing = SimpleNamespace(mean_distal_range=lambda limit: tensor(limit, 0.25 * limit)[0:2])
+        assert rewards.capped_ray_distance(given(sensing=sensing), max_distance=8.0).tolist() == [1.0, 0.25]
+
+    def test_base_motion(self):
+        env = given(
+            kinematics={
+                "base_lin_vel_b": tensor([3.0, 4.0, -0.5]),
+                "base_ang_vel_b": tensor([0.3, -0.4, 7.0]),
+                "projected_gravity_b": tensor([0.6, 0.0, -0.8]),
+            }
+        )
+        assert rewards.vertical_velocity_squared(env).item() == pytest.approx(0.25)
+        assert rewards.roll_pitch_rate_squared(env).item() == pytest.approx(0.25)
+        assert rewards.tilt_squared(env).item() == pytest.approx(0.36)
+
+    def test_foot_stumble(self):
+        force = tensor([[[30.0, 40.0, 5.0], [3.0, 4.0, 50.0], [0.0, 0.0, 0.0]]])[0]  # one env, three feet
+        env = given(foot_force=force)
+        assert rewards.foot_stumble(env, ratio=5.0, unit=1.0).item() == pytest.approx(2500.0)
+        assert rewards.foot_stumble(env, ratio=0.0, unit=1.0).item() == pytest.approx(2525.0)
+        assert rewards.foot_stumble(env, ratio=5.0, unit=10.0).item() == pytest.approx(25.0)
+        down = given(foot_force=force * torch.tensor([1.0, 1.0, -1.0]))
+        assert rewards.foot_stumble(down, ratio=5.0, unit=1.0).item() == pytest.approx(2500.0)
+
+    def test_link_collision(self):
+        env = given(link_force=tensor([[[3.0, 4.0, 99.0], [0.0, 1.0, 0.0]]])[0])
+        assert rewards.link_collision(env, unit=1.0).item() == pytest.approx(26.0)
+        assert rewards.link_collision(env, unit=2.0).item() == pytest.approx(6.5)
+
+    def test_joint_limit_violation_counts_joints(self):
+        env = given(
+            kinematics={"joint_pos": tensor([0.0, -1.1, 1.1], [0.0, 0.0, 1.0])},
+            joint_lower=torch.full((3,), -1.0),
+            joint_upper=torch.full((3,), 1.0),
+        )
+        assert rewards.joint_limit_violation(env).tolist() == [2.0, 0.0]
+
+    def test_joint_terms(self):
+        env = given(
+            kinematics={"joint_vel": tensor([1.0, -2.0]), "joint_pos": tensor([0.5, 0.0])},
+            joint_torque=tensor([3.0, -4.0]),
+            last_joint_vel=tensor([0.98, -1.96]),
+            control_dt=0.02,
+            default_joint_pos=torch.tensor([0.2, 0.4]),
+        )
+        assert rewards.joint_torque_squared(env).item() == pytest.approx(25.0)
+        assert rewards.joint_velocity_squared(env).item() == pytest.approx(5.0)
+        assert rewards.joint_acceleration_squared(env).item() == pytest.approx(1.0 + 4.0, rel=1e-4)
+        assert rewards.default_pose_deviation(env).item() == pytest.approx(0.25)
+
+    def test_action_terms(self):
+        newest, before, oldest = tensor([1.0, 0.0]), tensor([0.5, 1.0]), tensor([0.0, -1.0])
+        env = given(actions=(newest, before, oldest))
+        assert rewards.action_rate_squared(env).item() == pytest.approx(0.25 + 1.0)
+        assert rewards.action_acceleration_squared(env).item() == pytest.approx(0.0 + 9.0)
+
+    def test_contact_and_alive(self):
+        env = given(touching=torch.tensor([True, False]), num_envs=2, device="cpu")
+        assert rewards.obstacle_contact(env).tolist() == [1.0, 0.0]
+        assert rewards.alive(env).tolist() == [1.0, 1.0]
+
+    def closing(self, pos, vel, base_vel=(0.0, 0.0), active=True):
+        env = given(
+            kinematics={"base_lin_vel_yaw": tensor(base_vel)},
+            obstacle_rel_pos_yaw=tensor([pos]),
+            obstacle_vel_yaw=tensor([vel]),
+            obstacle_radius=torch.tensor([0.2]),
+            obstacle_active=torch.tensor([[active]]),
+        )
+        return rewards.closing_speed(env, horizon=2.0, margin=0.5).item()
+
+    def test_closing_speed(self):
+        assert self.closing((1.0, 0.0), (-1.0, 0.0)) == pytest.approx(0.5)  # meets after 1 s of 2
+        assert self.closing((1.0, 0.0), (0.0, 0.0), base_vel=(1.0, 0.0)) == pytest.approx(0.5)
+        assert self.closing((1.0, 0.45), (-1.0, 0.0)) == pytest.approx(0.5 * 0.5)  # passes 0.25 m off
+        assert self.closing((1.0, 0.8), (-1.0, 0.0)) == 0.0  # passes 0.6 m off
+        assert self.closing((1.0, 0.0), (1.0, 0.0)) == 0.0  # goes away
+        assert self.closing((3.0, 0.0), (-1.0, 0.0)) == 0.0  # beyond the horizon
+        assert self.closing((1.0, 0.0), (-1.0, 0.0), active=False) == 0.0
+
+
+class TestConfiguration:
+    def test_the_papers_weights(self, make_config):
+        terms = make_config("rewards=paper").env.rewards.terms
+        assert {name: term.weight for name, term in terms.items()} == PAPER_WEIGHTS
+
+    def test_yaw_is_not_in_the_papers_table_and_is_in_the_default(self, make_config):
+        assert "yaw_rate" not in make_config("rewards=paper").env.rewards.terms
+        assert make_config("rewards=default").env.rewards.terms["yaw_rate"].weight > 0
+
+    def test_weight_zero_removes_a_term_and_what_only_it_reads(self, make_env):
+        """Walking on free ground with the paper's contact terms, and without."""
+        contact_terms = (
+            "+rewards.terms.{0}._target_=omniperception.env.mdp.rewards.RewardTerm",
+            "+rewards.terms.{0}.weight={1}",
+            "+rewards.terms.{0}.func._target_=omniperception.env.mdp.rewards.{0}",
+            "+rewards.terms.{0}.func._partial_=true",
+            "+rewards.terms.{0}.func.unit=1.0",
+        )
+
+        def sensors(weight):
+            overrides = [o.format("link_collision", weight) for o in contact_terms]
+            env = make_env("obstacles=none", *overrides, blind=True)
+            return env.world.model.nsensor, "link_collision" in env.config.rewards.terms
+
+        assert sensors(-0.02) == (15, True)
+        assert sensors(0.0) == (0, False)
+
+    def test_only_the_terms_with_weight_need_the_lidar(self, make_env):
+        zero = "rewards.terms.velocity_avoid.weight=0"
+        env = make_env("perception=none", "observations=walk", zero)
+        assert env.sensing is None
+        env = make_env("perception=none", "observations=walk")
+        assert env.sensing is not None and env.sensing.frames is None
+
+    def test_sum_of_terms_times_the_control_step(self, make_env):
+        env = make_env("obstacles=none", "rewards.terms.tilt=null", blind=True)
+        torch.manual_seed(0)
+        _, reward, _, _ = env.step(torch.randn(4, 12))
+        by_hand = sum(0.02 * term.weight * term.func(env) for term in env.config.rewards.terms.values())
+        torch.testing.assert_close(reward, by_hand)
+        assert "tilt" not in env.config.rewards.terms

@@ -1,0 +1,235 @@
+"""The task's LiDAR: its ticks, its history of frames, and what a reset forgets."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.rewards import RewardTerm
+from omniperception.env.state import reads
+from omniperception.lidar import OUTPUTS
+
+
+def still(env):
+    return torch.zeros(env.num_envs, env.num_actions)
+
+
+def test_frames_come_at_tick_times_only(make_env):
+    env = make_env("obstacles=static")
+    observations = env.get_observations()
+    assert env.sensing.period_steps == 5
+    for step in range(1, 16):
+        before = observations["frames"].clone()
+        observations = env.step(still(env))[0]
+        changed = not torch.equal(before, observations["frames"])
+        assert changed == (step % 5 == 0), step
+        assert (observations["frame_tick"] == 1 + step // 5).all()
+        assert (observations["frame_count"] == 1 + step // 5).all()
+        if changed:
+            assert torch.equal(observations["frames"][:, :-1], before[:, 1:])
+
+
+def test_frame_count_stops_at_the_history(make_env):
+    env = make_env("obstacles=static", "perception.history=3", "lidar.sensor.period_s=0.02")
+    counts = [int(env.step(still(env))[0]["frame_count"][0]) for _ in range(5)]
+    assert counts == [2, 3, 3, 3, 3]
+    assert env.sensing.frames.shape[:2] == (4, 3)
+
+
+def test_a_reset_clears_that_environments_frames_only(make_env):
+    env = make_env("obstacles=static", "rewards=paper")
+    for _ in range(6):
+        env.step(still(env))
+    before = env.sensing.frames.clone()
+    sectors = env.sensing.sector_distance.clone()
+    env.sim.qpos[1, 2] = 0.05
+    observations, _, done, _ = env.step(still(env))
+    assert done.tolist() == [0, 1, 0, 0]
+    assert observations["frame_count"].flatten().tolist() == [2, 0, 2, 2]
+    assert (observations["frames"][1] == 0).all()
+    others = [0, 2, 3]
+    assert torch.equal(observations["frames"][others], before[others])
+    assert torch.equal(env.sensing.sector_distance[others], sectors[others])
+    assert (env.sensing.sector_distance[1] == 6.0).all()
+    assert env.sensing.mean_distal_range(6.0)[1] == 6.0  # the last episode's distances are forgotten, too
+    for _ in range(3):
+        observations = env.step(still(env))[0]
+    assert observations["frame_count"].flatten().tolist() == [3, 1, 3, 3]
+    assert (observations["frames"][1, :-1] == 0).all() and (observations["frames"][1, -1] != 0).any()
+    assert env.sensing.mean_distal_range(6.0)[1] < 6.0
+
+
+def test_points_lie_within_the_range_in_units_of_it(make_env):
+    env = make_env("obstacles=static")
+    distance = env.sensing.frames[:, -1].norm(dim=-1)
+    assert distance.max() <= 1.0 + 1e-6
+    assert distance[distance > 0].min() >= 0.1 / 6.0 - 1e-6
+
+
+def test_sector_distance_of_a_pillar_by_hand(make_env):
+    """A pillar of known radius 2 m to the left: 36 sectors from -180 deg, so sectors 26 and 27 see it."""
+    env = make_env("obstacles=static", "lidar.sensor.num_rays=20000", num_envs=1)
+    env.sim.qpos[0, 3:7] = torch.tensor([math.cos(0.4), 0.0, 0.0, math.sin(0.4)])  # yaw 0.8
+    left = 0.8 + math.pi / 2
+    env.sim.mocap_pos[0, :, 2] = -100.0
+    env.sim.mocap_pos[0, 0] = torch.tensor([2 * math.cos(left), 2 * math.sin(left), 0.5])
+    for _ in range(5):
+        env.step(still(env))
+    sectors = env.sensing.sector_distance[0]
+    radius = env.obstacles.radius[0].item()
+    base_shift = env.kinematics.base_pos_w[0, :2].norm().item()
+    for sector in (26, 27):
+        assert sectors[sector].item() == pytest.approx(2 - radius, abs=0.02 + base_shift)
+    assert (sectors[[*range(20), *range(34, 36)]] == 6.0).all()
+
+
+def test_ground_and_own_legs_never_count_as_obstacles(make_env):
+    env = make_env("obstacles=none", "perception=none")
+    for _ in range(10):
+        env.step(still(env))
+    assert (env.sensing.sector_distance == 6.0).all()
+    assert torch.isfinite(env.sensing.frame.true_ranges).float().mean() > 0.3  # though rays do hit the ground
+
+
+def test_distal_range_is_the_mean_of_capped_distances(make_env):
+    env = make_env("obstacles=static", "rewards=paper")
+    frame = env.sensing.frame
+    for i in range(env.num_envs):
+        distances = [
+            min(range_, 2.5)
+            for range_, theta in zip(frame.true_ranges[i].tolist(), frame.elevation[i].tolist(), strict=True)
+            if theta < math.radians(20)
+        ]
+        mean = sum(distances) / len(distances)
+        assert env.sensing.mean_distal_range(2.5)[i].item() == pytest.approx(mean, rel=1e-4)
+
+
+def test_noise_reaches_the_points_and_not_the_reward(make_env):
+    clean, noisy = make_env("obstacles=static"), make_env("obstacles=static", "randomization=lidar")
+    torch.testing.assert_close(clean.sensing.sector_distance, noisy.sensing.sector_distance)
+    assert torch.equal(clean.sensing.frame.true_ranges, noisy.sensing.frame.true_ranges)
+    assert not torch.equal(clean.sensing.frames, noisy.sensing.frames)
+
+
+def test_sector_target_is_the_nearness_of_obstacles(make_env):
+    """1 - d / 4 m, and 0 from 4 m on."""
+    env = make_env("obstacles=static", "perception.sector_weight=1.0")
+    env.sensing.sector_distance[0, :5] = torch.tensor([0.0, 1.0, 3.0, 4.0, 6.0])
+    target = env.step(still(env))[0]["sector_target"]
+    assert target[0, :5].tolist() == pytest.approx([1.0, 0.75, 0.25, 0.0, 0.0])
+    assert "sector_target" not in make_env("obstacles=static").get_observations().keys()  # noqa: SIM118
+
+
+@pytest.mark.parametrize("period", ["0.03", "0.005"])
+def test_a_period_between_control_steps_is_refused(make_env, period):
+    with pytest.raises(ValueError, match=rf"lidar\.sensor\.period_s={period} must be a multiple"):
+        make_env(f"lidar.sensor.period_s={period}")
+
+
+def test_the_lidar_sleeps_until_the_curriculum_lets_obstacles_in(make_env):
+    env = make_env("experiment=quickstart", "perception.sampler.num_proximal=8")
+    actions = torch.zeros(env.num_envs, env.num_actions)
+    for _ in range(6):
+        env.step(actions)
+    assert env.obstacles.level == 0.0 and env.sensing.tick == 0 and not env.sensing.frame_count.any()
+    assert "rays" not in env.timer.seconds
+    env.obstacles.level = 0.5
+    for _ in range(5):
+        observations = env.step(actions)[0]
+    assert env.sensing.tick == 1 and (observations["frame_count"] == 1).all()
+
+
+def test_nothing_is_computed_that_the_task_does_not_read(make_env):
+    def outputs(*overrides):
+        frame = make_env(*overrides).sensing.lidar.frame
+        return {name for name in OUTPUTS if getattr(frame, name) is not None}
+
+    sampled, sectors = {"ranges", "directions_s", "elevation", "azimuth"}, {"true_ranges", "directions_s", "class_id"}
+    assert outputs("rewards=default") == sampled | sectors
+    assert outputs("rewards=default", "perception=none") == sectors
+    assert outputs("rewards=paper", "perception=none") == sectors | {"elevation"}
+
+
+def take_frame(env, time_s):
+    env.sensing.take_frame(time_s, env.sensed.base_quat_w, env.timer)
+
+
+def test_motion_distortion_forgets_the_last_episode(make_env):
+    """A robot that is placed anew has not swept there; a robot that turns has."""
+    env = make_env("obstacles=static", "lidar.sensor.motion_segments=1", "lidar.sensor.motion_jump=100.0", num_envs=2)
+    still_env = make_env("obstacles=static", num_envs=2)
+    for each in (env, still_env):
+        each.sim.qpos[:, :2] += 3.0
+        each.sensing.reset(torch.tensor([0]))
+        take_frame(each, 0.1)
+    moving, still = env.sensing.frame.true_ranges, still_env.sensing.frame.true_ranges
+    torch.testing.assert_close(moving[0], still[0], rtol=1e-6, atol=1e-6)
+    assert not torch.allclose(moving[1], still[1], rtol=1e-3)
+
+
+def test_a_saved_state_goes_on_with_its_motion(make_env):
+    """The frame after a resumption starts where the frame before it ended."""
+    whole, resumed = (make_env("obstacles=static", "lidar.sensor.motion_segments=1", num_envs=2) for _ in range(2))
+    whole.sim.qpos[:, :2] += 0.3
+    take_frame(whole, 0.1)
+    resumed.sensing.load_state_dict(whole.sensing.state_dict())
+    for env in (whole, resumed):
+        env.sim.qpos[:, :2] = 0.5
+        take_frame(env, 0.2)
+    assert torch.equal(whole.sensing.frame.true_ranges, resumed.sensing.frame.true_ranges)
+    still = make_env("obstacles=static", num_envs=2)
+    still.sim.qpos[:, :2] = 0.5
+    take_frame(still, 0.2)
+    assert not torch.allclose(whole.sensing.frame.true_ranges, still.sensing.frame.true_ranges, rtol=1e-3)
+
+
+def test_more_pieces_than_the_task_knows_poses_for_are_refused(make_env):
+    with pytest.raises(ValueError, match=r"lidar\.sensor\.motion_segments=2 must be 0 or 1"):
+        make_env("lidar.sensor.motion_segments=2")
+
+
+class TestParts:
+    """Clouds of some environments after those of others give what all at once give."""
+
+    TASKS = (
+        ("rewards=paper", "obstacles=moving"),
+        ("experiment=avoid", "terrain=flat", "obstacles=crowd", "randomization=device"),
+        ("obstacles=static", "perception=fps_gru_small", "lidar.sensor.motion_segments=1"),
+    )
+
+    @pytest.mark.parametrize("task", TASKS)
+    def test_bit_for_bit(self, make_env, task):
+        whole, parts = (make_env(*task, f"lidar.cloud_mb={mb}", num_envs=5) for mb in ("1000.0", "0.1"))
+        sizes = [part.stop - part.start for part in parts.sensing.lidar.parts]
+        assert len(whole.sensing.lidar.parts) == 1 < len(sizes) and sum(sizes) == 5 and max(sizes) - min(sizes) <= 1
+        assert len(parts.sensing.lidar.frame.ranges) == max(sizes)
+        for step in range(23):
+            for env in (whole, parts):
+                env.episode_length_buf[step % 5] = env.max_episode_length - 1 if step % 4 == 1 else 5
+            actions = 0.3 * torch.sin(torch.arange(60.0).reshape(5, 12) + step)
+            expected, found = whole.step(actions), parts.step(actions)
+            assert torch.equal(expected[1], found[1])
+            for key, value in expected[0].items():
+                assert torch.equal(value, found[0][key]), (step, key)
+        if whole.sensing.unseen is not None:
+            assert torch.equal(whole.sensing.unseen, parts.sensing.unseen)
+
+    def test_what_reads_whole_clouds_is_told(self, make_env):
+        env = make_env("obstacles=static", "lidar.cloud_mb=0.1", num_envs=5)
+        with pytest.raises(ValueError, match=r"5 environments take more than lidar\.cloud_mb=0\.1"):
+            _ = env.sensing.frame
+        with pytest.raises(ValueError, match=r"lidar\.cloud_mb"):
+            make_env("obstacles=static", "lidar.cloud_mb=0.0")
+
+    def test_a_term_of_ones_own_that_reads_rays_gets_whole_clouds(self, make_env):
+        @reads("rays")
+        def nearest(env):
+            return env.sensing.frame.true_ranges.amin(1)
+
+        config = make_env("obstacles=static", "lidar.cloud_mb=0.1", num_envs=5).config
+        terms = {**config.rewards.terms, "nearest": RewardTerm(1.0, nearest)}
+        env = OmniEnv(replace(config, rewards=replace(config.rewards, terms=terms)))
+        env.step(torch.zeros(5, 12))
+        assert len(env.sensing.lidar.parts) == 1 and env.weighted_rewards["nearest"].min() > 0

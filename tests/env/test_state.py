@@ -1,0 +1,123 @@
+"""Robot state in its frames, against MuJoCo's own quaternion functions; the height grid."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from omniperception.common.rotations import rotate_inverse, rotate_yaw, yaw_of, yaw_quat
+from omniperception.env.heights import flat_heights, height_grid
+from omniperception.env.state import Kinematics, fields_read, reads
+
+
+def random_states(n=50, seed=0):
+    rng = np.random.default_rng(seed)
+    qpos, qvel = rng.normal(size=(n, 19)), rng.normal(size=(n, 18))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    return qpos, qvel
+
+
+def rotated(vector, quat, inverse=False):
+    used, result = np.array(quat), np.zeros(3)
+    if inverse:
+        mujoco.mju_negQuat(used, np.array(quat))
+    mujoco.mju_rotVecQuat(result, np.array(vector, dtype=float), used)
+    return result
+
+
+def test_base_frame_quantities():
+    qpos, qvel = random_states()
+    k = Kinematics.of(torch.tensor(qpos), torch.tensor(qvel))
+    for i in range(len(qpos)):
+        velocity = rotated(qvel[i, :3], qpos[i, 3:7], inverse=True)
+        gravity = rotated([0, 0, -1], qpos[i, 3:7], inverse=True)
+        np.testing.assert_allclose(k.base_lin_vel_b[i], velocity, atol=1e-5)
+        np.testing.assert_allclose(k.projected_gravity_b[i], gravity, atol=1e-5)
+    np.testing.assert_allclose(k.base_ang_vel_b, qvel[:, 3:6], rtol=1e-6)
+    np.testing.assert_allclose(k.joint_pos, qpos[:, 7:], rtol=1e-6)
+    np.testing.assert_allclose(k.joint_vel, qvel[:, 6:], rtol=1e-6)
+
+
+def test_velocities_are_those_of_mujocos_sensors(make_config):
+    """Which velocity is given in which frame is the engine's convention, so the engine decides."""
+    spec = make_config().env.robot.spec()
+    spec.body("base").add_site(name="origin")
+    for kind, name in (
+        (mujoco.mjtSensor.mjSENS_VELOCIMETER, "velocimeter"),
+        (mujoco.mjtSensor.mjSENS_GYRO, "gyro"),
+    ):
+        spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="origin")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    qpos, qvel = random_states(10, seed=1)
+    k = Kinematics.of(torch.tensor(qpos), torch.tensor(qvel))
+    for i in range(len(qpos)):
+        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(k.base_lin_vel_b[i], data.sensor("velocimeter").data, atol=1e-5)
+        np.testing.assert_allclose(k.base_ang_vel_b[i], data.sensor("gyro").data, atol=1e-5)
+
+
+def test_yaw_is_the_heading_of_the_x_axis():
+    qpos, qvel = random_states()
+    k = Kinematics.of(torch.tensor(qpos), torch.tensor(qvel))
+    for i in range(len(qpos)):
+        ahead = rotated([1, 0, 0], qpos[i, 3:7])
+        assert k.yaw[i].item() == pytest.approx(math.atan2(ahead[1], ahead[0]), abs=1e-5)
+        cos, sin = math.cos(k.yaw[i]), math.sin(k.yaw[i])
+        x, y = qvel[i, :2]
+        expected = [cos * x + sin * y, cos * y - sin * x]
+        assert k.base_lin_vel_yaw[i].tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def test_turning_about_the_vertical_changes_only_world_quantities():
+    qpos, qvel = random_states()
+    turned_qpos, turned_qvel = qpos.copy(), qvel.copy()
+    turn = np.array([math.cos(0.6), 0, 0, math.sin(0.6)])
+    for i in range(len(qpos)):
+        turned_qpos[i, :3], turned_qvel[i, :3] = rotated(qpos[i, :3], turn), rotated(qvel[i, :3], turn)
+        mujoco.mju_mulQuat(turned_qpos[i, 3:7], turn, qpos[i, 3:7])
+    a, b = (Kinematics.of(torch.tensor(p), torch.tensor(v)) for p, v in ((qpos, qvel), (turned_qpos, turned_qvel)))
+    for field in ("base_lin_vel_b", "base_lin_vel_yaw", "base_ang_vel_b", "projected_gravity_b"):
+        torch.testing.assert_close(getattr(a, field), getattr(b, field), atol=1e-5, rtol=0)
+    difference = torch.remainder(b.yaw - a.yaw - 1.2 + torch.pi, 2 * torch.pi) - torch.pi
+    assert difference.abs().max() < 1e-5
+
+
+def test_rotations_by_hand():
+    quarter = torch.tensor([[math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]])  # 90 degrees to the left
+    in_body = rotate_inverse(quarter, torch.tensor([[0.0, 1.0, 2.0]]))
+    assert in_body[0].tolist() == pytest.approx([1, 0, 2], abs=1e-6)
+    assert yaw_of(quarter).item() == pytest.approx(math.pi / 2)
+    torch.testing.assert_close(yaw_quat(torch.tensor([math.pi / 2])), quarter)
+    turned = rotate_yaw(torch.tensor([math.pi / 2]), torch.tensor([[[1.0, 0.0], [0.0, 2.0]]]))
+    torch.testing.assert_close(turned, torch.tensor([[[0.0, 1.0], [-2.0, 0.0]]]), atol=1e-6, rtol=0)
+
+
+def test_declared_reads_survive_partial():
+    from functools import partial
+
+    @reads("heights")
+    def term(env, scale):
+        return env.heights * scale
+
+    assert fields_read(partial(partial(term, scale=2.0))) == {"heights"}
+    assert fields_read(len) == frozenset()
+
+
+class TestHeights:
+    def test_grid(self):
+        grid = height_grid()
+        assert grid.shape == (187, 2)
+        torch.testing.assert_close(grid[0], torch.tensor([-0.8, -0.5]))
+        torch.testing.assert_close(grid[1], torch.tensor([-0.8, -0.4]))  # y is fast
+        torch.testing.assert_close(grid[11], torch.tensor([-0.7, -0.5]))  # x is slow
+        torch.testing.assert_close(grid[-1], torch.tensor([0.8, 0.5]))
+        torch.testing.assert_close(grid[93], torch.zeros(2))  # the middle lies under the base
+
+    def test_heights_over_flat_ground_are_clipped(self):
+        heights = flat_heights(torch.tensor([0.3, -0.2, 5.0, -5.0]))
+        assert heights.shape == (4, 187)
+        torch.testing.assert_close(heights, torch.tensor([[0.3], [-0.2], [1.0], [-1.0]]).expand(4, 187))

@@ -1,0 +1,198 @@
+"""Obstacles by sector against rays through outlines, by hand and by search, and what the task makes of them."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from omniperception.avoidance.sector_motion import encode
+from omniperception.avoidance.true_sectors import TrueSectors
+from omniperception.common.random import EnvRandom
+from omniperception.env.env import OmniEnv
+from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig, ray_shapes
+
+POST = ObstacleGroup("cylinder", 1, [[0.5, 0.5], [0.5, 0.5]])
+SOUTH_EAST, EAST, NORTH = 1, 2, 3  # of four sectors that begin at -180, -90, 0 and 90 degrees: EAST is 0 to 90 degrees
+CPU = torch.device("cpu")
+
+
+class Scene:
+    """Robots at a pose and obstacles that a test places."""
+
+    def __init__(self, groups, base=(0.0, 0.0), yaw=0.0, num_envs=1):
+        self.config, self.field, self.num_envs = ObstaclesConfig(groups), None, num_envs
+        if self.config.placed_slots():
+            slots = len(self.config.placed_slots())
+            pos, quat = (torch.zeros(num_envs, slots, n, dtype=torch.float64) for n in (3, 4))
+            quat[..., 0] = 1.0
+            self.field = ObstacleField(self.config, pos, quat, EnvRandom(0, num_envs))
+            self.field.active[:] = True
+            self.field.velocity_w[:] = 0.0
+        place = torch.tensor([[*base, 0.3]]).expand(num_envs, 3)
+        self.kinematics = SimpleNamespace(base_pos_w=place, yaw=torch.full((num_envs,), yaw))
+
+    def measure(self, num_sectors, known=None):
+        sectors = TrueSectors(num_sectors, self.config, self.field, self.num_envs, CPU)
+        return sectors.measure(self.kinematics, known)
+
+
+def test_a_circle_by_hand():
+    scene = Scene({"post": POST}, base=(1.0, 1.0))
+    scene.field.pos_w[0, 0] = torch.tensor([4.0, 5.0, 0.5])  # 3 m and 4 m off: 5 m away, its edge at 4.5 m
+    distance = scene.measure(4)[0, :, 0]
+    assert distance[EAST].item() == pytest.approx(4.5) and distance.isinf().tolist() == [True, True, False, True]
+
+
+def test_sectors_and_velocities_turn_with_the_robot():
+    scene = Scene({"post": POST}, yaw=-math.pi / 2)
+    scene.field.pos_w[0, 0] = torch.tensor([3.0, 4.0, 0.5])
+    scene.field.velocity_w[0, 0] = torch.tensor(
+        [0.0, 1.5]
+    )  # north of the world is to the left of a robot facing south...
+    north = scene.measure(4)[0, NORTH]
+    assert north.tolist() == pytest.approx([4.5, -1.5, 0.0], abs=1e-6)  # ...turned by -90 degrees: backwards
+
+
+def test_a_wall_is_as_far_as_along_the_sectors_middle_and_its_nearest_point_counts():
+    wall = ObstacleGroup("box", 1, [[0.1, 0.1], [3.0, 3.0], [0.5, 0.5]], poses=[[2.1, 0.0, 0.0]])
+    distance = Scene({"wall": wall}).measure(8)[0, :, 0]  # its face at x = 2, y from -3 to 3
+    along = 2.0 / math.cos(math.radians(22.5))
+    assert distance[3].item() == pytest.approx(along) and distance[4].item() == pytest.approx(
+        2.0
+    )  # nearest at 0 degrees
+    assert distance[[0, 1, 2, 5, 6, 7]].isinf().all()  # middles at 67.5 degrees and more pass it
+
+
+def test_what_reaches_in_from_the_side_alone_does_not_count():
+    scene = Scene({"post": ObstacleGroup("cylinder", 1, [[0.4, 0.4], [0.5, 0.5]])})
+    scene.field.pos_w[0, 0] = torch.tensor([2.0, 0.3, 0.5])  # bearings -3 to 20 degrees, nearest at 9 degrees
+    distance = scene.measure(36)[0, :, 0]
+    assert distance.isfinite().nonzero().flatten().tolist() == [18, 19]  # middles at 5 and 15 degrees, not at -5
+
+
+def test_a_pole_between_two_middles_is_in_its_sector():
+    scene = Scene({"pole": ObstacleGroup("cylinder", 1, [[0.01, 0.01], [0.5, 0.5]])})
+    bearing = math.radians(9.0)
+    scene.field.pos_w[0, 0] = torch.tensor([3 * math.cos(bearing), 3 * math.sin(bearing), 0.5])
+    distance = scene.measure(36)[0, :, 0]
+    assert distance[18].item() == pytest.approx(2.99) and distance.isfinite().sum() == 1
+
+
+def test_what_hangs_overhead_is_parked_or_unknown_does_not_count():
+    wall = ObstacleGroup("box", 1, [[3.0, 3.0], [0.1, 0.1], [0.5, 0.5]], poses=[[0.0, -2.0, 0.0]])
+    scene = Scene({"post": POST, "wall": wall})
+    scene.field.pos_w[0, 0] = torch.tensor([2.0, 2.0, 0.5 + 0.44])
+    distance = scene.measure(4)[0, :, 0]
+    assert distance[EAST].item() == pytest.approx(math.sqrt(8) - 0.5)
+    assert distance[SOUTH_EAST].item() == pytest.approx(1.9)
+    known = torch.tensor([[False, True]])  # placed obstacles first
+    assert scene.measure(4, known)[0, EAST, 0].isinf() and scene.measure(4, known)[0, SOUTH_EAST, 0].isfinite()
+    scene.field.pos_w[0, 0, 2] = 0.5 + 0.46
+    assert scene.measure(4)[0, EAST, 0].isinf()
+    scene.field.pos_w[0, 0, 2], scene.field.active[0, 0] = 0.5, False
+    assert scene.measure(4)[0, EAST, 0].isinf()
+
+
+def test_against_points_all_over_the_outlines():
+    n, generator = 40, torch.Generator().manual_seed(2)
+    groups = {
+        "post": ObstacleGroup("cylinder", 3, [[0.1, 0.6], [0.5, 0.5]]),
+        "crate": ObstacleGroup("box", 3, [[0.1, 0.7], [0.1, 0.7], [0.5, 0.5]]),
+    }
+    scene = Scene(groups, base=(0.3, -0.2), yaw=0.7, num_envs=n)
+    field = scene.field
+    angle = 2 * math.pi * torch.rand(n, 6, generator=generator, dtype=torch.float64)
+    distance = 1.2 + 3 * torch.rand(n, 6, generator=generator, dtype=torch.float64)
+    field.pos_w[..., :2] = torch.stack((angle.cos(), angle.sin()), -1) * distance[..., None]
+    field.pos_w[..., 2] = 0.5
+    field.quat_w[..., 0], field.quat_w[..., 3] = (angle / 2).cos(), (angle / 2).sin()
+    got = scene.measure(36)[..., 0].double()
+    expected = torch.full((n, 36), torch.inf, dtype=torch.float64)
+    middles = -math.pi + (torch.arange(36, dtype=torch.float64) + 0.5) * math.pi / 18
+    for k, slot in enumerate(scene.config.slots()):
+        s = torch.linspace(0, 1, 8001, dtype=torch.float64)
+        if slot.kind == "box":
+            x, y = slot.size[:2]
+            corners = torch.tensor([[x, y], [-x, y], [-x, -y], [x, -y], [x, y]], dtype=torch.float64)
+            outline = torch.cat([corners[i] + s[:, None] * (corners[i + 1] - corners[i]) for i in range(4)])
+        else:
+            outline = slot.size[0] * torch.stack(((2 * math.pi * s).cos(), (2 * math.pi * s).sin()), -1)
+        cos, sin = angle[:, k, None].cos(), angle[:, k, None].sin()
+        x = field.pos_w[:, k, :1] + cos * outline[:, 0] - sin * outline[:, 1] - 0.3
+        y = field.pos_w[:, k, 1:2] + sin * outline[:, 0] + cos * outline[:, 1] + 0.2
+        bearing = torch.remainder(torch.atan2(y, x) - 0.7 + math.pi, 2 * math.pi) - math.pi
+        reach = torch.hypot(x, y)
+        off = (bearing[:, None] - middles[:, None]).abs()  # (n, 36, points)
+        at_middle = torch.where(off < 4e-4, reach[:, None], torch.inf).amin(-1)
+        expected = torch.minimum(expected, at_middle)
+        near = reach.argmin(1, keepdim=True)
+        own = ((bearing.gather(1, near) + math.pi) / (2 * math.pi) * 36).long().clamp(0, 35)
+        expected.scatter_reduce_(1, own, reach.gather(1, near), "amin")
+    both = expected.isfinite() & got.isfinite()
+    assert (expected.isfinite() != got.isfinite()).float().mean() < 0.005  # grazed outlines
+    assert ((got - expected)[both].abs() > 5e-3).float().mean() < 0.02 and both.sum() > 300
+
+
+@pytest.fixture
+def risky_env(make_config):
+    def build(*overrides):
+        run = make_config("rewards=velocity_risk", "perception=none", "num_envs=5", *overrides)
+        return OmniEnv(run.env)
+
+    return build
+
+
+def test_risk_is_of_what_a_ray_has_hit_alone(risky_env):
+    env = risky_env("scenario=moving")
+    for _ in range(12):
+        env.step(torch.zeros(5, 12))
+    known = env.sensing.unseen < env.config.remembered_frames
+    assert known.any() and not known.all()  # the mount is blind behind
+    assert torch.equal(env.motion, env.true_sectors.measure(env.kinematics, known)) or env.step_count % 5
+    hit = env.sensing.frame.shape_id
+    names = ray_shapes(env.world, env.sensing.hidden).geom_names
+    for env_id in range(5):
+        seen = {names[k] for k in hit[env_id].unique().tolist() if k >= 0}
+        for o, name in enumerate(env.true_sectors.names):
+            assert (env.sensing.unseen[env_id, o] == 0) == (name in seen)
+
+
+def test_without_obstacles_there_is_no_risk(risky_env):
+    env = risky_env("obstacles=none")
+    env.step(torch.zeros(5, 12))
+    assert env.motion[..., 0].isinf().all() and not env.risk.any() and not env.avoidance_velocity.any()
+
+
+def test_a_reset_forgets_one_environment_alone(risky_env):
+    env = risky_env("scenario=corridor")
+    env.risk, env.motion = torch.rand_like(env.risk), torch.rand_like(env.motion)
+    before = env.risk.clone()
+    env._reset(torch.tensor([2]))
+    assert not env.risk[2].any() and not env.avoidance_velocity[2].any() and not encode(env.motion)[2].any()
+    assert torch.equal(env.risk[[0, 1, 3, 4]], before[[0, 1, 3, 4]])
+    assert (env.sensing.unseen[2] > 1000).all()
+
+
+def test_the_papers_law_has_no_risk(make_config):
+    env = OmniEnv(make_config("rewards=default", "num_envs=2").env)
+    assert env.true_sectors is None and env.risk is None and env.sensing.unseen is None
+
+
+def test_perception_alone_needs_no_risk_of_the_task(make_config):
+    env = OmniEnv(make_config("experiment=avoid", "init=unread", "num_envs=2").env)
+    assert env.true_sectors is not None and env.risk is None and env.sensing.sector_distance is None
+
+
+def test_motion_needs_its_law(make_config):
+    avoid = ("experiment=avoid", "init=unread")
+    with pytest.raises(
+        ValueError, match=r"perception\.motion_weight needs rewards\.avoidance\.risk; use rewards=veloc"
+    ):
+        make_config(*avoid, "rewards=default")
+    with pytest.raises(
+        ValueError, match=r"avoidance_weight=1\.0 and motion_weight=10\.0 would both change the command"
+    ):
+        make_config(*avoid, "perception.avoidance_weight=1.0")
+    with pytest.raises(ValueError, match=r"is learned beside PPO; set perception\.supervised_epochs to at least 1"):
+        make_config(*avoid, "perception.supervised_epochs=0", "ppo.num_learning_epochs=2")

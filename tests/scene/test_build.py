@@ -1,0 +1,157 @@
+"""The compiled environment: which geoms may touch, contact parameters, sensors."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from omniperception.scene import TerrainConfig, build_world
+from omniperception.scene.terrain import contact_solref, damping_ratio
+from omniperception.sim import SimConfig
+from omniperception.sim.mujoco import apply_options
+
+
+def world_of(run, sensors=()):
+    world = build_world(run.env.robot, run.env.terrain, run.env.obstacles, sensors)
+    apply_options(world.model, SimConfig())
+    return world
+
+
+@pytest.fixture(scope="module")
+def mixed(make_config):
+    return world_of(make_config("obstacles=mixed"))
+
+
+def contact_pairs(world, data):
+    """The pairs of classes that are in contact: R(obot), G(round), O(bstacle)."""
+    obstacles = set(world.obstacles.geom_names())
+
+    def kind(geom):
+        name = world.model.geom(geom).name
+        return "G" if name == "ground" else "O" if name in obstacles else "R"
+
+    return {"".join(sorted(map(kind, pair))) for pair in data.contact.geom}
+
+
+def test_only_the_robot_touches_ground_and_obstacles(mixed):
+    data = mujoco.MjData(mixed.model)
+    data.qpos[2] = 0.1  # belly on the ground, legs folded through one another and the trunk
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        data.qpos[7:] = rng.uniform(-1.5, 1.5, 12)
+        data.mocap_pos[:] = rng.uniform([-0.3, -0.3, -0.2], [0.3, 0.3, 0.4], (mixed.model.nmocap, 3))
+        mujoco.mj_forward(mixed.model, data)
+        assert contact_pairs(mixed, data) == {"GR", "OR"}
+
+
+def test_the_robot_would_touch_itself_without_the_filter(mixed):
+    """The test above can fail: these states have legs inside legs."""
+    spec = mixed.robot.spec()
+    for geom in spec.geoms:
+        geom.contype, geom.conaffinity = 1, 1
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    touched = 0
+    for _ in range(20):
+        data.qpos[7:] = rng.uniform(-1.5, 1.5, 12)
+        mujoco.mj_forward(model, data)
+        touched += data.ncon
+    assert touched > 0
+
+
+def test_fixed_poses_are_geoms_of_the_world(make_config):
+    world = world_of(make_config("obstacles=corridor", "commands=corridor"))
+    data = mujoco.MjData(world.model)
+    mujoco.mj_forward(world.model, data)
+    expected = {"obstacle_wall_0": (5.5, 2.05, 0.5), "obstacle_wall_1": (5.5, -2.05, 0.5)}
+    for name, pos in {**expected, "obstacle_back_wall_0": (-1.15, 0.0, 0.5)}.items():
+        np.testing.assert_allclose(data.geom(name).xpos, pos, atol=1e-12)
+        assert world.model.geom(name).bodyid[0] == 0
+    assert world.model.nmocap == 6
+
+
+def test_no_obstacles_leave_nothing_behind(make_config):
+    model = world_of(make_config("obstacles=none")).model
+    assert model.nmocap == 0 and model.nsensor == 0 and model.ngeom == len(model.geom_bodyid) == 20
+
+
+def test_sensor_columns_are_those_of_the_named_geoms(make_config):
+    world = world_of(make_config("obstacles=moving"), {"foot_force", "link_force", "obstacle_contact"})
+    widths = {kind: world.sensor_slice(kind) for kind in ("foot_force", "link_force", "obstacle_contact")}
+    assert {kind: s.stop - s.start for kind, s in widths.items()} == {
+        "foot_force": 12,
+        "link_force": 45,
+        "obstacle_contact": 8,
+    }
+    assert sum(s.stop - s.start for s in widths.values()) == world.model.nsensordata
+    first = world.model.sensor("foot_force:FL_foot")
+    assert first.adr[0] == widths["foot_force"].start
+    with pytest.raises(ValueError, match="unknown contact sensors"):
+        world_of(make_config("obstacles=moving"), {"smell"})
+
+
+def test_actuators_are_a_pd_law_with_torque_limits(mixed):
+    """tau = kp (target - q) - kv qdot, clipped; kp 25, kv 0.6, calf limit 45.43 N m."""
+    data = mujoco.MjData(mixed.model)
+    mixed_default = list(mixed.robot.default_joint_pos.values())
+    data.qpos[7:] = mixed_default
+    data.qpos[2] = 5.0
+    data.qvel[6:] = 0.5
+    data.ctrl[:] = mixed_default
+    data.ctrl[0] += 0.1
+    data.ctrl[2] += 3.0
+    mujoco.mj_forward(mixed.model, data)
+    expected = np.full(12, -0.6 * 0.5)
+    expected[0] += 25 * 0.1
+    expected[2] = 45.43
+    np.testing.assert_allclose(data.actuator_force, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("restitution", "ratio"), [(0.0, 1.0), (1.0, 0.0), (math.exp(-math.pi), 0.7071068)])
+def test_damping_ratio(restitution, ratio):
+    assert damping_ratio(torch.tensor(restitution)).item() == pytest.approx(ratio, abs=1e-6)
+
+
+def rebound(restitution, timestep, speed=1.0, gap=1e-4):
+    """Rebound speed over impact speed of a ball without weight."""
+    spec = mujoco.MjSpec()
+    TerrainConfig(restitution=restitution).add_to(spec)
+    ball = spec.worldbody.add_body(pos=[0, 0, 0.1 + gap])
+    ball.add_freejoint()
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], mass=1.0, contype=0, conaffinity=1)
+    spec.option.timestep, spec.option.gravity = timestep, [0, 0, 0]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[2] = -speed
+    mujoco.mj_step(model, data, nstep=int(0.5 / timestep))
+    return data.qvel[2] / speed
+
+
+@pytest.mark.parametrize("timestep", [0.001, 0.005])
+@pytest.mark.parametrize(("restitution", "tolerance"), [(0.5, 0.1), (0.7, 0.06), (0.9, 0.03), (0.99, 0.02)])
+def test_a_ball_rebounds_with_the_restitution(restitution, tolerance, timestep):
+    """A contact cannot pull, so little restitution comes out a little larger than the linear formula says."""
+    for gap in (1e-4, 2e-3, 4e-3):
+        assert rebound(restitution, timestep, gap=gap) == pytest.approx(restitution, abs=tolerance)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0])
+def test_no_contact_gains_energy(restitution):
+    assert max(rebound(restitution, 0.005, speed, gap) for speed in (0.5, 3.0) for gap in (1e-4, 3e-3)) < 1.02
+
+
+def test_without_restitution_the_contact_is_the_default_one():
+    """solref (0.02, 1) in MuJoCo's other format: stiffness 1 / 0.02^2, damping 2 / 0.02."""
+    assert contact_solref(0.0) == (-2500.0, -100.0)
+
+
+def test_the_ground_decides_the_friction(mixed):
+    data = mujoco.MjData(mixed.model)
+    data.qpos[2], data.mocap_pos[:, 2] = 0.25, -100.0
+    mujoco.mj_forward(mixed.model, data)
+    assert data.ncon > 0
+    assert np.unique(data.contact.friction[:, 0]).tolist() == [0.8]
