@@ -22,12 +22,12 @@ from pathlib import Path
 import torch
 
 from omniperception import build, config
+from omniperception.common.provenance import provenance
 from omniperception.deploy import DeployError, ExportedPolicy
 from omniperception.deploy.export import FOLDER
 from omniperception.deploy.latency import PERCENTILES, Latency, Reading, measure
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.exported import record
-from omniperception.evaluation.report import provenance
 
 ARGUMENTS = {"run": "latest", "steps": "5000", "out": ""}
 RECORDED = 250

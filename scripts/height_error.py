@@ -15,8 +15,8 @@ from dataclasses import asdict
 
 from omniperception import build, config
 from omniperception.build import build_runner
+from omniperception.common.provenance import provenance
 from omniperception.evaluation.heights import HeightErrors, height_errors
-from omniperception.evaluation.report import provenance
 from omniperception.evaluation.suite import FOLDER
 from omniperception.learning import CheckpointError, latest_checkpoint
 

@@ -11,13 +11,13 @@ import torch
 
 from omniperception import build, config
 from omniperception.build import RunConfig, build_runner
+from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
 from omniperception.deploy.description import Description, Group, Joints, Lidar, Perception, Term
 from omniperception.deploy.modules import BlindNetwork, exportable, write_onnx, write_torchscript
 from omniperception.env.env import MAX_ACTION, OmniEnv
 from omniperception.env.mdp import observations
 from omniperception.env.mdp.commands import VelocityCommandConfig
-from omniperception.evaluation.report import provenance
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
 from omniperception.learning.models import MOTION

@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 
 from omniperception import config
+from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
-from omniperception.evaluation.report import provenance
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
-from omniperception.evaluation.report import provenance
 from omniperception.evaluation.statistics import wilson
 from omniperception.evaluation.suite import FOLDER, Evaluation, evaluate
 from omniperception.learning import latest_checkpoint

@@ -1,17 +1,12 @@
-"""What is printed and written of evaluated episodes: a table, one line per episode, and where it was measured."""
+"""What is printed and written of evaluated episodes: a table, and one line per episode."""
 
 from __future__ import annotations
 
 import csv
-import platform
 from collections.abc import Mapping
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 
 from omniperception.evaluation.episodes import CLEARANCE_CAP, Episodes
-
-LIBRARIES = ("omniperception", "torch", "mujoco-core", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
 
 DEFINITIONS = {
     "success": "goal reached without a fall within the time (without a goal: time limit reached); touches allowed",
@@ -63,15 +58,6 @@ def write_trials(path: Path, by_policy: Mapping[str, Episodes]) -> None:
             columns = [_plain(getattr(episodes, name), len(episodes)) for name in _COLUMNS.values()]
             for k, (outcome, *values) in enumerate(zip(episodes.verdict, *columns, strict=True)):
                 writer.writerow([policy, *divmod(k, episodes.per_env), outcome, *values])
-
-
-def provenance(device: object) -> dict:
-    """When, on what machine and against which versions something was measured."""
-    return {
-        "date": datetime.now(UTC).date().isoformat(),
-        "machine": {"cpu": platform.machine(), "system": platform.system(), "device": str(device)},
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
-    }
 
 
 _QUANTILES = (

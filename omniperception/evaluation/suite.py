@@ -10,13 +10,14 @@ from pathlib import Path
 
 from omniperception import build, config
 from omniperception.build import TrainedPolicy, load_policy
+from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.evaluation.baselines import Limits, covered, steered
 from omniperception.evaluation.episodes import Episodes, run_episodes
 from omniperception.evaluation.exported import ExportedPolicies
-from omniperception.evaluation.report import DEFINITIONS, provenance, table, times_line, write_trials
+from omniperception.evaluation.report import DEFINITIONS, table, times_line, write_trials
 
 FOLDER = "evaluation"
 """Where in a run directory the results go."""

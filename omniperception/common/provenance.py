@@ -1,0 +1,96 @@
+"""Where a result comes from: commit, command, date, machine, versions and seeds; whatever is written to a file says."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[2]
+"""The checkout, or the folder that the package is installed in."""
+LIBRARIES = ("omniperception", "torch", "mujoco-core", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
+
+
+def provenance(device: object = "cpu", libraries: tuple[str, ...] = LIBRARIES, **facts: object) -> dict:
+    """Commit, command, date, machine and versions of whatever this process has measured.
+
+    Args:
+        device: where tensors and rays live.
+        libraries: distributions whose versions count; those that are not installed are left out.
+        **facts: further entries, such as ``seed`` or ``threads``.
+    """
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "command": command(),
+        "machine": {
+            "cpu": cpu_model(),
+            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "system": platform.system(),
+            "device": device_name(str(device)),
+            "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        },
+        "versions": {"python": platform.python_version(), **versions(libraries)},
+        **facts,
+    }
+
+
+@cache
+def commit(root: Path = ROOT) -> str | None:
+    """Hash of the commit that the code was run at, with "+changes" if files differed; None outside of a checkout."""
+    if not (root / ".git").exists():
+        return None
+    try:
+        found = _git(root, "rev-parse", "HEAD")
+        changed = _git(root, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return f"{found}+changes" if changed else found
+
+
+def command() -> str:
+    """The command line of this process; the program's path from the checkout's root, or its name alone."""
+    program = Path(sys.argv[0] or "python")
+    path = program.resolve()
+    name = str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else program.name
+    return shlex.join([name, *sys.argv[1:]])
+
+
+def versions(libraries: tuple[str, ...]) -> dict[str, str]:
+    """Versions of the distributions that are installed."""
+    found = {}
+    for name in libraries:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def cpu_model() -> str:
+    """The processor's name, with its family and model number where the name alone is ambiguous."""
+    facts: dict[str, str] = {}
+    info = Path("/proc/cpuinfo")
+    for line in info.read_text().splitlines() if info.exists() else ():
+        key, _, value = line.partition(":")
+        facts.setdefault(key.strip(), value.strip())
+    name = facts.get("model name") or platform.processor() or platform.machine()
+    return f"{name} (family {facts['cpu family']} model {facts['model']})" if "cpu family" in facts else name
+
+
+def device_name(device: str) -> str:
+    """A GPU's name; "cpu" as it is."""
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else device
+
+
+def _git(root: Path, *arguments: str) -> str:
+    done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True, timeout=10)
+    return done.stdout.strip()
