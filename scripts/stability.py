@@ -3,7 +3,7 @@
     python scripts/stability.py subject=physics|lidar|learning [out=outputs/stability/<subject>] [only=<part of a name>]
         physics:  [size=12] [num_envs=32] [seconds=4] [overrides of the robot and of sim, e.g. sim.timestep=0.002]
         lidar:    [rays=2000] [many=1000000]
-        learning: [iterations=3] [frames=1000000]
+        learning: [iterations=3]
 
 physics   gains kp 5..2000, kv 0..50 by step 0.5..10 ms and integrator, PD in the engine and outside, with the analytic
           limit of the linearised joints; corners of the randomization, drops, impacts, overlaps, wild targets, latency.
@@ -11,7 +11,7 @@ physics   gains kp 5..2000, kv 0..50 by step 0.5..10 ms and integrator, PD in th
 lidar     rays far away, at tiny and huge bodies, bad triangles, grazing, inside, without poses, none and very many,
           each against float64.
 learning  extreme rewards, observations, clouds, noise, gradients and batches, what training makes of them; float32
-          against float64 by layer; a carried state after very many frames.
+          against float64 by layer.
 
 Writes CSV, JSON and figures (extra `plots`). Exit status 1 if something is not as it should be. docs/stability.md holds
 what was measured.
@@ -29,7 +29,7 @@ from benchmarks.figures import PlotsUnavailable
 from benchmarks.stability.run import SUBJECTS, Options, execute
 from omniperception import config
 
-NUMBERS = {"size": "12", "num_envs": "32", "rays": "2000", "many": "1000000", "iterations": "3", "frames": "1000000"}
+NUMBERS = {"size": "12", "num_envs": "32", "rays": "2000", "many": "1000000", "iterations": "3"}
 ARGUMENTS = {"subject": "", "out": "", "only": "", "seconds": "4", **NUMBERS}
 
 

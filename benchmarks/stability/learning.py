@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from benchmarks.stability.report import Row
 from omniperception import build, config
 from omniperception.build import build_runner
 from omniperception.learning import PerceptivePpo, RolloutTooSmall, Runner, TrainingDiverged
-from omniperception.perception import CarriedPdRiskNet, FpsSampler, PdSampler, Sampler
+from omniperception.perception import FpsSampler, PdSampler, Sampler
 
 BASE = (
     "experiment=quickstart",
@@ -83,7 +82,6 @@ def cases() -> list[Case]:
         Case("more mini-batches than environments", "must not exceed", _nothing, ("num_envs=2",)),
         Case("one environment, one step", "no spread", _nothing, ("num_envs=1", "ppo.num_steps_per_env=1", *_ONE)),
         Case("every environment diverges in every step", "survives", _diverge),
-        Case("PD-RiskNet of the paper, carried state", "survives", _nothing, ("perception=pd_risknet_small_carried",)),
     ]
 
 
@@ -133,26 +131,6 @@ def precision(seed: int = 0, num_envs: int = 16) -> list[Row]:
         for name in double
         for gradients in [(single[name][1], double[name][1])]
     ]
-
-
-def carried_state(steps: int = 10**6, seed: int = 0) -> list[Row]:
-    """A carried GRU state after many frames without a reset: bounds, and float32 against float64."""
-    generator = torch.Generator().manual_seed(seed)
-    network = CarriedPdRiskNet(num_proximal=0, num_distal=8, proximal_dim=0, distal_dim=64).requires_grad_(False)
-    exact = copy.deepcopy(network).double()
-    state, true = torch.zeros(1, 64), torch.zeros(1, 64, dtype=torch.float64)
-    rows, done, chunk = [], 0, 1000
-    marks = {10**k for k in range(3, 7)} | {steps}
-    while done < steps:
-        frames = 2 * torch.rand(1, chunk + 1, 8, 3, generator=generator) - 1
-        count = torch.full((1, chunk), 2)
-        state = network(frames, count, state)[:, -1]
-        true = exact(frames.double(), count, true)[:, -1]
-        done += chunk
-        if done in marks:
-            error = float((state - true).abs().max())
-            rows.append({"frames": done, "largest |state|": float(state.abs().max()), "error of float32": error})
-    return rows
 
 
 def clouds() -> list[Row]:

@@ -26,7 +26,6 @@ class Options:
         rays: of each LiDAR case.
         many: rays of the case with very many.
         iterations: of each training.
-        frames: through which a carried state goes.
         only: part of the names of the learning cases to run, or of the parts "floating", "standing" and "scenes".
         overrides: of the configuration whose robot and physics settings are tried.
     """
@@ -38,7 +37,6 @@ class Options:
     rays: int
     many: int
     iterations: int
-    frames: int
     only: str
     overrides: tuple[str, ...]
 
@@ -73,8 +71,6 @@ def _learning(options: Options, about: Mapping[str, object]) -> bool:
     precision = learning.precision()
     _show(options.out, "precision", precision, about, ["layer", "output", "gradient"])
     plots.draw_precision(precision, options.out / "precision.png")
-    carried = learning.carried_state(options.frames)
-    _show(options.out, "carried", carried, about, list(carried[0]))
     return _good([*rows, *clouds])
 
 

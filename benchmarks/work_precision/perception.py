@@ -16,7 +16,7 @@ from omniperception.config import compose
 from omniperception.env.env import HEIGHT_TARGET, NEARNESS_RANGE, SECTOR_TARGET, OmniEnv
 from omniperception.env.heights import height_grid
 from omniperception.lidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
-from omniperception.perception import Attitude, CarriedPdRiskNet, PdRiskNet, PdSampler, ProximitySampler, Sampler
+from omniperception.perception import Attitude, PdRiskNet, PdSampler, ProximitySampler, Sampler
 from omniperception.scene import ray_shapes
 from omniperception.scene.rays import HitClass
 
@@ -269,7 +269,7 @@ def sectors_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] 
 
 
 def history_study(overrides: Sequence[str], sizes: Sizes, histories: Sequence[int] = (1, 2, 5, 10)) -> Study:
-    """How many frames the network sees, in a window or through a state that is carried on."""
+    """How many frames the network sees in a window."""
     recorder = Recorder(overrides, sizes.num_envs, CROWD)
     perception, per_episode = recorder.run.perception, recorder.frames_per_episode
     sampler = perception.sampler()
@@ -288,9 +288,7 @@ def history_study(overrides: Sequence[str], sizes: Sizes, histories: Sequence[in
         f"window of {n}": partial(PdRiskNet, **sampler.sizes, history=n, **options)
         for n in sorted({*histories, perception.history} & set(range(1, per_episode)))
     }
-    networks["carried"] = partial(CarriedPdRiskNet, **sampler.sizes, **options)
-    carried = recorder.run.composed["perception"]["network"]["_target_"].endswith("CarriedPdRiskNet")
-    default = "carried" if carried else f"window of {perception.history}"
+    default = f"window of {perception.history}"
     built, errors = {}, {}
     for name, build in networks.items():
         torch.manual_seed(0)
@@ -302,9 +300,7 @@ def history_study(overrides: Sequence[str], sizes: Sizes, histories: Sequence[in
     costs = _embedding_costs(built, frames, sizes)
     choices = []
     for name, network in built.items():
-        kept = frames[0, 0].numel() * 4 * (network.history if not network.carried else 1)
-        kept += 4 * network.feature_dim if network.carried else 0
-        facts = {"bytes per environment": kept}
+        facts = {"bytes per environment": frames[0, 0].numel() * 4 * network.history}
         choices.append(Choice(name, costs[name], {SECTOR: errors[name]}, name == default, facts=facts))
     notes = (
         f"PD-RiskNet as configured, {sizes.steps} steps of Adam (1e-3) on {int((~held_out).sum())} scenes of"
@@ -373,9 +369,8 @@ def _embedding_costs(networks: Mapping[str, PdRiskNet], frames: torch.Tensor, si
 
     def embed(network: PdRiskNet) -> None:
         count = torch.full((num_envs, 1), network.history)
-        state = torch.zeros(num_envs, network.feature_dim) if network.carried else None
         with torch.inference_mode():
-            network(some[:, -network.history :], count, state)
+            network(some[:, -network.history :], count)
 
     calls = {name: (lambda _, n=network: embed(n)) for name, network in networks.items()}
     timings = paired_timings(calls, sizes.rounds, block_s=sizes.block_s)
@@ -395,15 +390,8 @@ def _fit(network: PdRiskNet, frames: torch.Tensor, targets: torch.Tensor, sizes:
 
 def _embed(network: PdRiskNet, frames: torch.Tensor) -> torch.Tensor:
     """The sector part (B, 36) of the newest embedding of sequences (B, F, P, 3)."""
-    if network.carried:
-        num_windows = frames.shape[1]
-        before = torch.zeros_like(frames[:, :1])  # what came before the first frame is not looked at
-        count = torch.full((len(frames), num_windows), 2)
-        count[:, 0] = 1
-        embedding = network(torch.cat((before, frames), 1), count)[:, -1]
-    else:
-        count = torch.full((len(frames), 1), network.history)
-        embedding = network(frames[:, -network.history :], count)[:, 0]
+    count = torch.full((len(frames), 1), network.history)
+    embedding = network(frames[:, -network.history :], count)[:, 0]
     return embedding[:, network.supervised["sector_target"]]
 
 

@@ -82,11 +82,6 @@ def exportable(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
     if not isinstance(actor, PerceptionActor):
         return BlindNetwork(actor)
     before = 0
-    if actor.perception.carried:
-        raise ExportUnavailable(
-            f"{type(actor.perception).__name__} carries its state from frame to frame, which an exported policy cannot;"
-            " export a variant that sees a window, such as perception=pd_risknet"
-        )
     if actor.read_out_target is not None:
         names = list(group_sizes)
         before = sum(group_sizes[name] for name in names[: names.index(actor.command_group)])

@@ -1,4 +1,4 @@
-"""The embeddings that a policy acts on: computed once per LiDAR frame, and carried on where the network has a state."""
+"""The embeddings that a policy acts on: computed once per LiDAR frame."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ from omniperception.perception import PerceptionNetwork
 class RolloutEmbedding:
     """Embeddings of the current LiDAR histories of one set of environments.
 
-    Without gradients they are computed at a new tick or after a change of the parameters only. A network that carries
-    its state goes on from the embedding before the newest frame, once per tick and environment; which environments
-    start anew is told by their count of frames, so nobody has to report resets.
+    Without gradients they are computed at a new tick or after a change of the parameters only. Which environments have
+    been reset is told by their count of frames, so nobody has to report resets.
 
     Attributes:
         tick: number of the newest frame that is embedded; None before the first call.
-        before: (N, D) embedding before the newest frame, of a network that carries its state, else None.
     """
 
     def __init__(
@@ -28,8 +26,6 @@ class RolloutEmbedding:
         """Args: network; extend: makes what is acted on, once per embedding, from embeddings (N, D)."""
         self._network, self._extend = network, extend
         self._acted_on: torch.Tensor | None = None
-        self.before: torch.Tensor | None = None
-        self._after: torch.Tensor | None = None
         self._empty: torch.Tensor | None = None
         self.tick: int | None = None
         self._made_with: tuple | None = None
@@ -42,25 +38,12 @@ class RolloutEmbedding:
         with torch.no_grad():
             self._follow(obs)
         if torch.is_grad_enabled():
-            state = None if self.before is None else self.before.clone()  # it may come from inference mode
-            features, empty = self._network(frames, count, state)[:, 0], self._network.empty(frames)
+            features, empty = self._network(frames, count)[:, 0], self._network.empty(frames)
             if self._extend is not None:
                 features, empty = self._extend(features), self._extend(empty)
         else:
             features, empty = self._acted_on, self._empty
         return torch.where(count > 0, features, empty)
-
-    def state_dict(self) -> dict | None:
-        """What a resumed run goes on from; None for a network without a carried state."""
-        if self.before is None:
-            return None
-        return {"tick": self.tick, "before": self.before, "after": self._after}
-
-    def load_state_dict(self, state: dict | None) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        self._made_with = self._seen = None
-        if state is not None:
-            self.tick, self.before, self._after = state["tick"], state["before"].clone(), state["after"].clone()
 
     def _follow(self, obs: TensorDict) -> None:
         """Brings the embeddings up to the observations."""
@@ -75,14 +58,9 @@ class RolloutEmbedding:
         )
         if tick == self.tick and not changed and made_with == self._made_with:
             return
-        if self._network.carried and (tick != self.tick or self.before is None):
-            known = self._after is not None and len(self._after) == len(frames)
-            self.before = self._after if known else frames.new_zeros(len(frames), self._network.feature_dim)
-        self._after = self._network(frames, count, self.before)[:, 0]
-        self._empty = self._network.empty(frames)
-        self._acted_on = self._after
+        self._acted_on, self._empty = self._network(frames, count)[:, 0], self._network.empty(frames)
         if self._extend is not None:
-            self._acted_on, self._empty = self._extend(self._after), self._extend(self._empty)
+            self._acted_on, self._empty = self._extend(self._acted_on), self._extend(self._empty)
         self.tick, self._made_with, self._seen = tick, made_with, (probe, count.squeeze(-1).clone())
 
     def _tick_and_change(self, ticks: torch.Tensor, probe: torch.Tensor, count: torch.Tensor) -> tuple[int, bool]:

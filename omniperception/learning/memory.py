@@ -27,7 +27,7 @@ class Footprint:
         gradients: as many.
         optimizer: Adam's two moments.
         sensor: the history of sampled frames that the environment keeps, twice while a frame is appended.
-        rollout: frames stored for the update, and a carried state.
+        rollout: frames stored for the update.
         mini_batch: the frames of a mini-batch and what the forward pass keeps for the backward pass.
     """
 
@@ -70,7 +70,6 @@ def footprint(
     frame = FLOAT * 3 * network.num_points * num_envs
     num_steps, history = ppo.num_steps_per_env, network.history
     shared, windows = point_cloud_bytes(num_envs, num_steps, network.num_points, history, steps_per_frame)
-    state = FLOAT * network.feature_dim * num_envs if network.carried else 0
     batch, num_windows = -(-num_envs // ppo.num_mini_batches), max_windows(num_steps, steps_per_frame)
     if window_per_step:
         batch, num_windows = batch * num_steps, 1
@@ -79,7 +78,7 @@ def footprint(
         gradients=weights,
         optimizer=2 * weights,
         sensor=(2 * history + 1) * frame,
-        rollout=(windows if window_per_step else shared) + state,
+        rollout=windows if window_per_step else shared,
         mini_batch=_kept_for_backward(network, batch, num_windows),
     )
 

@@ -47,9 +47,9 @@ class PerceptionActor(MLPModel):
     """An MLP on one-dimensional observation groups and the embedding of the LiDAR history.
 
     While experience is collected (no gradients) the embedding is computed once per LiDAR tick and reused
-    until the next tick or parameter change (:class:`RolloutEmbedding`, which also carries the state of a network that
-    has one). In updates each distinct window of a :class:`WindowedObservations` is embedded once. An environment
-    without a frame since its reset gets the network's embedding of an empty history.
+    until the next tick or parameter change (:class:`RolloutEmbedding`). In updates each distinct window of a
+    :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the network's
+    embedding of an empty history.
 
     With ``supervision`` and ``end_to_end`` the mean squared error between the part of the embedding that the network
     sets aside for a target (``perception.supervised``) and the observation group of that name, over the steps that
@@ -117,11 +117,6 @@ class PerceptionActor(MLPModel):
         self._losses: dict[str, list[torch.Tensor]] = {target: [] for target in supervision}
 
     @property
-    def carried_state(self) -> torch.Tensor | None:
-        """(N, D) embedding before the newest frame acted on, of a network that carries its state."""
-        return self.rollout.before
-
-    @property
     def tick(self) -> int:
         """Number of the newest LiDAR frame acted on."""
         return self.rollout.tick
@@ -178,7 +173,7 @@ class PerceptionActor(MLPModel):
         empty = self.perception.empty(obs.frames)
         windows = obs.window_features
         if windows is None:
-            windows = self.perception(obs.frames, obs.window_count, obs.state)
+            windows = self.perception(obs.frames, obs.window_count)
         else:
             empty = functional.pad(empty, (0, windows.shape[2] - empty.shape[1]))
         table = torch.cat([windows.flatten(0, 1), empty])
@@ -187,7 +182,7 @@ class PerceptionActor(MLPModel):
     def embed_windows(self, obs: WindowedObservations) -> torch.Tensor:
         """(E, W, D) embeddings of an update's windows, with the risks of the candidate velocities where the actor
         acts on them: (E, W, D + K)."""
-        windows = self.perception(obs.frames, obs.window_count, obs.state)
+        windows = self.perception(obs.frames, obs.window_count)
         return self._with_risks(windows) if self.read_out_target == MOTION else windows
 
     def supervised_loss(self, features: torch.Tensor, obs: WindowedObservations) -> torch.Tensor:

@@ -95,7 +95,6 @@ class PerceptivePpo(PPO):
             device,
             frames=perceptive,
             steps_per_frame=cfg.get("steps_per_frame", 1),
-            state_dim=actor.perception.feature_dim if perceptive and actor.perception.carried else 0,
         )
         alg = alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])
         if perceptive and not actor.end_to_end:
@@ -107,7 +106,7 @@ class PerceptivePpo(PPO):
         """Sample actions; LiDAR frames are copied now because the environment may reuse their memory."""
         actions = super().act(obs) if self.learns_policy else self._follow(obs)
         if self.storage.has_frames:
-            self.storage.record_frames(obs, self._raw_actor.tick, self._raw_actor.carried_state)
+            self.storage.record_frames(obs, self._raw_actor.tick)
         return actions
 
     def train_mode(self) -> None:
@@ -166,10 +165,8 @@ class PerceptivePpo(PPO):
             return self._raw_actor.embed_windows(everyone)
 
     def save(self) -> dict:
-        """States of the networks, of the optimisers and of embeddings that are carried on."""
+        """States of the networks and of the optimisers."""
         state = super().save()
-        if isinstance(self._raw_actor, PerceptionActor):
-            state["carried"] = self._raw_actor.rollout.state_dict()
         if self.perception_trainer is not None:
             state["perception_optimizer_state_dict"] = self.perception_trainer.optimizer.state_dict()
         return state
@@ -178,8 +175,6 @@ class PerceptivePpo(PPO):
         """Load the parts that ``load_cfg`` names, all by default; whether the iteration is one of them."""
         if self.perception_trainer is not None and (load_cfg is None or load_cfg.get("optimizer")):
             self.perception_trainer.optimizer.load_state_dict(loaded_dict["perception_optimizer_state_dict"])
-        if isinstance(self._raw_actor, PerceptionActor) and (load_cfg is None or load_cfg.get("env")):
-            self._raw_actor.rollout.load_state_dict(loaded_dict.get("carried"))
         return super().load(loaded_dict, load_cfg, strict)
 
     def check_rollout(self) -> None:

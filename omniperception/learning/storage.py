@@ -26,7 +26,6 @@ class WindowedObservations:
         step_window: (B,) index e * W + w of each step's window.
         step_count: (B,) valid frames at each step; 0 after a reset until the next frame.
         window_features: (E, W, D) embeddings of the windows, where they are fixed during the update, else None.
-        state: (E, D) embedding before the newest frame of window 0, of a network that carries its state, else None.
     """
 
     groups: TensorDict
@@ -35,7 +34,6 @@ class WindowedObservations:
     step_window: torch.Tensor
     step_count: torch.Tensor
     window_features: torch.Tensor | None = None
-    state: torch.Tensor | None = None
 
     @property
     def has_frames(self) -> bool:
@@ -89,8 +87,7 @@ class PerceptiveStorage(RolloutStorage):
     One-dimensional groups are stored per step by rsl_rl. With frames, the H frames seen at the first step are
     copied and then one frame per tick; a step keeps its tick and its count of valid frames. Mini-batches are
     then random subsets of environments with all their steps, so that each window is embedded once per
-    mini-batch. Without frames the mini-batches are rsl_rl's. Of a network that carries its state, the state before
-    the first step's newest frame is stored once.
+    mini-batch. Without frames the mini-batches are rsl_rl's.
     """
 
     def __init__(
@@ -103,7 +100,6 @@ class PerceptiveStorage(RolloutStorage):
         device: str = "cpu",
         frames: bool = False,
         steps_per_frame: int = 1,
-        state_dim: int = 0,
     ) -> None:
         """Allocate the buffers.
 
@@ -117,7 +113,6 @@ class PerceptiveStorage(RolloutStorage):
             frames: whether the actor reads LiDAR frames.
             steps_per_frame: least control steps between two frames; 1 is always enough, the true value saves
                 memory.
-            state_dim: D of a network that carries its state, else 0.
         """
         super().__init__("rl", num_envs, num_steps, obs.select(*stored_groups), [num_actions], device)
         self.stored_groups = stored_groups
@@ -137,7 +132,6 @@ class PerceptiveStorage(RolloutStorage):
         capacity = self.history - 1 + max_windows(num_steps, steps_per_frame)
         self.frames = torch.zeros(num_envs, capacity, *obs["frames"].shape[2:], device=device)
         self.frame_count = torch.zeros(num_steps, num_envs, dtype=torch.int16, device=device)
-        self.initial_state = torch.zeros(num_envs, state_dim, device=device) if state_dim else None
         self.window_features: torch.Tensor | None = None
         self._step_windows: list[int] = []
         self._ticks: list[int] = []
@@ -152,13 +146,12 @@ class PerceptiveStorage(RolloutStorage):
         """The first control step of this rollout at which each window is the newest."""
         return [self._step_windows.index(window) for window in range(self.num_windows)]
 
-    def record_frames(self, obs: TensorDict, tick: int, state: torch.Tensor | None = None) -> None:
+    def record_frames(self, obs: TensorDict, tick: int) -> None:
         """Copy what is new in the observations of the current step; call before the environment moves on.
 
         Args:
             obs: observations of the step.
             tick: number of their newest frame, which is the same in all environments.
-            state: (N, D) embedding before the newest frame, of a network that carries its state.
         """
         if not self.has_frames:
             return
@@ -169,8 +162,6 @@ class PerceptiveStorage(RolloutStorage):
             )
         if not self._ticks:
             self.frames[:, : self.history].copy_(obs["frames"])
-            if self.initial_state is not None:
-                self.initial_state.copy_(state)
             self._ticks.append(tick)
         elif tick != self._ticks[-1]:
             slot = self.history - 1 + len(self._ticks)
@@ -258,5 +249,4 @@ class PerceptiveStorage(RolloutStorage):
             step_window=(first + window.unsqueeze(1)).flatten(),
             step_count=step_count.flatten().long(),
             window_features=None if self.window_features is None else self.window_features[env_ids],
-            state=None if self.initial_state is None else self.initial_state[env_ids],
         )

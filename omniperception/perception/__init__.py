@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from omniperception.perception.networks.base import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
-from omniperception.perception.networks.pd_risknet import CarriedPdRiskNet, PdRiskNet
+from omniperception.perception.networks.pd_risknet import PdRiskNet
 from omniperception.perception.samplers.base import Attitude, Sampler
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ _LOADED_WHEN_USED = {
 
 __all__ = [
     "Attitude",
-    "CarriedPdRiskNet",
     "DirectMlp",
     "FpsGru",
     "FpsMlp",

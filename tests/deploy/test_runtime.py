@@ -14,7 +14,6 @@ import torch
 from omniperception import build, config
 from omniperception.build import build_runner, load_policy
 from omniperception.deploy.export import Export, describe, export
-from omniperception.deploy.modules import ExportUnavailable, exportable
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.learning import CheckpointError
@@ -28,8 +27,6 @@ from omniperception.evaluation.exported import ExportedPolicies, raw_points, rec
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("num_envs=2", "ppo.hidden_dims=[32,16]", "seed=3")
-CARRIED = ("pd_risknet_carried", "pd_risknet_small_carried")
-"""Presets that cannot be exported."""
 RECIPES = {
     "none": ("experiment=walk",),
     "fps_mlp": ("perception=fps_mlp", "perception.sampler.num_points=64", "observations=paper"),
@@ -94,14 +91,7 @@ def trained(run_dir, *overrides):
 
 def test_every_preset_is_tried():
     presets = {path.stem for path in (config.CONFIG_DIR / "perception").glob("*.yaml")}
-    assert presets == {*RECIPES, *ALIKE, *CARRIED} - {"motion_by_fps", "motion_by_proximal"}
-
-
-@pytest.mark.parametrize("preset", CARRIED)
-def test_a_carried_state_is_refused(preset):
-    run = build.assemble(config.compose(["num_envs=2", f"perception={preset}"]))
-    with pytest.raises(ExportUnavailable, match="carries its state from frame to frame"):
-        exportable(build_runner(run, None).alg.actor, {})
+    assert presets == {*RECIPES, *ALIKE} - {"motion_by_fps", "motion_by_proximal"}
 
 
 @pytest.mark.slow

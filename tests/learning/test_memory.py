@@ -10,7 +10,7 @@ from toy_env import ToyEnv, config
 from omniperception.learning import PerceptivePpo
 from omniperception.learning.config import PerceptionConfig, PPOConfig
 from omniperception.learning.memory import _kept_for_backward, check_fits, footprint, largest_cloud
-from omniperception.perception import CarriedPdRiskNet, DirectMlp, FpsGru, PdRiskNet, PdSampler, RawSampler
+from omniperception.perception import DirectMlp, FpsGru, PdRiskNet, PdSampler, RawSampler
 
 RAYS, HISTORY = 40, 4
 
@@ -31,21 +31,19 @@ def halves(num_proximal=5, num_distal=7):
     return functools.partial(PdSampler, num_proximal, num_distal, max_range=5.0, split_deg=10.0)
 
 
-@pytest.mark.parametrize("carried", [False, True])
-def test_predicted_bytes_are_those_of_a_run(carried):
-    env = ToyEnv(6, history=2 if carried else HISTORY)
-    cfg = config(carried=carried, multi_gpu=None)
+def test_predicted_bytes_are_those_of_a_run():
+    env = ToyEnv(6)
+    cfg = config(multi_gpu=None)
     alg = PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
     collect(alg, env, 8)
     storage = alg.storage
-    kept = [storage.frames] + ([storage.initial_state] if carried else [])
-    rollout = sum(t.untyped_storage().nbytes() for t in kept)
+    rollout = storage.frames.untyped_storage().nbytes()
     alg.update()
     network = alg.actor.perception
     adam = [alg.optimizer.state[p][name] for p in network.parameters() for name in ("exp_avg", "exp_avg_sq")]
 
-    made = functools.partial(CarriedPdRiskNet if carried else PdRiskNet, proximal_dim=5, distal_dim=3)
-    needs = footprint(perception(made, halves(2, 1), 2 if carried else HISTORY), ppo_config(), 6, 5)
+    made = functools.partial(PdRiskNet, proximal_dim=5, distal_dim=3)
+    needs = footprint(perception(made, halves(2, 1), HISTORY), ppo_config(), 6, 5)
     assert needs.rollout == rollout
     assert needs.optimizer == sum(t.untyped_storage().nbytes() for t in adam)
     assert needs.weights == sum(p.untyped_storage().nbytes() for p in network.parameters())

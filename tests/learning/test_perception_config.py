@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 
 from omniperception.learning.config import PerceptionConfig
-from omniperception.perception import CarriedPdRiskNet, FpsMlp, FpsSampler, PdRiskNet, PdSampler, ProximitySampler
+from omniperception.perception import FpsMlp, FpsSampler, PdRiskNet, PdSampler, ProximitySampler
 
 CELLS = {"band_edges": [-1.0, 0.0, 0.5, 2.0], "decay": 0.5, "blind": 0.3, "body": [0.5, 0.3], "split_deg": 20.0}
 
@@ -36,15 +36,12 @@ def test_variants_differ_from_their_preset_in_one_thing(base, make_config):
     network = whole.build_network()
     near = make_config(f"perception={base}_no_distal").perception
     far = make_config(f"perception={base}_no_proximal").perception
-    carried = make_config(f"perception={base}_carried").perception
     halves = near.build_network(), far.build_network()
     assert [half.num_points for half in halves] == list(whole.sampler().sizes.values())
     assert [half.feature_dim for half in halves] == [187, 64]
     assert {t: w for t, w in whole.supervision.items() if t != "sector_target"} == near.supervision
     assert {t: w for t, w in whole.supervision.items() if t != "height_target"} == far.supervision
     assert (near.history, far.history) == (whole.history, whole.history)
-    assert isinstance(carried.build_network(), CarriedPdRiskNet) and carried.supervision == whole.supervision
     shapes = {name: p.shape for name, p in network.named_parameters()}
-    assert {name: p.shape for name, p in carried.build_network().named_parameters()} == shapes
     for half in halves:
         assert all(shapes[name] == p.shape for name, p in half.named_parameters())

@@ -3,14 +3,13 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
-from toy_env import SUPERVISED, ToyEnv, config
+from toy_env import ToyEnv, config
 
 from omniperception.learning import PerceptivePpo, TrainingDiverged
 
 
-def algorithm(env, num_steps=8, frames=True, carried=False, **options):
-    cfg = config(frames, carried=carried, num_steps_per_env=num_steps, multi_gpu=None)
+def algorithm(env, num_steps=8, frames=True, **options):
+    cfg = config(frames, num_steps_per_env=num_steps, multi_gpu=None)
     cfg["algorithm"] = {**cfg["algorithm"], **options}
     torch.manual_seed(0)
     return PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
@@ -70,60 +69,6 @@ def test_first_ratio_is_one():
         alg.actor(batch.observations, stochastic_output=True)
         log_prob = alg.actor.get_output_log_prob(batch.actions)
         assert torch.allclose(log_prob, batch.old_actions_log_prob.squeeze(-1), atol=1e-4)
-
-
-def gru_since_reset(gru, frames):
-    """State of a plain GRU after the frames (F, points, 3) of one environment since its reset."""
-    plain = nn.GRU(gru.input_size, gru.hidden_size, batch_first=True)
-    plain.load_state_dict(gru.state_dict())
-    return plain(torch.stack(frames).flatten(1)[None])[1][0, 0] if frames else torch.zeros(gru.hidden_size)
-
-
-def test_a_carried_state_runs_over_all_frames_since_the_reset():
-    """Of the rollout and of the update, over several rollouts whose borders lie anywhere between two frames."""
-    env = ToyEnv(6, episode=23, history=2)
-    alg = algorithm(env, carried=True)
-    seen, tick, longest = [[] for _ in range(6)], 0, 0
-    obs = env.get_observations()
-    for _ in range(5):
-        with torch.inference_mode():
-            by_step = []
-            for _ in range(8):
-                actions = alg.act(obs)
-                for e in range(6):
-                    if obs["frame_count"][e] == 0:
-                        seen[e] = []
-                    elif env.tick != tick:
-                        seen[e].append(obs["frames"][e, -1].clone())
-                tick = env.tick
-                longest = max(longest, *map(len, seen))
-                network = alg.actor.perception
-                halves = [(network.proximal, slice(0, 2)), (network.distal, slice(2, 3))]
-                expected = [torch.cat([gru_since_reset(g, [f[p] for f in s]) for g, p in halves]) for s in seen]
-                by_step.append(torch.stack(expected))
-                assert torch.allclose(alg.actor.rollout(obs), by_step[-1], atol=1e-6)
-                obs, rewards, dones, extras = env.step(actions)
-                alg.process_env_step(obs, rewards, dones, extras)
-        everyone = alg.storage.observations_of(torch.arange(6))
-        assert torch.allclose(alg.actor.embed(everyone), torch.cat(by_step), atol=1e-6)
-        for batch in alg.storage.mini_batch_generator(2, 1):
-            alg.actor(batch.observations, stochastic_output=True)
-            log_prob = alg.actor.get_output_log_prob(batch.actions)
-            assert torch.allclose(log_prob, batch.old_actions_log_prob.squeeze(-1), atol=1e-4)
-        alg.storage.clear()
-    assert longest > 3  # longer than any rollout
-
-
-@pytest.mark.parametrize("supervised", [False, True])
-def test_a_carried_network_learns(supervised):
-    env = ToyEnv(6, history=2)
-    cfg = config(True, SUPERVISED if supervised else None, True, multi_gpu=None)
-    alg = PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
-    errors = []
-    for _ in range(40):
-        collect(alg, env, 8)
-        errors.append(alg.update()["height_target"])
-    assert min(errors[-5:]) < 0.5 * errors[0]
 
 
 def test_storage_holds_only_what_is_read():

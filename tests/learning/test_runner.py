@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_env import HISTORY, SUPERVISED, ToyEnv, config
+from toy_env import SUPERVISED, ToyEnv, config
 
 from omniperception.learning import (
     CheckpointError,
@@ -24,11 +24,11 @@ from omniperception.learning.checkpoint import checkpoint_path, list_checkpoints
 HERE = Path(__file__).parent
 
 
-def runner_for(run_dir, frames=True, supervision=None, carried=False, **overrides):
+def runner_for(run_dir, frames=True, supervision=None, **overrides):
     torch.manual_seed(0)
     np.random.seed(0)
-    env = ToyEnv(frames=frames, history=2 if carried else HISTORY)
-    return Runner(env, config(frames, supervision, carried, **overrides), str(run_dir) if run_dir else None)
+    env = ToyEnv(frames=frames)
+    return Runner(env, config(frames, supervision, **overrides), str(run_dir) if run_dir else None)
 
 
 def differences(a, b, where=""):
@@ -41,10 +41,9 @@ def differences(a, b, where=""):
     return [] if same else [where]
 
 
-@pytest.mark.parametrize("kind", ["end_to_end", "supervised", "blind", "carried", "carried_supervised"])
+@pytest.mark.parametrize("kind", ["end_to_end", "supervised", "blind"])
 def test_resume_in_a_new_process_is_exact(tmp_path, kind):
-    options = {"frames": kind != "blind", "supervision": SUPERVISED if kind.endswith("supervised") else None}
-    options["carried"] = kind.startswith("carried")
+    options = {"frames": kind != "blind", "supervision": SUPERVISED if kind == "supervised" else None}
     whole = runner_for(tmp_path / "whole", **options)
     whole.learn(5)
     part = runner_for(tmp_path / "part", **options)

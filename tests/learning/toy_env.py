@@ -9,7 +9,7 @@ from rsl_rl.env import VecEnv
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from omniperception.perception import CarriedPdRiskNet, PdRiskNet
+from omniperception.perception import PdRiskNet
 
 HISTORY, POINTS, PERIOD = 4, 3, 5
 
@@ -89,10 +89,10 @@ SUPERVISED = {"epochs": 2, "learning_rates": (1e-2, 1e-2), "num_updates": 100}
 """Of a perception network that PPO does not train."""
 
 
-def config(frames=True, supervision=None, carried=False, **overrides):
-    """Runner configuration; keyword arguments replace top-level entries. A carried state needs ToyEnv(history=2)."""
+def config(frames=True, supervision=None, **overrides):
+    """Runner configuration; keyword arguments replace top-level entries."""
     sizes = {"num_proximal": 2, "num_distal": 1, "proximal_dim": 5, "distal_dim": 3}
-    network = functools.partial(CarriedPdRiskNet if carried else PdRiskNet, history=2 if carried else HISTORY, **sizes)
+    network = functools.partial(PdRiskNet, history=HISTORY, **sizes)
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5}
     mlp = {"hidden_dims": [16], "activation": "elu", "obs_normalization": True}
     actor = {"class_name": "rsl_rl.models:MLPModel", "distribution_cfg": gaussian, **mlp}

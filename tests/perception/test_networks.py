@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import nn
 
-from omniperception.perception import CarriedPdRiskNet, DirectMlp, FpsGru, FpsMlp, PdRiskNet
-from omniperception.perception.networks.windows import CarriedGru, WindowedGru, WindowedLinear
+from omniperception.perception import DirectMlp, FpsGru, FpsMlp, PdRiskNet
+from omniperception.perception.networks.windows import WindowedGru, WindowedLinear
 
 H, W, B = 5, 4, 3
 
@@ -133,44 +133,6 @@ def test_the_distal_encoder_is_a_layer_before_the_gru():
     encoded = torch.nn.functional.elu(network.encoder[0](frames[:, :, 4:].flatten(2)))
     far = gru_by_window(plain_gru(network.distal), encoded.unsqueeze(-1), count)
     assert torch.allclose(network(frames, count)[..., 5:], far, atol=1e-5)
-
-
-def test_carried_gru_equals_gru_since_the_reset():
-    """Runs of frames between resets, the first of them from the given state."""
-    torch.manual_seed(0)
-    frames = torch.randn(3, 6, 18, requires_grad=True)
-    count = torch.tensor([[2, 2, 1, 2, 0], [0, 1, 2, 2, 2], [1, 2, 2, 0, 1]])
-    state = torch.randn(3, 7).tanh().requires_grad_()
-    carried = CarriedGru(18, 7)
-    plain = plain_gru(carried)
-    got = carried(frames, count, state)
-    expected = []
-    for b in range(3):
-        hidden = state[b : b + 1]
-        for w in range(5):
-            n = int(count[b, w])
-            hidden = hidden if n == 2 else torch.zeros(1, 7)
-            hidden = plain(frames[b : b + 1, w + 1 : w + 2], hidden[None])[1][0] if n else torch.zeros(1, 7)
-            expected.append(hidden)
-    expected = torch.cat(expected).view(3, 5, 7)
-    assert torch.allclose(got, expected, atol=1e-6)
-    weights = torch.randn_like(expected)
-    got_grads = torch.autograd.grad((got * weights).sum(), [frames, state, *carried.parameters()])
-    expected_grads = torch.autograd.grad((expected * weights).sum(), [frames, state, *plain.parameters()])
-    for a, b in zip(got_grads, expected_grads, strict=True):
-        assert relative(a, b) < 1e-5
-
-
-def test_a_carried_network_hands_each_half_its_own_state():
-    network = CarriedPdRiskNet(4, 2, proximal_dim=5, distal_dim=3)
-    torch.manual_seed(0)
-    frames, count = torch.randn(B, 6, 6, 3), torch.full((B, 5), 2)
-    whole = network(frames, count)
-    first = network(frames[:, :3], count[:, :2])
-    rest = network(frames[:, 2:], count[:, 2:], first[:, -1])
-    assert torch.allclose(torch.cat([first, rest], 1), whole, atol=1e-6)
-    with pytest.raises(ValueError, match=r"perception\.history=5 must be 2"):
-        CarriedPdRiskNet(4, 2, history=5)
 
 
 def test_a_path_can_be_left_out():

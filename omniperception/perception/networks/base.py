@@ -24,15 +24,12 @@ class PerceptionNetwork(nn.Module):
         history: H, frames per window.
         feature_dim: D, size of the embedding.
         supervised: the part of the embedding that can be regressed on each privileged target.
-        carried: whether the embedding is a state that goes on from frame to frame since an environment's reset,
-            instead of being computed anew from each window.
     """
 
     num_points: int
     history: int
     feature_dim: int
     supervised: Mapping[str, slice] = {"sector_target": slice(0, NUM_SECTORS)}
-    carried: bool = False
 
     def __init__(self, num_points: int, history: int, feature_dim: int = FEATURE_DIM) -> None:
         super().__init__()
@@ -43,7 +40,7 @@ class PerceptionNetwork(nn.Module):
         self.history = history
         self.feature_dim = feature_dim
 
-    def forward(self, frames: torch.Tensor, count: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """Embed every window.
 
         Args:
@@ -51,8 +48,6 @@ class PerceptionNetwork(nn.Module):
                 W.
             count: (B, W) integers in 0..H; only the newest ``count[b, w]`` frames of window w (frames
                 w..w+H-1) are valid.
-            state: (B, D) embedding before the newest frame of window 0, zero by default; only for a network that is
-                ``carried``.
 
         Returns:
             (B, W, D) embeddings.
@@ -72,7 +67,7 @@ class FpsGru(PerceptionNetwork):
         super().__init__(num_points, history, feature_dim)
         self.gru = WindowedGru(3 * num_points, feature_dim, history)
 
-    def forward(self, frames: torch.Tensor, count: torch.Tensor, state: None = None) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """See :meth:`PerceptionNetwork.forward`."""
         return self.gru(frames.flatten(2), count)
 
@@ -96,7 +91,7 @@ class FpsMlp(PerceptionNetwork):
             rest += [nn.ELU(), nn.Linear(fan_in, fan_out)]
         self.rest = nn.Sequential(*rest)
 
-    def forward(self, frames: torch.Tensor, count: torch.Tensor, state: None = None) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """See :meth:`PerceptionNetwork.forward`."""
         return self.rest(self.first(frames.flatten(2), count))
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from omniperception.perception.networks.base import NUM_SECTORS, PerceptionNetwork
-from omniperception.perception.networks.windows import CARRIED_HISTORY, CarriedGru, WindowedGru
+from omniperception.perception.networks.windows import WindowedGru
 
 if TYPE_CHECKING:
     from omniperception.perception.networks.rings import RingPath
@@ -62,63 +62,29 @@ class PdRiskNet(PerceptionNetwork):
         self.supervised = {}
         self.proximal = self.encoder = self.distal = None
         if proximal_dim:
-            self.proximal = self._gru(3 * num_proximal, proximal_dim)
+            self.proximal = WindowedGru(3 * num_proximal, proximal_dim, history)
             self.supervised["height_target"] = slice(0, proximal_dim)
         if path is not None:
             self.supervised["motion_target"] = slice(proximal_dim, proximal_dim + distal_dim)
         elif distal_dim:
             if distal_encoder:
                 self.encoder = nn.Sequential(nn.Linear(3 * num_distal, distal_encoder), nn.ELU())
-            self.distal = self._gru(distal_encoder or 3 * num_distal, distal_dim)
+            self.distal = WindowedGru(distal_encoder or 3 * num_distal, distal_dim, history)
             self.supervised["sector_target"] = slice(proximal_dim, proximal_dim + NUM_SECTORS)
 
-    def forward(self, frames: torch.Tensor, count: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """See :meth:`PerceptionNetwork.forward`."""
         embeddings = []
         if self.proximal is not None:
             near = frames[:, :, : self.num_proximal].flatten(2)
-            embeddings.append(self._path(self.proximal, near, count, state, slice(0, self.proximal_dim)))
+            embeddings.append(self.proximal(near, count))
         if self.rings is not None:
             embeddings.append(self.rings(frames[:, :, self.num_proximal : -1], frames[:, :, -1], count))
         if self.distal is not None:
             far = frames[:, :, self.num_proximal :].flatten(2)
             far = far if self.encoder is None else self.encoder(far)
-            embeddings.append(self._path(self.distal, far, count, state, slice(self.proximal_dim, None)))
+            embeddings.append(self.distal(far, count))
         return torch.cat(embeddings, dim=-1)
-
-    def _gru(self, input_size: int, hidden_size: int) -> nn.GRU:
-        return WindowedGru(input_size, hidden_size, self.history)
-
-    def _path(self, gru: nn.GRU, points: torch.Tensor, count: torch.Tensor, state: None, part: slice) -> torch.Tensor:
-        """(B, W, part) embeddings by one path."""
-        return gru(points, count)
-
-
-class CarriedPdRiskNet(PdRiskNet):
-    """PD-RiskNet whose GRUs run on over all frames since an environment's reset (ablation).
-
-    Updates start from the state at the start of the rollout and go through its frames: back-propagation through time,
-    cut at the rollout's border.
-    """
-
-    carried = True
-
-    def __init__(self, *args, history: int = CARRIED_HISTORY, **options) -> None:
-        """Arguments of :class:`PdRiskNet`; ``history`` is fixed, see :class:`CarriedGru`."""
-        if history != CARRIED_HISTORY:
-            raise ValueError(
-                f"perception.history={history} must be {CARRIED_HISTORY} for a carried state, which needs to know only"
-                " whether a frame is the first one since a reset"
-            )
-        super().__init__(*args, history=history, **options)
-
-    def _gru(self, input_size: int, hidden_size: int) -> nn.GRU:
-        return CarriedGru(input_size, hidden_size)
-
-    def _path(
-        self, gru: nn.GRU, points: torch.Tensor, count: torch.Tensor, state: torch.Tensor | None, part: slice
-    ) -> torch.Tensor:
-        return gru(points, count, None if state is None else state[:, part])
 
 
 def _check_path(name: str, num_points: int, dim: int) -> None:

@@ -1,5 +1,4 @@
-"""Layers over sliding windows of frames: each frame enters a layer once, however many windows contain it; and a GRU
-whose state is carried on from frame to frame.
+"""Layers over sliding windows of frames: each frame enters a layer once, however many windows contain it.
 
 Window w of a (B, F, ...) sequence covers frames w .. w + H - 1, so W = F - H + 1 windows; count (B, W) says
 how many of a window's newest frames are valid.
@@ -17,8 +16,6 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 aten = torch.ops.aten
-CARRIED_HISTORY = 2
-"""Frames per window of a network that carries its state."""
 
 
 def window_count(frames: torch.Tensor, count: torch.Tensor, history: int) -> int:
@@ -146,42 +143,6 @@ def _autocast_like_now(device_type: str) -> Callable[[], AbstractContextManager]
         return nullcontext
     enabled, dtype = torch.is_autocast_enabled(device_type), torch.get_autocast_dtype(device_type)
     return partial(torch.autocast, device_type, dtype=dtype, enabled=enabled)
-
-
-class CarriedGru(nn.GRU):
-    """A GRU that runs over all frames since an environment's reset; parameters are those of ``nn.GRU`` with one layer.
-
-    Windows are two frames long (:data:`CARRIED_HISTORY`) only so that a window's count tells the first frame since a
-    reset (1), which starts from zero, from a later one (2), which goes on from the state before. Without a frame (0)
-    the state is zero.
-    """
-
-    def __init__(self, input_size: int, hidden_size: int) -> None:
-        """Args: input_size: numbers per frame; hidden_size: size of the state, which is the embedding."""
-        super().__init__(input_size, hidden_size, batch_first=True)
-
-    def forward(self, frames: torch.Tensor, count: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor:
-        """Frames (B, W + 1, input_size), count (B, W) in 0..2, state (B, hidden_size) before the first window's newest
-        frame, zero by default -> states after each window's newest frame (B, W, hidden_size)."""
-        num_windows = window_count(frames, count, CARRIED_HISTORY)
-        projected = functional.linear(frames[:, 1:], self.weight_ih_l0, self.bias_ih_l0).to(self.weight_hh_l0.dtype)
-        if state is None:
-            state = projected.new_zeros(frames.shape[0], self.hidden_size)
-        states = []
-        for w in range(num_windows):
-            before = torch.where(count[:, w, None] > 1, state, 0.0)
-            state = torch.where(count[:, w, None] > 0, self._step(projected[:, w], before), 0.0)
-            states.append(state)
-        return torch.stack(states, 1)
-
-    def _step(self, projected: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
-        """The state after a frame; gate order is PyTorch's: reset, update, new."""
-        recurrent = functional.linear(state, self.weight_hh_l0, self.bias_hh_l0).to(state.dtype)
-        from_frame, from_state = projected.chunk(3, dim=-1), recurrent.chunk(3, dim=-1)
-        reset = torch.sigmoid(from_frame[0] + from_state[0])
-        update = torch.sigmoid(from_frame[1] + from_state[1])
-        new = torch.tanh(from_frame[2] + reset * from_state[2])
-        return torch.lerp(new, state, update)
 
 
 class WindowedLinear(nn.Module):
