@@ -17,7 +17,7 @@ Peers that are not installed are named and left out. To have them all:
     pip install open3d                        (and the system's libusb-1.0)
 
 Everything is also written to `out` as JSON, CSV and markdown, with the date, the machine and all versions. On a machine
-that does other work, trust the ratios by CPU time. What was measured stands in docs/lidar.md.
+that does other work, trust the ratios by CPU time. What was measured stands in docs/lab/lidar.md.
 """
 
 from __future__ import annotations

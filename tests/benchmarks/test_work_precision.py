@@ -233,7 +233,7 @@ def test_farthest_points_lie_on_the_front(preset):
 
 def test_sectors_stay_near_the_front():
     measured = perception.sectors_study(("experiment=quickstart",), TINY, counts=(64, 216))
-    within_margin(measured, 2.0)  # 1.2 to 1.5 when written: docs/work_precision.md says why the default stays
+    within_margin(measured, 2.0)  # 1.2 to 1.5 when written: docs/lab/work_precision.md says why the default stays
 
 
 @pytest.mark.parametrize(
