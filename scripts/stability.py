@@ -13,8 +13,8 @@ lidar     rays far away, at tiny and huge bodies, bad triangles, grazing, inside
 learning  extreme rewards, observations, clouds, noise, gradients and batches, what training makes of them; float32
           against float64 by layer.
 
-Writes CSV, JSON and figures (extra `plots`). Exit status 1 if something is not as it should be. docs/lab/stability.md holds
-what was measured.
+Writes CSV, JSON and figures (extra `plots`). Exit status 1 if something is not as it should be. docs/lab/stability.md
+holds what was measured.
 """
 
 from __future__ import annotations
