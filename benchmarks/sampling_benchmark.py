@@ -18,7 +18,6 @@ from omniperception.perception import PdSampler
 SPLIT_DEG = 20.0
 """Elevation above which a hit is proximal, as in the presets."""
 NEVER = 10**9
-GRIDS = (32, 24, 16, 12)
 Method = Callable[[], torch.Tensor]
 """Samples all environments' clouds; (N, K, 3) points in metres."""
 
@@ -105,14 +104,14 @@ def hits_per_environment(frame: LidarFrame, max_range: float) -> float:
 
 
 def _ours(frame: LidarFrame, k: int, max_range: float, num_threads: int | None) -> dict[str, Method]:
-    """Exact sampling by looking at every point and by buckets; from one hit per grid cell; from some hits only.
+    """Exact sampling by looking at every point and by buckets; from some hits only.
 
     Choosing those hits is not timed.
     """
     ranges, rest = frame.ranges, (frame.directions_s, frame.elevation, frame.azimuth)
 
-    def method(ranges: torch.Tensor, grid: int = 0, buckets_from: int | None = None) -> Method:
-        sampler = PdSampler(k, 0, max_range=max_range, split_deg=SPLIT_DEG, grid=grid, num_threads=num_threads)
+    def method(ranges: torch.Tensor, buckets_from: int | None = None) -> Method:
+        sampler = PdSampler(k, 0, max_range=max_range, split_deg=SPLIT_DEG, num_threads=num_threads)
         if buckets_from is not None:
             sampler.buckets_from = buckets_from
         out = torch.empty(len(ranges), k, 3)
@@ -125,8 +124,6 @@ def _ours(frame: LidarFrame, k: int, max_range: float, num_threads: int | None) 
 
     ours = {"exact": method(ranges), "exact, every point": method(ranges, buckets_from=NEVER)}
     ours["exact, by bucket"] = method(ranges, buckets_from=1)
-    for cells in GRIDS:
-        ours[f"grid of {cells}"] = method(ranges, grid=cells)
     for factor in (8, 4, 2):
         ours[f"stride to {factor} K, then exact"] = method(_strided(frame, factor * k))
     ours["stride"] = method(_strided(frame, k))

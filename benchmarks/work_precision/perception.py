@@ -169,19 +169,17 @@ CROWD = ("obstacles=mixed",)
 
 
 def farthest_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] = (32, 64, 128, 256)) -> Study:
-    """Proximal points kept, exact and approximate farthest point sampling: how well they cover the cloud."""
+    """Proximal points kept by farthest point sampling: how well they cover the cloud."""
     recorder = Recorder(overrides, sizes.num_envs, CROWD)
     cloud, configured = recorder.frames(2)[-1], recorder.run.perception.sampler()
     options = {"max_range": cloud.max_range, "split_deg": math.degrees(configured.split), "num_threads": 1}
     samplers = {}
     for count in sorted({*counts, configured.num_proximal}):
         samplers[f"{count} exact"] = PdSampler(count, 0, **options)
-        for grid in (12, 16, 32):
-            samplers[f"{count} grid {grid}"] = PdSampler(count, 0, grid=grid, **options)
     costs, kept = _sampled(cloud, samplers, sizes)
     near = torch.isfinite(cloud.ranges) & (cloud.elevation > configured.split)
     hits = cloud.ranges.clamp(max=cloud.max_range)[..., None] * cloud.directions_s
-    default = f"{configured.num_proximal} {f'grid {configured.grid}' if configured.grid else 'exact'}"
+    default = f"{configured.num_proximal} exact"
     choices = []
     for name, points in kept.items():
         radius = [_radius(h[m], p) for h, m, p in zip(hits, near, points * cloud.max_range, strict=True) if m.any()]
@@ -218,16 +216,14 @@ def heights_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] 
 
 
 def sectors_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] = (32, 64, 128, 216, 256)) -> Study:
-    """The distal half averaged, picked, or as proximities: the nearest obstacle by sector that can be read from it."""
+    """The distal half averaged or as proximities: the nearest obstacle by sector that can be read from it."""
     recorder = Recorder(overrides, sizes.num_envs, CROWD)
     cloud, configured = recorder.frames(2)[-1], recorder.run.perception.sampler()
     split = math.degrees(configured.split)
     options = {"max_range": cloud.max_range, "split_deg": split, "num_threads": 1}
     samplers: dict[str, Sampler] = {}
-    for reduce in ("average", "pick"):
-        for count in counts:
-            ring = math.degrees(configured.ring)
-            samplers[f"{count} {reduce}"] = PdSampler(0, count, reduce=reduce, ring_deg=ring, **options)
+    for count in counts:
+        samplers[f"{count} average"] = PdSampler(0, count, ring_deg=math.degrees(configured.ring), **options)
     edges, decay = (-0.34, -0.25, -0.15, -0.05, 0.15, 0.5, 3.0), 0.5
     if isinstance(configured, ProximitySampler):
         edges, decay = tuple(configured.edges.tolist()), configured.decay
@@ -237,7 +233,7 @@ def sectors_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] 
             samplers[name] = ProximitySampler(
                 0, sectors, band_edges=bands, decay=decay, blind=0.3, body=BODY, **options
             )
-    default = f"{configured.num_distal} {'pick' if configured.pick_middle else 'average'}"
+    default = f"{configured.num_distal} average"
     if isinstance(configured, ProximitySampler):
         default = f"{configured.num_sectors} x {len(configured.edges) - 1} proximity"
     costs, kept = _sampled(cloud, samplers, sizes)

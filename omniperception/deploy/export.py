@@ -215,8 +215,7 @@ def sampler_figures(sampler: Sampler) -> dict:
         "ring": sampler.ring,
     }
     if not isinstance(sampler, ProximitySampler):
-        middle = bool(sampler.pick_middle)
-        return {"kind": "pd", **halves, "num_distal": sampler.num_distal, "pick_middle": middle}
+        return {"kind": "pd", **halves, "num_distal": sampler.num_distal}
     return {
         "kind": "proximity",
         **halves,

@@ -84,7 +84,6 @@ class PdSampler(CloudSampler):
         max_range: float,
         split: float | None,
         ring: float,
-        pick_middle: bool = False,
     ) -> None:
         """Configure both halves.
 
@@ -94,12 +93,11 @@ class PdSampler(CloudSampler):
             max_range: m.
             split: elevation in the sensor frame above which a point is proximal, rad; None: every point is.
             ring: height of an elevation ring for sorting, rad.
-            pick_middle: whether a distal bin gives its middle point in place of the mean.
         """
         self.num_points, self.max_range = num_proximal + num_distal, max_range
         self.num_proximal, self.num_distal = num_proximal, num_distal
         self.split = np.float32(-math.inf if split is None else split)
-        self.ring, self.pick_middle = np.float32(ring), pick_middle
+        self.ring = np.float32(ring)
 
     def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
         """See :meth:`CloudSampler.__call__`."""
@@ -136,10 +134,7 @@ class PdSampler(CloudSampler):
         ordered = self._scaled(points)[self._ring_order(points)]
         edges = np.arange(bins + 1) * len(points) // bins
         first, size = edges[:-1], np.diff(edges)
-        if self.pick_middle:
-            out[:bins] = ordered[first + size // 2]
-        else:
-            out[:bins] = np.add.reduceat(ordered, first, axis=0) / size[:, None].astype(np.float32)
+        out[:bins] = np.add.reduceat(ordered, first, axis=0) / size[:, None].astype(np.float32)
 
     def _scaled(self, points: np.ndarray) -> np.ndarray:
         return points * np.float32(1.0 / self.max_range)

@@ -32,7 +32,7 @@ def test_exact_covers_best_and_its_ways_agree():
     rows = {row.name: row for row in measure(frame(), 40, 5.0, 1, 1)}
     assert rows["exact"].radius_ratio == 1.0
     assert rows["exact, every point"].radius == rows["exact, by bucket"].radius == rows["exact"].radius
-    assert 1.0 <= rows["grid of 32"].radius_ratio < rows["random"].radius_ratio
+    assert rows["random"].radius_ratio > 1.0
     assert all(row.milliseconds > 0 for row in rows.values())
 
 

@@ -25,7 +25,6 @@ GRID = {
 }
 SAMPLERS = {
     "pd": lambda: PdSampler(48, 32, max_range=MAX_RANGE, split_deg=20.0, ring_deg=9.0),
-    "pick": lambda: PdSampler(48, 32, max_range=MAX_RANGE, split_deg=20.0, ring_deg=9.0, reduce="pick"),
     "fps": lambda: FpsSampler(64, max_range=MAX_RANGE, ring_deg=9.0),
     "proximity": lambda: ProximitySampler(32, 36, max_range=MAX_RANGE, **GRID),
     "raw": lambda: RawSampler(RAYS, max_range=MAX_RANGE),

@@ -13,8 +13,6 @@ SPLIT = {"max_range": MAX_RANGE, "split_deg": 10.0}
 PROXIMITY = {**SPLIT, "band_edges": (-1.0, -0.2, 0.3, 2.0), "decay": 0.6, "blind": 0.4, "body": (0.5, 0.3)}
 SAMPLERS = {
     "pd": lambda: PdSampler(24, 16, **SPLIT),
-    "middle": lambda: PdSampler(24, 16, reduce="pick", **SPLIT),
-    "thinned": lambda: PdSampler(24, 16, grid=8, **SPLIT),
     "proximal alone": lambda: PdSampler(24, 0, **SPLIT),
     "distal alone": lambda: PdSampler(0, 16, **SPLIT),
     "more than there are": lambda: PdSampler(700, 900, **SPLIT),

@@ -31,7 +31,6 @@ def test_kernels_compile_for_cuda(module, tmp_path):
 
 SAMPLERS = [
     PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0),
-    PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0, reduce="pick", grid=8),
     FpsSampler(70, max_range=MAX_RANGE),
 ]
 

@@ -150,7 +150,6 @@ def write_bins(
     scale: float,
     first_slot: int,
     num_bins: int,
-    pick_middle: int,
     items: wp.array(dtype=wp.int32),
     parts: wp.array2d(dtype=wp.int32),
     # out
@@ -166,14 +165,10 @@ def write_bins(
     if b < bins:
         first = b * n // bins
         last = (b + 1) * n // bins
-        if pick_middle != 0:
-            ray = items[start + first + (last - first) // 2]
-            point = (ranges[env, ray] * scale) * directions[env, ray]
-        else:
-            for i in range(first, last):
-                ray = items[start + i]
-                point += (ranges[env, ray] * scale) * directions[env, ray]
-            point = point / float(last - first)
+        for i in range(first, last):
+            ray = items[start + i]
+            point += (ranges[env, ray] * scale) * directions[env, ray]
+        point = point / float(last - first)
     points_out[env, first_slot + b] = point
 
 

@@ -194,65 +194,6 @@ def farthest_points_by_bucket(
 ): ...
 
 
-MAX_GRID = 32
-"""Most cells along an axis in :func:`first_of_each_cell`."""
-
-_FIRST_OF_EACH_CELL = r"""
-    const int n = num_proximal.data[env];
-    if (n <= num_picks) return;
-    float* xyz[3] = {
-        (float*)((char*)x.data + (size_t)env * x.strides[0]),
-        (float*)((char*)y.data + (size_t)env * y.strides[0]),
-        (float*)((char*)z.data + (size_t)env * z.strides[0])};
-    int* R = (int*)((char*)ray.data + (size_t)env * ray.strides[0]);
-    int* C = (int*)((char*)distance.data + (size_t)env * distance.strides[0]);
-    for (int i = 0; i < n; ++i) C[i] = 0;
-    for (int a = 2; a >= 0; --a) {
-        const float* __restrict__ X = xyz[a];
-        float lo = X[0], hi = X[0];
-        for (int i = 1; i < n; ++i) {
-            lo = X[i] < lo ? X[i] : lo;
-            hi = X[i] > hi ? X[i] : hi;
-        }
-        const float scale = hi > lo ? (float)grid / (hi - lo) : 0.0f;
-        for (int i = 0; i < n; ++i) {
-            const int cell = (int)((X[i] - lo) * scale);
-            C[i] = C[i] * grid + (cell > grid - 1 ? grid - 1 : cell);
-        }
-    }
-    unsigned int seen[1024];
-    for (int w = 0; w < (grid * grid * grid + 31) / 32; ++w) seen[w] = 0u;
-    int cells = 0;
-    for (int i = 0; i < n; ++i) {
-        const unsigned int bit = 1u << (C[i] & 31);
-        if (seen[C[i] >> 5] & bit) C[i] = -1;
-        else { seen[C[i] >> 5] |= bit; ++cells; }
-    }
-    if (cells < num_picks) return;
-    int kept = 0;
-    for (int i = 0; i < n; ++i) {
-        if (C[i] < 0) continue;
-        for (int a = 0; a < 3; ++a) xyz[a][kept] = xyz[a][i];
-        R[kept++] = R[i];
-    }
-    num_proximal.data[env] = kept;
-"""
-
-
-@wp.func_native(_FIRST_OF_EACH_CELL)
-def first_of_each_cell(
-    x: wp.array2d(dtype=wp.float32),
-    y: wp.array2d(dtype=wp.float32),
-    z: wp.array2d(dtype=wp.float32),
-    ray: wp.array2d(dtype=wp.int32),
-    distance: wp.array2d(dtype=wp.int32),
-    num_proximal: wp.array(dtype=wp.int32),
-    grid: int,
-    num_picks: int,
-    env: int,
-): ...
-
-
 _FARTHEST_POINTS = r"""
     const int n = num_proximal.data[env];
     const int k = n < num_picks ? n : num_picks;
@@ -423,22 +364,6 @@ def gather_proximal(
 
 
 @wp.kernel
-def thin_proximal(env_offset: int, grid: int, num_picks: int, scratch: Scratch):
-    """Keep the first hit in each cell of a grid over the cloud's box, if there are enough of them."""
-    first_of_each_cell(
-        scratch.x,
-        scratch.y,
-        scratch.z,
-        scratch.ray,
-        scratch.distance,
-        scratch.num_proximal,
-        grid,
-        num_picks,
-        env_offset + wp.tid(),
-    )
-
-
-@wp.kernel
 def pick_farthest(env_offset: int, num_picks: int, num_lanes: int, bucket_from: int, scratch: Scratch):
     """Exact farthest point sampling from the first hit in ray order; no point is picked twice.
 
@@ -520,22 +445,6 @@ def mean_hit(
     return total / float(last - first)
 
 
-@wp.func
-def middle_hit(
-    env: int,
-    half: int,
-    first: int,
-    last: int,
-    scale: float,
-    ranges: wp.array2d(dtype=wp.float32),
-    directions: wp.array2d(dtype=wp.vec3),
-    scratch: Scratch,
-) -> wp.vec3:
-    """The middle one of the sorted hits first..last-1."""
-    ray = scratch.items[half, env, first + (last - first) // 2]
-    return (ranges[env, ray] * scale) * directions[env, ray]
-
-
 @wp.kernel
 def write_distal(
     env_offset: int,
@@ -548,7 +457,6 @@ def write_distal(
     scale: float,
     first_slot: int,
     num_bins: int,
-    pick_middle: int,
     scratch: Scratch,
     points_out: wp.array2d(dtype=wp.vec3),
 ):
@@ -565,10 +473,7 @@ def write_distal(
     for b in range(bins):
         first = b * n // bins
         last = (b + 1) * n // bins
-        if pick_middle != 0:
-            points_out[env, first_slot + b] = middle_hit(env, half, first, last, scale, ranges, directions, scratch)
-        else:
-            points_out[env, first_slot + b] = mean_hit(env, half, first, last, scale, ranges, directions, scratch)
+        points_out[env, first_slot + b] = mean_hit(env, half, first, last, scale, ranges, directions, scratch)
     for b in range(bins, num_bins):
         points_out[env, first_slot + b] = wp.vec3(0.0, 0.0, 0.0)
 

@@ -72,8 +72,6 @@ class PdSampler(Sampler):
         max_range: float,
         split_deg: float,
         ring_deg: float = 2.0,
-        reduce: str = "average",
-        grid: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Configure the two halves.
@@ -84,9 +82,6 @@ class PdSampler(Sampler):
             max_range: metres; points are divided by it.
             split_deg: elevation in the sensor frame that separates the halves, degrees.
             ring_deg: height of a theta ring for sorting, degrees.
-            reduce: "average" takes a bin's mean, "pick" its middle point.
-            grid: cells along each axis of the proximal cloud's box; farthest point sampling then looks only at each
-                cell's first hit in ray order, if there are enough; 0, the default, looks at all hits: exact.
             num_threads: CPU threads; all cores by default.
         """
         if num_proximal < 0 or num_distal < 0:
@@ -94,19 +89,13 @@ class PdSampler(Sampler):
         super().__init__(num_proximal + num_distal, max_range, num_threads)
         if not 180.0 / kernels.MAX_RING < ring_deg <= 180.0:
             raise ValueError(f"ring_deg must lie in (0.006, 180], got {ring_deg}")
-        if reduce not in ("average", "pick"):
-            raise ValueError(f"reduce must be 'average' or 'pick', got '{reduce}'")
         if math.isnan(split_deg):
             raise ValueError("split_deg must be a number of degrees, got nan")
-        if not 0 <= grid <= kernels.MAX_GRID:
-            raise ValueError(f"grid={grid} must lie in 0..{kernels.MAX_GRID}; 0 samples exactly")
-        self.grid = grid
         self.buckets_from = BUCKETS_FROM
         self.num_proximal = num_proximal
         self.num_distal = num_distal
         self.split = math.radians(split_deg)
         self.ring = math.radians(ring_deg)
-        self.pick_middle = int(reduce == "pick")
         self._scratch: kernels.Scratch | None = None
         self._scratch_key: tuple[int, tuple | None] = (0, None)
         self._tensors: dict[str, torch.Tensor] = {}
@@ -117,8 +106,7 @@ class PdSampler(Sampler):
 
     @property
     def kernels(self) -> tuple[str, ...]:
-        thinning = ("thin_proximal",) if self.grid else ()
-        proximal = ("gather_proximal", *thinning, "pick_farthest", "write_proximal") if self.num_proximal else ()
+        proximal = ("gather_proximal", "pick_farthest", "write_proximal") if self.num_proximal else ()
         return (*proximal, "write_distal") if self.num_distal else proximal
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
@@ -168,7 +156,6 @@ class PdSampler(Sampler):
                 scale,
                 self.num_proximal,
                 self.num_distal,
-                self.pick_middle,
                 scratch,
                 points,
                 block_dim=32,
@@ -189,7 +176,7 @@ class PdSampler(Sampler):
         rays.sort()
         launch(by_ray.find_parts, 0, r, rays.keys, rays.parts, scratch.num_proximal)
         if self.num_distal:
-            bins = (first_bin, self.num_distal, self.pick_middle, rays.items, rays.parts)
+            bins = (first_bin, self.num_distal, rays.items, rays.parts)
             launch(by_ray.write_bins, self.num_distal, *cloud, scale, *bins, points)
         if self.num_proximal:
             launch(by_ray.gather_ranked, r, *cloud, scale, rays.items, rays.parts, scratch)
@@ -210,11 +197,8 @@ class PdSampler(Sampler):
             launch(by_ray.write_picks, self.num_proximal, self.num_proximal, picks.items, scratch, points)
 
     def _pick(self, n: int, scratch: kernels.Scratch, device: torch.device) -> None:
-        """Thins the proximal hits, if asked for, and picks from them."""
+        """Farthest points among the proximal hits."""
         threads = {"num_threads": self.num_threads}
-        if self.grid:
-            thinning = [self.grid, self.num_proximal, scratch]
-            launch_over_envs(kernels.thin_proximal, n, thinning, device, block_dim=32, **threads)
         lanes = _FPS_LANES if device.type == "cuda" else 1
         picks = [self.num_proximal, lanes, self.buckets_from, scratch]
         launch_over_envs(kernels.pick_farthest, n, picks, device, inner=lanes, block_dim=lanes, **threads)
@@ -280,7 +264,6 @@ class ProximitySampler(PdSampler):
         blind: float,
         body: Sequence[float],
         ring_deg: float = 2.0,
-        grid: int = 0,
         num_threads: int | None = None,
     ) -> None:
         """Configure both halves.
@@ -295,7 +278,6 @@ class ProximitySampler(PdSampler):
             blind: nearest range that counts, metres.
             body: half length and half width of the robot's own body around the base's origin, metres.
             ring_deg: height of a theta ring for sorting the proximal half, degrees.
-            grid: as in :class:`PdSampler`.
             num_threads: CPU threads; all cores by default.
         """
         edges = [float(edge) for edge in band_edges]
@@ -307,7 +289,7 @@ class ProximitySampler(PdSampler):
             raise ValueError(f"blind={blind} must lie in [0, max_range={max_range})")
         if len(body) != 2 or min(body) < 0.0:
             raise ValueError(f"body={list(body)} must be [half length, half width] in metres")
-        options = {"split_deg": split_deg, "ring_deg": ring_deg, "grid": grid, "num_threads": num_threads}
+        options = {"split_deg": split_deg, "ring_deg": ring_deg, "num_threads": num_threads}
         num_cells = num_sectors * (len(edges) - 1)
         super().__init__(num_proximal, num_cells, max_range=max_range, **options)
         self.num_distal = 0  # of the averages that PdSampler would write
@@ -359,18 +341,15 @@ class FpsSampler(PdSampler):
         *,
         max_range: float,
         ring_deg: float = 2.0,
-        grid: int = 0,
         num_threads: int | None = None,
     ) -> None:
-        """Args: num_points: slots; max_range: metres; ring_deg: height of a theta ring for sorting, degrees;
-        grid: as in :class:`PdSampler`."""
+        """Args: num_points: slots; max_range: metres; ring_deg: height of a theta ring for sorting, degrees."""
         super().__init__(
             num_points,
             0,
             max_range=max_range,
             split_deg=-math.inf,
             ring_deg=ring_deg,
-            grid=grid,
             num_threads=num_threads,
         )
 
