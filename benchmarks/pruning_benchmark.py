@@ -20,6 +20,7 @@ from omniperception import build, config
 from omniperception.build import RunConfig, build_runner
 from omniperception.env.env import EnvConfig, OmniEnv
 from omniperception.env.mdp import rewards
+from omniperception.env.mdp.terms import RewardTerm
 from omniperception.plan import OPTIONAL_FIELDS, OPTIONAL_PACKAGES, describe
 
 SCENES = {
@@ -85,7 +86,7 @@ def _with_terms(config: EnvConfig) -> EnvConfig:
         "alive": rewards.alive,
         "closing_speed": partial(rewards.closing_speed, horizon=1.5, margin=0.6),
     }
-    terms = {name: rewards.RewardTerm(NO_EFFECT, func) for name, func in more.items()}
+    terms = {name: RewardTerm(NO_EFFECT, func) for name, func in more.items()}
     return replace(config, rewards=replace(config.rewards, terms={**terms, **config.rewards.terms}))
 
 

@@ -18,10 +18,11 @@ from omniperception.common.rows import chosen, put, replaced, take
 from omniperception.common.timing import StageTimer
 from omniperception.env.heights import NUM_HEIGHTS, flat_heights
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.env.mdp.observations import GroupBuffer, ObservationsConfig
+from omniperception.env.mdp.observations import GroupBuffer
 from omniperception.env.mdp.randomization import RandomizationConfig, Randomizer
-from omniperception.env.mdp.rewards import RewardsConfig, avoidance_velocity, capped_ray_distance, distal_caps
+from omniperception.env.mdp.rewards import avoidance_velocity, capped_ray_distance, distal_caps
 from omniperception.env.mdp.terminations import TerminationsConfig
+from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
 from omniperception.env.metrics import EpisodeMetrics
 from omniperception.env.state import Kinematics, fields_read, plain
 from omniperception.lidar import DEVICES, Noise

@@ -204,7 +204,7 @@ class TestConfiguration:
     def test_weight_zero_removes_a_term_and_what_only_it_reads(self, make_env):
         """Walking on free ground with the paper's contact terms, and without."""
         contact_terms = (
-            "+rewards.terms.{0}._target_=omniperception.env.mdp.rewards.RewardTerm",
+            "+rewards.terms.{0}._target_=omniperception.env.mdp.terms.RewardTerm",
             "+rewards.terms.{0}.weight={1}",
             "+rewards.terms.{0}.func._target_=omniperception.env.mdp.rewards.{0}",
             "+rewards.terms.{0}.func._partial_=true",

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.rewards import RewardTerm
+from omniperception.env.mdp.terms import RewardTerm
 from omniperception.env.state import reads
 from omniperception.lidar import OUTPUTS
 

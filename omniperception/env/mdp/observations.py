@@ -1,61 +1,18 @@
-"""Observation terms and groups: each group is a concatenation of terms, with or without history."""
+"""Observation terms, and the history of a group of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
 from omniperception.common.rows import put, take
+from omniperception.env.mdp.terms import ObservationGroup
 from omniperception.env.mirror import JOINTS, ROTATION, VECTOR, mirrors
-from omniperception.env.state import checked_term, fields_read, reads
+from omniperception.env.state import reads
 
 if TYPE_CHECKING:
     from omniperception.env.env import OmniEnv
-
-
-@dataclass(frozen=True)
-class ObservationGroup:
-    """Terms concatenated in order, `history` control steps of them (newest last).
-
-    Attributes:
-        terms: functions of the environment that return (num_envs, width).
-        history: control steps kept; after a reset the first observation fills all of them.
-    """
-
-    terms: Mapping[str, Callable[[OmniEnv], torch.Tensor]]
-    history: int = 1
-
-    def __post_init__(self) -> None:
-        used = {name: term for name, term in self.terms.items() if term is not None}
-        object.__setattr__(self, "terms", {name: checked_term(f"terms.{name}", term) for name, term in used.items()})
-        if self.history < 1:
-            raise ValueError(f"observations: history={self.history} must be at least 1")
-
-
-@dataclass(frozen=True)
-class ObservationsConfig:
-    """Groups by name, and which of them the actor and the critic see."""
-
-    groups: Mapping[str, ObservationGroup]
-    actor: Sequence[str]
-    critic: Sequence[str]
-
-    def __post_init__(self) -> None:
-        used = [*self.actor, *self.critic]
-        missing = [name for name in used if name not in self.groups]
-        if missing:
-            raise ValueError(f"observations: groups {missing} are used but not defined; defined: {list(self.groups)}")
-        object.__setattr__(self, "groups", {name: g for name, g in self.groups.items() if name in used})
-        object.__setattr__(self, "actor", tuple(self.actor))
-        object.__setattr__(self, "critic", tuple(self.critic))
-
-    def readers(self) -> dict[str, frozenset[str]]:
-        """The optional fields that each term reads."""
-        terms = {f"{name}.{term}": f for name, group in self.groups.items() for term, f in group.terms.items()}
-        return {f"observations.{name}": fields_read(term) for name, term in terms.items()}
 
 
 class GroupBuffer:

@@ -6,54 +6,18 @@ paper lists the eleven of `rewards=paper`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
 from omniperception.avoidance.sector_motion import sector_bearings
-from omniperception.env.state import checked_term, fields_read, plain, reads
+from omniperception.env.state import plain, reads
 
 if TYPE_CHECKING:
     from omniperception.avoidance.velocity_risk import VelocityRisk
     from omniperception.env.env import OmniEnv
-
-
-@dataclass(frozen=True)
-class RewardTerm:
-    """A weighted term; a weight of 0 means that the term, and what only it reads, does not exist in this run."""
-
-    weight: float
-    func: Callable[[OmniEnv], torch.Tensor]
-
-
-@dataclass(frozen=True)
-class RewardsConfig:
-    """Weighted terms by name, summed and multiplied by the control step (s).
-
-    Attributes:
-        terms: the terms.
-        avoidance: how sector distances become the avoidance velocity.
-    """
-
-    terms: Mapping[str, RewardTerm]
-    avoidance: AvoidanceConfig
-
-    def __post_init__(self) -> None:
-        for name, term in self.terms.items():
-            if not isinstance(term, RewardTerm | None):
-                raise ValueError(
-                    f"terms.{name}={dict(term)} is no term, and these rewards have none of that name; use others, or"
-                    f" rewards.terms.{name}=null"
-                )
-        used = {name: term for name, term in self.terms.items() if term is not None and term.weight != 0}
-        checked = {name: replace(t, func=checked_term(f"terms.{name}.func", t.func)) for name, t in used.items()}
-        object.__setattr__(self, "terms", checked)
-
-    def readers(self) -> dict[str, frozenset[str]]:
-        """The optional fields that each term reads."""
-        return {f"rewards.{name}": fields_read(term.func) for name, term in self.terms.items()}
 
 
 @dataclass(frozen=True)
