@@ -247,7 +247,7 @@ def _measure_steps(options: CheckOptions, name: str, *overrides: str) -> Table:
     table.notes = [
         "stages were timed with the device waited for at both ends, in a block of their own",
         f"{', '.join(PERCEPTION_STAGES)} together: {share:.0f} % (bar: below 50 %)",
-        f"room that was too small: {env.sim.anomalies()}; clouds in {len(env.sensing.lidar.parts)} parts",
+        f"room that was too small: {env.sim.anomalies()}; clouds in {len(env.sensing.lidar.env_slices)} parts",
     ]
     return table
 

@@ -13,9 +13,9 @@ import sys
 from pathlib import Path
 
 from benchmarks.figures import PlotsUnavailable, new_figure
+from benchmarks.pattern_coverage import DURATIONS_S, angle_to_table, compare, strategy_coverage
 from omniperception import config
 from omniperception.lidar import DEVICES, LIVOX, ScanPattern
-from omniperception.lidar.patterns.coverage import DURATIONS_S, angle_to_table, compare, strategy_coverage
 
 ARGUMENTS = {
     "sensors": ",".join(LIVOX),

@@ -260,7 +260,7 @@ def staleness_study(bench: Bench, every: Sequence[int] = (1, 2, 5, 10)) -> Study
 def rays_study(
     bench: Bench,
     counts: Sequence[int] = (100, 200, 500, 1000, 2000, 5000, 20_000),
-    strategies: Sequence[str] = ("every_kth", "stratified", "random"),
+    strategies: Sequence[str] = ("every_kth", "stratified"),
 ) -> Study:
     """How many rays are kept, and which."""
     points = bench.pattern.points_per_frame(bench.sensor.period_s)

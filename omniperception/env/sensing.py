@@ -20,8 +20,8 @@ from omniperception.lidar import (
     RayScene,
     ScanPattern,
     SectorDistances,
-    even_parts,
-    largest_lean,
+    env_slices,
+    max_deviation,
     ray_bytes,
 )
 from omniperception.perception import Attitude
@@ -179,7 +179,7 @@ class LidarSensing:
         Raises:
             ValueError: they are cast in parts.
         """
-        if len(self.lidar.parts) > 1:
+        if len(self.lidar.env_slices) > 1:
             raise ValueError(
                 f"the clouds of {self._sim.num_envs} environments take more than"
                 f" lidar.cloud_mb={self.config.cloud_mb:g} MB and are never there at once; raise it, or lower num_envs"
@@ -189,7 +189,7 @@ class LidarSensing:
     def parts_of(self, num_envs: int) -> tuple[slice, ...]:
         """The parts in which the clouds of a run with so many environments are cast."""
         most = num_envs if self.needs.whole else envs_at_once(self.config, self.lidar.outputs)
-        return even_parts(num_envs, most)
+        return env_slices(num_envs, most)
 
     def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
         """Notes where the base of some environments, see `rows`, starts; call after their reset."""
@@ -220,8 +220,8 @@ class LidarSensing:
             if self.lidar.track is not None:
                 self.lidar.track.reset(self._placed_anew)
                 self._placed_anew.zero_()
-        parts = self.lidar.cast_parts(self._time.fill_(time_s))
-        for index in range(len(self.lidar.parts)):
+        parts = self.lidar.cast_slices(self._time.fill_(time_s))
+        for index in range(len(self.lidar.env_slices)):
             with timer.stage("rays"):
                 part, frame = next(parts)
                 if self.unseen is not None:
@@ -344,7 +344,7 @@ class LidarSensing:
                 num_threads=num_threads,
                 out=self.sector_distance[part],
             )
-            for part, frame in zip(self.lidar.parts, self.lidar.part_frames, strict=True)
+            for part, frame in zip(self.lidar.env_slices, self.lidar.slice_frames, strict=True)
         ]
 
 
@@ -352,7 +352,7 @@ def field_of_view(sensor: LidarConfig, pattern: ScanPattern, noise: Sequence[Noi
     """Where the rays of a sensor go."""
     directions, origins = pattern.directions_s.numpy(), pattern.origins_s
     reach = 0.0 if origins is None else float(origins.double().norm(dim=1).max())
-    return FieldOfView.of(sensor.mount_pos, sensor.quat, directions, largest_lean(noise), reach)
+    return FieldOfView.of(sensor.mount_pos, sensor.quat, directions, max_deviation(noise), reach)
 
 
 def _outputs_read(needs: SensingNeeds, sampled: bool) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from .noise import (
     MaskNoise,
     MixedPixels,
     Noise,
-    largest_lean,
+    max_deviation,
 )
 from .patterns import (
     LIVOX,
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from .mujoco import GeomShapes, MujocoScene, geom_shapes
     from .scene import RayHits, RayScene
     from .sectors import SectorDistances, sector_distances
-    from .sensor import OUTPUTS, Lidar, LidarConfig, LidarFrame, even_parts, quat_from_rpy, ray_bytes
+    from .sensor import OUTPUTS, Lidar, LidarConfig, LidarFrame, env_slices, quat_from_rpy, ray_bytes
     from .shapes import Shape, ShapeKind
 
 _LOADED_WHEN_USED = {
@@ -64,7 +64,7 @@ _LOADED_WHEN_USED = {
     "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
     "scene": ("RayHits", "RayScene"),
     "sectors": ("SectorDistances", "sector_distances"),
-    "sensor": ("OUTPUTS", "Lidar", "LidarConfig", "LidarFrame", "even_parts", "quat_from_rpy", "ray_bytes"),
+    "sensor": ("OUTPUTS", "Lidar", "LidarConfig", "LidarFrame", "env_slices", "quat_from_rpy", "ray_bytes"),
     "shapes": ("Shape", "ShapeKind"),
 }
 
@@ -98,7 +98,7 @@ __all__ = [
     "airy",
     "avia",
     "custom",
-    "even_parts",
+    "env_slices",
     "geom_shapes",
     "grid",
     "hap",
@@ -106,8 +106,8 @@ __all__ = [
     "hdl64e",
     "height_scanner",
     "horizon",
-    "largest_lean",
     "make_selection",
+    "max_deviation",
     "mid40",
     "mid70",
     "mid360",

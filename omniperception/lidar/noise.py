@@ -188,18 +188,14 @@ def noise_figures(named: dict[str, Noise], seed: int, min_range: float, max_rang
     return figures
 
 
-def largest_lean(noise: Sequence[Noise]) -> float:
+def max_deviation(noise: Sequence[Noise]) -> float:
     """Largest angle between a nominal direction and one that is cast for it, rad."""
-    return spread(noise_by_name(noise))
-
-
-def spread(named: dict[str, Noise]) -> float:
-    """``largest_lean`` of models by name."""
     angle = 0.0
-    if "jitter" in named:
-        angle += math.atan(MAX_SIGMAS * math.tan(math.radians(named["jitter"].sigma_deg)))
-    if "mixed" in named:
-        angle += math.radians(named["mixed"].divergence_deg) / 2.0
+    for model in noise:
+        if isinstance(model, AngularJitter):
+            angle += math.atan(MAX_SIGMAS * math.tan(math.radians(model.sigma_deg)))
+        elif isinstance(model, MixedPixels):
+            angle += math.radians(model.divergence_deg) / 2.0
     return angle
 
 

@@ -17,10 +17,10 @@ from .kernels.scan import Labels, Rays, ScanOutputs, ScanVariant, scan_kernel
 from .kernels.search import FEW_SLOTS, WORD, Slots, pack_slots
 from .launch import SplitLaunch
 from .motion import PoseTrack, SweptShapes, viewpoint_of
-from .noise import Noise, noise_by_name, noise_figures, spread
+from .noise import Noise, max_deviation, noise_by_name, noise_figures
 from .patterns import ROW_SLACK, ScanPattern, make_selection
 from .patterns.selection import Strategy
-from .rows import ScanRows
+from .scan_table import ScanTable
 from .scene import POSE_TYPES, PlacedShapes, RayScene, View
 from .shapes import ShapeKind, finite_tuple
 
@@ -54,7 +54,7 @@ class LidarConfig:
         mount_pos: Sensor position in the mount body's frame, metres.
         mount_rpy: Sensor orientation in the mount body's frame, roll-pitch-yaw about fixed axes, rad.
         mount_quat: The same as (w, x, y, z), in place of ``mount_rpy``.
-        selection: Which points of a frame are kept: "every_kth", "stratified" or "random", see ``make_selection``.
+        selection: Which points of a frame are kept: "every_kth" or "stratified", see ``make_selection``.
         reference_range: Distance at which a white wall seen perpendicularly has intensity 1, metres.
         motion_segments: Pieces into which a frame is cut for motion distortion: each point is cast from the sensor's
             and the bodies' poses at its own time, interpolated between the ends of its piece. 0: every point is cast
@@ -176,15 +176,15 @@ class Lidar:
     Attributes:
         config, pattern, scene: As given.
         outputs: Names of the fields of ``frame`` that are computed.
-        parts: Which environments are cast at the same time.
-        part_frames: Of each part, as many rows of ``frame``.
-        frame: The frame that ``cast`` fills and returns; with several ``parts``, that of the part cast last.
+        env_slices: Runs of environments that are cast at the same time.
+        slice_frames: Of each of them, as many rows of ``frame``.
+        frame: The frame that ``cast`` fills and returns; with several ``env_slices``, that of the slice cast last.
         phase_rows: Rows by which each environment's device is ahead, (num_envs,) int64, from the seed.
         variant: What the scan's kernel was compiled for.
         track: The poses that motion distortion needs; None without it. ``cast`` takes the scene's poses as those at
             the frame's end; with more than one segment, call ``track.advance()`` at the ends of the others.
         frame_count: Frames cast by each environment since its last ``reset``, (num_envs,) int32; the noise and a
-            random selection are functions of it, of the seed and of the environment.
+            stratified selection are functions of it, of the seed and of the environment.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class Lidar:
             outputs: What to compute, names from ``OUTPUTS``.
             reflectivity: Of each class of shapes, 0 to 1 for matt surfaces; 1 for classes not named. Read by
                 the output ``intensity`` only.
-            envs_at_once: Environments whose frames exist at the same time; None for all. With fewer, ``cast_parts``
+            envs_at_once: Environments whose frames exist at the same time; None for all. With fewer, ``cast_slices``
                 takes the place of ``cast``.
         """
         if not -1 <= mount_body < scene.num_bodies:
@@ -224,7 +224,7 @@ class Lidar:
         if envs_at_once is not None and envs_at_once < 1:
             raise ValueError(f"lidar.envs_at_once={envs_at_once} must be at least 1, or None for all")
         self.outputs = _known_outputs(outputs)
-        self.parts = even_parts(scene.num_envs, envs_at_once or scene.num_envs)
+        self.env_slices = env_slices(scene.num_envs, envs_at_once or scene.num_envs)
         self._selection = make_selection(pattern, config.period_s, config.num_rays, config.selection, seed)
         generator = torch.Generator().manual_seed(seed)
         self.phase_rows = self._selection.draw_phases(scene.num_envs, generator).to(scene.device)
@@ -233,7 +233,7 @@ class Lidar:
         self.frame_count = torch.zeros(scene.num_envs, dtype=torch.int32, device=scene.device)
         self._noise = noise_by_name(noise)
         self.frame = self._allocate_frame()
-        self.part_frames = tuple(self._first_rows(part.stop - part.start) for part in self.parts)
+        self.slice_frames = tuple(self._first_rows(envs.stop - envs.start) for envs in self.env_slices)
         self.track: PoseTrack | None = None
         self._rays = self._lay_out_rays()
         self._view, self._placed = self._place(mount_body, exclude_shapes)
@@ -251,21 +251,21 @@ class Lidar:
         Returns:
             ``self.frame``, every element of it rewritten.
         """
-        if len(self.parts) > 1:
+        if len(self.env_slices) > 1:
             raise ValueError(
-                f"this lidar's frames come in {len(self.parts)} parts; use cast_parts, or envs_at_once=None"
+                f"this lidar's frames come in {len(self.env_slices)} slices; use cast_slices, or envs_at_once=None"
             )
-        for _ in self.cast_parts(time_s):
+        for _ in self.cast_slices(time_s):
             pass
         return self.frame
 
-    def cast_parts(self, time_s: torch.Tensor | np.ndarray | float) -> Iterator[tuple[slice, LidarFrame]]:
+    def cast_slices(self, time_s: torch.Tensor | np.ndarray | float) -> Iterator[tuple[slice, LidarFrame]]:
         """``cast``, some environments after the others, so that the frames of all never exist at the same time.
 
         The iterator has to be run to its end; bodies stay where they are until then.
 
         Yields:
-            Which environments, and their frame with as many rows. It lasts until the next part.
+            Which environments, and their frame with as many rows. It lasts until the next slice.
         """
         if not isinstance(time_s, torch.Tensor):
             time_s = torch.as_tensor(time_s, dtype=torch.float64, device=self.scene.device)
@@ -279,9 +279,9 @@ class Lidar:
             self.track.advance()
         if self._placed.refresh() and self._pack is not None:
             self._pack()
-        for part, cast, frame in zip(self.parts, self._casts, self.part_frames, strict=True):
+        for envs, cast, frame in zip(self.env_slices, self._casts, self.slice_frames, strict=True):
             cast()
-            yield part, frame
+            yield envs, frame
         self.frame_count.add_(1)
 
     def reset(self, env_ids: torch.Tensor | None = None) -> None:
@@ -296,7 +296,7 @@ class Lidar:
         self.pattern.first_rows(time_s, self.config.period_s, self.phase_rows, self._first_row, self._scratch)
         self._rows.seek(self._first_row)
         if self._variant is not None:
-            self._selection.variants(self._first_row, self.frame_count, self._salts, self._variant)
+            self._selection.variants(self._first_row, self.frame_count, self._variant)
         if self._lag is not None:
             rate = self.pattern.points_per_second
             start = torch.sub(time_s, self.config.period_s, out=self._scratch).mul_(rate)
@@ -304,7 +304,7 @@ class Lidar:
             self._lag.copy_(lag.div_(rate))
 
     def _allocate_frame(self) -> LidarFrame:
-        most = max(part.stop - part.start for part in self.parts)
+        most = max(envs.stop - envs.start for envs in self.env_slices)
         shape, device = (most, self.config.num_rays), self.scene.device
 
         def tensor(name: str) -> torch.Tensor:
@@ -329,7 +329,7 @@ class Lidar:
         elevation = None
         if reach == 0.0:
             angles = torch.asin(self.pattern.directions_s[:, 2].double().clamp(-1.0, 1.0))
-            margin = spread(self._noise)
+            margin = max_deviation(tuple(self._noise.values()))
             elevation = (float(angles.min()) - margin, float(angles.max()) + margin)
         view = View(mount_body, config.mount_pos, config.quat, config.max_range + reach, elevation)
         if not config.motion_segments:
@@ -373,7 +373,7 @@ class Lidar:
         return slots, self.scene.launch(pack_slots, (), [slots], work_per_env=2 * num_viewed)
 
     def _record_casts(self, seed: int, reflectivity: Mapping[int, float], num_viewed: int) -> list[SplitLaunch]:
-        """A launch for each part."""
+        """A launch for each slice."""
         config, scene, rays = self.config, self.scene, self._rays
         written = self.outputs - ({"true_ranges"} if self.frame.true_ranges is self.frame.ranges else set())
         args = [
@@ -401,12 +401,12 @@ class Lidar:
         )
         work = rays.block * (min(num_viewed, 64) + 4)
 
-        def record(part: slice) -> SplitLaunch:
-            given, tasks = [*args, self._output_arrays(written, part.start)], (part.stop - part.start) * rays.num_blocks
-            kernel, first = scan_kernel(variant), part.start * rays.num_blocks
+        def record(envs: slice) -> SplitLaunch:
+            given, tasks = [*args, self._output_arrays(written, envs.start)], (envs.stop - envs.start) * rays.num_blocks
+            kernel, first = scan_kernel(variant), envs.start * rays.num_blocks
             return SplitLaunch(kernel, tasks, (), given, scene.device, scene.num_threads, work, first=first)
 
-        return [record(part) for part in self.parts]
+        return [record(envs) for envs in self.env_slices]
 
     def _stride(self) -> int:
         """The pattern's; warns if the last fifth of a frame, or more, is then not seen."""
@@ -428,7 +428,7 @@ class Lidar:
         angles = bool(self.outputs & {"elevation", "azimuth"})
         rays = Rays()
         rays.stride = self._stride() if every_kth else 1
-        self._rows = ScanRows(pattern, rays.stride, scene.num_envs, angles, scene.device)
+        self._rows = ScanTable(pattern, rays.stride, scene.num_envs, angles, scene.device)
         rays.directions = wp.from_torch(self._rows.directions, dtype=wp.vec3)
         if self._rows.origins is not None:
             rays.origins = wp.from_torch(self._rows.origins, dtype=wp.vec3)
@@ -439,7 +439,6 @@ class Lidar:
         self._variant: torch.Tensor | None = None
         if not every_kth:
             self._offsets = self._selection.offsets.to(scene.device).contiguous()
-            self._salts = self._selection.salts(scene.num_envs).to(scene.device)
             self._variant = torch.zeros_like(self._first_row)
             rays.offsets, rays.variant = wp.from_torch(self._offsets), wp.from_torch(self._variant)
         self._lag: torch.Tensor | None = None
@@ -477,7 +476,7 @@ def ray_bytes(outputs: Sequence[str]) -> int:
     return sum(1 if name == "valid" else 12 if name in _VECTORS else 4 for name in outputs)
 
 
-def even_parts(num_envs: int, most: int) -> tuple[slice, ...]:
+def env_slices(num_envs: int, most: int) -> tuple[slice, ...]:
     """Runs of environments, none longer than ``most`` and all of nearly one length."""
     count = -(-num_envs // most)
     edges = [num_envs * k // count for k in range(count + 1)]

@@ -202,8 +202,10 @@ class TestParts:
     @pytest.mark.parametrize("task", TASKS)
     def test_bit_for_bit(self, make_env, task):
         whole, parts = (make_env(*task, f"lidar.cloud_mb={mb}", num_envs=5) for mb in ("1000.0", "0.1"))
-        sizes = [part.stop - part.start for part in parts.sensing.lidar.parts]
-        assert len(whole.sensing.lidar.parts) == 1 < len(sizes) and sum(sizes) == 5 and max(sizes) - min(sizes) <= 1
+        sizes = [part.stop - part.start for part in parts.sensing.lidar.env_slices]
+        assert (
+            len(whole.sensing.lidar.env_slices) == 1 < len(sizes) and sum(sizes) == 5 and max(sizes) - min(sizes) <= 1
+        )
         assert len(parts.sensing.lidar.frame.ranges) == max(sizes)
         for step in range(23):
             for env in (whole, parts):
@@ -232,4 +234,4 @@ class TestParts:
         terms = {**config.rewards.terms, "nearest": RewardTerm(1.0, nearest)}
         env = OmniEnv(replace(config, rewards=replace(config.rewards, terms=terms)))
         env.step(torch.zeros(5, 12))
-        assert len(env.sensing.lidar.parts) == 1 and env.weighted_rewards["nearest"].min() > 0
+        assert len(env.sensing.lidar.env_slices) == 1 and env.weighted_rewards["nearest"].min() > 0

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.pattern_coverage import angle_to_table, compare
 from omniperception.lidar import LIVOX, hap, mid360
-from omniperception.lidar.patterns.coverage import angle_to_table, compare
 from omniperception.lidar.patterns.risley import RisleyScanner, Wedge
 
 needs_table = pytest.mark.skipif(

@@ -1,4 +1,4 @@
-"""Fewer rays than the device measures: every k-th, stratified, random."""
+"""Fewer rays than the device measures: every k-th, stratified."""
 
 import math
 
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.pattern_coverage import selection_coverage
 from omniperception.lidar import ScanPattern, avia, grid, make_selection, mid40, mid360, os1, select_rows, vlp16, xt16
 from omniperception.lidar.patterns.cells import SphereCells
-from omniperception.lidar.patterns.coverage import selection_coverage
 from omniperception.lidar.patterns.selection import _one_per_cell, field_cells
 
-STRATEGIES = ("every_kth", "stratified", "random")
+STRATEGIES = ("every_kth", "stratified")
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,6 @@ def test_offsets_increase_within_the_frame(selections, strategy):
 
 def test_numbers_of_variants(selections, rosette):
     assert selections["every_kth"].num_variants == 1
-    assert selections["random"].num_variants == 64
     stratified = selections["stratified"]
     assert stratified.num_variants * stratified.phase_step == rosette.num_rows
     assert 40 <= stratified.num_variants <= 256 and 10_000 % stratified.phase_step == 0
@@ -74,43 +73,28 @@ class TestVariants:
         selection = selections["stratified"]
         step, count = selection.phase_step, selection.num_variants
         first = torch.tensor([0, step, 5 * step, step // 2 - 1, rosette.num_rows - step // 2, rosette.num_rows - step])
-        salts = selection.salts(len(first))
-        assert selection.variants(first, torch.tensor([9]), salts).tolist() == [0, 1, 5, 0, 0, count - 1]
+        assert selection.variants(first, torch.tensor([9])).tolist() == [0, 1, 5, 0, 0, count - 1]
 
-    def test_stratified_chooses_anew_where_every_frame_is_the_same_turn(self):
+    def test_stratified_chooses_again_where_every_frame_is_the_same_turn(self):
         pattern = xt16()
         selection = make_selection(pattern, 0.1, 50, "stratified")
         starts = pattern.num_rows // selection.phase_step
         assert selection.num_variants == 16 * starts > 16
-        first, salts = torch.tensor([0, 2 * selection.phase_step]), selection.salts(2)
-        variants = [selection.variants(first, torch.tensor([k]), salts).tolist() for k in range(20)]
+        first = torch.tensor([0, 2 * selection.phase_step])
+        variants = [selection.variants(first, torch.tensor([k])).tolist() for k in range(20)]
         assert variants == [[(k % 16) * starts, (k % 16) * starts + 2] for k in range(20)]
         short, long = selection_coverage(pattern, selection, 0.1, (0.1, 1.0), cell_deg=5.0)
         assert long.seen > 2.0 * short.seen
 
-    def test_random_differs_by_environment_frame_and_seed_only(self, selections):
-        selection = selections["random"]
-        salts, first = selection.salts(256), torch.zeros(256, dtype=torch.int64)
-        frames = [selection.variants(first, torch.tensor([k], dtype=torch.int32), salts) for k in range(64)]
-        again = selection.variants(first + 77, torch.full((256,), 3), salts)
-        assert torch.equal(again, frames[3])  # a function of the frame, not of the row
-        bank = torch.stack(frames)
-        assert bank.min() == 0 and bank.max() == 63
-        counts = torch.bincount(bank.ravel(), minlength=64).double()
-        assert ((counts - 256.0) ** 2 / 256.0).sum() < 120.0  # chi-squared of 63 degrees of freedom: 1e-5
-        for a, b in ((bank[1:], bank[:-1]), (bank[:, 1:], bank[:, :-1])):  # neighbours agree by chance, 1 in 64
-            assert (a == b).double().mean().item() == pytest.approx(1.0 / 64.0, abs=0.004)
-        assert not torch.equal(salts, make_selection(mid40(), 0.1, 300, "random", seed=6).salts(256))
-
     @pytest.mark.parametrize("strategy", STRATEGIES)
     def test_they_are_written_where_told(self, selections, strategy):
         selection = selections[strategy]
-        first, frame, salts = torch.arange(8) * 4000, torch.tensor([2], dtype=torch.int32), selection.salts(8)
+        first, frame = torch.arange(8) * 4000, torch.tensor([2], dtype=torch.int32)
         out = torch.full((8,), -1)
-        before = [first.clone(), frame.clone(), salts.clone()]
-        assert selection.variants(first, frame, salts, out) is out
-        assert torch.equal(out, selection.variants(first, frame, salts))
-        assert all(torch.equal(a, b) for a, b in zip((first, frame, salts), before, strict=True))
+        before = [first.clone(), frame.clone()]
+        assert selection.variants(first, frame, out) is out
+        assert torch.equal(out, selection.variants(first, frame))
+        assert all(torch.equal(a, b) for a, b in zip((first, frame), before, strict=True))
 
     def test_phases_are_where_the_bank_begins(self, selections):
         for selection in selections.values():
@@ -131,19 +115,13 @@ class TestRows:
         phase = torch.tensor([0, 399_990])
         rows = select_rows(rosette, seconds(0.3, 0.3), 0.1, 300, phase, selection, frame=7)
         first = [20_000, 19_990]
-        variant = selection.variants(torch.tensor(first), torch.tensor([7]), selection.salts(2)).tolist()
+        variant = selection.variants(torch.tensor(first), torch.tensor([7])).tolist()
         for row, f, v in zip(rows.tolist(), first, variant, strict=True):
             assert row == [(f + o) % 400_000 for o in selection.offsets[v].tolist()]
 
-    def test_random_frames_of_environments_differ(self, rosette, selections):
-        rows = select_rows(rosette, seconds(0.1, 0.1, 0.1), 0.1, 300, 0, selections["random"], frame=1)
-        assert not torch.equal(rows[0], rows[1]) or not torch.equal(rows[1], rows[2])
-        later = select_rows(rosette, seconds(4.1, 4.1, 4.1), 0.1, 300, 0, selections["random"], frame=2)
-        assert not torch.equal(rows, later)  # the same table rows, another frame
-
     def test_a_selection_of_something_else_is_refused(self, rosette, selections):
         with pytest.raises(ValueError, match="selection holds 300 rays of 400000 rows, asked for 200 of 400000"):
-            select_rows(rosette, seconds(0.1), 0.1, 200, selection=selections["random"])
+            select_rows(rosette, seconds(0.1), 0.1, 200, selection=selections["every_kth"])
 
 
 class TestStratified:
@@ -178,18 +156,18 @@ class TestStratified:
             s: (pattern.elevation[make_selection(pattern, 1.0, 200, s).offsets[0].long()] < 0.0).sum().item()
             for s in STRATEGIES
         }
-        assert below["every_kth"] < 15 and below["random"] < 15
+        assert below["every_kth"] < 15
         assert 70 <= below["stratified"] <= 110  # some of the 200 share a cell
 
     @pytest.mark.parametrize("make", [avia, mid360], ids=["avia", "mid360"])
-    def test_it_leaves_smaller_gaps_than_chance(self, make):
+    def test_it_leaves_smaller_gaps_than_every_kth(self, make):
         pattern = make()
         gaps = {
             s: selection_coverage(pattern, make_selection(pattern, 0.1, 500, s), 0.1, (0.1,), cell_deg=4.0)[0]
-            for s in ("stratified", "random")
+            for s in STRATEGIES
         }
-        assert gaps["stratified"].gap_deg < gaps["random"].gap_deg
-        assert gaps["stratified"].seen > gaps["random"].seen
+        assert gaps["stratified"].gap_deg < gaps["every_kth"].gap_deg
+        assert gaps["stratified"].seen > gaps["every_kth"].seen
 
 
 class TestCells:
@@ -218,7 +196,7 @@ class TestCells:
 
 
 def test_wrong_selections_are_told_in_one_line(rosette):
-    with pytest.raises(ValueError, match=r"lidar.selection='best' must be one of every_kth, stratified, random"):
+    with pytest.raises(ValueError, match=r"lidar.selection='best' must be one of every_kth, stratified"):
         make_selection(rosette, 0.1, 10, "best")
     for strategy in STRATEGIES:
         with pytest.raises(ValueError, match=r"lidar.num_rays=10001 must be in 1..10000"):

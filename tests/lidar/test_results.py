@@ -122,7 +122,7 @@ def test_an_inside_wall_is_as_bright_as_an_outside_one():
     torch.testing.assert_close(frame.normals_w, frame.directions_s, atol=1e-5, rtol=0.0)
 
 
-@pytest.mark.parametrize("selection", ["every_kth", "random"])
+@pytest.mark.parametrize("selection", ["every_kth", "stratified"])
 @pytest.mark.parametrize("time", [0.7, 0.700003, 0.700013, 1_000_000.1])
 def test_time_counts_from_the_frames_start(pattern, time, selection):
     """Rows are emitted every 5 us, four at one instant; the frame begins with the first row at or after its start."""

@@ -193,7 +193,7 @@ class Allocations(TorchDispatchMode):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"selection": "stratified"}, {"selection": "random"}, {"motion_segments": 1}],
+    [{}, {"selection": "stratified"}, {"motion_segments": 1}],
     ids=lambda options: "-".join(map(str, options.values())) or "plain",
 )
 def test_a_cast_allocates_no_tensor(pattern, options):
@@ -260,13 +260,12 @@ def test_a_frame_is_every_kth_row_whatever_the_table(num_rows, stride):
         assert torch.equal(frame.directions_s, pattern.directions_s[rows])
 
 
-@pytest.mark.parametrize("selection", ["stratified", "random"])
-def test_a_selection_reports_and_casts_its_rows(pattern, selection):
+def test_a_selection_reports_and_casts_its_rows(pattern):
     """Rows and directions are those of the pattern's own function, and hits are those of its directions."""
-    config = LidarConfig(500, selection=selection, max_range=10.0)
+    config = LidarConfig(500, selection="stratified", max_range=10.0)
     scene = RayScene([Shape(K.SPHERE, (2.0,)), Shape(K.BOX, (0.3, 0.2, 0.4), pos=(0.9, 0.4, 0.2))], 3, 0)
     lidar = Lidar(config, pattern, scene, -1, seed=4, outputs=("ranges", "row", "directions_s"))
-    bank = make_selection(pattern, 0.1, 500, selection, 4)
+    bank = make_selection(pattern, 0.1, 500, "stratified", 4)
     for number, time in enumerate((0.1, 0.2, 0.3)):
         frame = lidar.cast(clock(3, time))
         rows = select_rows(pattern, clock(3, time), 0.1, 500, lidar.phase_rows, bank, number)
@@ -348,7 +347,7 @@ def test_keeping_the_first_part_of_each_frame_is_told():
             Lidar(LidarConfig(num_rays, 0.1), pattern, RayScene([], 1, 0), -1)
 
 
-class TestParts:
+class TestEnvSlices:
     """Frames that come for some environments after the others'."""
 
     @pytest.mark.parametrize("at_once", [1, 2, 3, 4])
@@ -356,10 +355,10 @@ class TestParts:
         scene, config = crowd(5), LidarConfig(num_rays=777)
         given = {"noise": [GaussianNoise()], "seed": 4, "outputs": OUTPUTS}
         whole = Lidar(config, pattern, scene, 0, **given)
-        parts = Lidar(config, pattern, scene, 0, envs_at_once=at_once, **given)
+        sliced = Lidar(config, pattern, scene, 0, envs_at_once=at_once, **given)
         for time in (0.1, 0.2):
             expected, met = whole.cast(clock(5, time)), []
-            for envs, frame in parts.cast_parts(clock(5, time)):
+            for envs, frame in sliced.cast_slices(clock(5, time)):
                 met += range(envs.start, envs.stop)
                 assert len(frame.ranges) == envs.stop - envs.start <= at_once
                 for name in OUTPUTS:
@@ -367,11 +366,11 @@ class TestParts:
                         getattr(frame, name), getattr(expected, name)[envs], rtol=0, atol=0, equal_nan=True
                     )
             assert met == [0, 1, 2, 3, 4]
-        assert parts.frame_count.tolist() == whole.frame_count.tolist() == [2] * 5
+        assert sliced.frame_count.tolist() == whole.frame_count.tolist() == [2] * 5
 
     def test_one_frame_of_all_is_refused(self, pattern):
         lidar = Lidar(LidarConfig(10), pattern, crowd(3), 0, envs_at_once=2)
-        with pytest.raises(ValueError, match="2 parts; use cast_parts, or envs_at_once=None"):
+        with pytest.raises(ValueError, match="2 slices; use cast_slices, or envs_at_once=None"):
             lidar.cast(0.1)
         with pytest.raises(ValueError, match=r"lidar\.envs_at_once=0 must be at least 1"):
             Lidar(LidarConfig(10), pattern, crowd(3), 0, envs_at_once=0)

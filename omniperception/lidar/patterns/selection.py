@@ -10,18 +10,15 @@ import torch
 from .cells import SphereCells
 from .table import ScanPattern
 
-Strategy = Literal["every_kth", "stratified", "random"]
+Strategy = Literal["every_kth", "stratified"]
 
-RANDOM_VARIANTS = 64
 MAX_STRATIFIED_VARIANTS = 256
 DISTINCT_FRAMES = 16
-"""A stratified choice is made anew so many times where the table repeats after fewer frames, as a spinning one does."""
+"""Choices of a stratified bank where the table repeats after fewer frames, as that of a spinning sensor does."""
 MAX_OFFSETS = 1 << 22
-"""Bound on variants x rays of a bank (16 MiB), and on variants x points of which a stratified one is chosen."""
+"""Bound on variants x points of which a stratified bank is chosen."""
 FIELD_SAMPLE = 50_000
 """Rows of the table from which the size of the field of view is found."""
-WEYL = 0x9E3779B97F4A7C15 - (1 << 64)
-"""2^64 over the golden ratio, as int64: multiples of it spread evenly over all integers."""
 
 
 @dataclass(frozen=True)
@@ -33,20 +30,18 @@ class Selection:
     frame: a reset, a pause or a replay at the same time and frame number gives the same points.
 
     Attributes:
-        strategy: "every_kth", "stratified" or "random".
+        strategy: "every_kth" or "stratified".
         offsets: Rows after the frame's first, increasing, in 0..P-1, (V, N) int32.
         num_rows: Rows of the pattern's table, M.
         phase_step: Phases of environments should be multiples of this many rows. It divides M. For "stratified" it is
             the distance between the frames that the variants were made for (a frame that begins in between gets the
             nearest one's offsets, and its cells are filled less evenly); otherwise the rows of one shot.
-        seed: Of the random choices.
     """
 
     strategy: Strategy
     offsets: torch.Tensor
     num_rows: int
     phase_step: int
-    seed: int
 
     @property
     def num_variants(self) -> int:
@@ -58,52 +53,31 @@ class Selection:
         """N."""
         return self.offsets.shape[1]
 
-    def to(self, device: torch.device | str) -> "Selection":
-        """The same with ``offsets`` on a device."""
-        offsets = self.offsets.to(device)
-        return Selection(self.strategy, offsets, self.num_rows, self.phase_step, self.seed)
-
     def draw_phases(self, num_envs: int, generator: torch.Generator | None = None) -> torch.Tensor:
         """Random rows by which each environment's device is ahead, multiples of ``phase_step``, (num_envs,) int64."""
         steps = self.num_rows // self.phase_step
         return torch.randint(steps, (num_envs,), generator=generator) * self.phase_step
 
-    def salts(self, num_envs: int) -> torch.Tensor:
-        """A random number per environment from the seed, drawn once and given to ``variants``, (num_envs,) int64."""
-        generator = torch.Generator().manual_seed(self.seed)
-        return torch.randint(-(1 << 63), (1 << 63) - 1, (num_envs,), generator=generator)
+    def variants(self, first_row: torch.Tensor, frame: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+        """Variant of each environment's frame; allocates nothing if given ``out``.
 
-    def variants(
-        self,
-        first_row: torch.Tensor,
-        frame: torch.Tensor,
-        salts: torch.Tensor,
-        out: torch.Tensor | None = None,
-    ) -> torch.Tensor:
-        """Variant of each environment's frame, a function of its arguments only; allocates nothing if given ``out``.
+        The bank holds the variants of all starts for one choice, then those for the next choice.
 
         Args:
-            first_row: Of each frame, (num_envs,) int64; used by "stratified".
-            frame: Number of the frame, one for all (1,) or (num_envs,), any integer type; "every_kth" ignores it, and
-                "stratified" where the table's frames are many.
-            salts: From ``salts``, (num_envs,) int64, on the device of ``first_row``; used by "random".
+            first_row: Of each frame, (num_envs,) int64.
+            frame: Number of the frame, one for all (1,) or (num_envs,), any integer type.
             out: Where to write, (num_envs,) int64.
 
         Returns:
             ``out``, in 0..V-1.
         """
         out = torch.empty_like(first_row) if out is None else out
-        if self.strategy == "every_kth":
+        if self.num_variants == 1:
             return out.zero_()
-        if self.strategy == "stratified":  # the bank holds all starts for one choice, then all for the next
-            starts = self.num_rows // self.phase_step
-            torch.add(first_row, self.phase_step // 2, out=out)
-            out.floor_divide_(self.phase_step).remainder_(starts)
-            return out.add_(frame, alpha=starts).remainder_(self.num_variants)
-        out.copy_(frame).mul_(WEYL).add_(salts)
-        for _ in range(3):  # the middle of the square of a sequence that never repeats
-            out.mul_(out).add_(salts).bitwise_right_shift_(16)
-        return out.remainder_(self.num_variants)
+        starts = self.num_rows // self.phase_step
+        torch.add(first_row, self.phase_step // 2, out=out)
+        out.floor_divide_(self.phase_step).remainder_(starts)
+        return out.add_(frame, alpha=starts).remainder_(self.num_variants)
 
 
 def make_selection(
@@ -120,24 +94,20 @@ def make_selection(
             of a spinning sensor, that is always the same sector. "stratified": cells of the field of view, of equal
             solid angle and about as many as rays, each give their most central point, then another, until there are
             enough; one variant, with the cells shifted at random, for each of at most 256 places in the table where a
-            frame can begin, and several where few frames differ. "random": any points with equal chance, anew in each
-            frame of each environment, from 64 variants.
+            frame can begin, and several where few frames differ.
         seed: Of the random choices.
     """
     points = pattern.check_num_rays(period_s, num_rays)
     if strategy == "every_kth":
         offsets = (torch.arange(num_rays) * pattern.stride(period_s, num_rays))[None]
-        return Selection(strategy, offsets.int(), pattern.num_rows, pattern.rows_per_shot, seed)
-    if strategy == "random":
-        offsets = _random_offsets(points, num_rays, min(RANDOM_VARIANTS, max(1, MAX_OFFSETS // num_rays)), seed)
-        return Selection(strategy, offsets, pattern.num_rows, pattern.rows_per_shot, seed)
+        return Selection(strategy, offsets.int(), pattern.num_rows, pattern.rows_per_shot)
     if strategy == "stratified":
         variants = min(MAX_STRATIFIED_VARIANTS, max(1, MAX_OFFSETS // points))
         frames = pattern.num_rows // math.gcd(pattern.num_rows, points)
         choices = 1 if num_rays == points else min(variants, math.ceil(DISTINCT_FRAMES / frames))
         step = _frame_step(pattern.num_rows, points, variants // choices)
         offsets = _stratified_offsets(pattern, points, num_rays, step, choices, seed)
-        return Selection(strategy, offsets, pattern.num_rows, step, seed)
+        return Selection(strategy, offsets, pattern.num_rows, step)
     raise ValueError(f"lidar.selection={strategy!r} must be one of {', '.join(get_args(Strategy))}")
 
 
@@ -159,7 +129,7 @@ def select_rows(
         num_rays: Points kept.
         phase_rows: Rows by which each environment's device is ahead, int64, (num_envs,) or scalar.
         selection: From ``make_selection`` for this pattern, period and number; None: every k-th.
-        frame: Number of the frame, scalar or (num_envs,); "random" depends on it.
+        frame: Number of the frame, scalar or (num_envs,); "stratified" may depend on it.
 
     Returns:
         Rows in 0..M-1, (num_envs, num_rays) int64; exact also after 10^6 s.
@@ -173,14 +143,8 @@ def select_rows(
         )
     first = pattern.first_rows(time, period_s, phase_rows)
     frame = torch.as_tensor(frame, device=time.device)
-    variants = selection.variants(first, frame, selection.salts(len(time)).to(time.device))
+    variants = selection.variants(first, frame)
     return (first[:, None] + selection.offsets.to(time.device)[variants]).remainder_(pattern.num_rows)
-
-
-def _random_offsets(points: int, num_rays: int, variants: int, seed: int) -> torch.Tensor:
-    random = np.random.default_rng(seed)
-    rows = [np.sort(random.choice(points, num_rays, replace=False)) for _ in range(variants)]
-    return torch.from_numpy(np.stack(rows).astype(np.int32))
 
 
 def _frame_step(num_rows: int, points: int, max_variants: int) -> int:

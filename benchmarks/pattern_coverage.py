@@ -7,13 +7,14 @@ averaged over several windows of the table.
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import torch
 
-from .cells import SphereCells
-from .selection import Selection, make_selection
-from .table import ScanPattern
+from omniperception.lidar.patterns.cells import SphereCells
+from omniperception.lidar.patterns.selection import Selection, Strategy, make_selection
+from omniperception.lidar.patterns.table import ScanPattern
 
 DURATIONS_S = (0.1, 0.5, 1.0)
 WINDOWS = 4
@@ -131,9 +132,7 @@ def strategy_coverage(
     seed: int = 0,
 ) -> dict[str, list[Coverage]]:
     """``selection_coverage`` of every strategy and, for comparison, of all points ("all")."""
-    strategies = {
-        s: make_selection(pattern, period_s, num_rays, s, seed) for s in ("every_kth", "stratified", "random")
-    }
+    strategies = {s: make_selection(pattern, period_s, num_rays, s, seed) for s in get_args(Strategy)}
     strategies["all"] = make_selection(pattern, period_s, pattern.points_per_frame(period_s))
     return {
         name: selection_coverage(pattern, selection, period_s, durations_s, cell_deg)
@@ -170,7 +169,7 @@ def _frames(pattern: ScanPattern, selection: Selection, period_s: float, start_s
     phase = round(start_s * pattern.points_per_second / selection.phase_step) * selection.phase_step
     frame = torch.arange(frames)
     first = pattern.first_rows((frame + 1).double() * period_s, period_s, phase)
-    variants = selection.variants(first, frame, selection.salts(1).expand(frames))
+    variants = selection.variants(first, frame)
     return ((first[:, None] + selection.offsets[variants]) % pattern.num_rows).ravel()
 
 

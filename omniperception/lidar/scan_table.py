@@ -7,7 +7,7 @@ import torch
 from .patterns import ScanPattern
 
 
-class ScanRows:
+class ScanTable:
     """A repeating table laid out so that a frame of every ``stride``-th row reads neighbours in memory.
 
     Steps of ``stride`` through a table of M rows walk along gcd(stride, M) cycles of equal length. The cycles are
