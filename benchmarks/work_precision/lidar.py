@@ -125,13 +125,12 @@ class Caster:
         return self.lidar.cast(time_s)
 
     def distorted(self, time_s: float) -> LidarFrame:
-        """The frame that ends at ``time_s``, with the poses at the ends of all its pieces."""
-        period, pieces = self.config.period_s, self.config.motion_segments
-        self.rays.set_poses(*self.poses(time_s - period))
-        self.lidar.track.reset()
-        for k in range(1, pieces):
-            self.rays.set_poses(*self.poses(time_s - period + k * period / pieces))
-            self.lidar.track.advance()
+        """The frame that ends at ``time_s``, with the poses at the ends of all its segments."""
+        period, segments = self.config.period_s, self.config.motion_segments
+        self.lidar.forget_motion()
+        for k in range(segments):
+            self.rays.set_poses(*self.poses(time_s - period + k * period / segments))
+            self.lidar.record_poses()
         return self.cast(time_s)
 
     def timed(self, cast: Callable[[float], object] | None = None) -> Callable[[int], None]:

@@ -149,7 +149,6 @@ class LidarSensing:
             outputs=outputs,
             envs_at_once=None if needs.whole else envs_at_once(config, outputs),
         )
-        self._placed_anew = torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
         self._time = torch.zeros(sim.num_envs, dtype=torch.float64, device=sim.device)
         self.tick, self._is_cast = 0, False
         self.frame_count = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
@@ -217,9 +216,6 @@ class LidarSensing:
             pos, quat = self._sim.body_poses(self._bodies)
             self.scene.body_pos.copy_(pos)
             self.scene.body_quat.copy_(quat)
-            if self.lidar.track is not None:
-                self.lidar.track.reset(self._placed_anew)
-                self._placed_anew.zero_()
         parts = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
             with timer.stage("rays"):
@@ -276,12 +272,11 @@ class LidarSensing:
     def state_dict(self) -> dict:
         return {
             "tick": self.tick,
-            "noise_frame": self.lidar.frame_count.clone(),
+            "lidar": self.lidar.state_dict(),
             "frame_count": self.frame_count,
             "frames": self.frames,
             "sector_distance": None if self.sector_distance is None else self.sector_distance.clone(),
             "distal_range": {str(key): value.clone() for key, value in self._distal_range.items()},
-            "motion": self._last_poses(),
             "unseen": None if self.unseen is None else self.unseen.clone(),
             "odometry": self.odometry.state_dict() if self.odometry is not None else None,
         }
@@ -289,7 +284,7 @@ class LidarSensing:
     def load_state_dict(self, state: dict) -> None:
         self.tick = state["tick"]
         self.frame_tick.fill_(self.tick)
-        self.lidar.frame_count.copy_(state["noise_frame"])
+        self.lidar.load_state_dict(state["lidar"])
         self.frame_count.copy_(state["frame_count"])
         if self.frames is not None:
             self.frames = state["frames"].clone()
@@ -300,16 +295,10 @@ class LidarSensing:
         if self.odometry is not None:
             self.odometry.load_state_dict(state["odometry"])
         self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
-        if self.lidar.track is not None and state.get("motion") is not None:
-            pos, quat, placed_anew = state["motion"]
-            self.scene.body_pos.copy_(pos)
-            self.scene.body_quat.copy_(quat)
-            self.lidar.track.reset()
-            self._placed_anew.copy_(placed_anew)
 
     def reset(self, envs: torch.Tensor) -> None:
         """Forgets what some environments, see `rows`, have seen, and how their bodies moved."""
-        put(self._placed_anew, envs, True)
+        self.lidar.forget_motion(envs)
         put(self.frame_count, envs, 0)
         if self.frames is not None:
             put(self.frames, envs, 0.0)
@@ -319,12 +308,6 @@ class LidarSensing:
             put(self.unseen, envs, NEVER)
         for max_distance, mean in self._distal_range.items():
             put(mean, envs, max_distance)
-
-    def _last_poses(self) -> list[torch.Tensor] | None:
-        """Where the next frame's motion starts, if it needs that."""
-        if self.lidar.track is None:
-            return None
-        return [self.scene.body_pos.clone(), self.scene.body_quat.clone(), self._placed_anew.clone()]
 
     def _record_sectors(self, num_threads: int | None) -> list[SectorDistances]:
         """A launch for each part."""

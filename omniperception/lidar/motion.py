@@ -6,22 +6,21 @@ from collections.abc import Sequence
 import torch
 import warp as wp
 
-from .kernels.motion import BROKEN, Track, Viewpoint, bound_swept_shapes, record_kernel
+from .kernels.motion import Track, Viewpoint, bound_swept_shapes, record_poses
 from .launch import SplitLaunch
-from .scene import POSE_TYPES, RayScene, View, wp_pose
+from .scene import RayScene, View, wp_pose
 
 
 class PoseTrack:
     """Poses of a scene's bodies at K + 1 evenly spaced moments of a frame.
 
-    ``advance`` takes the scene's poses as the newest moment. In between, a body moves evenly along a line and turns
-    evenly about an axis, by the shorter way: for moments h seconds apart, positions are off by at most
-    max|acceleration| * h^2 / 8, angles likewise by angular acceleration, and constant velocities are exact. A body that
-    is placed anew instead of moving, because it went farther than ``jump`` in one piece, has its new pose from the
-    piece's beginning; one without a valid pose in some piece is not there during the whole frame.
+    Within a segment a body moves evenly along a line and turns evenly about an axis, by the shorter way: for segments
+    of h seconds, positions are off by at most max|acceleration| * h^2 / 8, angles likewise by angular acceleration, and
+    constant velocities are exact. A body that went farther than ``jump`` in a segment has that segment's last pose
+    all along; one without a valid pose in some segment is not there during the whole frame.
 
     Attributes:
-        segments: K, the pieces of a frame.
+        segments: K, the segments of a frame.
         arrays: The poses as the kernels read them.
     """
 
@@ -31,12 +30,8 @@ class PoseTrack:
         Args:
             scene: Whose bodies move.
             segments: K, at least 1.
-            jump: A body that moves farther than this between two moments was placed anew, metres.
+            jump: A body that moves farther than this between two moments did not move there but jumped, metres.
         """
-        if segments < 1:
-            raise ValueError(f"a track's segments={segments} must be at least 1")
-        if not jump > 0.0:
-            raise ValueError(f"a track's jump={jump} must be a positive distance in metres")
         self.segments, self._scene = segments, scene
         shape = (segments + 1, scene.num_envs, max(scene.num_bodies, 1))
         self._pos = torch.zeros(*shape, 3, dtype=torch.float64, device=scene.device)
@@ -44,36 +39,54 @@ class PoseTrack:
         self._turn = torch.zeros_like(self._quat)
         self._oldest = torch.zeros(1, dtype=torch.int32, device=scene.device)
         self._newest = torch.full_like(self._oldest, segments)
+        self._forget = torch.ones(scene.num_envs, dtype=torch.bool, device=scene.device)
+        self._num_recorded, self._is_complete = 0, False
         self.arrays = self._as_arrays()
         args = [scene.wp_body_pos, scene.wp_body_quat, wp.from_torch(self._newest), min(jump, 3.0e38)]
-        args += [self.arrays.pos, self.arrays.quat, self.arrays.turn]
-        kernel = record_kernel(POSE_TYPES[scene.body_pos.dtype])
-        self._record = scene.launch(kernel, (), args, work_per_env=160 * scene.num_bodies)
-        self._is_new = True
+        args += [wp.from_torch(self._forget), self.arrays.pos, self.arrays.quat, self.arrays.turn]
+        self._record = scene.launch(record_poses, (), args, work_per_env=160 * scene.num_bodies)
 
-    def advance(self) -> None:
-        """Takes the scene's poses as the newest moment; the oldest one is forgotten."""
-        if self._is_new:
-            self.reset()
+    def record(self) -> None:
+        """Takes the scene's poses as the newest moment; the oldest one is dropped."""
         self._newest.copy_(self._oldest)
         self._oldest.add_(1).remainder_(self.segments + 1)
         self._record()
+        self._num_recorded += 1
 
-    def reset(self, which: torch.Tensor | None = None) -> None:
-        """Forgets how the bodies of some environments moved: they have always been where the scene has them now.
+    def record_end(self) -> None:
+        """``record`` at the frame's end.
 
-        Args:
-            which: (num_envs,) bool; None for all.
+        Raises:
+            ValueError: The moments within the frame are not the K - 1 that they must be.
         """
-        scene = self._scene
-        moved = scene.body_quat.new_ones(scene.num_envs, dtype=torch.bool) if which is None else which
-        xyzw = torch.nn.functional.normalize(scene.body_quat.double().roll(-1, -1), dim=-1)
-        turn = torch.zeros_like(xyzw)
-        turn[..., 3] = scene.broken_poses().double() * float(BROKEN)
-        for kept, now in ((self._pos, scene.body_pos.double()), (self._quat, xyzw), (self._turn, turn)):
-            kept = kept[:, :, : scene.num_bodies]
-            kept.copy_(torch.where(moved[:, None, None], now, kept))
-        self._is_new = False
+        if self._is_complete and self._num_recorded != self.segments - 1:
+            raise ValueError(
+                f"lidar.motion_segments={self.segments} needs record_poses() {self.segments - 1} times, evenly spaced,"
+                f" between two casts, got {self._num_recorded}"
+            )
+        self.record()
+        self._num_recorded, self._is_complete = 0, True
+
+    def forget(self, env_ids: torch.Tensor | None = None) -> None:
+        """Makes the next poses of some environments, or of all, those of all moments."""
+        if env_ids is None:
+            self._forget.fill_(True)
+            self._num_recorded, self._is_complete = 0, False
+        else:
+            self._forget[env_ids] = True
+
+    def state_dict(self) -> dict:
+        """A copy of the poses."""
+        tensors = (self._pos, self._quat, self._turn, self._oldest, self._newest, self._forget)
+        counts = {"num_recorded": self._num_recorded, "is_complete": self._is_complete}
+        return {"tensors": [tensor.clone() for tensor in tensors], **counts}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Brings back what ``state_dict`` gave."""
+        tensors = (self._pos, self._quat, self._turn, self._oldest, self._newest, self._forget)
+        for own, saved in zip(tensors, state["tensors"], strict=True):
+            own.copy_(saved)
+        self._num_recorded, self._is_complete = state["num_recorded"], state["is_complete"]
 
     def _as_arrays(self) -> Track:
         track = Track()

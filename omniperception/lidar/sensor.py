@@ -56,10 +56,10 @@ class LidarConfig:
         mount_quat: The same as (w, x, y, z), in place of ``mount_rpy``.
         selection: Which points of a frame are kept: "every_kth" or "stratified", see ``make_selection``.
         reference_range: Distance at which a white wall seen perpendicularly has intensity 1, metres.
-        motion_segments: Pieces into which a frame is cut for motion distortion: each point is cast from the sensor's
-            and the bodies' poses at its own time, interpolated between the ends of its piece. 0: every point is cast
+        motion_segments: Segments into which a frame is cut for motion distortion: each point is cast from the sensor's
+            and the bodies' poses at its own time, interpolated between the ends of its segment. 0: every point is cast
             from the poses at the frame's end. Vertices of deformables are in either case those at the frame's end.
-        motion_jump: A body that moves farther than this within a piece was placed anew and does not sweep, metres.
+        motion_jump: A body that moves farther than this within a segment has jumped and does not sweep, metres.
     """
 
     num_rays: int = 1000
@@ -173,6 +173,12 @@ class Lidar:
     ``exclude_shapes``. A robot with several sensors has one ``Lidar`` for each on the same scene: they share the
     bodies' poses and nothing else, so each has its own mount, rate and outputs.
 
+    Motion distortion, ``config.motion_segments = K > 0``: the segments of a frame lie between K + 1 evenly spaced
+    moments, which are the end of the last frame, K - 1 moments at which the caller writes the scene's poses and calls
+    ``record_poses``, and this frame's end, for which ``cast`` takes the scene's poses itself. With a frame of five
+    control steps and K = 5, call it after each of the first four. Bodies that were put somewhere else, as by a reset,
+    have not moved there: call ``forget_motion``.
+
     Attributes:
         config, pattern, scene: As given.
         outputs: Names of the fields of ``frame`` that are computed.
@@ -181,8 +187,6 @@ class Lidar:
         frame: The frame that ``cast`` fills and returns; with several ``env_slices``, that of the slice cast last.
         phase_rows: Rows by which each environment's device is ahead, (num_envs,) int64, from the seed.
         variant: What the scan's kernel was compiled for.
-        track: The poses that motion distortion needs; None without it. ``cast`` takes the scene's poses as those at
-            the frame's end; with more than one segment, call ``track.advance()`` at the ends of the others.
         frame_count: Frames cast by each environment since its last ``reset``, (num_envs,) int32; the noise and a
             stratified selection are functions of it, of the seed and of the environment.
     """
@@ -234,7 +238,7 @@ class Lidar:
         self._noise = noise_by_name(noise)
         self.frame = self._allocate_frame()
         self.slice_frames = tuple(self._first_rows(envs.stop - envs.start) for envs in self.env_slices)
-        self.track: PoseTrack | None = None
+        self._track: PoseTrack | None = None
         self._rays = self._lay_out_rays()
         self._view, self._placed = self._place(mount_body, exclude_shapes)
         num_viewed = len(scene.shapes) - len(set(exclude_shapes))
@@ -243,7 +247,7 @@ class Lidar:
         self._casts = self._record_casts(seed, reflectivity or {}, num_viewed)
 
     def cast(self, time_s: torch.Tensor | np.ndarray | float) -> LidarFrame:
-        """Casts the frame that ends at ``time_s`` from the bodies' current poses or, with a ``track``, along it.
+        """Casts the frame that ends at ``time_s`` from the scene's poses and, with motion, those recorded before.
 
         Args:
             time_s: Each environment's time, s, (num_envs,) float64, or one number for all of them.
@@ -275,8 +279,8 @@ class Lidar:
                 f"time_s must be float64 ({self.scene.num_envs},), got {time_s.dtype} {tuple(time_s.shape)}"
             )
         self._seek(time_s)
-        if self.track is not None:
-            self.track.advance()
+        if self._track is not None:
+            self._track.record_end()
         if self._placed.refresh() and self._pack is not None:
             self._pack()
         for envs, cast, frame in zip(self.env_slices, self._casts, self.slice_frames, strict=True):
@@ -290,6 +294,35 @@ class Lidar:
             self.frame_count.zero_()
         else:
             self.frame_count[env_ids] = 0
+
+    def record_poses(self) -> None:
+        """Takes the scene's poses as those at the end of a segment within the frame, for all environments.
+
+        Needed K - 1 times, evenly spaced, between two casts with ``motion_segments = K > 1``; may be called as well
+        at the start of the very first frame.
+        """
+        if self._track is not None:
+            self._track.record()
+
+    def forget_motion(self, env_ids: torch.Tensor | None = None) -> None:
+        """Makes the next poses of some environments, or of all, those that their bodies have had all along.
+
+        Args:
+            env_ids: Indices, (n,) int64; None for all.
+        """
+        if self._track is not None:
+            self._track.forget(env_ids)
+
+    def state_dict(self) -> dict:
+        """What the next frames depend on beside the scene's poses and the time."""
+        track = None if self._track is None else self._track.state_dict()
+        return {"frame_count": self.frame_count.clone(), "track": track}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Goes on where ``state_dict`` was taken."""
+        self.frame_count.copy_(state["frame_count"])
+        if self._track is not None:
+            self._track.load_state_dict(state["track"])
 
     def _seek(self, time_s: torch.Tensor) -> None:
         """Finds the rows of the frame that ends at ``time_s``."""
@@ -334,8 +367,8 @@ class Lidar:
         view = View(mount_body, config.mount_pos, config.quat, config.max_range + reach, elevation)
         if not config.motion_segments:
             return view, PlacedShapes(self.scene, exclude_shapes, view)
-        self.track = PoseTrack(self.scene, config.motion_segments, config.motion_jump)
-        return view, SweptShapes(self.scene, exclude_shapes, view, self.track)
+        self._track = PoseTrack(self.scene, config.motion_segments, config.motion_jump)
+        return view, SweptShapes(self.scene, exclude_shapes, view, self._track)
 
     def _reach(self) -> float:
         """How far from the sensor's origin its rays start, metres."""
@@ -349,7 +382,7 @@ class Lidar:
         return (
             scene.device.type == "cpu"
             and sum(shape.kind == ShapeKind.HEIGHTFIELD for shape in viewed) == 1
-            and self.track is None
+            and self._track is None
             and self._variant is None
             and self.pattern.origins_s is None
             and "jitter" not in self._noise
@@ -383,7 +416,7 @@ class Lidar:
             scene.wp_body_quat,
             scene.geometry,
             self._slots,
-            self.track.arrays if self.track is not None else Track(),
+            self._track.arrays if self._track is not None else Track(),
             self._labels(reflectivity),
             noise_figures(self._noise, seed, config.min_range, config.max_range),
         ]
@@ -392,7 +425,7 @@ class Lidar:
             outputs=frozenset(written),
             noise=frozenset(self._noise),
             packed=self._pack is not None,
-            moving=self.track is not None,
+            moving=self._track is not None,
             displaced=self.pattern.origins_s is not None,
             selected=self._variant is not None,
             shots=self._lag is not None and self.pattern.rows_per_shot > 1,

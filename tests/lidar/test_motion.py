@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.lidar import Lidar, LidarConfig, RayScene, ScanPattern, Shape, ShapeKind, mid360
+from omniperception.lidar import GaussianNoise, Lidar, LidarConfig, RayScene, ScanPattern, Shape, ShapeKind, mid360
 
 K = ShapeKind
 PERIOD = 0.1
@@ -37,7 +37,7 @@ def sweep(scene, start, end, segments=1, pattern=None, **options):
         scene.body_pos.copy_(pos)
         scene.body_quat.copy_(quat)
         if moment < segments:
-            lidar.track.advance()
+            lidar.record_poses()
     return lidar.cast(torch.full((scene.num_envs,), PERIOD, dtype=torch.float64))
 
 
@@ -187,7 +187,7 @@ def test_each_ray_sees_the_scene_of_its_own_time(segments, turn, num_bodies):
     assert frame.ranges.isfinite().float().mean() > 0.1
 
 
-def test_a_body_placed_anew_does_not_sweep():
+def test_a_body_that_jumps_does_not_sweep():
     """A jump by 8 m within the frame: as if it had been there all along; a step by 0.4 m is a motion."""
     scene = RayScene([Shape(K.SPHERE, (0.5,), body=1)], 2, 2, num_threads=2)
     start = torch.tensor([[[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]]]).repeat(2, 1, 1)
@@ -210,20 +210,75 @@ def test_a_reset_forgets_the_motion_of_its_environment_only():
     lidar.phase_rows.zero_()
     still.phase_rows.zero_()
     now = torch.full((2,), PERIOD, dtype=torch.float64)
-    for which in (None, torch.tensor([False, True])):
+    for which in (None, torch.tensor([1])):
         scene.body_quat[:, 0] = yaw_quat(-0.5)
         lidar.cast(now)
         scene.body_quat[:, 0] = yaw_quat(0.5)
         if which is not None:
-            lidar.track.reset(which)
+            lidar.forget_motion(which)
         ranges, flat = lidar.cast(now).ranges, still.cast(now).ranges
         bent = [not torch.allclose(ranges[env], flat[env], rtol=1e-5) for env in (0, 1)]
         assert bent == [True, which is None]
 
 
-def test_without_motion_distortion_there_is_no_track():
-    lidar = Lidar(LidarConfig(NUM_RAYS, PERIOD), fan(), wall_scene(), 0)
-    assert lidar.track is None
+def moves(scene, generator, count):
+    """Poses at ``count`` moments, each a little farther than the last one."""
+    keys = [random_poses(scene, generator, 2.0)]
+    for _ in range(count - 1):
+        pos, quat = random_poses(scene, generator, 0.3)
+        nudge = torch.nn.functional.normalize(torch.cat([torch.ones_like(quat[..., :1]), 0.3 * quat[..., 1:]], -1))
+        keys.append((keys[-1][0] + pos, torch.nn.functional.normalize(multiply(keys[-1][1], nudge), dim=-1)))
+    return keys
+
+
+def set_poses(scene, key):
+    scene.body_pos.copy_(key[0])
+    scene.body_quat.copy_(key[1])
+
+
+def test_frames_share_the_moment_between_them():
+    """Three frames of two segments in a row: each is the one that is cast alone from its own three moments."""
+    scene = crowd(2, 6)
+    keys = moves(scene, torch.Generator().manual_seed(4), 7)
+    lidar = Lidar(LidarConfig(NUM_RAYS, PERIOD, 0.0, 50.0, motion_segments=2), fan(), scene, 0)
+    lidar.phase_rows.zero_()
+    set_poses(scene, keys[0])
+    lidar.record_poses()
+    for k in range(3):
+        set_poses(scene, keys[2 * k + 1])
+        lidar.record_poses()
+        set_poses(scene, keys[2 * k + 2])
+        ranges = lidar.cast((k + 1) * PERIOD).ranges.clone()
+        alone = sweep(scene, keys[2 * k], keys[2 * k + 1 : 2 * k + 3], 2)
+        assert torch.equal(ranges, alone.ranges)
+
+
+def test_a_sensor_that_goes_on_from_a_saved_state_casts_the_same():
+    config = LidarConfig(NUM_RAYS, PERIOD, 0.0, 50.0, motion_segments=3)
+    scenes = crowd(2, 6), crowd(2, 6)
+    first, second = (Lidar(config, fan(), scene, 0, noise=[GaussianNoise()]) for scene in scenes)
+    keys = moves(scenes[0], torch.Generator().manual_seed(4), 7)
+    for moment, key in enumerate(keys):
+        for lidar in (first, second)[: 1 if moment < 4 else 2]:
+            set_poses(lidar.scene, key)
+            if moment in (3, 6):
+                lidar.cast(moment / 3 * PERIOD)
+            else:
+                lidar.record_poses()
+        if moment == 3:
+            first.forget_motion(torch.tensor([1]))
+            second.load_state_dict(first.state_dict())
+    assert torch.equal(first.frame.ranges, second.frame.ranges)
+
+
+def test_moments_that_are_missing_are_told():
+    lidar = Lidar(LidarConfig(NUM_RAYS, PERIOD, motion_segments=3), fan(), wall_scene(), 0)
+    lidar.cast(PERIOD)  # the very first frame has none
+    lidar.record_poses()
+    with pytest.raises(ValueError, match=r"motion_segments=3 needs record_poses\(\) 2 times, .* got 1"):
+        lidar.cast(2 * PERIOD)
+    lidar.record_poses()
+    lidar.cast(2 * PERIOD)
 
 
 @pytest.mark.parametrize("what", ["pos", "quat"])

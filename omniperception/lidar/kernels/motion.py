@@ -3,16 +3,16 @@
 # ruff: noqa: UP018  (in a kernel, int(0) and float(0) declare a variable that may change)
 
 import math
+from typing import Any
 
 import warp as wp
 
 from .geometry import INF, PI
-from .variants import variants
 
 wp.set_module_options({"enable_backward": False})
 
 HELD = wp.constant(wp.float64(-1.0))
-"""Half angle of a segment in which a body was placed anew: it has its new pose all along."""
+"""Half angle of a segment in which a body jumped: it has the segment's last pose all along."""
 BROKEN = wp.constant(wp.float64(-2.0))
 """Half angle of a segment at whose end a body has no pose: it is not there."""
 
@@ -59,38 +59,45 @@ def to_quatd(wxyz: wp.vec4d):
     return wp.normalize(wp.quatd(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
 
 
-@variants
-def record_kernel(pose_type: type) -> wp.Kernel:
-    """The kernel for poses of bodies in ``wp.float32`` or ``wp.float64``."""
-    vec3 = wp.types.vector(3, pose_type)
-    vec4 = wp.types.vector(4, pose_type)
+@wp.kernel(module="unique", enable_backward=False)
+def record_poses(
+    env_offset: int,
+    body_pos: wp.array2d(dtype=Any),
+    body_quat: wp.array2d(dtype=Any),
+    newest: wp.array(dtype=wp.int32),
+    jump: float,
+    # in and out
+    forget: wp.array(dtype=wp.bool),
+    # out
+    pos_out: wp.array3d(dtype=wp.vec3d),
+    quat_out: wp.array3d(dtype=wp.quatd),
+    turn_out: wp.array3d(dtype=wp.vec4d),
+):
+    """Stores one environment's poses as the newest moment, and how each body turned on the way there.
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def record_poses(
-        env_offset: int,
-        body_pos: wp.array2d(dtype=vec3),
-        body_quat: wp.array2d(dtype=vec4),
-        newest: wp.array(dtype=wp.int32),
-        jump: float,
-        # out
-        pos_out: wp.array3d(dtype=wp.vec3d),
-        quat_out: wp.array3d(dtype=wp.quatd),
-        turn_out: wp.array3d(dtype=wp.vec4d),
-    ):
-        """Stores one environment's poses as the newest moment, and how each body turned on the way there."""
-        env = wp.tid() + env_offset
-        rows = pos_out.shape[0]
-        new = newest[0]
-        last = (new + rows - 1) % rows
-        before = (new + rows - 2) % rows
-        for body in range(body_pos.shape[1]):
-            p = wp.vec3d(body_pos[env, body])
-            wxyz = wp.vec4d(body_quat[env, body])
-            q = to_quatd(wxyz)
+    Where ``forget`` is set, the bodies have these poses at all moments, and it is cleared.
+    """
+    env = wp.tid() + env_offset
+    rows = pos_out.shape[0]
+    new = newest[0]
+    last = (new + rows - 1) % rows
+    before = (new + rows - 2) % rows
+    for body in range(body_pos.shape[1]):
+        p = wp.vec3d(body_pos[env, body])
+        wxyz = wp.vec4d(body_quat[env, body])
+        q = to_quatd(wxyz)
+        norm = wp.dot(wxyz, wxyz)
+        is_pose = norm > wp.float64(1.0e-12) and norm < wp.float64(1.0e12) and wp.dot(p, p) < wp.float64(1.0e30)
+        if forget[env]:
+            turn = wp.vec4d(ZERO, ZERO, ONE, wp.where(is_pose, ZERO, BROKEN))
+            for row in range(rows):
+                pos_out[row, env, body] = p
+                quat_out[row, env, body] = q
+                turn_out[row, env, body] = turn
+        else:
             turn = wp.vec4d(ZERO, ZERO, ONE, HELD)
-            norm = wp.dot(wxyz, wxyz)
             was_there = turn_out[before, env, body][3] > BROKEN
-            if not (norm > wp.float64(1.0e-12) and norm < wp.float64(1.0e12) and wp.dot(p, p) < wp.float64(1.0e30)):
+            if not is_pose:
                 turn[3] = BROKEN
             elif was_there and wp.length(p - pos_out[last, env, body]) <= wp.float64(jump):
                 step = wp.quat_inverse(quat_out[last, env, body]) * q
@@ -104,8 +111,7 @@ def record_kernel(pose_type: type) -> wp.Kernel:
             turn_out[last, env, body] = turn
             pos_out[new, env, body] = p
             quat_out[new, env, body] = q
-
-    return record_poses
+    forget[env] = False
 
 
 @wp.func
