@@ -23,6 +23,7 @@ from omniperception.env.mirror import Mirror
 from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import PerceptionConfig, PPOConfig, runner_config
 from omniperception.learning.memory import check_fits
+from omniperception.schema import check_config
 
 if TYPE_CHECKING:
     from omniperception.evaluation.episodes import Policy
@@ -60,6 +61,7 @@ def assemble(config: DictConfig) -> RunConfig:
     try:
         _check_groups(config)
         composed = OmegaConf.to_container(config, resolve=True)
+        check_config(composed)
         parts = {key: _instantiate(key, value) for key, value in composed.items() if isinstance(value, dict)}
         perception, ppo = parts.pop("perception"), parts.pop("ppo")
         env = EnvConfig(

@@ -1,51 +1,262 @@
-"""Configurations as text: compose, check, save and load."""
+"""Configurations as text: compose, override, save and load."""
 
 from __future__ import annotations
 
 import contextlib
+import difflib
+import importlib.util
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-CONFIG_DIR = Path(__file__).resolve().parents[1] / "conf"
+_SHIPPED = Path(__file__).resolve().parent / "conf"
+CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"
+"""Presets: inside an installed package, at the top of a checkout."""
 CONFIG_FILE = "config.yaml"
 OUTPUTS = Path("outputs")
+SEARCH_PATH = "search_path"
+"""Key of a configuration: folders of one's own with presets, from `--config-dir` or `hydra.searchpath`."""
 FIXED_BY_SCENARIO = ("seed", "terrain", "obstacles", "commands", "terminations", "randomization")
 """What a scenario replaces in a run's configuration; the run keeps everything else."""
 DEFINED_BY_SCENARIO = ("obstacles", "commands")
 """Groups that a scenario writes out in full, so that another preset would be mixed with it."""
+OPTIONAL_GROUPS = ("experiment", "scenario")
+"""Groups of which none may be chosen."""
+_EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
 
 
 class ConfigError(ValueError):
     """A configuration that cannot run; the message is one line that says what to change."""
 
 
-def compose(overrides: Sequence[str]) -> DictConfig:
-    """Composes `conf/config.yaml` with overrides as on the command line."""
-    _check_scenario(overrides)
+class UnknownKey(ConfigError):
+    """A key that nothing takes.
+
+    Attributes:
+        given: the override or key.
+        known: the keys that could have been meant.
+    """
+
+    def __init__(self, given: str, known: Iterable[str], name: str = "") -> None:
+        self.given, self.known = given, tuple(known)
+        self.name = name or given.lstrip("+~").partition("=")[0].rpartition(".")[2]
+        super().__init__(f"{given} is unknown; {suggest(self.name, self.known)}")
+
+
+def suggest(name: str, known: Sequence[str]) -> str:
+    """Which of the known names was probably meant, or all of them."""
+    near = difflib.get_close_matches(name, known, 1)
+    return f"did you mean {near[0]}?" if near else f"known: {', '.join(sorted(known))}"
+
+
+def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
+    """Composes `conf/config.yaml` with overrides as on Hydra's command line.
+
+    Args:
+        overrides: presets (obstacles=static), values (num_envs=64), settings of Hydra (hydra.run.dir=here).
+        with_hydra: whether the result keeps Hydra's own node.
+
+    Raises:
+        ConfigError: an override is wrong or fits nothing.
+    """
+    parsed = parse(overrides)
+    folders = search_path(parsed)
+    chosen, values = _split(parsed, folders)
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
-            config = hydra_compose("config", overrides=list(overrides))
-            presets = hydra_compose("config", overrides=[o for o in overrides if _is_group(o)])
+            given = [*(str(o.input_line) for o in chosen), *_as_override(folders)]
+            config = hydra_compose("config", given, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(one_line(error)) from None
-    _check_kinds(config, presets)
+    apply(config, values)
+    remember(config, folders)
+    if not with_hydra:
+        with open_dict(config):
+            del config["hydra"]
     return config
+
+
+def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
+    """The configuration of a run, changed by overrides in Hydra's grammar.
+
+    obstacles=static replaces a whole group, dotted overrides single values, and scenario=corridor replaces what
+    FIXED_BY_SCENARIO names.
+    """
+    config = read(run_dir)
+    parsed = parse(overrides)
+    folders = search_path(parsed, config)
+    chosen, values = _split(parsed, folders)
+    fresh = compose([*(str(o.input_line) for o in chosen), *_as_override(folders)]) if chosen else {}
+    for override in chosen:
+        group = override.key_or_group
+        if group == "experiment" or override.is_hydra_override():
+            raise ConfigError(f"{override.input_line}: a run keeps its {group}; override the groups that should differ")
+        for key in FIXED_BY_SCENARIO if group == "scenario" else (group,):
+            config[key] = fresh[key]
+    OmegaConf.set_struct(config, True)
+    apply(config, values)
+    remember(config, folders)
+    return config
+
+
+def parse(overrides: Sequence[str]) -> list[Override]:
+    """Overrides by Hydra's grammar; a sweep over several values is a ConfigError."""
+    parsed = []
+    for text in overrides:
+        try:
+            (override,) = OverridesParser.create().parse_overrides([text])
+        except HydraException as error:
+            why = f": {one_line(error).partition(' See https')[0]}" if "=" in text else ""
+            raise ConfigError(f"'{text}' is not of the form key=value{why}") from None
+        if override.is_sweep_override():
+            raise ConfigError(f"{text} has several values, which only python train.py -m runs; lists are [a,b]")
+        parsed.append(override)
+    return parsed
+
+
+def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
+    """Sets, adds (+key=value) and deletes (~key) values as Hydra does.
+
+    A key that a preset leaves at its default need not be added: whether its `_target_` takes it is checked later.
+    """
+    for override in overrides:
+        adds = override.is_add() or override.is_force_add()
+        if not adds and not _exists(config, override):
+            override = replace(override, type=OverrideType.FORCE_ADD)
+        try:
+            ConfigLoaderImpl._apply_overrides_to_config([override], config)
+        except (HydraException, OmegaConfBaseException, TypeError, ValueError) as error:
+            raise ConfigError(f"{override.input_line}: {one_line(error.__cause__ or error)}") from None
+
+
+def _exists(config: DictConfig, override: Override) -> bool:
+    """Whether the key of an override is there; a ConfigError where it cannot be."""
+    node: Any = config
+    text, names = str(override.input_line), override.key_or_group.split(".")
+    for depth, name in enumerate(names):
+        if isinstance(node, ListConfig) and name.isdecimal() and int(name) < len(node):
+            node = node[int(name)]
+        elif isinstance(node, DictConfig) and name in node:
+            node = OmegaConf.select(node, name)
+        elif isinstance(node, DictConfig) and "_target_" in node and name == names[-1] and not override.is_delete():
+            return False
+        elif isinstance(node, DictConfig):
+            known = {str(key) for key in node} - {"hydra", "_target_"}
+            raise UnknownKey(text, known | set(OPTIONAL_GROUPS) if depth == 0 else known, name)
+        else:
+            held = "null" if node is None else f"{node}"
+            raise ConfigError(f"{text} is unknown; {'.'.join(names[:depth])} is {held}")
+    return True
+
+
+def _split(overrides: Sequence[Override], folders: Sequence[Path]) -> tuple[list[Override], list[Override]]:
+    """Presets and settings of Hydra, which compose a configuration, and values, which are applied to it."""
+    chosen: list[Override] = []
+    values: list[Override] = []
+    for override in overrides:
+        group = override.key_or_group
+        if presets(group, folders):
+            _check_preset(override, presets(group, folders))
+            chosen.append(override)
+        elif group != "hydra.searchpath":
+            (chosen if override.is_hydra_override() else values).append(override)
+    by_group = {o.key_or_group: o for o in chosen}
+    for group in DEFINED_BY_SCENARIO if "scenario" in by_group else ():
+        if group in by_group:
+            raise ConfigError(
+                f"{by_group['scenario'].input_line} defines the {group}; leave {by_group[group].input_line} out, or"
+                f" override single values such as {group}.{_EXAMPLES[group]}"
+            )
+    return chosen, values
+
+
+def _check_preset(override: Override, known: Sequence[str]) -> None:
+    """Refuses a preset that does not exist."""
+    value, group = override.value(), override.key_or_group
+    if value is None and group in OPTIONAL_GROUPS:
+        return
+    for name in value if isinstance(value, list) and value else [value]:
+        if override.is_delete() or not isinstance(name, str):
+            raise ConfigError(f"{override.input_line}: {group} names a preset; known: {', '.join(known)}")
+        if name not in known:
+            raise ConfigError(f"{group}={name} is unknown; {suggest(name, known)}")
+
+
+def search_path(overrides: Sequence[Override], config: DictConfig | None = None) -> list[Path]:
+    """Folders of one's own with presets: those that a run remembers, and those that hydra.searchpath names."""
+    remembered = config.get(SEARCH_PATH) or () if config is not None else ()
+    found = [Path(name) for name in remembered if Path(name).is_dir()]
+    for override in overrides:
+        if override.key_or_group == "hydra.searchpath":
+            value = override.value()
+            found += [_folder(str(entry)) for entry in (value if isinstance(value, list) else [value])]
+    return list(dict.fromkeys(found))
+
+
+def _folder(entry: str) -> Path:
+    """The folder that an entry of Hydra's search path names."""
+    if entry.startswith("pkg://"):
+        with contextlib.suppress(ImportError):
+            spec = importlib.util.find_spec(entry.removeprefix("pkg://").replace("/", "."))
+            for folder in (spec and spec.submodule_search_locations) or ():
+                return Path(folder)
+        raise ConfigError(f"hydra.searchpath: there is no package {entry.removeprefix('pkg://')}")
+    folder = Path(entry.removeprefix("file://")).resolve()
+    if not folder.is_dir():
+        raise ConfigError(f"hydra.searchpath: {folder} is not a folder")
+    return folder
+
+
+def _as_override(folders: Sequence[Path]) -> list[str]:
+    """The override that puts folders on Hydra's search path."""
+    return [f"hydra.searchpath=[{','.join(repr(f'file://{folder}') for folder in folders)}]"] if folders else []
+
+
+def remember(config: DictConfig, folders: Sequence[Path]) -> None:
+    """Notes the search path in a configuration, so that what trains a run also replays it."""
+    if folders:
+        with open_dict(config):
+            config[SEARCH_PATH] = [str(folder) for folder in folders]
+
+
+def presets(group: str, folders: Sequence[Path] = ()) -> tuple[str, ...]:
+    """Names of a group's presets, those in folders of one's own included; none where there is no such group."""
+    found = {path.stem for folder in (CONFIG_DIR, *folders) for path in (folder / group).glob("*.yaml")}
+    return tuple(sorted(found))
 
 
 def save(composed: dict, run_dir: Path) -> None:
     """Writes the resolved configuration into the run directory."""
     run_dir.mkdir(parents=True, exist_ok=True)
     (run_dir / CONFIG_FILE).write_text(yaml.safe_dump(composed, sort_keys=False))
+
+
+def read(run_dir: Path) -> DictConfig:
+    """The configuration that a run directory holds."""
+    path = run_dir / CONFIG_FILE
+    if not path.is_file():
+        raise ConfigError(f"{run_dir} is not a run directory: it has no {CONFIG_FILE}; run=latest finds the newest run")
+    try:
+        config = OmegaConf.load(path)
+    except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not a configuration: {one_line(error)}") from None
+    if not isinstance(config, DictConfig):
+        raise ConfigError(f"{path} is not a configuration")
+    return config
 
 
 def is_begun(run_dir: Path, composed: dict) -> bool:
@@ -61,36 +272,6 @@ def is_begun(run_dir: Path, composed: dict) -> bool:
     return True
 
 
-def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
-    """The configuration of a run, changed by overrides.
-
-    obstacles=static replaces a whole group, dotted overrides single values, and scenario=corridor replaces what
-    FIXED_BY_SCENARIO names.
-    """
-    path = run_dir / CONFIG_FILE
-    if not path.is_file():
-        raise ConfigError(f"{run_dir} is not a run directory: it has no {CONFIG_FILE}; run=latest finds the newest run")
-    config = OmegaConf.load(path)
-    groups = [o for o in overrides if _is_group(o)]
-    if groups:
-        fresh = compose(groups)
-        for override in groups:
-            group = override.split("=", 1)[0]
-            if group == "experiment":
-                raise ConfigError(f"{override}: a run keeps its experiment; override the groups that should differ")
-            for key in FIXED_BY_SCENARIO if group == "scenario" else (group,):
-                config[key] = fresh[key]
-    for override in overrides:
-        if override not in groups:
-            _set(config, override)
-    return config
-
-
-def scenarios() -> tuple[str, ...]:
-    """Names of the scenarios in conf/scenario."""
-    return tuple(sorted(path.stem for path in (CONFIG_DIR / "scenario").glob("*.yaml")))
-
-
 def find_run(name: str, key: str = "run") -> Path:
     """The run directory that `run=...`, or another key, names: a path, or `latest` for the newest under outputs/."""
     if name != "latest":
@@ -102,6 +283,20 @@ def find_run(name: str, key: str = "run") -> Path:
     if not runs:
         raise ConfigError(f"{key}=latest finds no run under outputs/; train one with python train.py first")
     return runs[-1].parent
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error without line breaks."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines) or type(error).__name__
+
+
+# Replaced by omniperception/cli.py; goes when the last script is converted.
+
+
+def scenarios() -> tuple[str, ...]:
+    """Names of the scenarios in conf/scenario."""
+    return presets("scenario")
 
 
 def split_arguments(arguments: Sequence[str], known: dict[str, str]) -> tuple[dict[str, str], list[str]]:
@@ -137,68 +332,3 @@ def one_line_errors(*also: type[Exception]) -> Iterator[None]:
     except (ConfigError, *also) as error:
         print(f"error: {one_line(error)}", file=sys.stderr, flush=True)
         sys.exit(2)
-
-
-def _check_scenario(overrides: Sequence[str]) -> None:
-    chosen = dict(override.split("=", 1) for override in overrides if "=" in override)
-    if "scenario" not in chosen:
-        return
-    for group in DEFINED_BY_SCENARIO:
-        if group in chosen:
-            raise ConfigError(
-                f"scenario={chosen['scenario']} defines the {group}; leave {group}={chosen[group]} out, or override"
-                f" single values such as {group}.{_EXAMPLES[group]}"
-            )
-
-
-_EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
-
-
-def _is_group(override: str) -> bool:
-    """Whether an override chooses a preset, such as obstacles=static."""
-    return (CONFIG_DIR / override.split("=", 1)[0]).is_dir()
-
-
-_ONE_OR_SEVERAL = ("init",)
-"""Keys that take a name or a list of names, whichever the preset has; `_names` checks them."""
-
-
-def _check_kinds(config: object, presets: object, key: str = "") -> None:
-    """Every value must be of the kind that its preset has: a number for a number, a list for a list."""
-    if isinstance(config, DictConfig) and isinstance(presets, DictConfig):
-        for name in presets:
-            path = f"{key}.{name}" if key else str(name)
-            if name in config and path not in _ONE_OR_SEVERAL and not OmegaConf.is_interpolation(presets, name):
-                _check_kinds(config[name], presets[name], path)
-        return
-    given, expected = _kind(config), _kind(presets)
-    if None in (given, expected) or given == expected or (given, expected) == ("a whole number", "a number"):
-        return
-    raise ConfigError(f"{key}={config} must be {expected}")
-
-
-def _kind(value: object) -> str | None:
-    kinds = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-    kinds |= {ListConfig: "a list", DictConfig: "a group of settings"}
-    return kinds.get(type(value))
-
-
-def _set(config: DictConfig, override: str) -> None:
-    key, separator, value = override.partition("=")
-    if not separator:
-        raise ConfigError(f"argument '{override}' is not of the form key=value")
-    if OmegaConf.select(config, key, default=_MISSING) is _MISSING:
-        parent = OmegaConf.select(config, key.rpartition(".")[0]) if "." in key else config
-        known = ", ".join(map(str, parent)) if isinstance(parent, DictConfig) else "nothing"
-        raise ConfigError(f"unknown override '{override}'; known there: {known}")
-    before = OmegaConf.select(config, key)
-    OmegaConf.update(config, key, yaml.safe_load(value))
-    _check_kinds(OmegaConf.select(config, key), before, key)
-
-
-_MISSING = object()
-
-
-def one_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return " ".join(lines) or type(error).__name__

@@ -106,6 +106,9 @@ class TestRates:
 
 WRONG = [
     (["foo=1"], "foo"),
+    (["num_env=64"], "did you mean num_envs?"),
+    (["+num_env=64"], "did you mean num_envs?"),
+    (["+lidar.sensor.rate=3"], "lidar.sensor.rate is unknown"),
     (["obstacles=dragons"], "dragons"),
     (["num_envs=0"], "num_envs=0 must be at least 1"),
     (["perception=pd_risknet", "lidar=none"], "perception=none"),
@@ -216,7 +219,26 @@ class TestRunDirectories:
             ("num_envs", "key=value"),
         ):
             with pytest.raises(ConfigError, match=named):
-                config.load(run_dir, [override])
+                build.assemble(config.load(run_dir, [override]))
+
+    def test_values_are_replayed_in_hydras_grammar(self, run_dir):
+        given = ["randomization.latency_s=[0.02,0.02]", "rewards.terms.tilt.weight=1e-9", "~rewards.terms.yaw_rate"]
+        run = build.assemble(config.load(run_dir, given))
+        assert run.env.randomization.latency_s == (0.02, 0.02)
+        assert run.env.rewards.terms["tilt"].weight == 1e-9 and "yaw_rate" not in run.env.rewards.terms
+
+    def test_presets_of_ones_own_are_found_again(self, tmp_path):
+        folder = tmp_path / "conf" / "obstacles"
+        folder.mkdir(parents=True)
+        preset = (config.CONFIG_DIR / "obstacles" / "static.yaml").read_text()
+        (folder / "mine.yaml").write_text(preset.replace("shape_seed: 0", "shape_seed: 3"))
+        given = [f"hydra.searchpath=['file://{folder.parent}']", "experiment=quickstart"]
+        run = build.assemble(config.compose([*given, "obstacles=mine"]))
+        assert run.env.obstacles.shape_seed == 3
+        config.save(run.composed, tmp_path)
+        assert config.load(tmp_path, ["obstacles=mine"]).obstacles.shape_seed == 3
+        with pytest.raises(ConfigError, match="obstacles=mine is unknown"):
+            config.compose(["obstacles=mine"])
 
     def test_missing_runs(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

@@ -1,0 +1,220 @@
+"""Command lines: each command declares its own `key=value` arguments, and all are read and explained in one way.
+
+    @dataclass(frozen=True, kw_only=True)
+    class Arguments:
+        what: str = argument(doc="what is timed", choices=("step", "iteration"))  # no default: must be given
+        trials: int = argument(1000, "at least so many episodes", least=1)
+        seconds: float = argument(0.1, "length of a frame (s)", positive=True)
+        num_envs: int | None = argument(None, "environments at a time; as many as the trials need", least=1)
+        variants: tuple[str, ...] = argument(("fps_mlp", "fps_gru"), "perception presets")
+        out: Path = argument(Path("outputs/x"), "folder of what is written")
+
+    def main(arguments: Arguments, overrides: list[str]) -> None:
+        run = build.assemble(config.compose(overrides))
+
+    command = Command(main, Arguments, __doc__, overrides="of the task")
+
+    if __name__ == "__main__":
+        command()
+
+`trials=200 variants=fps_mlp,pd_risknet out=here num_envs=64` on the command line then gives
+`Arguments(trials=200, variants=("fps_mlp", "pd_risknet"), out=Path("here"))` if `num_envs` is not an argument of the
+command, and the overrides `["num_envs=64"]`. A command without `overrides` refuses them, and its `main` takes the
+arguments alone. `--help` prints the documentation and every argument with its default. Wrong input ends with one line
+on standard error and exit code 2; so does a ConfigError, and each of `errors`, that `main` raises.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+import types
+import typing
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omniperception.config import ConfigError, UnknownKey, one_line
+
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false"}
+
+
+def argument(
+    default: Any = dataclasses.MISSING,
+    doc: str = "",
+    *,
+    choices: Sequence[str] = (),
+    least: float | None = None,
+    positive: bool = False,
+) -> Any:
+    """An argument of a command: a field of a frozen dataclass with str, int, float, bool, Path, or a tuple of these.
+
+    Args:
+        default: its value unless given; none: it must be given.
+        doc: what it is, in one line.
+        choices: the only values allowed, of each item of a tuple.
+        least: the least value allowed.
+        positive: whether it must be above 0.
+    """
+    metadata = {"doc": doc, "choices": tuple(choices), "least": least, "positive": positive}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def trust() -> Any:
+    """The argument `trust` of commands that read a configuration, for `build.assemble(config, trust)`."""
+    return argument((), "packages of your own that a configuration may name, such as own_project")
+
+
+@dataclass(frozen=True)
+class Command:
+    """A function behind a command line.
+
+    Attributes:
+        main: called with the arguments and, where overrides are accepted, with the list of them.
+        arguments: dataclass of `argument` fields.
+        doc: help; its first line says what the command does.
+        overrides: what other `key=value` arguments and `--config-dir` change, such as "of the run's configuration";
+            empty: they are refused.
+        errors: exceptions beside ConfigError whose message is for the user.
+        flags: words such as -m that stay among the overrides.
+    """
+
+    main: Callable[..., Any]
+    arguments: type
+    doc: str
+    overrides: str = ""
+    errors: tuple[type[Exception], ...] = ()
+    flags: tuple[str, ...] = ()
+
+    def __call__(self, argv: Sequence[str] | None = None, name: str | None = None) -> None:
+        """Runs the command line `argv`, by default the process's."""
+        argv = list(sys.argv[1:] if argv is None else argv)
+        if {"-h", "--help"} & set(argv):
+            print(self.help(name or f"python {sys.argv[0]}"))
+            return
+        try:
+            arguments, overrides = self.parse(argv)
+            self.main(arguments, overrides) if self.overrides else self.main(arguments)
+        except UnknownKey as error:
+            own = [field.name for field in dataclasses.fields(self.arguments)]
+            fail(UnknownKey(error.given, (*error.known, *own) if "." not in error.given else error.known))
+        except (ConfigError, *self.errors) as error:
+            fail(error)
+
+    def parse(self, argv: Sequence[str]) -> tuple[Any, list[str]]:
+        """Arguments and overrides of a command line."""
+        fields = {field.name: field for field in dataclasses.fields(self.arguments)}
+        hints = typing.get_type_hints(self.arguments)
+        given, keys, overrides = {}, set(), []
+        for text in self._without_flags(argv):
+            key, separator, value = text.partition("=")
+            if not separator and not text.startswith("~") and text not in self.flags:
+                raise ConfigError(f"argument '{text}' is not of the form key=value")
+            if key in keys:
+                raise ConfigError(f"{key} is given twice")
+            keys.add(key)
+            if key in fields:
+                given[key] = _value(fields[key], hints[key], value)
+            elif self.overrides:
+                overrides.append(text)
+            else:
+                raise UnknownKey(text, tuple(fields))
+        for name, field in fields.items():
+            if field.default is dataclasses.MISSING and name not in given:
+                expected = f" one of {', '.join(field.metadata['choices'])}" if field.metadata["choices"] else ""
+                raise ConfigError(f"{name}=... must be given:{expected or ' ' + field.metadata['doc']}")
+        return self.arguments(**given), overrides
+
+    def _without_flags(self, argv: Sequence[str]) -> list[str]:
+        """Arguments of the form key=value; folders of `--config-dir DIR` as Hydra's search path."""
+        words, rest, folders = iter(argv), [], []
+        for word in words:
+            flag, _, value = word.partition("=")
+            if self.overrides and flag in ("--config-dir", "-cd"):
+                folder = value or next(words, "")
+                if not folder or not Path(folder).is_dir():
+                    raise ConfigError(f"{flag} {folder}: there is no such folder")
+                folders.append(f"'file://{Path(folder).resolve()}'")
+            elif word in self.flags:
+                rest.append(word)
+            elif word.startswith("-"):
+                known = ["--help", *self.flags, *(["--config-dir DIR"] if self.overrides else [])]
+                raise ConfigError(f"{word} is unknown; known flags: {', '.join(known)}")
+            else:
+                rest.append(word)
+        return [*rest, f"hydra.searchpath=[{','.join(folders)}]"] if folders else rest
+
+    def help(self, name: str) -> str:
+        """What `--help` prints."""
+        fields = dataclasses.fields(self.arguments)
+        lines = [f"usage: {name} [key=value ...]", "", self.doc.strip(), ""]
+        shown = {field.name: f"{field.name}={_text(field.default)}" for field in fields}
+        width = min(max((len(text) for text in shown.values()), default=0), 30)
+        lines += ["arguments:"] if fields else []
+        for field in fields:
+            choices = f" ({', '.join(field.metadata['choices'])})" if field.metadata["choices"] else ""
+            given = " (must be given)" if field.default is dataclasses.MISSING else ""
+            lines.append(f"  {shown[field.name]:<{width}}  {field.metadata['doc']}{choices}{given}")
+        if self.overrides:
+            lines += [
+                "",
+                f"Any other key=value is an override {self.overrides} in Hydra's grammar, such as num_envs=64,",
+                "obstacles=static, commands.lin_vel_x=[0,1], +key=value, ~key.",
+                "--config-dir DIR adds a folder of presets of your own.",
+            ]
+        return "\n".join(lines)
+
+
+def fail(error: BaseException) -> typing.NoReturn:
+    """Ends the process with one line on standard error and exit code 2."""
+    print(f"error: {one_line(error)}", file=sys.stderr, flush=True)
+    sys.exit(2)
+
+
+def _value(field: dataclasses.Field, hint: Any, text: str) -> Any:
+    """The value that `name=text` stands for."""
+    if not text:
+        raise ConfigError(f"{field.name}= is empty; it is {field.metadata['doc']}")
+    if isinstance(hint, types.UnionType):
+        (hint,) = (part for part in hint.__args__ if part is not types.NoneType)
+        if text == "null":
+            return None
+    if typing.get_origin(hint) is not tuple:
+        return _single(field, hint, text)
+    parts = text.strip("[]").split(",")
+    values = tuple(_single(field, hint.__args__[0], part.strip()) for part in parts)
+    if len(set(values)) < len(values):
+        raise ConfigError(f"{field.name}={text} names one twice")
+    return values
+
+
+def _single(field: dataclasses.Field, kind: type, text: str) -> Any:
+    limits = field.metadata
+    if limits["choices"] and text not in limits["choices"]:
+        raise ConfigError(f"{field.name}={text} must be one of {', '.join(limits['choices'])}")
+    if kind is bool:
+        if text not in ("true", "false"):
+            raise ConfigError(f"{field.name}={text} must be true or false")
+        return text == "true"
+    if kind not in (int, float):
+        return kind(text)
+    bound = " above 0" if limits["positive"] else f" >= {limits['least']:g}" if limits["least"] is not None else ""
+    try:
+        value = kind(text)
+        inside = (not limits["positive"] or value > 0) and (limits["least"] is None or value >= limits["least"])
+        if not (inside and math.isfinite(value)):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(f"{field.name}={text} must be {_KINDS[kind]}{bound}") from None
+    return value
+
+
+def _text(value: Any) -> str:
+    """A default as it would be given."""
+    if value is dataclasses.MISSING or value is None or value == ():
+        return "..."
+    if isinstance(value, bool):
+        return str(value).lower()
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
