@@ -13,4 +13,4 @@ def function_body(header: str | Path) -> str:
     text = Path(header).read_text(encoding="utf-8")
     if text.count("\n{\n") != 1 or text.count("\n}\n") != 1:
         raise ValueError(f"{header}: one function was expected, its braces on lines of their own")
-    return text.partition("\n{\n")[2].rpartition("\n}\n")[0]
+    return text.partition("\n{\n")[2].rpartition("}\n")[0]
