@@ -357,7 +357,7 @@ class OmniEnv(VecEnv):
         if OBSTACLE_CONTACT in self.world.sensors:
             self.touching = self.sim.touched(OBSTACLE_CONTACT)
         if self._past is not None:
-            for past, recorded in zip(self._past, (self.sim.qpos_steps, self.sim.qvel_steps), strict=True):
+            for past, recorded in zip(self._past, self.sim.recorded_states(), strict=True):
                 past.copy_(torch.cat((past[:, recorded.shape[1] :], recorded), 1)[:, -past.shape[1] :])
 
     def _obstacle_path(self) -> torch.Tensor:
@@ -369,7 +369,7 @@ class OmniEnv(VecEnv):
         return self.obstacles.travel(sim.timestep, sim.decimation, self.sim.qpos[:, :2])
 
     def _read_state(self) -> None:
-        self.kinematics = Kinematics.of(self.sim.qpos, self.sim.qvel)
+        self.kinematics = Kinematics.of(*self.sim.robot_state())
         self.sensed = self.kinematics if self._past is None else self._late_kinematics()
         if "joint_torque" in self._reads:
             self.joint_torque = self.sim.joint_torque()
@@ -508,7 +508,7 @@ class OmniEnv(VecEnv):
         if self._past is not None:
             for past, now in zip(self._past, (qpos, qvel), strict=True):
                 put(past, envs, now[:, None])
-        self.command.reset(envs, Kinematics.of(self.sim.qpos, self.sim.qvel))
+        self.command.reset(envs, Kinematics.of(*self.sim.robot_state()))
         if self.obstacles is not None:
             commanded = rotate_yaw(pose[:, 2], take(self.command.value, envs)[:, :2])
             goal = None if self.command.goal_w is None else take(self.command.goal_w, envs)
@@ -655,5 +655,5 @@ class OmniEnv(VecEnv):
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._past: tuple[torch.Tensor, torch.Tensor] | None = None
         if self.randomizer.delay is not None:
-            entry = self.sim.qpos, self.sim.qvel
-            self._past = tuple(x[:, None].repeat(1, self.randomizer.max_delay + 1, 1) for x in entry)
+            steps = self.randomizer.max_delay + 1
+            self._past = tuple(x[:, None].repeat(1, steps, 1) for x in self.sim.robot_state())

@@ -78,7 +78,7 @@ class Kinematics:
 
     @classmethod
     def of(cls, qpos: torch.Tensor, qvel: torch.Tensor) -> Kinematics:
-        """From generalised positions (n, 7 + joints) and velocities (n, 6 + joints)."""
+        """From `Simulator.robot_state`: (n, 7 + joints) and (n, 6 + joints)."""
         qpos, qvel = qpos.float(), qvel.float()
         quat = qpos[:, 3:7]
         yaw = yaw_of(quat)

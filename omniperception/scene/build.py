@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 
@@ -15,6 +16,7 @@ from omniperception.scene.tiled_terrain import TiledTerrainConfig
 FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT = "foot_force", "link_force", "obstacle_contact"
 """Contact sensors that exist only when something reads them."""
 
+_FREE = mujoco.mjtJoint.mjJNT_FREE
 _FOUND, _FORCE = 1, 2
 _REDUCE_NET_FORCE = 3
 
@@ -41,6 +43,12 @@ class World:
     def base_body(self) -> int:
         return self.model.body(self.robot.base).id
 
+    @cached_property
+    def joint_order(self) -> tuple[int, ...] | None:
+        """For each of `robot.joints` its place among the model's joints after the base; None where the orders agree."""
+        order = tuple(int(self.model.joint(name).qposadr[0]) - 7 for name in self.robot.joints)
+        return None if order == tuple(range(len(order))) else order
+
     @property
     def ground_mocap(self) -> int | None:
         """Index of the kinematic body that carries the ground, before all obstacles; None for a plane."""
@@ -64,15 +72,47 @@ def build_world(
     obstacles: ObstaclesConfig,
     sensors: Collection[str] = (),
 ) -> World:
-    """Compiles one environment: the robot meets the ground and the obstacles, nothing else meets anything."""
+    """Compiles one environment: the robot touches the ground and the obstacles, nothing else touches anything.
+
+    Raises:
+        ValueError: the preset names a part that the robot does not have, or the base does not float.
+    """
     spec = robot.spec()
+    _check_geoms(spec, robot)
     for geom in spec.geoms:
         geom.contype, geom.conaffinity, geom.condim = 0, 1, 3
     terrain.add_to(spec)
     obstacles.add_to(spec)
     _add_contact_sensors(spec, robot, obstacles, frozenset(sensors))
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    return World(spec.compile(), robot, terrain, obstacles, frozenset(sensors))
+    model = spec.compile()
+    _check_joints(model, robot)
+    return World(model, robot, terrain, obstacles, frozenset(sensors))
+
+
+def _check_geoms(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
+    known = [geom.name for geom in spec.geoms]
+    for key in ("foot_geoms", "penalized_geoms"):
+        unknown = sorted(set(getattr(robot, key)) - set(known))
+        if unknown:
+            raise ValueError(f"robot.{key} names {', '.join(unknown)}; known: {', '.join(filter(None, known))}")
+
+
+def _check_joints(model: mujoco.MjModel, robot: RobotConfig) -> None:
+    """Base at qpos[0:7] and every other joint in the list, one number each: what states are made of."""
+    types = {model.joint(k).name: model.jnt_type[k] for k in range(model.njnt)}
+    floating = [model.body(model.jnt_bodyid[k]).name for k in range(model.njnt) if model.jnt_type[k] == _FREE]
+    if floating != [robot.base] or model.jnt_type[0] != _FREE:
+        raise ValueError(
+            f"robot.base={robot.base} must be the first body of {robot.mjcf} with a joint, and the only one with a free"
+            f" joint; bodies with a free joint: {', '.join(floating) or 'none'}"
+        )
+    missing = [name for name, kind in types.items() if kind != _FREE and name not in robot.joints]
+    if missing:
+        raise ValueError(f"robot.joints must name every joint of {robot.mjcf}; missing: {', '.join(missing)}")
+    balls = [name for name in robot.joints if types[name] == mujoco.mjtJoint.mjJNT_BALL]
+    if balls:
+        raise ValueError(f"robot.joints names {', '.join(balls)}: joints must be hinges or slides, not balls")
 
 
 def _add_contact_sensors(

@@ -17,7 +17,8 @@ class RobotConfig:
     Attributes:
         mjcf: a file in `omniperception/scene/assets`, or a path to a user's own MJCF without actuators.
         base: name of the free-floating base body.
-        joints: actuated joints in the order of actions and joint observations.
+        joints: all joints but the base's free one, in the order of actions, joint observations and the exported policy;
+            the file may have them in any order.
         default_joint_pos: joint angle (rad) of the default pose, by joint name.
         base_height: height (m) of the base origin above the ground in the default pose.
         kp: proportional gain (N m / rad) of the joint position actuators.
@@ -50,6 +51,9 @@ class RobotConfig:
                 raise ValueError(f"robot.{name}={getattr(self, name)} must be positive")
         if self.kv < 0 or self.frictionloss < 0:
             raise ValueError(f"robot.kv={self.kv} and robot.frictionloss={self.frictionloss} must not be negative")
+        if len(set(self.joints)) != len(self.joints):
+            twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
+            raise ValueError(f"robot.joints names {', '.join(twice)} more than once")
         for name in ("default_joint_pos", "torque_limits"):
             missing = set(self.joints) ^ set(getattr(self, name))
             if missing:
@@ -65,7 +69,8 @@ class RobotConfig:
         for name in self.joints:
             joint = spec.joint(name)
             if joint is None:
-                raise ValueError(f"robot.joints names '{name}', which {self.mjcf} does not have")
+                known = ", ".join(joint.name for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE)
+                raise ValueError(f"robot.joints names {name}, which {self.mjcf} does not have; known: {known}")
             joint.frictionloss = self.frictionloss
             actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             actuator.set_to_position(kp=self.kp, kv=self.kv)

@@ -96,7 +96,8 @@ class Simulator(Protocol):
     num_envs: int
     device: torch.device
     qpos: torch.Tensor
-    """(num_envs, 7 + num_joints): base position (m, environment frame), quaternion (wxyz), joints (rad)."""
+    """(num_envs, 7 + num_joints): base position (m, environment frame), quaternion (wxyz), joints (rad) in the order
+    of the robot's file; `robot_state` has them in the order of `robot.joints`."""
     qvel: torch.Tensor
     """(num_envs, 6 + num_joints): base linear velocity (m/s, world), angular velocity (rad/s, base), joints."""
     mocap_pos: torch.Tensor
@@ -112,10 +113,12 @@ class Simulator(Protocol):
     def failed(self) -> torch.Tensor:
         """(num_envs,) bool: simulations with a failure since their last reset."""
 
-    qpos_steps: torch.Tensor
-    """(num_envs, num_steps, nq): qpos after each physics step of the last call, if they are recorded."""
-    qvel_steps: torch.Tensor
-    """(num_envs, num_steps, nv): likewise qvel."""
+    def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Copies of `qpos` and `qvel`, float32, with the joints in the order of `robot.joints`."""
+
+    def recorded_states(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(num_envs, num_steps, nq) and (num_envs, num_steps, nv): positions and velocities after each physics step of
+        the last call of `step`, joints likewise, of a simulator that records states; valid until the next call."""
 
     def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
         """Physics steps with (num_envs, num_joints) joint position targets (rad).
@@ -127,8 +130,8 @@ class Simulator(Protocol):
                 each step; None leaves them where they are.
         """
 
-    def reset(self, envs: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        """Puts some environments, see `rows`, into a state, (n, nq) and (n, nv)."""
+    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Puts environments `env_ids` (n,) into states (n, nq) and (n, nv), joints in the order of `robot.joints`."""
 
     def joint_torque(self) -> torch.Tensor:
         """(num_envs, num_joints) actuator torque (N m) of the last physics step.
@@ -169,5 +172,28 @@ class Simulator(Protocol):
     def detect_failures(self) -> None:
         """Marks simulations whose state is no longer one that a robot can be in."""
 
-    def update_model(self, envs: torch.Tensor) -> None:
-        """Recomputes what the engine derives from model fields that were written for some environments, see `rows`."""
+    def update_model(self, env_ids: torch.Tensor) -> None:
+        """Recomputes what the engine derives from model fields that were written for environments `env_ids` (n,)."""
+
+
+class JointOrder:
+    """The order of `robot.joints` and that of the robot's file; nothing is moved where they agree."""
+
+    def __init__(self, world: World, device: torch.device) -> None:
+        self._from_file: torch.Tensor | None = None
+        if world.joint_order is not None:
+            self._from_file = torch.tensor(world.joint_order, device=device)
+            self._to_file = self._from_file.argsort()
+
+    def from_file(self, state: torch.Tensor) -> torch.Tensor:
+        """The engine's positions (..., 7 + num_joints) or velocities (..., 6 + num_joints) reordered."""
+        return state if self._from_file is None else _reorder(state, self._from_file)
+
+    def to_file(self, state: torch.Tensor) -> torch.Tensor:
+        """The inverse of `from_file`."""
+        return state if self._from_file is None else _reorder(state, self._to_file)
+
+
+def _reorder(state: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
+    base, joints = state[..., : -len(order)], state[..., -len(order) :]
+    return torch.cat((base, joints[..., order]), -1)

@@ -8,7 +8,7 @@ import torch
 from mujoco.batch import Batch, SimulationError
 
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, SimConfig
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, SimConfig
 
 _INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -25,8 +25,7 @@ class MujocoSimulator:
     """`num_envs` simulations on a native thread pool; only what is asked for is copied out of the engine.
 
     State tensors are views of the engine's own memory. Contact sensors and torques describe the state before the last
-    physics step, as `mj_step` leaves them; body poses are recomputed for the current state. Environments are told by
-    their indices, not by a mask.
+    physics step, as `mj_step` leaves them; body poses are recomputed for the current state.
 
     The steps of one call are one native call: threads that sleep between calls cost more than the obstacles' motion.
     """
@@ -44,6 +43,7 @@ class MujocoSimulator:
         if world.ground_mocap is not None:
             self.ground_pos = self.mocap_pos[:, 0]
             self.mocap_pos, self.mocap_quat = self.mocap_pos[:, 1:], self.mocap_quat[:, 1:]
+        self._order = JointOrder(world, self.device)
         self.failure = torch.zeros(num_envs, dtype=torch.int64)
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
         self._record = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
@@ -70,13 +70,12 @@ class MujocoSimulator:
     def failed(self) -> torch.Tensor:
         return self.failure > Failure.NONE
 
-    @property
-    def qpos_steps(self) -> torch.Tensor:
-        return torch.from_numpy(self._records["qpos"])
+    def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self._order.from_file(self.qpos.float()), self._order.from_file(self.qvel.float())
 
-    @property
-    def qvel_steps(self) -> torch.Tensor:
-        return torch.from_numpy(self._records["qvel"])
+    def recorded_states(self) -> tuple[torch.Tensor, torch.Tensor]:
+        qpos, qvel = (torch.from_numpy(self._records[name]) for name in ("qpos", "qvel"))
+        return self._order.from_file(qpos), self._order.from_file(qvel)
 
     def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
         if not bool(torch.isfinite(joint_target).all()):
@@ -130,18 +129,18 @@ class MujocoSimulator:
             self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
             self.mark_failed(warned, Failure.ENGINE)
 
-    def reset(self, envs: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        kept = [poses[envs].clone() for poses in self._kinematic]
-        self.batch.reset(envs.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        kept = [poses[env_ids].clone() for poses in self._kinematic]
+        self.batch.reset(env_ids.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for poses, before in zip(self._kinematic, kept, strict=True):
-            poses[envs] = before
-        self.qpos[envs] = qpos.double()
-        self.qvel[envs] = qvel.double()
-        self.failure[envs] = Failure.NONE
+            poses[env_ids] = before
+        self.qpos[env_ids] = self._order.to_file(qpos.double())
+        self.qvel[env_ids] = self._order.to_file(qvel.double())
+        self.failure[env_ids] = Failure.NONE
         for values in self._records.values():
-            values[envs.numpy()] = 0.0
+            values[env_ids.numpy()] = 0.0
         if self._torque is not None:
-            self._torque[envs] = 0.0
+            self._torque[env_ids] = 0.0
 
     def joint_torque(self) -> torch.Tensor:
         if self._torque is None:
@@ -186,8 +185,8 @@ class MujocoSimulator:
             self._fields[name] = torch.from_numpy(self.batch.expand(name))
         return self._fields[name]
 
-    def update_model(self, envs: torch.Tensor) -> None:
-        self.batch.set_const(envs.numpy())
+    def update_model(self, env_ids: torch.Tensor) -> None:
+        self.batch.set_const(env_ids.numpy())
 
     def anomalies(self) -> dict[str, float]:
         return {}

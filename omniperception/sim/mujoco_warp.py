@@ -13,10 +13,9 @@ import mujoco
 import torch
 import warp as wp
 
-from omniperception.common.rows import put
 from omniperception.lidar.launch import wp_device
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, SimConfig
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, SimConfig
 from omniperception.sim.mujoco import apply_options
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
@@ -143,6 +142,7 @@ class MujocoWarpSimulator:
         if world.ground_mocap is not None:
             self.ground_pos = self.mocap_pos[:, 0]
             self.mocap_pos, self.mocap_quat = self.mocap_pos[:, 1:], self.mocap_quat[:, 1:]
+        self._order = JointOrder(world, self.device)
         self.failure = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.overflow = wp.to_torch(data.overflow)
         self._torque = wp.to_torch(data.actuator_force)
@@ -160,13 +160,12 @@ class MujocoWarpSimulator:
     def failed(self) -> torch.Tensor:
         return self.failure > Failure.NONE
 
-    @property
-    def qpos_steps(self) -> torch.Tensor:
-        return self._records["qpos"]
+    def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self._order.from_file(self.qpos.clone()), self._order.from_file(self.qvel.clone())
 
-    @property
-    def qvel_steps(self) -> torch.Tensor:
-        return self._records["qvel"]
+    def recorded_states(self) -> tuple[torch.Tensor, torch.Tensor]:
+        qpos, qvel = (self._records[name] for name in ("qpos", "qvel"))
+        return self._order.from_file(qpos), self._order.from_file(qvel)
 
     def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
         if num_steps != self._num_steps:
@@ -190,12 +189,12 @@ class MujocoWarpSimulator:
         self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
         self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
 
-    def reset(self, envs: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        put(self.qpos, envs, qpos)
-        put(self.qvel, envs, qvel)
-        put(self.failure, envs, int(Failure.NONE))
+    def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        self.qpos[env_ids] = self._order.to_file(qpos.float())
+        self.qvel[env_ids] = self._order.to_file(qvel.float())
+        self.failure[env_ids] = int(Failure.NONE)
         for values in (*self._forgotten, *self._records.values()):
-            put(values, envs, 0.0)
+            values[env_ids] = 0.0
 
     def joint_torque(self) -> torch.Tensor:
         return self._torque.clone()
@@ -225,7 +224,7 @@ class MujocoWarpSimulator:
                 self.update_model(torch.arange(self.num_envs, device=self.device))
         return self._fields[name]
 
-    def update_model(self, envs: torch.Tensor) -> None:
+    def update_model(self, env_ids: torch.Tensor) -> None:
         """Derives anew for all worlds, whose other constants come out as they were, in one launch for all."""
         self._launch("constants", self._constants)
 

@@ -1,12 +1,14 @@
 """The compiled environment: which geoms may touch, contact parameters, sensors."""
 
 import math
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 
+import omniperception.scene
 from omniperception.scene import TerrainConfig, build_world
 from omniperception.scene.terrain import contact_solref, damping_ratio
 from omniperception.sim import SimConfig
@@ -108,6 +110,36 @@ def test_actuators_are_a_pd_law_with_torque_limits(mixed):
     expected[0] += 25 * 0.1
     expected[2] = 45.43
     np.testing.assert_allclose(data.actuator_force, expected, atol=1e-9)
+
+
+GO2 = (Path(omniperception.scene.__file__).parent / "assets" / "go2.xml").read_text()
+CALF = '<joint name="RR_calf_joint"'
+
+
+@pytest.mark.parametrize(
+    ("mjcf", "overrides", "message"),
+    [
+        (GO2, ["robot.base=trunk"], "robot.base=trunk must be the first body .* bodies with a free joint: base"),
+        (GO2, ["robot.base=FL_hip"], "robot.base=FL_hip must be the first body"),
+        (GO2.replace("<freejoint", "<joint"), [], "bodies with a free joint: none"),
+        (GO2.replace(CALF, '<joint name="tail"/>' + CALF), [], "robot.joints must name every joint .* missing: tail"),
+        (GO2.replace(CALF, CALF + ' type="ball" range="0 1"'), [], "robot.joints names RR_calf_joint: .* not balls"),
+        (GO2.replace("RR_calf_joint", "knee"), [], "robot.joints names RR_calf_joint, which .* known: .*knee"),
+        (GO2, ["robot.foot_geoms=[FL_foot,paw]"], "robot.foot_geoms names paw; known: .*FL_foot"),
+        (GO2, ["robot.penalized_geoms=[nose]"], "robot.penalized_geoms names nose; known: .*trunk"),
+    ],
+)
+def test_a_preset_that_does_not_fit_its_file_is_refused_in_one_line(make_config, tmp_path, mjcf, overrides, message):
+    path = tmp_path / "robot.xml"
+    path.write_text(mjcf)
+    with pytest.raises(ValueError, match=message) as error:
+        world_of(make_config(*overrides, f"robot.mjcf={path}"))
+    assert "\n" not in str(error.value)
+
+
+def test_joints_named_twice_are_refused(make_config):
+    with pytest.raises(ValueError, match="robot.joints names FL_hip_joint more than once"):
+        make_config("robot.joints=[FL_hip_joint,FL_hip_joint]")
 
 
 @pytest.mark.parametrize(("restitution", "ratio"), [(0.0, 1.0), (1.0, 0.0), (math.exp(-math.pi), 0.7071068)])

@@ -57,6 +57,14 @@ def test_body_poses_are_those_of_the_current_state(sim):
     np.testing.assert_allclose(mat[1, 0].numpy().ravel(), data.geom_xmat[foot], atol=1e-6)
 
 
+def test_a_state_that_was_read_stays_as_it_was(sim):
+    before = sim.robot_state()
+    kept = [values.clone() for values in before]
+    sim.step(targets(sim, 1, 1)[0])
+    assert all(torch.equal(a, b) for a, b in zip(before, kept, strict=True))
+    assert not torch.equal(sim.robot_state()[1], before[1])
+
+
 def test_standing_feet_carry_the_weight(sim):
     """The reading is what a foot does to the ground: downwards."""
     target = default_joints(sim).expand(4, -1)
