@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from functools import lru_cache
 
@@ -31,13 +32,14 @@ def view(tensor: torch.Tensor, dtype: type) -> wp.array:
         _views.move_to_end(key)
         return cached
     wp.init()
-    inner = 1 if wp.types.type_is_vector(dtype) else 0
-    if inner and (tensor.stride(-1) != 1 or tensor.shape[-1] != wp.types.type_size(dtype)):
+    inner = getattr(dtype, "_shape_", ())
+    outer = tensor.dim() - len(inner)
+    packed = tuple(math.prod(inner[axis + 1 :]) for axis in range(len(inner)))
+    if (tuple(tensor.shape[outer:]), tensor.stride()[outer:]) != (inner, packed):
         raise ValueError(
-            f"a {dtype.__name__} view needs a contiguous last dimension, got shape {tuple(tensor.shape)}"
+            f"a {dtype.__name__} view needs contiguous last dimensions {inner}, got shape {tuple(tensor.shape)}"
             f" with strides {tensor.stride()}; pass tensor.contiguous()"
         )
-    outer = tensor.dim() - inner
     cached = wp.array(
         ptr=tensor.data_ptr(),
         dtype=dtype,

@@ -10,8 +10,6 @@ from clouds import MAX_RANGE, random_rays, sample
 
 from omniperception.perception import Attitude, PdSampler, ProximitySampler
 
-pytestmark = pytest.mark.usefixtures("each_way")
-
 SPLIT, EDGES, SECTORS, DECAY, BLIND, BODY = 10.0, (-1.0, -0.2, 0.3, 2.0), 7, 0.6, 0.4, (0.5, 0.3)
 MOUNT_POS, MOUNT_RPY = (0.3, 0.05, -0.1), (0.1, -2.8, 3.0)
 

@@ -10,8 +10,6 @@ from clouds import MAX_RANGE, random_rays, rays_from_points, sample
 
 from omniperception.perception import FpsSampler, PdSampler, RawSampler
 
-pytestmark = pytest.mark.usefixtures("each_way")
-
 
 def brute_force_fps(points, k):
     """Indices of exact farthest point sampling in float64 from point 0, ties to the lowest index."""

@@ -1,4 +1,4 @@
-"""What a sampler of point clouds is; those that there are compile kernels and stand in sampling.py."""
+"""The interface of samplers of point clouds, without Warp; the samplers stand in sampling.py."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Sampler(ABC):
     @property
     @abstractmethod
     def kernels(self) -> tuple[str, ...]:
-        """Names of the kernels that sampling a frame launches."""
+        """Names of the kernels that sampling a frame launches on a CPU."""
 
     def __call__(
         self,

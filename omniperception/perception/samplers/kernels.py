@@ -1,278 +1,87 @@
-"""Warp kernels of the point-cloud samplers: partition, farthest points, sorting and averaging, one source for
-all devices."""
+"""Warp kernels of the samplers, for all devices.
+
+A kernel is launched over (N, lanes): the lanes share the rays, points or cells of an environment, lane i taking
+i, i + lanes, ... A CPU has one lane, a GPU many (:data:`LANES`). Only :mod:`sorting` has a form for each kind of
+device.
+"""
+
+from pathlib import Path
 
 import warp as wp
 
 from omniperception.lidar.kernels.geometry import to_quat
 from omniperception.lidar.kernels.sectors import levelled
+from omniperception.lidar.native import function_body
 
 wp.set_module_options({"enable_backward": False})
 
-RADIX_BITS = 8
-RADIX_SIZE = 1 << RADIX_BITS
 PHI_BITS = 16
 MAX_RING = (1 << (31 - PHI_BITS)) - 1
 """Largest ring index that fits a sort key of 31 bits beside the quantised azimuth."""
+BUCKET_SIZE = 32
+"""Points per bucket of ``farthest_points_by_bucket``."""
+WORDS_PER_BUCKET = 5 * BUCKET_SIZE + 7
+"""Work memory of a bucket: five numbers for each point, its box, and its largest distance."""
 
+LANES = {"cpu": 1, "cuda": 128}
+"""Threads that share one environment, by kind of device."""
+BLOCK = {"cpu": 1, "cuda": 128}
+"""The same where they wait for each other: a CUDA block, or one thread."""
+
+_HERE = Path(__file__).parent
 _HALF_PI = wp.constant(1.5707963267948966)
 _PI = wp.constant(3.141592653589793)
+_LAST_RAY = wp.constant(wp.int64(0x7FFFFFFF))
 
 
 @wp.struct
-class Scratch:
-    """Work memory of one sampler; N environments, R rays, K points to pick, arrays one row per
-    environment."""
+class Work:
+    """Work memory of one sampler: N environments, R rays, K points to pick; a row for each environment."""
 
+    rays: wp.array2d(dtype=wp.int32)  # (N, R) rays in sampling order, see `sorting`
+    parts: wp.array2d(dtype=wp.int32)  # (N, 3) where in it the proximal hits begin, the distal hits begin, and they end
     x: wp.array2d(dtype=wp.float32)  # (N, R) coordinates of the proximal hits / max range
     y: wp.array2d(dtype=wp.float32)
     z: wp.array2d(dtype=wp.float32)
-    ray: wp.array2d(dtype=wp.int32)  # (N, R) ray index of each proximal hit
-    distance: wp.array2d(dtype=wp.int32)  # (N, R) bits of the squared distance to the picked points
+    distance: wp.array2d(dtype=wp.int32)  # (N, R) bits of the squared distance to the nearest picked point
+    buckets: wp.array2d(dtype=wp.int32)  # (N, WORDS_PER_BUCKET * buckets)
     picked: wp.array2d(dtype=wp.int32)  # (N, K) positions in x, y, z
-    num_proximal: wp.array(dtype=wp.int32)  # (N,) proximal hits
-    keys: wp.array3d(dtype=wp.int32)  # (2, N, R) sort keys, read from one half and written to the other
-    items: wp.array3d(dtype=wp.int32)  # (2, N, R) what is sorted by them
+    picked_keys: wp.array2d(dtype=wp.int32)  # (N, K) what the picked points are sorted by
+    keys: wp.array3d(dtype=wp.int32)  # (2, N, R) sort keys of rays, twice because a sort writes from half to half
+    items: wp.array3d(dtype=wp.int32)  # (2, N, R) rays that are sorted by them
     histogram: wp.array2d(dtype=wp.int32)  # (N, RADIX_SIZE)
-    bucketed: wp.array3d(dtype=wp.float32)  # (N, 3, R rounded up to whole buckets) x, y, z in order of place
-    position: wp.array2d(dtype=wp.int32)  # (N, the same) their positions in x, y, z
-    boxes: wp.array3d(dtype=wp.float32)  # (N, 6, buckets) least x, y, z and greatest x, y, z of each bucket
-    bucket_distance: wp.array2d(dtype=wp.int32)  # (N, buckets) greatest distance bits in each bucket
 
 
-BUCKET_SIZE = 32
-"""Points per bucket of :func:`farthest_points_by_bucket`."""
-
-_FARTHEST_POINTS_BY_BUCKET = r"""
-#if !defined(__CUDA_ARCH__)
-    const int SIZE = 32, CELLS = 16;
-    const int n = num_proximal.data[env];
-    const int buckets = (n + SIZE - 1) / SIZE, padded = buckets * SIZE;
-    const float* in[3] = {
-        (const float*)((const char*)x.data + (size_t)env * x.strides[0]),
-        (const float*)((const char*)y.data + (size_t)env * y.strides[0]),
-        (const float*)((const char*)z.data + (size_t)env * z.strides[0])};
-    float* sorted[3];
-    float* low[3];
-    float* high[3];
-    for (int a = 0; a < 3; ++a) {
-        sorted[a] = (float*)((char*)bucketed.data + (size_t)env * bucketed.strides[0] + a * bucketed.strides[1]);
-        low[a] = (float*)((char*)boxes.data + (size_t)env * boxes.strides[0] + a * boxes.strides[1]);
-        high[a] = (float*)((char*)boxes.data + (size_t)env * boxes.strides[0] + (a + 3) * boxes.strides[1]);
-    }
-    const float* __restrict__ X = sorted[0];
-    const float* __restrict__ Y = sorted[1];
-    const float* __restrict__ Z = sorted[2];
-    int* __restrict__ I = (int*)((char*)position.data + (size_t)env * position.strides[0]);
-    int* __restrict__ D = (int*)((char*)distance.data + (size_t)env * distance.strides[0]);
-    int* __restrict__ M = (int*)((char*)bucket_distance.data + (size_t)env * bucket_distance.strides[0]);
-    int* __restrict__ P = (int*)((char*)picked.data + (size_t)env * picked.strides[0]);
-
-    // Order by cell of a grid over the cloud, along a Z-curve, so that consecutive points are near each other.
-    float least[3], scale[3];
-    for (int a = 0; a < 3; ++a) {
-        float lo = in[a][0], hi = in[a][0];
-        for (int i = 1; i < n; ++i) {
-            lo = in[a][i] < lo ? in[a][i] : lo;
-            hi = in[a][i] > hi ? in[a][i] : hi;
-        }
-        least[a] = lo;
-        scale[a] = hi > lo ? (float)CELLS / (hi - lo) : 0.0f;
-    }
-    static const unsigned short SPREAD[16] = {
-        0, 1, 8, 9, 64, 65, 72, 73, 512, 513, 520, 521, 576, 577, 584, 585};
-    int starts[4097];
-    for (int c = 0; c <= 4096; ++c) starts[c] = 0;
-    for (int i = 0; i < n; ++i) {
-        int key = 0;
-        for (int a = 0; a < 3; ++a) {
-            int cell = (int)((in[a][i] - least[a]) * scale[a]);
-            cell = cell < 0 ? 0 : (cell > CELLS - 1 ? CELLS - 1 : cell);
-            key |= SPREAD[cell] << a;
-        }
-        D[i] = key;
-        ++starts[key + 1];
-    }
-    for (int c = 0; c < 4096; ++c) starts[c + 1] += starts[c];
-    int current = 0;
-    for (int i = 0; i < n; ++i) {
-        const int slot = starts[D[i]]++;
-        if (i == 0) current = slot;
-        I[slot] = i;
-        for (int a = 0; a < 3; ++a) sorted[a][slot] = in[a][i];
-    }
-    for (int i = n; i < padded; ++i) {
-        I[i] = 0x7fffffff;
-        for (int a = 0; a < 3; ++a) sorted[a][i] = sorted[a][n - 1];
-    }
-    for (int i = 0; i < padded; ++i) D[i] = i < n ? 0x7f7fffff : -1;
-    for (int b = 0; b < buckets; ++b) {
-        M[b] = 0x7f7fffff;
-        for (int a = 0; a < 3; ++a) {
-            float lo = sorted[a][b * SIZE], hi = lo;
-            for (int i = b * SIZE + 1; i < (b + 1) * SIZE; ++i) {
-                lo = sorted[a][i] < lo ? sorted[a][i] : lo;
-                hi = sorted[a][i] > hi ? sorted[a][i] : hi;
-            }
-            low[a][b] = lo;
-            high[a][b] = hi;
-        }
-    }
-    const float* __restrict__ LX = low[0];
-    const float* __restrict__ LY = low[1];
-    const float* __restrict__ LZ = low[2];
-    const float* __restrict__ HX = high[0];
-    const float* __restrict__ HY = high[1];
-    const float* __restrict__ HZ = high[2];
-    for (int s = 0; s < num_picks; ++s) {
-        P[s] = I[current];
-        if (s == num_picks - 1) return;
-        D[current] = -1;
-        const int own = current / SIZE;
-        const float cx = X[current], cy = Y[current], cz = Z[current];
-        // A block of buckets at a time: those whose box is nearer than their farthest point must look at their points.
-        for (int first = 0; first < buckets; first += 16) {
-            const int last = first + 16 < buckets ? first + 16 : buckets;
-            int looks[16];
-            int any = 0;
-            for (int b = first; b < last; ++b) {
-                float dx = LX[b] - cx > cx - HX[b] ? LX[b] - cx : cx - HX[b];
-                float dy = LY[b] - cy > cy - HY[b] ? LY[b] - cy : cy - HY[b];
-                float dz = LZ[b] - cz > cz - HZ[b] ? LZ[b] - cz : cz - HZ[b];
-                dx = dx > 0.0f ? dx : 0.0f;
-                dy = dy > 0.0f ? dy : 0.0f;
-                dz = dz > 0.0f ? dz : 0.0f;
-                const float squared = dx * dx + dy * dy + dz * dz;
-                int bits;
-                memcpy(&bits, &squared, sizeof(bits));
-                looks[b - first] = bits < M[b] || b == own;
-                any |= looks[b - first];
-            }
-            if (!any) continue;
-            for (int b = first; b < last; ++b) {
-                if (!looks[b - first]) continue;
-                int farthest = -1;
-                for (int i = b * SIZE; i < (b + 1) * SIZE; ++i) {
-                    const float dx = X[i] - cx, dy = Y[i] - cy, dz = Z[i] - cz;
-                    const float squared = dx * dx + dy * dy + dz * dz;
-                    int bits;
-                    memcpy(&bits, &squared, sizeof(bits));
-                    const int d = D[i] < bits ? D[i] : bits;
-                    D[i] = d;
-                    farthest = farthest > d ? farthest : d;
-                }
-                M[b] = farthest;
-            }
-        }
-        int farthest = -1;
-        for (int b = 0; b < buckets; ++b) farthest = farthest > M[b] ? farthest : M[b];
-        int winner = 0x7fffffff;
-        for (int b = 0; b < buckets; ++b) {
-            if (M[b] != farthest) continue;
-            for (int i = b * SIZE; i < (b + 1) * SIZE; ++i) {
-                if (D[i] == farthest && I[i] < winner) { winner = I[i]; current = i; }
-            }
-        }
-    }
-#endif
-"""
-
-
-@wp.func_native(_FARTHEST_POINTS_BY_BUCKET)
-def farthest_points_by_bucket(
-    x: wp.array2d(dtype=wp.float32),
-    y: wp.array2d(dtype=wp.float32),
-    z: wp.array2d(dtype=wp.float32),
-    distance: wp.array2d(dtype=wp.int32),
-    picked: wp.array2d(dtype=wp.int32),
-    num_proximal: wp.array(dtype=wp.int32),
-    bucketed: wp.array3d(dtype=wp.float32),
-    position: wp.array2d(dtype=wp.int32),
-    boxes: wp.array3d(dtype=wp.float32),
-    bucket_distance: wp.array2d(dtype=wp.int32),
-    num_picks: int,
-    env: int,
-): ...
-
-
-_FARTHEST_POINTS = r"""
-    const int n = num_proximal.data[env];
-    const int k = n < num_picks ? n : num_picks;
-    int* P = picked.data + (size_t)env * (picked.strides[0] / sizeof(int));
-    if (n <= num_picks) {
-        for (int i = lane; i < n; i += num_lanes) P[i] = i;
-        return;
-    }
-    const size_t row = (size_t)env * (x.strides[0] / sizeof(float));
-    const float* __restrict__ X = x.data + row;
-    const float* __restrict__ Y = y.data + row;
-    const float* __restrict__ Z = z.data + row;
-    int* __restrict__ D = distance.data + (size_t)env * (distance.strides[0] / sizeof(int));
-    for (int i = lane; i < n; i += num_lanes) D[i] = 0x7f7fffff;
-    int current = 0;
-#if defined(__CUDA_ARCH__)
-    // One block per environment; three slots so that a slot is cleared two barriers before its next use.
-    __shared__ unsigned long long best[3];
-    __syncthreads();
-    if (lane < 3) best[lane] = 0ull;
-    __syncthreads();
-    for (int s = 0; s < k; ++s) {
-        if (lane == 0) { P[s] = current; best[(s + 1) % 3] = 0ull; }
-        if (lane == current % num_lanes) D[current] = -1;
-        const float cx = X[current], cy = Y[current], cz = Z[current];
-        unsigned long long mine = 0ull;
-        for (int i = lane; i < n; i += num_lanes) {
-            const float dx = X[i] - cx, dy = Y[i] - cy, dz = Z[i] - cz;
-            const int d = min(D[i], __float_as_int(dx * dx + dy * dy + dz * dz));
-            D[i] = d;
-            if (d >= 0) {
-                const unsigned long long key = ((unsigned long long)d << 32) | (unsigned int)~i;
-                if (key > mine) mine = key;
-            }
-        }
-        for (int step = 16; step > 0; step >>= 1) {
-            const unsigned long long other = __shfl_down_sync(0xffffffffu, mine, step);
-            if (other > mine) mine = other;
-        }
-        if ((lane & 31) == 0) atomicMax(&best[s % 3], mine);
-        __syncthreads();
-        current = (int)~(unsigned int)(best[s % 3] & 0xffffffffull);
-    }
-#else
-    // Non-negative floats order like their bits: integer minima and maxima vectorise without fast-math.
-    for (int s = 0; s < k; ++s) {
-        P[s] = current;
-        D[current] = -1;
-        const float cx = X[current], cy = Y[current], cz = Z[current];
-        int farthest = -1;
-        for (int i = 0; i < n; ++i) {
-            const float dx = X[i] - cx, dy = Y[i] - cy, dz = Z[i] - cz;
-            const float squared = dx * dx + dy * dy + dz * dz;
-            int bits;
-            memcpy(&bits, &squared, sizeof(bits));
-            const int d = D[i] < bits ? D[i] : bits;
-            D[i] = d;
-            farthest = farthest > d ? farthest : d;
-        }
-        current = 0;
-        while (current < n - 1 && D[current] != farthest) ++current;
-    }
-#endif
-"""
-
-
-@wp.func_native(_FARTHEST_POINTS)
+@wp.func_native(function_body(_HERE / "farthest_points.h"))
 def farthest_points(
     x: wp.array2d(dtype=wp.float32),
     y: wp.array2d(dtype=wp.float32),
     z: wp.array2d(dtype=wp.float32),
     distance: wp.array2d(dtype=wp.int32),
     picked: wp.array2d(dtype=wp.int32),
-    num_proximal: wp.array(dtype=wp.int32),
+    n: int,
     num_picks: int,
     env: int,
     lane: int,
     num_lanes: int,
 ): ...
+
+
+@wp.func_native(function_body(_HERE / "farthest_points_by_bucket.h"))
+def farthest_points_by_bucket(
+    x: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+    z: wp.array2d(dtype=wp.float32),
+    picked: wp.array2d(dtype=wp.int32),
+    work: wp.array2d(dtype=wp.int32),
+    n: int,
+    num_picks: int,
+    env: int,
+): ...
+
+
+@wp.func_native(function_body(_HERE / "rank.h"))
+def rank_of(keys: wp.array2d(dtype=wp.int32), env: int, i: int, n: int) -> int: ...
 
 
 @wp.func
@@ -291,191 +100,108 @@ def sort_key(theta: float, phi: float, ring: float) -> int:
     return (row << PHI_BITS) | column
 
 
-@wp.func
-def radix_sort(env: int, n: int, scratch: Scratch) -> int:
-    """Stable sort of the first n items of half 0 by key; returns the half that holds the result."""
-    half = wp.int32(0)
-    for digit in range(4):
-        shift = digit * RADIX_BITS
-        for b in range(RADIX_SIZE):
-            scratch.histogram[env, b] = 0
-        for i in range(n):
-            b = (scratch.keys[half, env, i] >> shift) & (RADIX_SIZE - 1)
-            scratch.histogram[env, b] = scratch.histogram[env, b] + 1
-        first = wp.int32(0)
-        if n > 0:
-            first = (scratch.keys[half, env, 0] >> shift) & (RADIX_SIZE - 1)
-        if scratch.histogram[env, first] < n:  # otherwise this digit is the same everywhere
-            start = wp.int32(0)
-            for b in range(RADIX_SIZE):
-                count = scratch.histogram[env, b]
-                scratch.histogram[env, b] = start
-                start += count
-            for i in range(n):
-                key = scratch.keys[half, env, i]
-                b = (key >> shift) & (RADIX_SIZE - 1)
-                slot = scratch.histogram[env, b]
-                scratch.histogram[env, b] = slot + 1
-                scratch.keys[1 - half, env, slot] = key
-                scratch.items[1 - half, env, slot] = scratch.items[half, env, i]
-            half = 1 - half
-    return half
-
-
 @wp.kernel
-def raw_points(
+def write_raw(
     env_offset: int,
     ranges: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.vec3),
     scale: float,
+    num_lanes: int,
+    # out
     points_out: wp.array2d(dtype=wp.vec3),
 ):
     """Every ray's point; a miss is zero."""
-    thread, ray = wp.tid()
+    thread, lane = wp.tid()
     env = env_offset + thread
-    point = wp.vec3(0.0, 0.0, 0.0)
-    if is_hit(ranges[env, ray]):
-        point = (ranges[env, ray] * scale) * directions[env, ray]
-    points_out[env, ray] = point
+    for ray in range(lane, ranges.shape[1], num_lanes):
+        point = wp.vec3(0.0, 0.0, 0.0)
+        if is_hit(ranges[env, ray]):
+            point = (ranges[env, ray] * scale) * directions[env, ray]
+        points_out[env, ray] = point
 
 
 @wp.kernel
-def gather_proximal(
+def pick_farthest(
     env_offset: int,
     ranges: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.vec3),
     elevation: wp.array2d(dtype=wp.float32),
-    split: float,
-    scale: float,
-    scratch: Scratch,
-):
-    """Collect the hits with theta above the split, in ray order."""
-    env = env_offset + wp.tid()
-    n = wp.int32(0)
-    for ray in range(ranges.shape[1]):
-        if is_hit(ranges[env, ray]) and elevation[env, ray] > split:
-            point = (ranges[env, ray] * scale) * directions[env, ray]
-            scratch.x[env, n] = point[0]
-            scratch.y[env, n] = point[1]
-            scratch.z[env, n] = point[2]
-            scratch.ray[env, n] = ray
-            n += 1
-    scratch.num_proximal[env] = n
-
-
-@wp.kernel
-def pick_farthest(env_offset: int, num_picks: int, num_lanes: int, bucket_from: int, scratch: Scratch):
-    """Exact farthest point sampling from the first hit in ray order; no point is picked twice.
-
-    A single lane sorts ``bucket_from`` points and more into buckets, of which far ones need not be looked at.
-    """
-    thread, lane = wp.tid()
-    num_points = scratch.num_proximal[env_offset + thread]
-    if num_lanes == 1 and num_points >= bucket_from and num_points > num_picks:
-        farthest_points_by_bucket(
-            scratch.x,
-            scratch.y,
-            scratch.z,
-            scratch.distance,
-            scratch.picked,
-            scratch.num_proximal,
-            scratch.bucketed,
-            scratch.position,
-            scratch.boxes,
-            scratch.bucket_distance,
-            num_picks,
-            env_offset + thread,
-        )
-        return
-    farthest_points(
-        scratch.x,
-        scratch.y,
-        scratch.z,
-        scratch.distance,
-        scratch.picked,
-        scratch.num_proximal,
-        num_picks,
-        env_offset + thread,
-        lane,
-        num_lanes,
-    )
-
-
-@wp.kernel
-def write_proximal(
-    env_offset: int,
-    elevation: wp.array2d(dtype=wp.float32),
     azimuth: wp.array2d(dtype=wp.float32),
+    scale: float,
     ring: float,
     num_picks: int,
-    scratch: Scratch,
-    points_out: wp.array2d(dtype=wp.vec3),
+    num_lanes: int,
+    buckets_from: int,
+    work: Work,
 ):
-    """Write the picked points sorted by (theta ring, phi), then zeros."""
-    env = env_offset + wp.tid()
-    n = wp.min(scratch.num_proximal[env], num_picks)
-    for i in range(n):
-        ray = scratch.ray[env, scratch.picked[env, i]]
-        scratch.keys[0, env, i] = sort_key(elevation[env, ray], azimuth[env, ray], ring)
-        scratch.items[0, env, i] = scratch.picked[env, i]
-    half = radix_sort(env, n, scratch)
-    for i in range(n):
-        p = scratch.items[half, env, i]
-        points_out[env, i] = wp.vec3(scratch.x[env, p], scratch.y[env, p], scratch.z[env, p])
-    for i in range(n, num_picks):
-        points_out[env, i] = wp.vec3(0.0, 0.0, 0.0)
+    """Exact farthest point sampling of the proximal hits from the first in ray order; no point is picked twice.
 
-
-@wp.func
-def mean_hit(
-    env: int,
-    half: int,
-    first: int,
-    last: int,
-    scale: float,
-    ranges: wp.array2d(dtype=wp.float32),
-    directions: wp.array2d(dtype=wp.vec3),
-    scratch: Scratch,
-) -> wp.vec3:
-    """Mean of the sorted hits first..last-1."""
-    total = wp.vec3(0.0, 0.0, 0.0)
-    for i in range(first, last):
-        ray = scratch.items[half, env, i]
-        total += (ranges[env, ray] * scale) * directions[env, ray]
-    return total / float(last - first)
+    A single lane sorts ``buckets_from`` points and more into buckets.
+    """
+    thread, lane = wp.tid()
+    env = env_offset + thread
+    first = work.parts[env, 0]
+    n = work.parts[env, 1] - first
+    for i in range(lane, n, num_lanes):
+        ray = work.rays[env, first + i]
+        point = (ranges[env, ray] * scale) * directions[env, ray]
+        work.x[env, i] = point[0]
+        work.y[env, i] = point[1]
+        work.z[env, i] = point[2]
+    if num_lanes == 1 and n >= buckets_from and n > num_picks:
+        farthest_points_by_bucket(work.x, work.y, work.z, work.picked, work.buckets, n, num_picks, env)
+    else:
+        farthest_points(work.x, work.y, work.z, work.distance, work.picked, n, num_picks, env, lane, num_lanes)
+    for i in range(lane, wp.min(n, num_picks), num_lanes):
+        ray = work.rays[env, first + work.picked[env, i]]
+        work.picked_keys[env, i] = sort_key(elevation[env, ray], azimuth[env, ray], ring)
 
 
 @wp.kernel
-def write_distal(
+def write_picked(env_offset: int, num_picks: int, num_lanes: int, work: Work, points_out: wp.array2d(dtype=wp.vec3)):
+    """The picked points sorted by key, of equal keys the first picked first, then zeros."""
+    thread, lane = wp.tid()
+    env = env_offset + thread
+    n = wp.min(work.parts[env, 1] - work.parts[env, 0], num_picks)
+    for i in range(lane, num_picks, num_lanes):
+        if i < n:
+            p = work.picked[env, i]
+            points_out[env, rank_of(work.picked_keys, env, i, n)] = wp.vec3(
+                work.x[env, p], work.y[env, p], work.z[env, p]
+            )
+        else:
+            points_out[env, i] = wp.vec3(0.0, 0.0, 0.0)
+
+
+@wp.kernel
+def write_bins(
     env_offset: int,
     ranges: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.vec3),
-    elevation: wp.array2d(dtype=wp.float32),
-    azimuth: wp.array2d(dtype=wp.float32),
-    split: float,
-    ring: float,
     scale: float,
     first_slot: int,
     num_bins: int,
-    scratch: Scratch,
+    num_lanes: int,
+    work: Work,
+    # out
     points_out: wp.array2d(dtype=wp.vec3),
 ):
-    """One point per bin of consecutive distal points in (theta ring, phi) order, then zeros."""
-    env = env_offset + wp.tid()
-    n = wp.int32(0)
-    for ray in range(ranges.shape[1]):
-        if elevation[env, ray] <= split and is_hit(ranges[env, ray]):
-            scratch.keys[0, env, n] = sort_key(elevation[env, ray], azimuth[env, ray], ring)
-            scratch.items[0, env, n] = ray
-            n += 1
-    half = radix_sort(env, n, scratch)
+    """The mean of each bin of consecutive distal hits; zeros where there are fewer hits than bins."""
+    thread, lane = wp.tid()
+    env = env_offset + thread
+    start = work.parts[env, 1]
+    n = work.parts[env, 2] - start
     bins = wp.min(n, num_bins)
-    for b in range(bins):
-        first = b * n // bins
-        last = (b + 1) * n // bins
-        points_out[env, first_slot + b] = mean_hit(env, half, first, last, scale, ranges, directions, scratch)
-    for b in range(bins, num_bins):
-        points_out[env, first_slot + b] = wp.vec3(0.0, 0.0, 0.0)
+    for b in range(lane, num_bins, num_lanes):
+        point = wp.vec3(0.0, 0.0, 0.0)
+        if b < bins:
+            first = b * n // bins
+            last = (b + 1) * n // bins
+            for i in range(first, last):
+                ray = work.rays[env, start + i]
+                point += (ranges[env, ray] * scale) * directions[env, ray]
+            point = point / float(last - first)
+        points_out[env, first_slot + b] = point
 
 
 @wp.func
@@ -493,44 +219,74 @@ def proximity_cell(p: wp.vec3, body: wp.vec2, band_edges: wp.array(dtype=wp.floa
 
 
 @wp.func
-def proximity_point(p: wp.vec3, proximity: float) -> wp.vec3:
-    """Bearing of a point times its proximity, and that itself."""
-    bearing = proximity / wp.max(wp.sqrt(p[0] * p[0] + p[1] * p[1]), 1.0e-6)
-    return wp.vec3(bearing * p[0], bearing * p[1], proximity)
+def nearest_key(proximity: float, ray: int) -> wp.int64:
+    """A number that is larger for a larger proximity, which is not negative, and of equal ones for the first ray."""
+    bits = wp.int64(wp.cast(proximity, wp.int32))
+    return (bits << wp.int64(32)) | (_LAST_RAY - wp.int64(ray))
 
 
-@wp.kernel(module="unique", enable_backward=False)
-def proximity_grid(
+@wp.kernel
+def find_nearest(
     env_offset: int,
     ranges: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.vec3),
-    elevation: wp.array2d(dtype=wp.float32),
-    split: float,
-    blind: float,
     base_quat: wp.array(dtype=wp.vec4),  # (w, x, y, z)
     mount_pos: wp.vec3,
     mount_quat: wp.vec4,
+    elevation: wp.array2d(dtype=wp.float32),
+    split: float,
+    blind: float,
     body: wp.vec2,
     band_edges: wp.array(dtype=wp.float32),
     num_sectors: int,
     decay: float,
-    first_slot: int,
-    points_out: wp.array2d(dtype=wp.vec3),
+    num_lanes: int,
+    # out
+    nearest_out: wp.array2d(dtype=wp.int64),
 ):
-    """The nearest distal hit of each azimuth sector and height band around the base, as bearing and proximity."""
-    env = env_offset + wp.tid()
-    num_bands = band_edges.shape[0] - 1
-    for cell in range(num_bands * num_sectors):
-        points_out[env, first_slot + cell] = wp.vec3(0.0, 0.0, 0.0)
+    """The distal hit with the largest proximity in each cell, see `nearest_key`; cells have to be 0 before."""
+    thread, lane = wp.tid()
+    env = env_offset + thread
     level = levelled(base_quat[env])
     offset = wp.quat_rotate(level, mount_pos)
     turn = wp.quat_to_matrix(level * to_quat(mount_quat))
-    for ray in range(ranges.shape[1]):
+    for ray in range(lane, ranges.shape[1], num_lanes):
         distance = ranges[env, ray]
         if elevation[env, ray] <= split and is_hit(distance) and distance >= blind:
             p = offset + distance * (turn * directions[env, ray])
             cell = proximity_cell(p, body, band_edges, num_sectors)
             if cell >= 0:
                 proximity = wp.exp(-wp.sqrt(p[0] * p[0] + p[1] * p[1]) / decay)
-                if proximity > points_out[env, first_slot + cell][2]:
-                    points_out[env, first_slot + cell] = proximity_point(p, proximity)
+                wp.atomic_max(nearest_out, env, cell, nearest_key(proximity, ray))
+
+
+@wp.kernel
+def write_nearest(
+    env_offset: int,
+    ranges: wp.array2d(dtype=wp.float32),
+    directions: wp.array2d(dtype=wp.vec3),
+    base_quat: wp.array(dtype=wp.vec4),  # (w, x, y, z)
+    mount_pos: wp.vec3,
+    mount_quat: wp.vec4,
+    nearest: wp.array2d(dtype=wp.int64),
+    first_slot: int,
+    num_lanes: int,
+    # out
+    points_out: wp.array2d(dtype=wp.vec3),
+):
+    """Bearing of each cell's nearest hit times its proximity, and that itself; zeros without one."""
+    thread, lane = wp.tid()
+    env = env_offset + thread
+    level = levelled(base_quat[env])
+    offset = wp.quat_rotate(level, mount_pos)
+    turn = wp.quat_to_matrix(level * to_quat(mount_quat))
+    for cell in range(lane, nearest.shape[1], num_lanes):
+        key = nearest[env, cell]
+        point = wp.vec3(0.0, 0.0, 0.0)
+        if key > wp.int64(0):
+            proximity = wp.cast(wp.int32(key >> wp.int64(32)), wp.float32)
+            ray = wp.int32(_LAST_RAY - (key & _LAST_RAY))
+            p = offset + ranges[env, ray] * (turn * directions[env, ray])
+            bearing = proximity / wp.max(wp.sqrt(p[0] * p[0] + p[1] * p[1]), 1.0e-6)
+            point = wp.vec3(bearing * p[0], bearing * p[1], proximity)
+        points_out[env, first_slot + cell] = point

@@ -12,9 +12,9 @@ from omniperception.lidar.kernels.sectors import sector_minima_by_ray
 from omniperception.perception import FpsSampler, PdSampler
 from omniperception.perception.networks.motion_match import match_motion
 from omniperception.perception.networks.rings import write_rings
-from omniperception.perception.samplers import by_ray, kernels
+from omniperception.perception.samplers import kernels, sorting
 
-MODULES = [kernels, by_ray, *(k.module for k in (match_motion, write_rings, worst_sectors, sector_minima_by_ray))]
+MODULES = [kernels, sorting, *(k.module for k in (match_motion, write_rings, worst_sectors, sector_minima_by_ray))]
 
 
 @pytest.mark.parametrize("module", MODULES)
