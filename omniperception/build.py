@@ -56,7 +56,7 @@ class RunConfig:
             )
 
 
-def assemble(config: DictConfig) -> RunConfig:
+def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     """Instantiates and validates every part of a composed configuration."""
     try:
         _check_groups(config)

@@ -213,8 +213,10 @@ def _single(field: dataclasses.Field, kind: type, text: str) -> Any:
 
 def _text(value: Any) -> str:
     """A default as it would be given."""
-    if value is dataclasses.MISSING or value is None or value == ():
+    if value is dataclasses.MISSING or value == ():
         return "..."
+    if value is None:
+        return "null"
     if isinstance(value, bool):
         return str(value).lower()
     return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -84,9 +84,14 @@ def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
         raise ConfigError(one_line(error)) from None
     apply(config, values)
     remember(config, folders)
-    if not with_hydra:
-        with open_dict(config):
-            del config["hydra"]
+    _check_keys(config)
+    return config if with_hydra else without_hydra(config)
+
+
+def without_hydra(config: DictConfig) -> DictConfig:
+    """A composed configuration after Hydra's own node was taken out."""
+    with open_dict(config):
+        del config["hydra"]
     return config
 
 
@@ -109,8 +114,21 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
             config[key] = fresh[key]
     OmegaConf.set_struct(config, True)
     apply(config, values)
+    _check_keys(config)
     remember(config, folders)
     return config
+
+
+def _keys() -> set[str]:
+    """Keys at the top of a command line."""
+    return {"seed", "num_envs", "init", *(path.name for path in CONFIG_DIR.iterdir() if path.is_dir())}
+
+
+def _check_keys(config: DictConfig) -> None:
+    """Refuses what was added (+key=value) at the top of a configuration and nothing reads."""
+    for key in config:
+        if str(key) not in _keys() | {"hydra", SEARCH_PATH}:
+            raise UnknownKey(str(key), _keys())
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
@@ -131,7 +149,8 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
     """Sets, adds (+key=value) and deletes (~key) values as Hydra does.
 
-    A key that a preset leaves at its default need not be added: whether its `_target_` takes it is checked later.
+    A key below a group that a preset leaves at its default need not be added: whether something takes it is checked
+    where it is built.
     """
     for override in overrides:
         adds = override.is_add() or override.is_force_add()
@@ -152,11 +171,10 @@ def _exists(config: DictConfig, override: Override) -> bool:
             node = node[int(name)]
         elif isinstance(node, DictConfig) and name in node:
             node = OmegaConf.select(node, name)
-        elif isinstance(node, DictConfig) and "_target_" in node and name == names[-1] and not override.is_delete():
+        elif isinstance(node, DictConfig) and 0 < depth == len(names) - 1 and not override.is_delete():
             return False
         elif isinstance(node, DictConfig):
-            known = {str(key) for key in node} - {"hydra", "_target_"}
-            raise UnknownKey(text, known | set(OPTIONAL_GROUPS) if depth == 0 else known, name)
+            raise UnknownKey(text, _keys() if depth == 0 else map(str, node), name)
         else:
             held = "null" if node is None else f"{node}"
             raise ConfigError(f"{text} is unknown; {'.'.join(names[:depth])} is {held}")
@@ -196,11 +214,14 @@ def _check_preset(override: Override, known: Sequence[str]) -> None:
             raise ConfigError(f"{group}={name} is unknown; {suggest(name, known)}")
 
 
-def search_path(overrides: Sequence[Override], config: DictConfig | None = None) -> list[Path]:
+def search_path(overrides: Sequence[Override | str], config: DictConfig | None = None) -> list[Path]:
     """Folders of one's own with presets: those that a run remembers, and those that hydra.searchpath names."""
     remembered = config.get(SEARCH_PATH) or () if config is not None else ()
     found = [Path(name) for name in remembered if Path(name).is_dir()]
-    for override in overrides:
+    for given in overrides:
+        if isinstance(given, str) and not given.startswith("hydra.searchpath="):
+            continue
+        override = parse([given])[0] if isinstance(given, str) else given
         if override.key_or_group == "hydra.searchpath":
             value = override.value()
             found += [_folder(str(entry)) for entry in (value if isinstance(value, list) else [value])]

@@ -24,8 +24,7 @@ def test_pooled_rates_by_hand():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"variants": ["fps_gru", "fps_gru"]}, "variants=fps_gru,fps_gru must name at least one, and none twice"),
-        ({"seeds": []}, "seeds= must name"),
+        ({"variants": ["fps_gruu"]}, r"variants=fps_gruu is unknown; did you mean fps_gru\?"),
         ({"overrides": ["seed=4"]}, "seed=4: give experiment=, variants= and seeds= instead"),
     ],
 )
@@ -58,7 +57,7 @@ def test_every_line_of_a_table_has_as_many_cells(tmp_path):
 def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path):
     arguments = [
         f"out={tmp_path}",
-        "variants=fps_mlp,pd_risknet_small",
+        "variants=fps_mlp_small,pd_risknet_small",
         "seeds=1,2",
         "scenarios=corridor",
         "trials=2",
@@ -84,8 +83,10 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path):
     assert done.returncode == 0, done.stderr
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
     table = (tmp_path / "ablation.md").read_text()
-    assert re.search(r"\| fps_mlp \| .*33\.3 \\\| 93\.3 \|", table) and re.search(r"pd_risknet_small .*76\.7", table)
+    assert re.search(r"\| fps_mlp_small \| .*33\.3 \\\| 93\.3 \|", table) and re.search(
+        r"pd_risknet_small .*76\.7", table
+    )
     rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]
-    assert rows["fps_mlp"]["corridor"]["collision"]["n"] == 4
+    assert rows["fps_mlp_small"]["corridor"]["collision"]["n"] == 4
     done = study("ppo.gamma=0.9")
     assert done.returncode == 2 and "holds a run of another configuration" in done.stderr

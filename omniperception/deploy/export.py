@@ -45,16 +45,13 @@ class Export:
         run_dir: the run.
         out: folder for the files; None: FOLDER in the run directory.
         formats: names from FORMATS.
+        trust: packages of one's own whose names the run's configuration may build.
     """
 
     run_dir: Path
     out: Path | None = None
     formats: Sequence[str] = tuple(FORMATS)
-
-    def __post_init__(self) -> None:
-        for name in self.formats:
-            if name not in FORMATS:
-                raise ConfigError(f"formats={','.join(self.formats)}: {name} is unknown; known: {', '.join(FORMATS)}")
+    trust: Sequence[str] = ()
 
     @property
     def folder(self) -> Path:
@@ -64,7 +61,7 @@ class Export:
 
 def export(request: Export) -> Description:
     """Writes the policy of the newest checkpoint and checks the written networks against the actor."""
-    run = build.assemble(config.load(request.run_dir, ["num_envs=1"]))
+    run = build.assemble(config.load(request.run_dir, ["num_envs=1"]), request.trust)
     checkpoint = latest_checkpoint(request.run_dir)
     runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0)), None)
     runner.load(str(checkpoint), load_cfg={"actor": True})

@@ -6,18 +6,32 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
+from omniperception import config
 from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
 from omniperception.evaluation.statistics import wilson
 from omniperception.evaluation.suite import FOLDER, Evaluation, evaluate
 from omniperception.learning import latest_checkpoint
 
-TRAIN = Path(__file__).resolve().parents[2] / "train.py"
-RUN_NAME = "${hydra:runtime.choices.perception}/seed${seed}"
-"""Where in the study's directory a run lies."""
+_FEWER = ("perception.history=5", "perception.sampler.num_points=280")
+_NO_PROXIMAL = ("perception.height_weight=0", "perception.sampler.num_proximal=0", "perception.network.proximal_dim=0")
+_NO_DISTAL = ("perception.sampler.num_distal=0", "perception.network.distal_dim=0")
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "direct_mlp_small": ("perception=direct_mlp", "perception.history=5"),
+    "fps_mlp_small": ("perception=fps_mlp", *_FEWER),
+    "fps_gru_small": ("perception=fps_gru", *_FEWER),
+    "pd_risknet_no_proximal": ("perception=pd_risknet", *_NO_PROXIMAL),
+    "pd_risknet_no_distal": ("perception=pd_risknet", *_NO_DISTAL),
+    "pd_risknet_small_no_proximal": ("perception=pd_risknet_small", *_NO_PROXIMAL),
+    "pd_risknet_rings_no_proximal": ("perception=pd_risknet_rings", *_NO_PROXIMAL),
+    "pd_risknet_rings_no_height": ("perception=pd_risknet_rings", "perception.height_weight=0"),
+    "pd_risknet_rings_no_match": ("perception=pd_risknet_rings", "perception.network.rings.match=null"),
+}
+"""Overrides of the variants that are no presets of `perception` themselves. `_small` has as many frames and points as
+pd_risknet_small; what the perception is supervised with is the experiment's."""
 
 PAPER = {
     "direct_mlp": "out of memory (24 GB)",
@@ -35,11 +49,12 @@ class Ablation:
     Attributes:
         out: the study's directory.
         experiment: the recipe that all variants share.
-        variants: perception presets.
+        variants: perception presets, or names from VARIANTS.
         seeds: one run of each variant for each.
         scenarios: names from conf/scenario.
         trials: of each run in each scenario.
         overrides: of the training, Hydra's own (such as hydra/launcher=submitit_slurm) included.
+        trust: packages of one's own whose names the configuration may build.
     """
 
     out: Path
@@ -48,13 +63,14 @@ class Ablation:
     seeds: Sequence[int]
     scenarios: Sequence[str]
     trials: int = 1000
-    overrides: Sequence[str] = field(default_factory=tuple)
+    overrides: Sequence[str] = ()
+    trust: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        for key in ("variants", "seeds", "scenarios"):
-            values = list(getattr(self, key))
-            if not values or len(set(values)) < len(values):
-                raise ConfigError(f"{key}={','.join(map(str, values))} must name at least one, and none twice")
+        known = (*VARIANTS, *config.presets("perception", config.search_path(self.overrides)))
+        for variant in self.variants:
+            if variant not in known:
+                raise ConfigError(f"variants={variant} is unknown; {config.suggest(variant, known)}")
         for override in self.overrides:
             if override.split("=", 1)[0] in ("experiment", "perception", "seed"):
                 raise ConfigError(f"{override}: give experiment=, variants= and seeds= instead")
@@ -64,21 +80,38 @@ class Ablation:
 
 
 def train(study: Ablation) -> None:
-    """Trains what is missing, as one sweep of train.py; runs that were stopped go on, finished ones are left alone."""
-    command = [
-        sys.executable,
-        str(TRAIN),
-        "-m",
-        f"experiment={study.experiment}",
-        f"perception={','.join(study.variants)}",
-        f"seed={','.join(map(str, study.seeds))}",
-        f"hydra.sweep.dir={study.out}",
-        f"hydra.sweep.subdir={RUN_NAME}",
-        *study.overrides,
-    ]
-    done = subprocess.run(command)
-    if done.returncode:
-        raise ConfigError(f"training ended with exit code {done.returncode}; the same command goes on from there")
+    """Trains what is missing, a sweep over the seeds for each variant.
+
+    Stopped runs go on, finished ones are left alone. With a launcher of Hydra's (a cluster) the variants are trained at
+    the same time, otherwise one after the other.
+    """
+    together = any(override.startswith("hydra/launcher=") for override in study.overrides)
+    running = []
+    for variant in study.variants:
+        command = [
+            *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),
+            *overrides_of(variant),
+            f"seed={','.join(map(str, study.seeds))}",
+            f"hydra.sweep.dir={study.out}",
+            f"hydra.sweep.subdir={variant}/seed${{seed}}",
+            *([f"trust={','.join(study.trust)}"] if study.trust else []),
+            *study.overrides,
+        ]
+        running.append(subprocess.Popen(command))
+        if not together:
+            _wait(running.pop())
+    for process in running:
+        _wait(process)
+
+
+def overrides_of(variant: str) -> tuple[str, ...]:
+    """What makes a variant: a preset of `perception`, or one of VARIANTS."""
+    return VARIANTS.get(variant, (f"perception={variant}",))
+
+
+def _wait(process: subprocess.Popen) -> None:
+    if process.wait():
+        raise ConfigError(f"training ended with exit code {process.returncode}; the same command goes on from there")
 
 
 def evaluate_all(study: Ablation) -> None:
@@ -88,7 +121,7 @@ def evaluate_all(study: Ablation) -> None:
             run_dir = study.run_dir(variant, seed)
             missing = [name for name in study.scenarios if not _evaluated(run_dir, name, study.trials)]
             if missing:
-                evaluate(Evaluation(run_dir, missing, trials=study.trials, plots=False))
+                evaluate(Evaluation(run_dir, missing, trials=study.trials, plots=False, trust=study.trust))
 
 
 def write_tables(study: Ablation) -> str:

@@ -1,4 +1,4 @@
-"""Evaluates a run in scenarios, beside baselines; what scripts/evaluate.py and larger studies call."""
+"""Evaluation of a run in scenarios, beside baselines, for the evaluate command and the ablation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import build, config
-from omniperception.build import TrainedPolicy, load_policy
+from omniperception.build import RunConfig, TrainedPolicy, load_policy
 from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
@@ -25,9 +25,10 @@ FOLDER = "evaluation"
 POLICIES = {
     "run": "the run's policy",
     "blind": "the same policy, its LiDAR covered: every ray a miss",
-    "scripted": "a walking policy told V_cmd + V_avoid, V_avoid by the run's own law from true distances",
-    "command": "a walking policy told V_cmd alone",
-    "exported": "the run's exported policy on what a robot senses: scripts/export.py, onnxruntime",
+    "scripted": "a walking policy that follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from"
+    " ground-truth distances",
+    "command": "a walking policy that follows V_cmd alone",
+    "exported": "the run's exported policy on what a robot measures: onnxruntime",
 }
 """What can be evaluated; the walking policy is the one of `walker`, or for `scripted` the run's own, LiDAR covered."""
 
@@ -48,6 +49,7 @@ class Evaluation:
         walker: run directory of a policy that follows velocity commands, for the policies that walk; or None.
         plots: whether to draw the trajectories.
         overrides: changes to the configuration, on top of the scenario's.
+        trust: packages of one's own whose names the run's configuration may build.
     """
 
     run_dir: Path
@@ -58,10 +60,14 @@ class Evaluation:
     walker: Path | None = None
     plots: bool = True
     overrides: Sequence[str] = ()
+    trust: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        _check_known("scenario", self.scenarios, config.scenarios())
-        _check_known("policy", self.policies, tuple(POLICIES))
+        folders = config.search_path(self.overrides, config.read(self.run_dir))
+        known = config.presets("scenario", folders)
+        for name in self.scenarios:
+            if name not in known:
+                raise ConfigError(f"scenario={name} is unknown; {config.suggest(name, known)}")
         if "command" in self.policies and self.walker is None:
             raise ConfigError(
                 "policy=command needs a policy that walks without avoiding: walker=<run directory of experiment=walk>;"
@@ -98,7 +104,7 @@ def evaluate(evaluation: Evaluation) -> dict[str, dict]:
         write_trials(folder / f"{scenario}.csv", episodes)
         written = [f"{scenario}.json", f"{scenario}.csv"]
         if evaluation.plots:
-            obstacles = build.assemble(_configuration(evaluation, scenario, evaluation.run_dir)).env.obstacles
+            obstacles = _assemble(evaluation, scenario, evaluation.run_dir).env.obstacles
             plots.draw_tracks(folder / f"{scenario}.png", scenario, episodes, obstacles)
             written.append(f"{scenario}.png")
         print(f"{scenario}, {report['num_envs']} environments, seed {report['seed']}:")
@@ -138,16 +144,16 @@ def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolic
     """One of POLICIES in a fresh environment of the scenario."""
     walks = name in ("scripted", "command")
     run_dir = evaluation.walker if walks and evaluation.walker is not None else evaluation.run_dir
-    run = build.assemble(_configuration(evaluation, scenario, run_dir))
+    run = _assemble(evaluation, scenario, run_dir)
     trained = load_policy(run, run_dir)
     policy = trained.policy
     try:
         if name == "blind":
             policy = covered(trained.env, policy)
         if name == "scripted":
-            avoidance = build.assemble(config.load(evaluation.run_dir)).env.rewards.avoidance
-            own_law = run_dir == evaluation.run_dir and avoidance.risk is not None  # what the run itself is told
-            policy = steered(trained.env, policy, avoidance, None if own_law else _learned_commands(run_dir))
+            avoidance = build.assemble(config.load(evaluation.run_dir), evaluation.trust).env.rewards.avoidance
+            own = run_dir == evaluation.run_dir and avoidance.risk is not None  # the run's commands follow from it
+            policy = steered(trained.env, policy, avoidance, None if own else _learned_commands(run_dir))
         if name == "exported":
             exported = ExportedPolicies(trained.env, ExportedPolicy.load(run_dir / EXPORTED))
             return TrainedPolicy(trained.env, exported, run_dir / EXPORTED)
@@ -156,28 +162,19 @@ def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolic
     return TrainedPolicy(trained.env, policy, trained.checkpoint)
 
 
-def _configuration(evaluation: Evaluation, scenario: str, run_dir: Path):
-    """The run's configuration with the scenario's scene; a walker takes the overrides that change the scene."""
+def _assemble(evaluation: Evaluation, scenario: str, run_dir: Path) -> RunConfig:
+    """The run with the scenario's scene; a walker takes the overrides that change the scene."""
     overrides = list(evaluation.overrides)
     if run_dir != evaluation.run_dir:
-        scene = (*config.FIXED_BY_SCENARIO, "sim")
-        overrides = [o for o in overrides if o.split("=", 1)[0].split(".", 1)[0] in scene]
-    return config.load(run_dir, [f"scenario={scenario}", *overrides, f"num_envs={evaluation.envs}"])
+        scene = (*config.FIXED_BY_SCENARIO, "sim", "hydra")
+        overrides = [o for o in overrides if o.lstrip("+~").split("=", 1)[0].split(".", 1)[0] in scene]
+    composed = config.load(run_dir, [f"scenario={scenario}", *overrides, f"num_envs={evaluation.envs}"])
+    return build.assemble(composed, evaluation.trust)
 
 
 def _learned_commands(run_dir: Path) -> Limits | None:
     """The ranges of v_x and v_y (m/s) that a run has been trained with, or None where it was given goals."""
-    commands = config.load(run_dir).commands
+    commands = config.read(run_dir).commands
     if "lin_vel_x" not in commands:
         return None
     return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)
-
-
-def _check_known(key: str, names: Sequence[str], known: Sequence[str]) -> None:
-    if not names:
-        raise ConfigError(f"{key}= names nothing; known: {', '.join(known)}")
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"{key}={name} is unknown; known: {', '.join(known)}")
-        if list(names).count(name) > 1:
-            raise ConfigError(f"{key}={','.join(names)} names {name} twice")

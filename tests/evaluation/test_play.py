@@ -39,7 +39,7 @@ def run_dir(tmp_path_factory):
 @pytest.mark.slow
 def test_a_run_is_replayed(run_dir):
     overrides = ("num_envs=3", "terminations.episode_length_s=0.3")
-    done = play(f"run={run_dir}", "episodes=6", "video_s=0.2", *overrides)
+    done = play(f"run={run_dir}", "trials=6", "video_s=0.2", *overrides)
     assert done.returncode == 0, done.stderr
     assert "success" in done.stdout and "us" in done.stdout
     report = json.loads((run_dir / "replay.json").read_text())
@@ -55,9 +55,9 @@ def test_a_run_is_replayed(run_dir):
     "arguments, message",
     [
         (("run=nowhere",), "run=nowhere does not exist"),
-        (("viewer=hologram",), "viewer=hologram is unknown; known: video, none"),
-        (("episodes=many",), "episodes=many must be a positive whole number"),
-        (("speed=3",), "unknown override 'speed=3'"),
+        (("viewer=hologram",), "viewer=hologram must be one of video, none"),
+        (("trials=many",), "trials=many must be a whole number >= 1"),
+        (("speed=3",), "speed=3 is unknown"),
     ],
 )
 def test_mistakes_are_one_line(run_dir, arguments, message):

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.figures import new_figure
+from omniperception.commands.scan.ply import write_ply
+from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, ROOM, DemoClass, DemoScene
+from omniperception.common.figures import new_figure
 from omniperception.env.sensing import SensorConfig
 from omniperception.lidar import Lidar, ScanPattern
-from omniperception.lidar.demo_scene import COLOURS, REFLECTIVITY, ROOM, DemoClass, DemoScene
-from omniperception.lidar.ply import write_ply
 
 DURATIONS_S = (0.1, 0.5, 1.0)
 CAMERA, TARGET, FOCAL = (-4.3, -6.2, 5.0), (0.85, -0.35, 0.15), 1.34

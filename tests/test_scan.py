@@ -1,17 +1,13 @@
-"""What view_scan writes: pictures and a point cloud that is read back; and the scene that it shows."""
-
-import runpy
-import sys
-from pathlib import Path
+"""What the scan command writes: pictures and a point cloud that is read back; and the scene that it shows."""
 
 import numpy as np
 import pytest
 
-from benchmarks import view_scan
-from omniperception.lidar.demo_scene import ROOM, DemoClass, demo_scene
-from omniperception.lidar.ply import write_ply
+from omniperception.commands import main
+from omniperception.commands.scan import pictures
+from omniperception.commands.scan.ply import write_ply
+from omniperception.commands.scan.room import ROOM, DemoClass, demo_scene
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "view_scan.py"
 NUMPY_TYPES = {"float": "<f4", "uchar": "|u1", "int": "<i4"}
 
 
@@ -27,13 +23,9 @@ def read_ply(path):
 
 @pytest.fixture
 def command(monkeypatch):
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["view_scan.py", *arguments])
-        monkeypatch.setattr(view_scan, "PIXELS", (120, 66))
-        monkeypatch.setattr(view_scan, "DURATIONS_S", (0.02, 0.04, 0.06))
-        runpy.run_path(str(SCRIPT), run_name="__main__")
-
-    return run
+    monkeypatch.setattr(pictures, "PIXELS", (120, 66))
+    monkeypatch.setattr(pictures, "DURATIONS_S", (0.02, 0.04, 0.06))
+    return lambda *arguments: main(["scan", *arguments])
 
 
 @pytest.mark.slow
@@ -59,7 +51,7 @@ def test_pictures_and_a_cloud_are_written(command, capsys, tmp_path, preset):
     [
         (("lidar=none",), "lidar=none has nothing to view"),
         (("colour=pink",), "colour=pink must be one of class, height"),
-        (("lidar=avia", "rays=0"), "rays=0 must be a positive whole number"),
+        (("lidar=avia", "rays=0"), "rays=0 must be a whole number >= 1"),
         (("seed=-1",), "seed=-1 must be a whole number >= 0"),
     ],
 )
@@ -73,7 +65,7 @@ def test_wrong_arguments_are_told_in_one_line(command, capsys, arguments, told):
 def test_a_scan_has_every_class_and_the_robot_sees_itself(make_config):
     run = make_config("perception=none", "observations=walk", "rewards=walk", "lidar=mid360")
     demo = demo_scene(run.env.robot)
-    scan = view_scan.take_scan("mid360", run.env.lidar, demo, seconds=0.5)
+    scan = pictures.take_scan("mid360", run.env.lidar, demo, seconds=0.5)
     assert set(scan.class_id) == set(DemoClass)
     housing = [demo.robot_geoms[name] for name in run.env.lidar.exclude_geoms]
     assert not np.isin(scan.shape_id, housing).any()

@@ -1,0 +1,59 @@
+"""The commands of `omniperception`, a module each."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+COMMANDS = {
+    "train": "trains a policy, or goes on with a run",
+    "play": "replays a run: rates over whole episodes, and a video",
+    "evaluate": "evaluates a run in fixed scenarios, beside baselines",
+    "ablate": "trains and evaluates variants of the perception over seeds",
+    "export": "exports a policy for a robot or another simulator",
+    "publish": "makes a small run directory, fit for a repository",
+    "scan": "draws what a LiDAR sees",
+    "plan": "lists what a configuration consists of and what was left out",
+}
+EXTRAS = {
+    "hydra": "train",
+    "imageio_ffmpeg": "train",
+    "mujoco": "train",
+    "omegaconf": "train",
+    "rsl_rl": "train",
+    "tensorboard": "train",
+    "tensordict": "train",
+    "yaml": "train",
+    "matplotlib": "plots",
+    "onnx": "export",
+    "onnxruntime": "deploy",
+    "trimesh": "meshes",
+}
+"""Extra of this package that brings each library."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs `omniperception <command> [key=value ...]`."""
+    name, *rest = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name in ("-h", "--help"):
+        width = max(map(len, COMMANDS))
+        lines = (f"  {command:<{width}}  {what}" for command, what in COMMANDS.items())
+        print("\n".join(["usage: omniperception <command> [key=value ...]", "", *lines, ""]))
+        print("omniperception <command> --help explains a command.")
+        return
+    if name not in COMMANDS:
+        _fail(f"{name} is unknown; known: {', '.join(COMMANDS)}")
+    try:
+        command = importlib.import_module(f"omniperception.commands.{name}").command
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        if library not in EXTRAS:
+            raise
+        _fail(f"{name} needs {library}: pip install 'omniperception[{EXTRAS[library]}]'")
+    command(rest, f"omniperception {name}")
+
+
+def _fail(message: str) -> None:
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)

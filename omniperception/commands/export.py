@@ -1,0 +1,47 @@
+"""Exports a run's newest policy for a robot or another simulator.
+
+    export run=latest
+
+Writes into exported/ in the run directory, or into `out`:
+
+    policy.onnx    the network as ONNX: observations, sampled frames and their number -> actions
+    policy.pt      the same as TorchScript
+    policy.json    names, scales, rates, layout of the observations, sampling, mount of the sensor, provenance
+
+omniperception.deploy.ExportedPolicy runs it, with sampling and history, from raw points, joint states and IMU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from omniperception import config
+from omniperception.cli import Command, argument, trust
+from omniperception.deploy.export import FORMATS, Export, export
+from omniperception.deploy.modules import ExportUnavailable
+from omniperception.learning import CheckpointError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's arguments."""
+
+    run: str = argument("latest", "run directory, or latest for the newest under outputs/")
+    out: Path | None = argument(None, "folder of what is written; null: exported/ in the run directory")
+    formats: tuple[str, ...] = argument(tuple(FORMATS), "which networks are written", choices=tuple(FORMATS))
+    trust: tuple[str, ...] = trust()
+
+
+def main(arguments: Arguments) -> None:
+    """Exports and tells what was written."""
+    request = Export(config.find_run(arguments.run), arguments.out, arguments.formats, arguments.trust)
+    described = export(request)
+    inputs = ", ".join(f"{name} {list(shape)}" for name, shape in described.inputs.items())
+    print(f"{described.provenance['checkpoint']}: {inputs} -> {len(described.joints.names)} actions")
+    lidar = f"LiDAR {1 / described.lidar.period_s:g} Hz" if described.lidar else "blind"
+    print(f"control {1 / described.control_period_s:g} Hz, {lidar}")
+    print(f"wrote {', '.join(str(request.folder / name) for name in [*described.files.values(), 'policy.json'])}")
+
+
+command = Command(main, Arguments, __doc__, errors=(CheckpointError, ExportUnavailable))

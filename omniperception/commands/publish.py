@@ -1,0 +1,35 @@
+"""Makes a small run directory of a run's newest policy, fit for a repository.
+
+    publish run=latest to=pretrained/mine precision=float16
+
+The folder holds weights, config.yaml and provenance.json; play, evaluate and export take it as run=<folder>, train as
+init=<folder>. At most 4 MB are published.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from omniperception import config
+from omniperception.cli import Command, argument
+from omniperception.deploy.publish import PRECISIONS, publish
+from omniperception.learning import CheckpointError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's arguments."""
+
+    run: str = argument("latest", "run directory, or latest for the newest under outputs/")
+    to: Path = argument(doc="folder that becomes a run directory")
+    precision: str = argument("float32", "of the weights; float16 rounds to three digits", choices=tuple(PRECISIONS))
+
+
+def main(arguments: Arguments) -> None:
+    """Publishes and tells what the run was."""
+    record = publish(config.find_run(arguments.run), arguments.to, arguments.precision)
+    print(f"{arguments.to}: {record['iterations']} iterations, {record['training_hours']} h of training")
+
+
+command = Command(main, Arguments, __doc__, errors=(CheckpointError,))

@@ -1,0 +1,59 @@
+"""Draws what a LiDAR sees: its pattern after 0.1, 0.5 and 1 s, and a scan of a demonstration room.
+
+    scan lidar=avia rays=20000 lidar.max_range=30
+    scan lidar=mid360,avia,os0_128,vlp16        # each of them, and comparison.png
+
+The room holds people, thin rods, a shelf without legs, a rock, rubble and the robot, which carries the sensor. Writes
+pattern.png, scan.png and scan.ply; the pictures need the extra `plots`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from omniperception import build, config
+from omniperception.cli import Command, argument, trust
+from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
+from omniperception.commands.scan.room import demo_scene
+from omniperception.common.figures import PlotsUnavailable
+
+FILES = ("pattern.png", "scan.png", "scan.ply")
+NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
+"""A sensor is looked at, no task is run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's own arguments."""
+
+    lidar: tuple[str, ...] = argument(("mid360",), "presets of conf/lidar")
+    out: Path | None = argument(None, "folder; null: outputs/view_scan/<lidar>")
+    seed: int = argument(0, "of the time at which the device is, and of random choices", least=0)
+    rays: int | None = argument(None, "how many of the points are kept; null: all", least=1)
+    seconds: float | None = argument(None, "how long the sensor measures; null: one frame of the preset", positive=True)
+    colour: str = argument("class", "of the points in scan.ply", choices=("class", "height"))
+    trust: tuple[str, ...] = trust()
+
+
+def main(arguments: Arguments, overrides: list[str]) -> None:
+    """Scans the room with each sensor and writes pictures and clouds."""
+    if "none" in arguments.lidar:
+        raise config.ConfigError("lidar=none has nothing to view; give a sensor, such as lidar=mid360")
+    out, scans = arguments.out or Path("outputs/view_scan"), []
+    for name in arguments.lidar:
+        composed = config.compose([*NO_TASK, f"lidar={name}", *overrides])
+        env = build.assemble(composed, arguments.trust).env
+        demo = demo_scene(env.robot)
+        scans.append(take_scan(name, env.lidar, demo, arguments.seconds, arguments.rays, arguments.seed))
+        folder = out if arguments.out and len(arguments.lidar) == 1 else out / name
+        write_scan(scans[-1], env.lidar, demo, folder, arguments.colour)
+        print(f"{summary(scans[-1])}\nwritten: {', '.join(str(folder / file) for file in FILES)}", flush=True)
+    if len(scans) > 1:
+        draw_comparison(scans, demo, out / "comparison.png")
+        print(f"written: {out / 'comparison.png'}")
+
+
+command = Command(
+    main, Arguments, __doc__, "of the sensor's preset", (PlotsUnavailable, ModuleNotFoundError, ValueError)
+)

@@ -1,0 +1,138 @@
+"""Trains a policy, or goes on with a run.
+
+    train experiment=quickstart obstacles=mixed num_envs=256
+    train run=outputs/2026-01-31/12-00-00
+    train -m experiment=quickstart seed=1,2 perception=pd_risknet,fps_mlp
+
+A run's directory is outputs/<date>/<time>, or hydra.run.dir=<folder>. `run` goes on exactly where a stopped run was,
+and so does a command line whose run directory holds checkpoints of the same configuration. `-m` runs every combination
+of values with commas, on a cluster with hydra/launcher=submitit_slurm. `--cfg job` prints the composed configuration.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydra
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from omniperception import build, config
+from omniperception.cli import Command, argument, fail, trust
+from omniperception.learning import (
+    CheckpointError,
+    RolloutTooSmall,
+    TrainingDiverged,
+    distributed,
+    latest_checkpoint,
+    list_checkpoints,
+)
+from omniperception.plan import describe
+
+ERRORS = (CheckpointError, RolloutTooSmall, TrainingDiverged)
+SWEEP, SHOW = {"-m", "--multirun"}, {"--cfg", "job"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's own arguments."""
+
+    run: str | None = argument(None, "run directory to go on with, or latest")
+    trust: tuple[str, ...] = trust()
+
+
+def main(arguments: Arguments, overrides: list[str]) -> None:
+    """Resumes a run, runs a sweep, or trains one run."""
+    flags = {text for text in overrides if text in SWEEP | SHOW}
+    values = [text for text in overrides if text not in flags]
+    if arguments.run is not None:
+        if flags:
+            raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
+        run_dir = config.find_run(arguments.run)
+        learn(build.assemble(config.load(run_dir, values), arguments.trust), run_dir, resume=True)
+    elif flags & SHOW:
+        print(OmegaConf.to_yaml(config.compose(values)), end="")
+    elif flags:
+        sweep(values, arguments.trust)
+    else:
+        composed = config.compose(values, with_hydra=True)
+        HydraConfig.instance().set_config(composed)  # for ${hydra:...} in hydra.run.dir
+        run_dir = Path(os.path.relpath(composed.hydra.run.dir))
+        train(config.without_hydra(composed), run_dir, arguments.trust)
+
+
+def train(composed: DictConfig, run_dir: Path, trust: Sequence[str]) -> None:
+    """Trains one composed configuration in its directory."""
+    run = build.assemble(composed, trust)
+    distributed.connect(run.env.sim.torch_device)
+    run_dir = distributed.of_first(run_dir)
+    begun = distributed.of_first(config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir)))
+    if distributed.rank() == 0:
+        config.save(run.composed, run_dir)
+    learn(run, run_dir, resume=begun)
+
+
+def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
+    """Trains a run to its end in `run_dir`; of several processes the first one reports."""
+    runner = build.build_runner(run, run_dir)
+    if resume:
+        runner.load(str(latest_checkpoint(run_dir)))
+        report(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
+    else:
+        for name in run.init:
+            runner.start_from(config.find_run(name, "init"))
+        report(f"run directory: {run_dir}")
+    plan = describe(run, runner)
+    if distributed.rank() == 0:
+        plan.save(run_dir)
+    report(plan.summary())
+    runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
+    report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
+    distributed.disconnect()
+
+
+def report(text: str) -> None:
+    """Prints a line, once however many processes learn."""
+    if distributed.rank() == 0:
+        print(text)
+
+
+def sweep(overrides: Sequence[str], trust: Sequence[str]) -> None:
+    """Runs every combination of overrides with several values, by Hydra and the launcher that is chosen."""
+    check_jobs(overrides, trust)
+
+    def job(_: DictConfig) -> None:
+        settings = HydraConfig.get()
+        folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
+        try:
+            composed = config.compose([*settings.overrides.task, *folders])
+            train(composed, Path(os.path.relpath(settings.runtime.output_dir)), trust)
+        except (config.ConfigError, *ERRORS) as error:
+            fail(error)
+
+    given, sys.argv = sys.argv, [sys.argv[0], "-m", *overrides]
+    try:
+        hydra.main(config_path=str(config.CONFIG_DIR), config_name="config", version_base="1.3")(job)()
+    finally:
+        sys.argv = given
+
+
+def check_jobs(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
+    """Composes and validates every job of a sweep before the first is started."""
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise config.ConfigError(config.one_line(error)) from None
+    for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None):
+        for job in batch:
+            build.assemble(config.compose(job), trust)
+
+
+command = Command(main, Arguments, __doc__, "of the configuration", ERRORS, flags=(*sorted(SWEEP), *sorted(SHOW)))

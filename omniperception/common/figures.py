@@ -1,0 +1,25 @@
+"""Empty matplotlib figures; the one place of this folder that imports it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class PlotsUnavailable(ImportError):
+    """matplotlib is not installed."""
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of so many inches that is drawn to a file only.
+
+    Raises:
+        PlotsUnavailable: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise PlotsUnavailable("pictures need matplotlib: pip install 'omniperception[plots]'") from None
+    return Figure(figsize=(width, height), layout="constrained")
