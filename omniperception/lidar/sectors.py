@@ -3,11 +3,11 @@
 import torch
 import warp as wp
 
-from .kernels.sectors import sector_minima, sector_minima_by_ray
+from .kernels.sectors import sector_minima
 from .launch import SplitLaunch, default_num_threads
 
-BY_RAY_ON = ("cuda",)
-"""Kinds of devices on which each ray has a thread; elsewhere each environment has one."""
+LANES = {"cpu": 1, "cuda": 128}
+"""Threads that share an environment's rays, by kind of device."""
 
 
 class SectorDistances:
@@ -65,6 +65,7 @@ class SectorDistances:
         out = torch.empty(num_envs, num_sectors, device=true_ranges.device) if out is None else out
         self.distances = out.fill_(max_distance)
         wp.init()  # from_torch does not, and no scene need have been built before
+        lanes = LANES[true_ranges.device.type]
         args = [
             wp.from_torch(true_ranges),
             wp.from_torch(directions_s, dtype=wp.vec3),
@@ -74,12 +75,11 @@ class SectorDistances:
             wp.vec3(*mount_pos),
             wp.vec4(*mount_quat),
             obstacle_class,
+            lanes,
             wp.from_torch(self.distances),
         ]
         self._max_distance, threads, device = max_distance, num_threads or default_num_threads(), true_ranges.device
-        by_ray = device.type in BY_RAY_ON
-        kernel, inner = (sector_minima_by_ray, (num_rays,)) if by_ray else (sector_minima, ())
-        self._launch = SplitLaunch(kernel, num_envs, inner, args, device, threads, 16 * num_rays)
+        self._launch = SplitLaunch(sector_minima, num_envs, (lanes,), args, device, threads, 16 * num_rays)
 
     def __call__(self) -> torch.Tensor:
         """Measures the tensors' present contents; returns ``distances``."""

@@ -12,11 +12,10 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 OBSTACLE = 2
 
 
-@pytest.fixture(params=["a thread per environment", "a thread per ray"], autouse=True)
-def each_way(request, monkeypatch):
-    """With the kernel of a CPU and, on the CPU, too, with that of a GPU."""
-    if request.param == "a thread per ray":
-        monkeypatch.setattr(module, "BY_RAY_ON", ("cpu",))
+@pytest.fixture(params=[1, 32], autouse=True)
+def lanes(request, monkeypatch):
+    """With one lane, as on a CPU, and with many, as on a GPU."""
+    monkeypatch.setitem(module.LANES, "cpu", request.param)
 
 
 def sectors(points_s, classes, base_quat=UPRIGHT, mount_pos=(0.0, 0.0, 0.0), mount_quat=UPRIGHT, **options):

@@ -32,41 +32,21 @@ def sector_minima(
     mount_pos: wp.vec3,
     mount_quat: wp.vec4,
     wanted_class: int,
+    num_lanes: int,
     # in and out
     distances: wp.array2d(dtype=wp.float32),
 ):
-    """Nearest horizontal distance of one environment's hits of a class, per azimuth sector, and what was there."""
-    env = wp.tid() + env_offset
+    """Nearest horizontal distance of one environment's hits of a class, per azimuth sector, and what was there.
+
+    The lanes share an environment's rays.
+    """
+    thread, lane = wp.tid()
+    env = thread + env_offset
     num_sectors = distances.shape[1]
     level = levelled(base_quat[env, base])
     offset = wp.quat_rotate(level, mount_pos)
     turn = wp.quat_to_matrix(level * to_quat(mount_quat))
-    for ray in range(ranges.shape[1]):
+    for ray in range(lane, ranges.shape[1], num_lanes):
         if class_id[env, ray] == wanted_class:
             p = offset + ranges[env, ray] * (turn * directions[env, ray])
-            sector = sector_of(p, num_sectors)
-            distances[env, sector] = wp.min(distances[env, sector], wp.sqrt(p[0] * p[0] + p[1] * p[1]))
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def sector_minima_by_ray(
-    env_offset: int,
-    ranges: wp.array2d(dtype=wp.float32),
-    directions: wp.array2d(dtype=wp.vec3),
-    class_id: wp.array2d(dtype=wp.int32),
-    base_quat: wp.array2d(dtype=wp.vec4),
-    base: int,
-    mount_pos: wp.vec3,
-    mount_quat: wp.vec4,
-    wanted_class: int,
-    # in and out
-    distances: wp.array2d(dtype=wp.float32),
-):
-    """The same with a thread for each ray, for GPUs."""
-    thread, ray = wp.tid()
-    env = thread + env_offset
-    if class_id[env, ray] == wanted_class:
-        level = levelled(base_quat[env, base])
-        turn = wp.quat_to_matrix(level * to_quat(mount_quat))
-        p = wp.quat_rotate(level, mount_pos) + ranges[env, ray] * (turn * directions[env, ray])
-        wp.atomic_min(distances, env, sector_of(p, distances.shape[1]), wp.sqrt(p[0] * p[0] + p[1] * p[1]))
+            wp.atomic_min(distances, env, sector_of(p, num_sectors), wp.sqrt(p[0] * p[0] + p[1] * p[1]))
