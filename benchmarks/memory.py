@@ -82,7 +82,7 @@ def held_bytes(runner: Runner) -> dict[str, int]:
     physics = buffer_bytes(env.sim) + _native_bytes(env.sim)
     rays = buffer_bytes(env.sim, env.sensing) - buffer_bytes(env.sim)
     task = buffer_bytes(env) - buffer_bytes(env.sim, env.sensing)
-    models = (runner.alg._raw_actor, runner.alg._raw_critic)
+    models = (runner.alg.actor, runner.alg.critic)
     weights = sum(p.numel() * p.element_size() for model in models for p in model.parameters())
     return {"physics": physics, "rays": rays, "task": task, "rollout": buffer_bytes(*rollout), "networks": 4 * weights}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -71,14 +72,14 @@ class StepwiseStorage(PerceptiveStorage):
         shape = (self.num_transitions_per_env, self.num_envs, self.history, *self.frames.shape[2:])
         self.windows = torch.zeros(shape, device=self.device)
 
-    def record_frames(self, obs: TensorDict, tick: int, state: torch.Tensor | None = None) -> None:
+    def record_frames(self, obs: TensorDict, tick: int) -> None:
         """Copy the current window."""
-        super().record_frames(obs, tick, state)
+        super().record_frames(obs, tick)
         self.windows[self.step].copy_(obs["frames"])
 
-    def observations_of(self, env_ids: torch.Tensor) -> WindowedObservations:
+    def observations_of(self, env_ids: torch.Tensor, steps: Sequence[int] | None = None) -> WindowedObservations:
         """What some environments saw, with the windows of all steps as ``frames``."""
-        return replace(super().observations_of(env_ids), frames=self.windows[:, env_ids].flatten(0, 1))
+        return replace(super().observations_of(env_ids, steps), frames=self.windows[:, env_ids].flatten(0, 1))
 
 
 class RandomFrames(VecEnv):

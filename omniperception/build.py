@@ -21,7 +21,7 @@ from omniperception.config import ConfigError, compose, one_line
 from omniperception.env.env import EnvConfig, OmniEnv
 from omniperception.env.mirror import Mirror
 from omniperception.learning import Runner, distributed, latest_checkpoint
-from omniperception.learning.config import PerceptionConfig, PPOConfig, runner_config
+from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.learning.memory import check_fits
 from omniperception.schema import check_config
 
@@ -134,7 +134,7 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
         if run.perception is not None:
             check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), run.env.sim.torch_device)
         env = OmniEnv(run.env)
-        return Runner(env, learning_settings(run, env), str(log_dir) if log_dir else None, str(env.device))
+        return Runner(env, learning_config(run, env), log_dir, str(env.device))
     except (ValueError, ImportError) as error:
         raise ConfigError(str(error)) from error
 
@@ -162,8 +162,8 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
     """
     checkpoint = latest_checkpoint(run_dir)
     runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0)), None)
-    runner.load(str(checkpoint), load_cfg={"actor": True})
-    return TrainedPolicy(runner.env, runner.get_inference_policy(str(runner.env.device)), checkpoint)
+    runner.load_policy(checkpoint)
+    return TrainedPolicy(runner.env, runner.policy, checkpoint)
 
 
 def steps_per_frame(run: RunConfig) -> int:
@@ -171,14 +171,13 @@ def steps_per_frame(run: RunConfig) -> int:
     return max(1, round(run.env.lidar.sensor.period_s / run.env.sim.control_dt))
 
 
-def learning_settings(run: RunConfig, env: OmniEnv) -> dict:
-    """rsl_rl's configuration for a run in its environment."""
-    observations = run.env.observations
-    return runner_config(
+def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
+    """What learns in the environment of a run."""
+    return LearningConfig(
         run.ppo,
         run.perception,
-        observations.actor,
-        observations.critic,
+        run.env.observations.actor,
+        run.env.observations.critic,
         steps_per_frame(run) if run.perception is not None else 1,
         run.env.rewards.avoidance.risk,
         Mirror(env) if run.ppo.symmetry else None,

@@ -18,7 +18,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.env.state import fields_read
 from omniperception.inventory import Buffer, buffers_of, is_launch, walk
 from omniperception.learning import Runner
-from omniperception.learning.models import MOTION
+from omniperception.learning.read_out import MotionReadOut
 
 if TYPE_CHECKING:
     from omniperception.env.sensing import LidarSensing
@@ -270,7 +270,7 @@ def _kernels_of_policy(runner: Runner) -> Iterator[tuple[str, str]]:
         yield "write_rings", "perception.network.rings"
     if rings is not None and rings.match is not None:
         yield "match_motion", "perception.network.rings.match"
-    if getattr(actor, "read_out_target", None) == MOTION:
+    if isinstance(getattr(actor, "read_out", None), MotionReadOut):
         yield "worst_sectors", "perception.motion_weight: risks follow from what is perceived"
 
 

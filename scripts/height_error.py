@@ -56,8 +56,8 @@ def main() -> None:
         )
         runner = build_runner(run, None)
         checkpoint = latest_checkpoint(run_dir)
-        runner.load(str(checkpoint), load_cfg={"actor": True})
-        policy = runner.get_inference_policy(str(runner.env.device))
+        runner.load_policy(checkpoint)
+        policy = runner.policy
         try:
             errors = height_errors(runner.env, policy, runner.alg.actor, steps)
         except ValueError as error:

@@ -11,21 +11,16 @@ from __future__ import annotations
 import sys
 
 import omniperception  # noqa: F401  before torch, whose threads it sets up
+from benchmarks.network_memory import footprint_of_windows, largest_cloud
 from omniperception import build, config
 from omniperception.build import steps_per_frame
-from omniperception.learning.memory import GB, Footprint, footprint, largest_cloud
+from omniperception.learning.memory import GB, Footprint, footprint
 
 COLUMNS = ("parameters", "weights, Adam", "sensor", "rollout", "mini-batch", "total", "verdict")
 
 
 def row(name: str, needs: Footprint, budget: float) -> str:
-    sizes = (
-        needs.weights + needs.gradients + needs.optimizer,
-        needs.sensor,
-        needs.rollout,
-        needs.mini_batch,
-        needs.total,
-    )
+    sizes = (needs.optimization, needs.sensor, needs.rollout, needs.mini_batch, needs.total)
     cells = [f"{needs.parameters / 1e6:.2f} M", *(f"{size / GB:.3f}" for size in sizes)]
     verdict = "fits" if needs.total <= budget else "OUT OF MEMORY"
     return f"| {name} | {' | '.join(cells)} | {verdict} |"
@@ -47,8 +42,8 @@ def main() -> None:
             sizes = (run.perception, run.ppo, run.env.num_envs, steps_per_frame(run))
             lines.append(row(name, footprint(*sizes), budget))
             if name == "direct_mlp":
-                lines.append(row(f"{name}, window per step", footprint(*sizes, window_per_step=True), budget))
-                largest = [largest_cloud(*sizes, budget), largest_cloud(*sizes, budget, window_per_step=True)]
+                lines.append(row(f"{name}, window per step", footprint_of_windows(*sizes), budget))
+                largest = [largest_cloud(*sizes, budget), largest_cloud(*sizes, budget, footprint_of_windows)]
     print(
         f"{' '.join(overrides)}: {sizes[2]} environments x {run.ppo.num_steps_per_env} steps, a frame every {sizes[3]},"
         f" {run.ppo.num_mini_batches} mini-batches, {run.env.lidar.sensor.num_rays} rays; GB (10^9 bytes), limit"

@@ -47,7 +47,7 @@ def test_every_preset_composes_builds_and_steps(preset):
         runner = build_runner(run, None)
         env = runner.env
         with torch.inference_mode():
-            actions = runner.get_inference_policy("cpu")(env.get_observations())
+            actions = runner.policy(env.get_observations())
         assert actions.shape == (2, 12)
     else:
         env = OmniEnv(run.env)
@@ -276,5 +276,5 @@ def test_every_variant_of_perception_learns_to_avoid(variant):
     overrides = ("experiment=avoid", f"perception={variant}", "init=unread", "num_envs=2")
     runner = build_runner(build.assemble(config.compose(overrides)), None)
     with torch.inference_mode():
-        actions = runner.get_inference_policy("cpu")(runner.env.get_observations())
+        actions = runner.policy(runner.env.get_observations())
     assert actions.shape == (2, 12) and torch.isfinite(actions).all()

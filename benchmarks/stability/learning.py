@@ -122,7 +122,7 @@ def precision(seed: int = 0, num_envs: int = 16) -> list[Row]:
     alg, obs = runner.alg, runner.env.get_observations()
     with torch.inference_mode():
         for _ in range(11):
-            obs = runner._step(obs)
+            obs = runner.step(obs)
         alg.compute_returns(obs)
     single = _pass(alg, torch.float32)
     double = _pass(alg, torch.float64)
@@ -314,7 +314,7 @@ def _weights(runner: Runner) -> Iterator[torch.Tensor]:
 
 def _pass(alg: PerceptivePpo, dtype: torch.dtype) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     """(output, gradient of the parameters) by layer, and of PPO's loss, over the whole rollout in a precision."""
-    batch = alg.storage._batch(torch.arange(alg.storage.num_envs))
+    batch = alg.storage.batch_of(torch.arange(alg.storage.num_envs))
     actor, critic = alg.actor.to(dtype), alg.critic.to(dtype)
     observations = replace(
         batch.observations,

@@ -20,7 +20,7 @@ from omniperception.env.mdp import observations
 from omniperception.env.mdp.commands import VelocityCommandConfig
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
-from omniperception.learning.models import MOTION
+from omniperception.learning.read_out import MotionReadOut
 from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler
 
 FOLDER = "exported"
@@ -64,7 +64,7 @@ def export(request: Export) -> Description:
     run = build.assemble(config.load(request.run_dir, ["num_envs=1"]), request.trust)
     checkpoint = latest_checkpoint(request.run_dir)
     runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0)), None)
-    runner.load(str(checkpoint), load_cfg={"actor": True})
+    runner.load_policy(checkpoint)
     actor, env = runner.alg.actor.eval(), runner.env
     sizes = {name: env.get_observations()[name].shape[1] for name in run.env.observations.actor}
     network = exportable(actor, sizes)
@@ -128,7 +128,7 @@ def _check(network: BlindNetwork, written: Callable, path: Path) -> None:
     inputs = network.examples(23)
     with torch.no_grad():
         error = float((written(*inputs) - network(*inputs)).abs().max())
-    steep = getattr(network.actor, "velocity_risk", None) is not None and network.actor.read_out_target == MOTION
+    steep = isinstance(getattr(network.actor, "read_out", None), MotionReadOut)
     if not error <= (STEEP_TOLERANCE if steep else TOLERANCE):
         raise ConfigError(f"{path} differs from the policy by {error:.1e} in an action: not exportable")
 

@@ -54,10 +54,10 @@ class PerceptiveNetwork(BlindNetwork):
     def forward(self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor) -> torch.Tensor:
         """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> (B, num_actions)."""
         features = self.actor.perception(frames, frame_count)[:, 0]
-        if self.actor.read_out_target is not None:
+        if self.actor.read_out is not None:
             start, stop = self.command_start, self.command_start + 2
             command = observations[:, start:stop]
-            command = command + self.actor.avoidance(features, command) * (frame_count > 0)
+            command = command + self.actor.read_out.velocity(features, command) * (frame_count > 0)
             observations = torch.cat((observations[:, :start], command, observations[:, stop:]), 1)
         return self.output(self.actor.mlp(torch.cat((self.actor.obs_normalizer(observations), features), 1)))
 
@@ -82,7 +82,7 @@ def exportable(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
     if not isinstance(actor, PerceptionActor):
         return BlindNetwork(actor)
     before = 0
-    if actor.read_out_target is not None:
+    if actor.read_out is not None:
         names = list(group_sizes)
         before = sum(group_sizes[name] for name in names[: names.index(actor.command_group)])
     return PerceptiveNetwork(actor, before)

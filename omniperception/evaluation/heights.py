@@ -65,7 +65,7 @@ def height_errors(env: OmniEnv, policy: Policy, actor: PerceptionActor, steps: i
         if env.sensing.tick != tick:
             tick = env.sensing.tick
             seen = (obs["frame_count"] > 0).squeeze(-1)
-            predicted = actor.rollout(obs)[:, part]
+            predicted = actor.embed_newest(obs)[:, part]
             squared.append((predicted - obs[HEIGHT_TARGET]).square() * seen[:, None])
             targets.append(obs[HEIGHT_TARGET].clone())
             weights.append(seen.float())

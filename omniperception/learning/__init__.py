@@ -1,5 +1,4 @@
-"""Training on top of rsl_rl: the perceptive actor, PPO, a rollout storage that shares LiDAR frames, and the
-runner."""
+"""Training on top of rsl_rl: the actor that reads LiDAR frames, PPO, storage that shares frames, the runner."""
 
 from omniperception.learning.checkpoint import (
     CheckpointError,
@@ -8,10 +7,11 @@ from omniperception.learning.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from omniperception.learning.divergence import TrainingDiverged
 from omniperception.learning.models import PerceptionActor
-from omniperception.learning.ppo import PerceptivePpo, RolloutTooSmall, TrainingDiverged
+from omniperception.learning.ppo import PerceptivePpo, RolloutTooSmall
 from omniperception.learning.runner import Runner
-from omniperception.learning.storage import PerceptiveStorage, WindowedObservations, point_cloud_bytes
+from omniperception.learning.storage import PerceptiveStorage, WindowedObservations
 
 __all__ = [
     "CheckpointError",
@@ -25,6 +25,5 @@ __all__ = [
     "latest_checkpoint",
     "list_checkpoints",
     "load_checkpoint",
-    "point_cloud_bytes",
     "save_checkpoint",
 ]

@@ -1,18 +1,16 @@
-"""Settings of the perception network and of PPO, and their translation to rsl_rl's runner configuration."""
+"""Settings of the perception network and of PPO."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 
+from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.env.env import AVOIDANCE_TARGET, HEIGHT_TARGET, MOTION_TARGET, SECTOR_TARGET
 from omniperception.perception import PerceptionNetwork, Sampler
-
-if TYPE_CHECKING:
-    from omniperception.avoidance.velocity_risk import VelocityRisk
 
 
 @dataclass(frozen=True)
@@ -172,84 +170,60 @@ class PPOConfig:
         if self.schedule not in ("adaptive", "fixed"):
             raise ValueError(f"ppo.schedule={self.schedule} must be adaptive or fixed")
 
+    @property
+    def mlp(self) -> dict[str, Any]:
+        """Arguments of rsl_rl's `MLPModel` for the actor and for the critic."""
+        return {
+            "hidden_dims": list(self.hidden_dims),
+            "activation": self.activation,
+            "obs_normalization": self.obs_normalization,
+        }
 
-def multiplies_bfloat16() -> bool:
-    """Whether this CPU multiplies bfloat16 matrices in units made for it, at several times the speed of float32."""
-    return getattr(torch.cpu, "_is_amx_tile_supported", bool)()
+    @property
+    def algorithm(self) -> dict[str, Any]:
+        """Arguments of rsl_rl's `PPO`."""
+        amx = getattr(torch.cpu, "_is_amx_tile_supported", bool)()
+        mixed = amx if self.mixed_precision is None else self.mixed_precision
+        return {name: getattr(self, name) for name in _RSL_RL} | {"use_mixed_precision": mixed}
 
 
-def runner_config(
-    ppo: PPOConfig,
-    perception: PerceptionConfig | None,
-    actor_groups: Sequence[str],
-    critic_groups: Sequence[str],
-    steps_per_frame: int,
-    velocity_risk: VelocityRisk | None = None,
-    mirror: Callable | None = None,
-) -> dict:
-    """rsl_rl's runner configuration.
+_RSL_RL = (
+    "num_learning_epochs",
+    "num_mini_batches",
+    "clip_param",
+    "gamma",
+    "lam",
+    "learning_rate",
+    "schedule",
+    "desired_kl",
+    "value_loss_coef",
+    "use_clipped_value_loss",
+    "entropy_coef",
+    "max_grad_norm",
+)
+"""Fields of :class:`PPOConfig` that are arguments of rsl_rl's `PPO` under the same name."""
 
-    Args:
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """What learns in an environment, and how.
+
+    Attributes:
         ppo: learning settings.
-        perception: the actor's view of the LiDAR, or None.
+        perception: the actor's view of the LiDAR; None for a blind policy.
         actor_groups: observation groups of the actor.
         critic_groups: observation groups of the critic.
         steps_per_frame: control steps between two LiDAR frames.
-        velocity_risk: how the risk of velocities becomes an avoidance velocity, where the actor is supervised with it.
-        mirror: rsl_rl's `data_augmentation_func`, or None.
+        velocity_risk: the controller of a policy that is supervised with obstacles' motion, else None.
+        mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
+        command_group: the group that begins with the commanded velocity (v_x, v_y).
     """
-    network = {"hidden_dims": list(ppo.hidden_dims), "activation": ppo.activation}
-    network["obs_normalization"] = ppo.obs_normalization
-    actor = {
-        **network,
-        "class_name": "rsl_rl.models:MLPModel",
-        "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": ppo.init_std},
-    }
-    supervision = None
-    if perception is not None:
-        actor["class_name"] = "omniperception.learning.models:PerceptionActor"
-        actor["perception"] = perception.build_network
-        actor["supervision"] = perception.supervision
-        actor["velocity_risk"] = velocity_risk
-        actor["end_to_end"] = perception.supervised_epochs == 0
-        first, last = perception.learning_rate, perception.final_learning_rate
-        supervision = {
-            "epochs": perception.supervised_epochs,
-            "learning_rates": (first, first if last is None else last),
-            "num_updates": ppo.max_iterations,
-        }
-    return {
-        "num_steps_per_env": ppo.num_steps_per_env,
-        "save_interval": ppo.save_interval,
-        "keep_checkpoints": ppo.keep_checkpoints,
-        "max_minutes": ppo.max_minutes,
-        "steps_per_frame": steps_per_frame,
-        "supervision": supervision,
-        "obs_groups": {"actor": list(actor_groups), "critic": list(critic_groups)},
-        "actor": actor,
-        "critic": {**network, "class_name": "rsl_rl.models:MLPModel"},
-        "algorithm": {
-            "class_name": "omniperception.learning.ppo:PerceptivePpo",
-            "num_learning_epochs": ppo.num_learning_epochs,
-            "num_mini_batches": ppo.num_mini_batches,
-            "clip_param": ppo.clip_param,
-            "gamma": ppo.gamma,
-            "lam": ppo.lam,
-            "learning_rate": ppo.learning_rate,
-            "schedule": ppo.schedule,
-            "desired_kl": ppo.desired_kl,
-            "value_loss_coef": ppo.value_loss_coef,
-            "use_clipped_value_loss": ppo.use_clipped_value_loss,
-            "entropy_coef": ppo.entropy_coef,
-            "max_grad_norm": ppo.max_grad_norm,
-            "symmetry_cfg": {"data_augmentation_func": mirror, "use_data_augmentation": True} if mirror else None,
-            "use_mixed_precision": multiplies_bfloat16() if ppo.mixed_precision is None else ppo.mixed_precision,
-        },
-        "console_metrics": [
-            "velocity_error",
-            "yaw_rate_error",
-            "collision_rate",
-            "fall_rate",
-            "obstacle_level",
-        ],
-    }
+
+    ppo: PPOConfig
+    perception: PerceptionConfig | None
+    actor_groups: Sequence[str]
+    critic_groups: Sequence[str]
+    steps_per_frame: int = 1
+    velocity_risk: VelocityRisk | None = None
+    mirror: Callable | None = None
+    command_group: str = "command"

@@ -20,14 +20,14 @@ def rank() -> int:
     return int(os.environ.get("RANK", 0)) if world_size() > 1 else 0
 
 
-def local_rank() -> int:
-    """Number of this process among those of its machine: which GPU is its own."""
-    return int(os.environ.get("LOCAL_RANK", 0)) if world_size() > 1 else 0
-
-
 def world_size() -> int:
     """Number of processes."""
     return int(os.environ.get("WORLD_SIZE", 1))
+
+
+def multi_gpu() -> dict[str, int] | None:
+    """rsl_rl's `multi_gpu_cfg`, for processes on CPUs as well; None for a single process."""
+    return {"global_rank": rank(), "world_size": world_size()} if world_size() > 1 else None
 
 
 def connect(device: torch.device | str) -> None:

@@ -1,133 +1,161 @@
-"""Training log: rsl_rl's TensorBoard scalars and one console line per iteration."""
+"""Training log: TensorBoard scalars under rsl_rl's names, and one console line per iteration."""
 
 from __future__ import annotations
 
-import contextlib
 import datetime
-import io
 import statistics
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from pathlib import Path
 
 import torch
-from rsl_rl.utils.logger import Logger
 
 METRICS, ANOMALIES = "Metrics/", "Anomalies/"
 """Keys of ``extras["log"]`` that begin so are shown on the console; anomalies only if there are any."""
 
+CONSOLE_METRICS = ("velocity_error", "yaw_rate_error", "collision_rate", "fall_rate", "obstacle_level")
+"""What the console shows of the metrics, in this order."""
 
-class CompactLogger(Logger):
-    """rsl_rl's logger with TensorBoard only and a single line per iteration.
 
-    ``cfg["console_metrics"]`` (names without the prefix "Metrics/") selects and orders what the line shows;
-    all by default. Anomalies that happened are always shown.
+class Logger:
+    """Returns and lengths of episodes, TensorBoard scalars, and the console's line.
+
+    Attributes:
+        log_dir: where the TensorBoard file goes; None writes and prints nothing.
+        total_steps: control steps of all environments and iterations.
+        returns: of the last 100 episodes.
+        lengths: of these, control steps.
     """
 
-    def init_logging_writer(self, first_iteration: int = 0) -> None:
-        """Open the TensorBoard file; scalars of iterations that will be repeated after a resume are
-        dropped."""
-        self._recent = deque(maxlen=20)
+    def __init__(self, log_dir: Path | None, num_envs: int, device: str) -> None:
+        self.log_dir, self.num_envs = log_dir, num_envs
+        self.total_steps = 0
+        self.returns: deque[float] = deque(maxlen=100)
+        self.lengths: deque[float] = deque(maxlen=100)
+        self._return_so_far = torch.zeros(num_envs, device=device)
+        self._length_so_far = torch.zeros(num_envs, device=device)
+        self._infos: list[Mapping] = []
         self._ended: list[torch.Tensor] = []  # by step: whether episodes ended, their returns and lengths
-        if self.log_dir is None or self.disable_logs:
-            return
-        from torch.utils.tensorboard import SummaryWriter
+        self._recent: deque[float] = deque(maxlen=20)  # s, of iterations
+        self._writer = None
 
-        purge = first_iteration if first_iteration > 0 else None
-        self.writer = SummaryWriter(log_dir=self.log_dir, flush_secs=10, purge_step=purge)  # type: ignore
+    def open(self, first_iteration: int) -> None:
+        """Open the TensorBoard file; scalars of iterations that will be repeated after a resume are dropped."""
+        if self.log_dir is not None:
+            from torch.utils.tensorboard import SummaryWriter
 
-    def process_env_step(
-        self,
-        rewards: torch.Tensor,
-        dones: torch.Tensor,
-        extras: dict,
-        intrinsic_rewards: torch.Tensor | None = None,
-    ) -> None:
-        """As rsl_rl's, but that finished episodes are read out by `log`: a step does not wait for a GPU."""
-        if self.writer is None or intrinsic_rewards is not None:
-            super().process_env_step(rewards, dones, extras, intrinsic_rewards)
+            purge = first_iteration if first_iteration > 0 else None
+            self._writer = SummaryWriter(log_dir=str(self.log_dir), flush_secs=10, purge_step=purge)
+
+    def close(self) -> None:
+        """Close the TensorBoard file."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def add_step(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping) -> None:
+        """Note a control step; finished episodes are read out by :meth:`log`: a step does not wait for a GPU."""
+        if self._writer is None:
             return
         if "log" in extras:
-            self.ep_extras.append(extras["log"])
-        self.cur_reward_sum += rewards
-        self.cur_episode_length += 1
+            self._infos.append(extras["log"])
+        self._return_so_far += rewards
+        self._length_so_far += 1
         done = dones > 0
-        self._ended.append(torch.stack((done.float(), self.cur_reward_sum, self.cur_episode_length)))
-        self.cur_reward_sum.masked_fill_(done, 0.0)
-        self.cur_episode_length.masked_fill_(done, 0.0)
+        self._ended.append(torch.stack((done.float(), self._return_so_far, self._length_so_far)))
+        self._return_so_far.masked_fill_(done, 0.0)
+        self._length_so_far.masked_fill_(done, 0.0)
 
-    def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **values) -> None:
-        """Write the scalars and print the line; ``values`` are rsl_rl's other arguments."""
-        if self.writer is None:
+    def log(
+        self,
+        iteration: int,
+        total: int,
+        num_steps: int,
+        collect_time: float,
+        learn_time: float,
+        losses: Mapping[str, float],
+        scalars: Mapping[str, float],
+        time_left: float | None,
+    ) -> None:
+        """Write an iteration's scalars and print its line.
+
+        Args:
+            iteration: its number, from 0.
+            total: iterations at which training ends.
+            num_steps: control steps of all environments in it.
+            collect_time: s.
+            learn_time: s.
+            losses: by name.
+            scalars: what else to write, by tag.
+            time_left: s until the time budget is spent; None without one.
+        """
+        if self._writer is None:
             return
+        self.total_steps += num_steps
         self._read_out_episodes()
-        metrics = self._mean_metrics()
-        with contextlib.redirect_stdout(io.StringIO()):
-            super().log(it, start_it, total_it, collect_time, learn_time, **values)
-        self._recent.append(collect_time + learn_time)
-        print(self._line(it + 1, total_it, collect_time, learn_time, values["loss_dict"], metrics), flush=True)
+        steps_per_s = int(num_steps / max(collect_time + learn_time, 1e-9))
+        means = {key: _mean(self._infos, key) for key in dict.fromkeys(key for info in self._infos for key in info)}
+        self._infos.clear()
+        values = {key if "/" in key else f"Episode/{key}": value for key, value in means.items()}
+        values |= {f"Loss/{name}": value for name, value in losses.items()} | dict(scalars)
+        values |= {
+            "Perf/total_fps": steps_per_s,
+            "Perf/collection_time": collect_time,
+            "Perf/learning_time": learn_time,
+        }
+        if self.returns:
+            values["Train/mean_reward"] = statistics.mean(self.returns)
+            values["Train/mean_episode_length"] = statistics.mean(self.lengths)
+        for tag, value in values.items():
+            self._writer.add_scalar(tag, value, iteration)
 
-    def stop_logging_writer(self) -> None:
-        """Close the TensorBoard file."""
-        if self.writer is not None:
-            self.writer.close()  # type: ignore[attr-defined]
-            self.writer = None
+        self._recent.append(collect_time + learn_time)
+        remaining = statistics.mean(self._recent) * (total - iteration - 1)
+        if time_left is not None:
+            remaining = min(remaining, max(time_left, 0.0))
+        parts = [
+            f"{iteration + 1:>{len(str(total))}}/{total}",
+            f"{steps_per_s:,} steps/s",
+            f"collect {collect_time:.2f} s, learn {learn_time:.2f} s",
+        ]
+        if self.returns:
+            parts.append(f"reward {statistics.mean(self.returns):.3f}, length {statistics.mean(self.lengths):.0f}")
+        shown = {name: loss for name, loss in losses.items() if name == "value" or name.endswith("_target")}
+        shown |= {name: means[METRICS + name] for name in CONSOLE_METRICS if METRICS + name in means}
+        anomalies = {key.removeprefix(ANOMALIES): n for key, n in means.items() if key.startswith(ANOMALIES)}
+        shown |= {name: count for name, count in anomalies.items() if count > 0}
+        parts += [f"{name} {value:.3g}" for name, value in shown.items()]
+        print(" | ".join([*parts, f"ETA {datetime.timedelta(seconds=round(remaining))}"]), flush=True)
 
     def state_dict(self) -> dict:
         """Counters and running episode sums, to continue the same curves after a resume."""
         return {
-            "total_steps": self.tot_timesteps,
-            "reward_buffer": list(self.rewbuffer),
-            "length_buffer": list(self.lenbuffer),
-            "reward_sum": self.cur_reward_sum,
-            "episode_length": self.cur_episode_length,
+            "total_steps": self.total_steps,
+            "returns": list(self.returns),
+            "lengths": list(self.lengths),
+            "return_so_far": self._return_so_far,
+            "length_so_far": self._length_so_far,
         }
 
     def load_state_dict(self, state: dict) -> None:
         """Restore what :meth:`state_dict` returned; sums of another number of environments are dropped."""
-        self.tot_timesteps = state["total_steps"]
-        self.rewbuffer.extend(state["reward_buffer"])
-        self.lenbuffer.extend(state["length_buffer"])
-        if len(state["reward_sum"]) == self.num_envs:
-            self.cur_reward_sum.copy_(state["reward_sum"])
-            self.cur_episode_length.copy_(state["episode_length"])
+        self.total_steps = state["total_steps"]
+        self.returns.extend(state["returns"])
+        self.lengths.extend(state["lengths"])
+        if len(state["return_so_far"]) == self.num_envs:
+            self._return_so_far.copy_(state["return_so_far"])
+            self._length_so_far.copy_(state["length_so_far"])
 
     def _read_out_episodes(self) -> None:
         """Returns and lengths of the episodes that ended in the iteration, in their order."""
         if self._ended:
             done, total, length = torch.stack(self._ended, 1).cpu()
-            self.rewbuffer.extend(total[done > 0].tolist())
-            self.lenbuffer.extend(length[done > 0].tolist())
+            self.returns.extend(total[done > 0].tolist())
+            self.lengths.extend(length[done > 0].tolist())
             self._ended.clear()
 
-    def _mean_metrics(self) -> dict[str, float]:
-        """Means over the iteration of the entries under "Metrics/" that the console shows."""
-        names = list(dict.fromkeys(key for info in self.ep_extras for key in info if key.startswith(METRICS)))
-        chosen: Sequence[str] | None = self.cfg.get("console_metrics")
-        if chosen is not None:
-            names = [METRICS + name for name in chosen if METRICS + name in names]
-        means = {name.removeprefix(METRICS): _mean(self.ep_extras, name) for name in names}
-        keys = dict.fromkeys(key for info in self.ep_extras for key in info if key.startswith(ANOMALIES))
-        anomalies = {key.removeprefix(ANOMALIES): _mean(self.ep_extras, key) for key in keys}
-        return means | {name: count for name, count in anomalies.items() if count > 0}
 
-    def _line(self, done: int, total: int, collect: float, learn: float, losses: dict, metrics: dict) -> str:
-        steps = self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
-        parts = [
-            f"{done:>{len(str(total))}}/{total}",
-            f"{steps / max(collect + learn, 1e-9):,.0f} steps/s",
-            f"collect {collect:.2f} s, learn {learn:.2f} s",
-        ]
-        if self.rewbuffer:
-            parts.append(f"reward {statistics.mean(self.rewbuffer):.3f}, length {statistics.mean(self.lenbuffer):.0f}")
-        if "value" in losses:
-            parts.append(f"value {losses['value']:.3g}")
-        parts += [f"{name} {value:.3g}" for name, value in losses.items() if name.endswith("_target")]
-        parts += [f"{name} {value:.3g}" for name, value in metrics.items()]
-        remaining = datetime.timedelta(seconds=round(statistics.mean(self._recent) * (total - done)))
-        return " | ".join([*parts, f"ETA {remaining}"])
-
-
-def _mean(infos: list[Mapping], name: str) -> float:
+def _mean(infos: list[Mapping], key: str) -> float:
     """Mean of one entry over all log dictionaries that have it."""
-    values = [torch.as_tensor(info[name], dtype=torch.float32).flatten().cpu() for info in infos if name in info]
+    values = [torch.as_tensor(info[key], dtype=torch.float32).flatten().cpu() for info in infos if key in info]
     return torch.cat(values).mean().item()

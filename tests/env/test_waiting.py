@@ -72,17 +72,17 @@ def test_a_step_of_training_waits_for_its_check_and_for_the_newest_tick(task, tm
     run = build.assemble(config.compose([*TASKS[task], *ON_WARP, "ppo.num_mini_batches=1"]))
     runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0, log_interval=10**9)), tmp_path)
     runner.alg.train_mode()
-    runner.logger.init_logging_writer()
+    runner.logger.open(0)
     obs, steps = runner.env.get_observations(), 12
     with torch.inference_mode():
-        obs = runner._step(obs)
+        obs = runner.step(obs)
         with find_waits() as waits:
             for step in range(steps):
                 wear_out(runner.env, step)
-                obs = runner._step(obs)
-    runner.logger.stop_logging_writer()
+                obs = runner.step(obs)
+    runner.logger.close()
     found = {place.partition(":")[0]: times for place, times in waits.places().items()}
-    assert found == {"omniperception/learning/runner.py": steps, "omniperception/learning/embedding.py": steps}
+    assert found == {"omniperception/learning/runner.py": steps, "omniperception/learning/models.py": steps}
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -105,7 +105,7 @@ class TestCovered:
         assert torch.equal(env.get_observations()["frames"], frames)  # what the robot itself sees is what it was
 
     def test_what_is_around_does_not_matter_to_a_blind_policy(self, runner):
-        env, seeing = runner.env, runner.get_inference_policy("cpu")
+        env, seeing = runner.env, runner.policy
         blind = covered(env, seeing)
         with torch.no_grad():
             observations = env.get_observations()

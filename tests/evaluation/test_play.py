@@ -70,8 +70,8 @@ def test_mistakes_are_one_line(run_dir, arguments, message):
 def test_replaying_does_not_change_the_policy(run_dir):
     run = build.assemble(config.compose(SMALL))
     runner = build_runner(run, None)
-    runner.load(str(run_dir / "checkpoints" / "model_1.pt"), load_cfg={"actor": True})
-    policy = runner.get_inference_policy("cpu")
+    runner.load_policy(run_dir / "checkpoints" / "model_1.pt")
+    policy = runner.policy
     before = {name: value.clone() for name, value in policy.state_dict().items()}
     with torch.no_grad():
         for _ in range(3):

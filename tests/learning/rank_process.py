@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import torch
-from toy_env import SUPERVISED, ToyEnv, config
+from toy_env import ToyEnv, config
 
 from omniperception.learning import Runner, distributed, latest_checkpoint, list_checkpoints
 
@@ -16,7 +16,7 @@ if __name__ == "__main__":
     np.random.seed(rank)
     env = ToyEnv(seed=rank)
     env.curriculum_level = 0.25 + 0.5 * rank
-    runner = Runner(env, config(True, SUPERVISED), run_dir)
+    runner = Runner(env, config(supervised=True), run_dir)
     if list_checkpoints(run_dir):
         runner.load(str(latest_checkpoint(run_dir)))
     elif synchronized == "once":  # from then on only gradients are exchanged

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_env import SUPERVISED, ToyEnv, config
+from toy_env import ToyEnv, config
 
 from omniperception.learning import Runner, latest_checkpoint, list_checkpoints
 
@@ -55,7 +55,7 @@ def test_two_processes_learn_one_policy(tmp_path):
     assert len(list((tmp_path / "run").glob("events.*"))) == 1
     assert [path.name for path in list_checkpoints(tmp_path / "run")] == ["model_3.pt"]
 
-    alone = Runner(ToyEnv(seed=5), config(True, SUPERVISED), str(tmp_path / "run"))
+    alone = Runner(ToyEnv(seed=5), config(supervised=True), str(tmp_path / "run"))
     alone.load(str(latest_checkpoint(tmp_path / "run")))
     assert_same({"actor": dict(alone.alg.actor.named_parameters())}, {"actor": first["parameters"]["actor"]})
     alone.learn(1)

@@ -7,9 +7,10 @@ import torch
 from test_ppo import collect
 from toy_env import ToyEnv, config
 
+from benchmarks.network_memory import footprint_of_windows, largest_cloud
 from omniperception.learning import PerceptivePpo
 from omniperception.learning.config import PerceptionConfig, PPOConfig
-from omniperception.learning.memory import _kept_for_backward, check_fits, footprint, largest_cloud
+from omniperception.learning.memory import check_fits, footprint, kept_for_backward
 from omniperception.perception import DirectMlp, FpsGru, PdRiskNet, PdSampler, RawSampler
 
 RAYS, HISTORY = 40, 4
@@ -32,22 +33,17 @@ def halves(num_proximal=5, num_distal=7):
 
 
 def test_predicted_bytes_are_those_of_a_run():
-    env = ToyEnv(6)
-    cfg = config(multi_gpu=None)
-    alg = PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
+    env, cfg = ToyEnv(6), config()
+    alg = PerceptivePpo.build(env, cfg, "cpu")
     collect(alg, env, 8)
-    storage = alg.storage
-    rollout = storage.frames.untyped_storage().nbytes()
+    rollout = alg.storage.frames.untyped_storage().nbytes()
     alg.update()
-    network = alg.actor.perception
-    adam = [alg.optimizer.state[p][name] for p in network.parameters() for name in ("exp_avg", "exp_avg_sq")]
-
-    made = functools.partial(PdRiskNet, proximal_dim=5, distal_dim=3)
-    needs = footprint(perception(made, halves(2, 1), HISTORY), ppo_config(), 6, 5)
+    parameters = list(alg.actor.perception.parameters())
+    adam = [alg.optimizer.state[p][name] for p in parameters for name in ("exp_avg", "exp_avg_sq")]
+    held = [*parameters, *(p.grad for p in parameters), *adam]
+    needs = footprint(cfg.perception, cfg.ppo, 6, 5)
     assert needs.rollout == rollout
-    assert needs.optimizer == sum(t.untyped_storage().nbytes() for t in adam)
-    assert needs.weights == sum(p.untyped_storage().nbytes() for p in network.parameters())
-    assert needs.gradients == sum(p.grad.untyped_storage().nbytes() for p in network.parameters())
+    assert needs.optimization == sum(t.untyped_storage().nbytes() for t in held)
 
 
 def test_direct_mlp_by_hand():
@@ -58,7 +54,7 @@ def test_direct_mlp_by_hand():
     assert needs.sensor == 10 * 9 * 40 * 12
     frames, hidden, out = 5 * 6 * 120, 5 * 3 * 256, 5 * 3 * 251
     assert needs.mini_batch >= 4 * (frames + hidden + out)
-    windows = footprint(perception(), ppo_config(), 10, 5, window_per_step=True)
+    windows = footprint_of_windows(perception(), ppo_config(), 10, 5)
     assert windows.rollout == 10 * 8 * 4 * 40 * 12
     assert needs.total < windows.total
 
@@ -67,15 +63,15 @@ def test_direct_mlp_by_hand():
     "network", [DirectMlp(8, 4), FpsGru(8, 4, 9), PdRiskNet(5, 3, 4, 6, 5)], ids=lambda n: type(n).__name__
 )
 def test_meta_tensors_are_as_large_as_real_ones(network):
-    real = _kept_for_backward(network, 6, 3)
-    assert real == _kept_for_backward(network.to("meta"), 6, 3) > 6 * 6 * 8 * 12
+    real = kept_for_backward(network, 6, 3)
+    assert real == kept_for_backward(network.to("meta"), 6, 3) > 6 * 6 * 8 * 12
 
 
 def test_the_papers_verdict():
     """24 GB, 4096 environments, whole Mid-360 frames (20,000 points), 10 frames: out of memory, shared or not."""
     whole = perception(sampler=functools.partial(RawSampler, num_rays=20_000, max_range=5.0), history=10)
     ppo = ppo_config(num_steps_per_env=24, num_mini_batches=4)
-    shared, windows = footprint(whole, ppo, 4096, 5), footprint(whole, ppo, 4096, 5, window_per_step=True)
+    shared, windows = footprint(whole, ppo, 4096, 5), footprint_of_windows(whole, ppo, 4096, 5)
     assert shared.rollout == 4096 * 15 * 20_000 * 12 and windows.rollout == 4096 * 240 * 20_000 * 12
     assert windows.total > shared.total > 24e9
     risknet = functools.partial(PdRiskNet)

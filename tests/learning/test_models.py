@@ -4,9 +4,10 @@ import functools
 
 import pytest
 import torch
-from toy_env import HISTORY, ToyEnv, rollout
+from test_ppo import collect
+from toy_env import HISTORY, ToyEnv, config, rollout
 
-from omniperception.learning import PerceptionActor, PerceptiveStorage
+from omniperception.learning import PerceptionActor, PerceptivePpo, PerceptiveStorage
 from omniperception.perception import FpsMlp, PdRiskNet
 
 NETWORKS = {
@@ -19,7 +20,7 @@ def actor_for(env, network="pd", **options):
     torch.manual_seed(1)
     groups = {"actor": ["policy"]}
     options = {"hidden_dims": [8], "distribution_cfg": {"class_name": "GaussianDistribution"}, **options}
-    return PerceptionActor(env.get_observations(), groups, "actor", 2, perception=NETWORKS[network], **options)
+    return PerceptionActor(env.get_observations(), groups, "actor", 2, perception=NETWORKS[network](), **options)
 
 
 def advance(env, steps):
@@ -59,7 +60,7 @@ def test_update_equals_rollout(network, normalize):
             assert torch.allclose(got[row], by_step[step, env_id], atol=1e-5)
 
 
-def test_features_once_per_tick_and_parameter_version():
+def test_features_once_per_tick_until_the_actor_is_reset():
     env = ToyEnv(4)
     actor = actor_for(env)
     counter = Counter(actor.perception)
@@ -75,19 +76,31 @@ def test_features_once_per_tick_and_parameter_version():
     with torch.no_grad():
         next(actor.perception.parameters()).add_(0.1)
     with torch.inference_mode():
-        actor(env.get_observations())
+        before = actor.embed_newest(env.get_observations())
+        actor.reset()
+        assert not torch.equal(actor.embed_newest(env.get_observations()), before)
     assert counter.calls == 3 * first
 
 
-def test_cache_tells_environments_apart():
-    a, b = ToyEnv(4, seed=0), ToyEnv(4, seed=1)
-    advance(a, 10)
-    advance(b, 10)
-    actor = actor_for(a)
-    with torch.no_grad():
-        actor(a.get_observations())
-        cached = actor(b.get_observations())
-    assert torch.allclose(actor(b.get_observations()), cached)
+def test_weights_that_learn_or_are_loaded_are_used_at_once():
+    env = ToyEnv(6)
+    alg, other = (PerceptivePpo.build(env, config(supervised=True), "cpu") for _ in range(2))
+    collect(alg, env, 8)
+    obs = env.get_observations()
+    with torch.inference_mode():
+        before = alg.actor(obs)
+    alg.update()
+    for changed in (lambda: None, lambda: alg.load(other.save())):
+        changed()
+        with torch.inference_mode():
+            now = alg.actor(obs)
+            expected = alg.actor.perception(obs["frames"], obs["frame_count"])[:, 0]
+            assert torch.equal(
+                alg.actor.embed_newest(obs),
+                torch.where(obs["frame_count"] > 0, expected, alg.actor.perception.empty(obs["frames"])),
+            )
+            assert not torch.equal(now, before)
+            before = now
 
 
 def test_a_reset_alone_embeds_nothing_anew():
@@ -121,7 +134,7 @@ def height_case(weight):
     torch.manual_seed(5)
     env = ToyEnv(5, episode=11)
     advance(env, 7)
-    actor = actor_for(env, supervision={"height_target": weight})
+    actor = actor_for(env, supervision={"height_target": weight} if weight else None)
     storage = PerceptiveStorage(5, 9, env.get_observations(), ["policy", "height_target"], 2, frames=True)
     rollout(env, storage, 9)
     torch.manual_seed(6)
@@ -175,14 +188,16 @@ def test_height_supervision_needs_a_predictor_and_a_fitting_target():
     obs = env.get_observations()
     obs["height_target"] = torch.zeros(3, 7)
     with pytest.raises(ValueError, match="of 5 values within the embedding's 8, the environment gives 7"):
-        PerceptionActor(obs, {"actor": ["policy"]}, "actor", 2, NETWORKS["pd"], {"height_target": 1.0}, hidden_dims=[8])
+        PerceptionActor(
+            obs, {"actor": ["policy"]}, "actor", 2, NETWORKS["pd"](), {"height_target": 1.0}, hidden_dims=[8]
+        )
 
 
 def avoiding_actor(env, network="mlp", **options):
     actor = actor_for(env, network, supervision={"avoidance_target": 1.0}, command_group="policy", **options)
     with torch.no_grad():
-        actor.read_out[-1].weight.normal_()
-        actor.read_out[-1].bias.normal_()
+        actor.read_out.layers[-1].weight.normal_()
+        actor.read_out.layers[-1].bias.normal_()
     return actor
 
 
@@ -197,7 +212,7 @@ def test_avoidance_velocity_shifts_the_command(normalize):
     if normalize:
         actor.update_normalization(obs)
     with torch.no_grad():
-        velocity = actor.read_out(actor.perception(obs["frames"], obs["frame_count"])[:, 0])
+        velocity = actor.read_out.layers(actor.perception(obs["frames"], obs["frame_count"])[:, 0])
         velocity[2] = 0.0
         seen = actor.get_latent(obs)[:, :3]
         command = obs["policy"] + torch.cat([velocity, torch.zeros(4, 1)], 1)

@@ -1,5 +1,7 @@
 """PPO: returns by hand, its update with shared frames, and the stop at non-finite numbers."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,10 +11,8 @@ from omniperception.learning import PerceptivePpo, TrainingDiverged
 
 
 def algorithm(env, num_steps=8, frames=True, **options):
-    cfg = config(frames, num_steps_per_env=num_steps, multi_gpu=None)
-    cfg["algorithm"] = {**cfg["algorithm"], **options}
     torch.manual_seed(0)
-    return PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
+    return PerceptivePpo.build(env, config(frames, num_steps_per_env=num_steps, **options), "cpu")
 
 
 def collect(alg, env, steps):
@@ -96,7 +96,7 @@ def test_non_finite_parameters_are_named():
     with torch.no_grad():
         alg.actor.perception.distal.bias_hh_l0[0] = float("nan")
     with pytest.raises(TrainingDiverged, match="perception.distal.bias_hh_l0"):
-        alg._check_parameters()
+        alg.guard.check_parameters()
 
 
 def test_an_exploding_learning_rate_ends_in_a_clear_stop():
@@ -110,7 +110,9 @@ def test_an_exploding_learning_rate_ends_in_a_clear_stop():
 
 def test_symmetry_and_frames_are_refused():
     with pytest.raises(ValueError, match="one-dimensional observations only"):
-        algorithm(ToyEnv(4), symmetry_cfg={"use_mirror_loss": True})
+        PerceptivePpo.build(ToyEnv(4), replace(config(), mirror=lambda **_: None), "cpu")
+    with pytest.raises(ValueError, match="observations.actor is empty"):
+        PerceptivePpo.build(ToyEnv(4), replace(config(), actor_groups=()), "cpu")
 
 
 def test_groups_are_a_tensordict():

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_env import SUPERVISED, ToyEnv, config
+from toy_env import ToyEnv, config
 
 from omniperception.learning import (
     CheckpointError,
@@ -24,11 +24,10 @@ from omniperception.learning.checkpoint import checkpoint_path, list_checkpoints
 HERE = Path(__file__).parent
 
 
-def runner_for(run_dir, frames=True, supervision=None, **overrides):
+def runner_for(run_dir, frames=True, supervised=False, **ppo):
     torch.manual_seed(0)
     np.random.seed(0)
-    env = ToyEnv(frames=frames)
-    return Runner(env, config(frames, supervision, **overrides), str(run_dir) if run_dir else None)
+    return Runner(ToyEnv(frames=frames), config(frames, supervised, **ppo), run_dir)
 
 
 def differences(a, b, where=""):
@@ -43,7 +42,7 @@ def differences(a, b, where=""):
 
 @pytest.mark.parametrize("kind", ["end_to_end", "supervised", "blind"])
 def test_resume_in_a_new_process_is_exact(tmp_path, kind):
-    options = {"frames": kind != "blind", "supervision": SUPERVISED if kind == "supervised" else None}
+    options = {"frames": kind != "blind", "supervised": kind == "supervised"}
     whole = runner_for(tmp_path / "whole", **options)
     whole.learn(5)
     part = runner_for(tmp_path / "part", **options)
@@ -123,10 +122,8 @@ class TestCheckpoints:
 
     def test_another_architecture_is_a_clear_error(self, tmp_path):
         runner_for(tmp_path).learn(1)
-        other = config()
-        other["actor"]["hidden_dims"] = [4]
         with pytest.raises(CheckpointError, match="does not fit this configuration") as error:
-            Runner(ToyEnv(), other).load(str(latest_checkpoint(tmp_path)))
+            Runner(ToyEnv(), config(hidden_dims=[4])).load(latest_checkpoint(tmp_path))
         assert "\n" not in str(error.value)
 
     def test_loading_the_actor_alone(self, tmp_path):
@@ -134,10 +131,10 @@ class TestCheckpoints:
         env = ToyEnv(3)
         other = Runner(env, config())
         position, rng = env.position.clone(), torch.get_rng_state()
-        other.load(str(latest_checkpoint(tmp_path)), load_cfg={"actor": True})
+        other.load_policy(latest_checkpoint(tmp_path))
         assert other.current_learning_iteration == 0
         assert torch.equal(env.position, position) and torch.equal(torch.get_rng_state(), rng)
-        policy = other.get_inference_policy("cpu")
+        policy = other.policy
         with torch.inference_mode():
             assert policy(env.get_observations()).shape == (3, 2)
 
@@ -169,7 +166,7 @@ class TestLearn:
         lines = capsys.readouterr().out.strip().splitlines()
         assert len(lines) == 3
         assert lines[2].startswith("3/3 | ")
-        for part in ("steps/s", "collect", "learn", "reward", "length", "height_target", "distance", "ETA"):
+        for part in ("steps/s", "collect", "learn", "reward", "length", "height_target", "velocity_error", "ETA"):
             assert part in lines[2]
 
     def test_scalars_are_those_of_rsl_rl(self, tmp_path):
@@ -188,7 +185,7 @@ class TestLearn:
             "Perf/total_fps",
             "Train/mean_reward",
             "Train/mean_episode_length",
-            "Metrics/distance",
+            "Metrics/velocity_error",
         } <= tags
         assert [e.step for e in events.Scalars("Loss/height_target")] == [0, 1, 2]
         assert not (tmp_path / "git").exists()
@@ -212,6 +209,24 @@ class TestLearn:
         resumed.learn(50)
         assert resumed.stop_reason == "time budget" and resumed.current_learning_iteration == 3
         assert latest_checkpoint(tmp_path).name == "model_3.pt"
+
+    def test_the_eta_is_that_of_whichever_limit_comes_first(self, tmp_path, capsys):
+        budget, runner = 1.0, runner_for(tmp_path, max_minutes=1.0, max_iterations=10**6)
+        runner.total_time = 60.0 * budget - 5.0
+        runner._iterate(self.ready(runner), last=10**6)
+        assert 4 <= self.eta(capsys) <= 5
+        runner.total_time = 0.0
+        runner._iterate(runner.env.get_observations(), last=2)
+        assert self.eta(capsys) == 0
+
+    def ready(self, runner):
+        runner.alg.train_mode()
+        runner.logger.open(0)
+        return runner.env.get_observations()
+
+    def eta(self, capsys):
+        hours, minutes, seconds = capsys.readouterr().out.strip().rpartition("ETA ")[2].split(":")
+        return 3600 * int(hours) + 60 * int(minutes) + int(seconds)
 
     def test_interrupt_saves_and_leaves(self, tmp_path):
         runner = runner_for(tmp_path)
@@ -247,6 +262,6 @@ class TestLearn:
     def test_training_improves_the_reward(self, tmp_path):
         runner = runner_for(tmp_path, num_steps_per_env=16)
         runner.learn(8)  # about 40 episodes
-        start = float(np.mean(runner.logger.rewbuffer))
+        start = float(np.mean(runner.logger.returns))
         runner.learn(60)
-        assert float(np.mean(list(runner.logger.rewbuffer)[-40:])) > 0.8 * start
+        assert float(np.mean(list(runner.logger.returns)[-40:])) > 0.8 * start

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from test_ppo import algorithm, collect
-from toy_env import SUPERVISED, ToyEnv, config
+from toy_env import ToyEnv, config
 
 from omniperception.learning import PerceptivePpo, RolloutTooSmall, Runner, TrainingDiverged
 
@@ -22,9 +22,7 @@ def finite_weights(alg):
 
 def test_a_frame_that_is_not_finite_does_not_reach_a_supervised_network():
     env = ToyEnv(6)
-    alg = PerceptivePpo.construct_algorithm(
-        env.get_observations(), env, config(supervision=SUPERVISED, multi_gpu=None), "cpu"
-    )
+    alg = PerceptivePpo.build(env, config(supervised=True), "cpu")
     collect(alg, env, 8)
     alg.storage.frames[2] = float("nan")
     line = stopped_by(alg)
@@ -101,6 +99,6 @@ def test_anomalies_are_on_the_console_when_they_happen(tmp_path, capsys):
         return observations, rewards, dones, extras
 
     env.step = log
-    Runner(env, config(console_metrics=["distance"]), str(tmp_path)).learn(1)
+    Runner(env, config(), tmp_path).learn(1)
     line = capsys.readouterr().out
     assert "| diverged 3" in line and "engine" not in line

@@ -2,15 +2,14 @@
 
 import torch
 from test_ppo import collect
-from toy_env import SUPERVISED, ToyEnv, config
+from toy_env import ToyEnv, config
 
 from omniperception.learning import PerceptivePpo
 
 
-def algorithm(env, **overrides):
+def algorithm(env):
     torch.manual_seed(0)
-    cfg = config(supervision=SUPERVISED, multi_gpu=None, **overrides)
-    return PerceptivePpo.construct_algorithm(env.get_observations(), env, cfg, "cpu")
+    return PerceptivePpo.build(env, config(supervised=True), "cpu")
 
 
 def parameters(module):
@@ -23,7 +22,7 @@ def test_supervision_learns_the_target():
     collect(alg, env, 8)
     errors = []
     for _ in range(60):
-        alg.perception_trainer.train(alg.storage, 0, 2, mixed_precision=False)
+        alg.train_perception()
         errors.append(alg.actor.pop_supervised_losses()["height_target"])
     assert errors[-1] < 0.3 * errors[0]
 
@@ -45,10 +44,10 @@ def test_ppo_sees_the_embedding_that_the_policy_acted_on_and_does_not_change_it(
     alg = algorithm(env)
     collect(alg, env, 8)
     acted_on = alg._embed_rollout()
-    alg.perception_trainer.train(alg.storage, 0, 2, mixed_precision=False)
+    alg.train_perception()
     alg.storage.window_features = acted_on
     after_supervision = parameters(alg.actor.perception)
-    alg.perception_trainer = None  # what follows is PPO alone
+    alg.perception_optimizer = None  # what follows is PPO alone
     for batch in alg.storage.mini_batch_generator(2, 1):
         alg.actor(batch.observations, stochastic_output=True)
         log_prob = alg.actor.get_output_log_prob(batch.actions)

@@ -86,7 +86,7 @@ def test_perception_learns_and_the_policy_stays_as_it_is(make_config, walk):
     for update in range(13):
         with torch.inference_mode():
             for _ in range(10):
-                obs = runner._step(obs)
+                obs = runner.step(obs)
         if update < 12:
             losses = runner.alg.update()
     assert all(torch.equal(actor.state_dict()[name], value) for name, value in kept.items())
@@ -103,7 +103,7 @@ def test_perception_learns_and_the_policy_stays_as_it_is(make_config, walk):
 def losses_on_the_rollout(runner):
     """By target, on frames that no update has seen."""
     actor, storage = runner.alg.actor, runner.alg.storage
-    frames = storage.observations_of(torch.arange(storage.num_envs)).at_steps(storage.first_steps)
+    frames = storage.observations_of(torch.arange(storage.num_envs), storage.first_steps)
     with torch.no_grad():
         actor.supervised_loss(actor.embed(frames), frames)
     return actor.pop_supervised_losses()
@@ -119,9 +119,9 @@ def test_the_learning_rate_falls(make_config):
     for _ in range(5):
         with torch.inference_mode():
             for _ in range(10):
-                obs = runner._step(obs)
+                obs = runner.step(obs)
         runner.alg.update()
-        rates.append(runner.alg.perception_trainer.optimizer.param_groups[0]["lr"])
+        rates.append(runner.alg.perception_optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4, 2e-4])
 
 

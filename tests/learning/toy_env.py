@@ -9,7 +9,8 @@ from rsl_rl.env import VecEnv
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from omniperception.perception import PdRiskNet
+from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
+from omniperception.perception import PdRiskNet, PdSampler
 
 HISTORY, POINTS, PERIOD = 4, 3, 5
 
@@ -55,7 +56,7 @@ class ToyEnv(VecEnv):
         time_outs = (self.episode_length_buf >= self.max_episode_length) & ~fell
         rewards = -self.position.norm(dim=-1)
         self._reset((fell | time_outs).nonzero().flatten())
-        extras = {"time_outs": time_outs.float(), "log": {"Metrics/distance": -rewards.mean()}}
+        extras = {"time_outs": time_outs.float(), "log": {"Metrics/velocity_error": -rewards.mean()}}
         return self.get_observations(), rewards, (fell | time_outs).long(), extras
 
     def _new_frame(self):
@@ -85,39 +86,42 @@ class ToyEnv(VecEnv):
             setattr(self, name, state[name])
 
 
-SUPERVISED = {"epochs": 2, "learning_rates": (1e-2, 1e-2), "num_updates": 100}
-"""Of a perception network that PPO does not train."""
-
-
-def config(frames=True, supervision=None, **overrides):
-    """Runner configuration; keyword arguments replace top-level entries."""
-    sizes = {"num_proximal": 2, "num_distal": 1, "proximal_dim": 5, "distal_dim": 3}
-    network = functools.partial(PdRiskNet, history=HISTORY, **sizes)
-    gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5}
-    mlp = {"hidden_dims": [16], "activation": "elu", "obs_normalization": True}
-    actor = {"class_name": "rsl_rl.models:MLPModel", "distribution_cfg": gaussian, **mlp}
-    if frames:
-        actor |= {
-            "class_name": "omniperception.learning.models:PerceptionActor",
-            "perception": network,
-            "supervision": {"height_target": 1.0},
-            "end_to_end": supervision is None,
-        }
-    return {
-        "num_steps_per_env": 8,
+def config(frames=True, supervised=False, **ppo):
+    """What learns in a `ToyEnv`; keyword arguments replace settings of PPO."""
+    defaults = {
+        "max_iterations": 100,
+        "max_minutes": None,
         "save_interval": 100,
-        "steps_per_frame": PERIOD,
-        "supervision": supervision,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
-        "actor": actor,
-        "critic": {"class_name": "MLPModel", **mlp},
-        "algorithm": {
-            "class_name": "omniperception.learning.ppo:PerceptivePpo",
-            "num_learning_epochs": 2,
-            "num_mini_batches": 2,
-        },
-        **overrides,
+        "keep_checkpoints": 10,
+        "num_steps_per_env": 8,
+        "num_learning_epochs": 2,
+        "num_mini_batches": 2,
+        "clip_param": 0.2,
+        "gamma": 0.99,
+        "lam": 0.95,
+        "learning_rate": 1e-3,
+        "schedule": "adaptive",
+        "desired_kl": 0.01,
+        "value_loss_coef": 1.0,
+        "use_clipped_value_loss": True,
+        "entropy_coef": 0.01,
+        "max_grad_norm": 1.0,
+        "hidden_dims": [16],
+        "activation": "elu",
+        "init_std": 0.5,
+        "obs_normalization": True,
     }
+    perception = PerceptionConfig(
+        functools.partial(PdSampler, 2, 1, max_range=5.0, split_deg=10.0),
+        functools.partial(PdRiskNet, proximal_dim=5, distal_dim=3),
+        HISTORY,
+        height_weight=1.0,
+        sector_weight=0.0,
+        supervised_epochs=2 if supervised else 0,
+        learning_rate=1e-2,
+    )
+    groups = ("policy",)
+    return LearningConfig(PPOConfig(**defaults | ppo), perception if frames else None, groups, groups, PERIOD)
 
 
 def rollout(env, storage, num_steps):
@@ -126,7 +130,8 @@ def rollout(env, storage, num_steps):
     obs = env.get_observations()
     for step in range(num_steps):
         seen.append(obs.clone())
-        storage.record_frames(obs, env.tick)
+        if env.has_frames:
+            storage.record_frames(obs, env.tick)
         transition = RolloutStorage.Transition()
         transition.observations = obs
         transition.actions = torch.randn(env.num_envs, 2)

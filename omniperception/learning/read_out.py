@@ -1,0 +1,91 @@
+"""Avoidance velocities from an embedding: regressed directly, or by way of the obstacles around and their motion."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from omniperception.avoidance.sector_motion import decode, motion_error
+from omniperception.avoidance.velocity_risk import VelocityRisk
+
+
+class VelocityReadOut(nn.Module):
+    """The avoidance velocity itself, by an MLP on the embedding that starts at zero."""
+
+    def __init__(self, feature_dim: int) -> None:
+        """Args: feature_dim: D, size of the embedding."""
+        super().__init__()
+        self.layers = zero_mlp(feature_dim, 64, 2)
+
+    def extend(self, embedding: torch.Tensor) -> torch.Tensor:
+        """What is computed once per embedding (..., D): nothing."""
+        return embedding
+
+    def velocity(self, features: torch.Tensor, command: torch.Tensor) -> torch.Tensor:
+        """(B, 2) avoidance velocity (m/s, yaw-aligned frame) from embeddings (B, D); the command is not read."""
+        return self.layers(features).float()
+
+    def error(self, features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """(B,) mean squared error against the avoidance velocity (B, 2) that the simulation's obstacles give."""
+        return (self.layers(features).float() - target).square().mean(-1)
+
+
+class MotionReadOut(nn.Module):
+    """The nearest obstacle of each azimuth sector and its motion; the avoidance velocity follows from their risk.
+
+    The risks of the candidate velocities are computed once per embedding, the choice among them at every control step.
+    """
+
+    def __init__(self, feature_dim: int, num_values: int, part: slice | None, velocity_risk: VelocityRisk) -> None:
+        """Configure the read-out.
+
+        Args:
+            feature_dim: D, size of the embedding.
+            num_values: 3 S, numbers of the S sectors.
+            part: where in the embedding they are; None: an MLP on the whole embedding gives them.
+            velocity_risk: the controller.
+        """
+        super().__init__()
+        self.feature_dim, self.part, self.velocity_risk = feature_dim, part, velocity_risk
+        self.layers = zero_mlp(feature_dim, 256, num_values) if part is None else None
+        self.register_buffer("candidates", velocity_risk.candidates(), persistent=False)
+
+    def motion(self, embedding: torch.Tensor) -> torch.Tensor:
+        """(B, S, 3) sectors as :func:`~omniperception.avoidance.sector_motion.encode` gives them, from (B, D)."""
+        values = embedding[:, self.part] if self.layers is None else self.layers(embedding)
+        return values.float().unflatten(-1, (-1, 3))
+
+    def extend(self, embedding: torch.Tensor) -> torch.Tensor:
+        """Embeddings (..., D) with the risks of the K candidate velocities appended: (..., D + K)."""
+        risk = self._risk(self.motion(embedding.flatten(0, -2)))
+        return torch.cat((embedding, risk.unflatten(0, embedding.shape[:-1])), -1)
+
+    def velocity(self, features: torch.Tensor, command: torch.Tensor) -> torch.Tensor:
+        """(B, 2) avoidance velocity (m/s, yaw-aligned frame).
+
+        Args:
+            features: (B, D + K) from :meth:`extend`, or (B, D) embeddings.
+            command: (B, 2) commanded velocity, m/s.
+        """
+        if features.shape[1] == self.feature_dim:
+            features = self.extend(features)
+        return self.velocity_risk.avoidance(features[:, self.feature_dim :], command, self.candidates)
+
+    def error(self, features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """(B,) squared errors against the true sectors (B, 3 S), and of the risks that follow from them."""
+        target = target.unflatten(-1, (-1, 3))
+        predicted = self.motion(features)
+        with torch.no_grad():
+            risk = self._risk(target)
+        return motion_error(predicted, target) + (self._risk(predicted) - risk).square().mean(-1)
+
+    def _risk(self, motion: torch.Tensor) -> torch.Tensor:
+        return self.velocity_risk.risk(decode(motion), self.candidates)
+
+
+def zero_mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """An MLP of one hidden layer whose output is zero until it is trained."""
+    last = nn.Linear(hidden, outputs)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ELU(), last)
