@@ -141,7 +141,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
             why = f": {one_line(error).partition(' See https')[0]}" if "=" in text else ""
             raise ConfigError(f"'{text}' is not of the form key=value{why}") from None
         if override.is_sweep_override():
-            raise ConfigError(f"{text} has several values, which only python train.py -m runs; lists are [a,b]")
+            raise ConfigError(f"{text} has several values, which only train -m runs; lists are [a,b]")
         parsed.append(override)
     return parsed
 
@@ -287,7 +287,7 @@ def is_begun(run_dir: Path, composed: dict) -> bool:
         return False
     if yaml.safe_load(path.read_text()) != yaml.safe_load(yaml.safe_dump(composed)):
         raise ConfigError(
-            f"{run_dir} holds a run of another configuration; go on with it by python train.py run={run_dir}, or choose"
+            f"{run_dir} holds a run of another configuration; go on with it by train run={run_dir}, or choose"
             " another hydra.run.dir"
         )
     return True
@@ -302,7 +302,7 @@ def find_run(name: str, key: str = "run") -> Path:
         return path
     runs = sorted(OUTPUTS.glob(f"**/{CONFIG_FILE}"), key=lambda path: path.stat().st_mtime)
     if not runs:
-        raise ConfigError(f"{key}=latest finds no run under outputs/; train one with python train.py first")
+        raise ConfigError(f"{key}=latest finds no run under outputs/; train one first")
     return runs[-1].parent
 
 

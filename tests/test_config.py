@@ -242,7 +242,7 @@ class TestRunDirectories:
 
     def test_missing_runs(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        with pytest.raises(ConfigError, match=r"train\.py first"):
+        with pytest.raises(ConfigError, match=r"train one first"):
             config.find_run("latest")
         with pytest.raises(ConfigError, match="run=latest"):
             config.find_run("nowhere")

@@ -94,7 +94,7 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
         plan.save(run_dir)
     report(plan.summary())
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
-    report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
+    report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; play run={run_dir} replays it")
     distributed.disconnect()
 
 

@@ -1,5 +1,7 @@
 """Recorded kernel launches: one on a GPU, split over environments and threads on a CPU."""
 
+import contextlib
+import ctypes
 import itertools
 import os
 from collections.abc import Sequence
@@ -11,6 +13,25 @@ import torch
 import warp as wp
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no line per compiled kernel
+
+
+def _init_without_driver() -> None:
+    """Initialises Warp where there is no CUDA driver, which its native code would report on file descriptor 2."""
+    with contextlib.suppress(OSError):
+        ctypes.CDLL("libcuda.so.1")
+        return
+    with contextlib.suppress(OSError):  # of a process without standard error
+        saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(nowhere, 2)
+            wp.init()
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            os.close(nowhere)
+
+
+_init_without_driver()
 
 CHUNKS_PER_THREAD = 4
 MIN_CHUNK_WORK = 65536
