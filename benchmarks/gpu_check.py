@@ -68,7 +68,7 @@ class CheckOptions:
 
     def run(self, *overrides: str) -> build.RunConfig:
         """The paper's recipe on this device, at the paper's size or a tiny one."""
-        sizes = ("num_envs=8", "lidar.sensor.num_rays=200", "ppo.num_steps_per_env=8") if self.small else ()
+        sizes = ("num_envs=8", "lidar.num_rays=200", "ppo.num_steps_per_env=8") if self.small else ()
         recipe = ("experiment=paper", "sim=mujoco_warp", f"sim.device={self.device}", *sizes, *overrides)
         return build.assemble(config.compose(recipe))
 
@@ -204,7 +204,7 @@ def measure_env(options: CheckOptions) -> list[Table]:
     whole = 300 if options.small else 20_000
     return [
         _measure_steps(options, "env_stages"),
-        _measure_steps(options, "env_stages_whole_clouds", f"lidar.sensor.num_rays={whole}"),
+        _measure_steps(options, "env_stages_whole_clouds", f"lidar.num_rays={whole}"),
     ]
 
 
@@ -238,7 +238,7 @@ def _measure_steps(options: CheckOptions, name: str, *overrides: str) -> Table:
     rate = env.num_envs * steps / seconds
     table = Table(
         name,
-        f"env.step with {env.num_envs} environments, {run.env.lidar.sensor.num_rays} rays: {rate:,.0f} env steps/s",
+        f"env.step with {env.num_envs} environments, {run.env.lidar.num_rays} rays: {rate:,.0f} env steps/s",
         ("stage", "us per env step", "share, %"),
     )
     for stage, spent in stages.items():

@@ -12,20 +12,26 @@ import numpy as np
 import torch
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, InstantiationException
-from hydra.utils import instantiate
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from omniperception.config import ConfigError, compose, one_line
+from omniperception.config import ConfigError, compose, is_composed, one_line
 from omniperception.env.env import EnvConfig, OmniEnv
+from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
+from omniperception.env.mdp.randomization import RandomizationConfig
+from omniperception.env.mdp.terminations import TerminationsConfig
+from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
 from omniperception.env.mirror import Mirror
 from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.learning.memory import check_fits
-from omniperception.schema import check_config
+from omniperception.scene import Mount, ObstaclesConfig, RobotConfig, TerrainConfig, TiledTerrainConfig
+from omniperception.schema import ANYTHING, make
+from omniperception.sim import SimConfig
 
 if TYPE_CHECKING:
+    from omniperception.env.sensing import SensorConfig
     from omniperception.evaluation.episodes import Policy
 
 
@@ -56,29 +62,74 @@ class RunConfig:
             )
 
 
+_PARTS = {
+    "terrain": TerrainConfig | TiledTerrainConfig,
+    "obstacles": ObstaclesConfig,
+    "commands": VelocityCommandConfig | GoalCommandConfig,
+    "observations": ObservationsConfig,
+    "rewards": RewardsConfig,
+    "terminations": TerminationsConfig,
+    "randomization": RandomizationConfig,
+    "sim": SimConfig,
+}
+"""The parts of the task that stand for themselves."""
+
+
 def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
-    """Instantiates and validates every part of a composed configuration."""
+    """Builds and validates every part of a configuration.
+
+    Args:
+        config: from `config.compose`, which may name whatever can be imported, or from `config.load`, which may not.
+        trust: modules outside of this package that a loaded configuration may name, with what is below them.
+
+    Raises:
+        ConfigError: one line that says what to change.
+    """
+    trust = ANYTHING if is_composed(config) else trust
+    if config.get("perception") and not config.get("lidar"):
+        raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
     try:
-        _check_groups(config)
         composed = OmegaConf.to_container(config, resolve=True)
-        check_config(composed)
-        parts = {key: _instantiate(key, value) for key, value in composed.items() if isinstance(value, dict)}
-        perception, ppo = parts.pop("perception"), parts.pop("ppo")
+    except OmegaConfBaseException as error:
+        message = one_line(error).partition(" full_key:")[0]
+        raise ConfigError(message.partition("raised while resolving interpolation: ")[2] or message) from None
+    needed = {"num_envs", "seed", "lidar", "perception", "ppo", "robot", *_PARTS}
+    for key in needed - composed.keys():
+        raise ConfigError(f"the configuration has no {key}")
+    perception = make(PerceptionConfig, composed["perception"], "perception", trust) if composed["perception"] else None
+    ppo = make(PPOConfig, composed["ppo"], "ppo", trust)
+    robot = make(RobotConfig, composed["robot"], "robot", trust)
+    try:
         env = EnvConfig(
-            num_envs=composed["num_envs"],
-            seed=composed["seed"],
+            num_envs=make(int, composed["num_envs"], "num_envs"),
+            seed=make(int, composed["seed"], "seed"),
+            robot=robot,
+            lidar=_sensor(composed["lidar"], robot, trust) if composed["lidar"] else None,
             sampler=perception.sampler if perception else None,
             frame_history=perception.history if perception else 0,
             base_motion=perception.base_motion if perception else False,
             targets=tuple(perception.supervision) if perception else (),
             log_interval=ppo.num_steps_per_env,
-            **parts,
+            **{key: make(part, composed[key], key, trust) for key, part in _PARTS.items()},
         )
         return RunConfig(env, perception, ppo, _names(composed.get("init")), composed)
-    except (OmegaConfBaseException, InstantiationException) as error:
+    except ValueError as error:
         raise ConfigError(one_line(error)) from None
-    except (TypeError, ValueError) as error:
-        raise ConfigError(one_line(error)) from None
+
+
+def _sensor(preset: dict, robot: RobotConfig, trust: Sequence[str] | None) -> SensorConfig:
+    """A sensor on one of the robot's mounts."""
+    from omniperception.env.sensing import SensorConfig
+
+    settings = dict(preset)
+    mount = settings.pop("mount", None)
+    if isinstance(mount, str) and mount not in robot.mounts:
+        raise ConfigError(f"lidar.mount={mount} is unknown; robot.mounts has {', '.join(robot.mounts) or 'none'}")
+    mount = robot.mounts[mount] if isinstance(mount, str) else make(Mount, mount, "lidar.mount", trust)
+    mounted = {"mount_pos": mount.pos, "mount_rpy": mount.rpy, "exclude_geoms": mount.exclude_geoms}
+    for name in settings.keys() & mounted.keys():
+        raise ConfigError(f"lidar.{name} is unknown; a mount has it: lidar.mount=... or robot.mounts.<name>=...")
+    return make(SensorConfig, settings | mounted, "lidar", trust)
 
 
 def _names(value: object) -> tuple[str, ...]:
@@ -102,21 +153,6 @@ def check(overrides: Sequence[str]) -> None:
         jobs = [values]
     for job in jobs:
         assemble(compose([o for o in job if not o.startswith("hydra")]))
-
-
-def _check_groups(config: DictConfig) -> None:
-    if config.perception and not config.lidar:
-        raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
-
-
-def _instantiate(key: str, value: dict) -> object | None:
-    if not value:
-        return None
-    try:
-        return instantiate(value, _convert_="all")
-    except InstantiationException as error:
-        cause = error.__cause__ or error
-        raise ConfigError(f"{key}: {one_line(cause)}") from None
 
 
 def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
@@ -168,7 +204,7 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
 
 def steps_per_frame(run: RunConfig) -> int:
     """Control steps between two LiDAR frames."""
-    return max(1, round(run.env.lidar.sensor.period_s / run.env.sim.control_dt))
+    return max(1, round(run.env.lidar.period_s / run.env.sim.control_dt))
 
 
 def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:

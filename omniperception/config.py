@@ -38,6 +38,18 @@ OPTIONAL_GROUPS = ("experiment", "scenario")
 _EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
 
 
+def _device_figure(name: str, figure: str) -> float:
+    """A figure of a device, for `${device:...}` in presets."""
+    from omniperception.lidar import DEVICES
+
+    if name not in DEVICES:
+        raise ValueError(f"lidar.device={name} is unknown; known: {', '.join(DEVICES)}")
+    return getattr(DEVICES[name], figure)
+
+
+OmegaConf.register_new_resolver("device", _device_figure, replace=True)
+
+
 class ConfigError(ValueError):
     """A configuration that cannot run; the message is one line that says what to change."""
 
@@ -85,7 +97,16 @@ def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
     apply(config, values)
     remember(config, folders)
     _check_keys(config)
+    config._set_flag(_COMPOSED, True)
     return config if with_hydra else without_hydra(config)
+
+
+_COMPOSED = "composed"
+
+
+def is_composed(config: DictConfig) -> bool:
+    """Whether a configuration is from `compose`: of presets and overrides, not from a run's file."""
+    return bool(config._get_flag(_COMPOSED))
 
 
 def without_hydra(config: DictConfig) -> DictConfig:
@@ -256,7 +277,7 @@ def remember(config: DictConfig, folders: Sequence[Path]) -> None:
 
 def presets(group: str, folders: Sequence[Path] = ()) -> tuple[str, ...]:
     """Names of a group's presets, those in folders of one's own included; none where there is no such group."""
-    found = {path.stem for folder in (CONFIG_DIR, *folders) for path in (folder / group).glob("*.yaml")}
+    found = {path.stem for folder in (CONFIG_DIR, *folders) for path in (folder / group).glob("[!_]*.yaml")}
     return tuple(sorted(found))
 
 

@@ -1,88 +1,241 @@
-"""Values of a configuration, checked against the types of the dataclasses and functions that take them."""
+"""Configurations as objects: finds what names stand for, checks keys and values, and builds dataclasses of them.
+
+A name, such as a reward's or a network's, stands for a function or class of this package: `NAMES` lists all of them. A
+dotted path, such as `my_project.rewards.power`, stands for one of the user's own, if the user trusts it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib
 import inspect
 import sys
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cache, partial
 from typing import Any
 
 import yaml
-from hydra.utils import get_object
 
-from omniperception.config import CONFIG_DIR, OPTIONAL_GROUPS, SEARCH_PATH, ConfigError, UnknownKey
+from omniperception.config import ConfigError, UnknownKey, suggest
+from omniperception.env.mdp.terms import RewardTerm
 
-_SEQUENCES = (tuple, list, Sequence)
-_MAPPINGS = (dict, Mapping)
-_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-
-
-TOP: dict[str, Any] = {"seed": int, "num_envs": int, "init": str | list[str] | None, SEARCH_PATH: list[str]}
-"""Keys of a configuration beside its groups, and their types."""
+ANYTHING = None
+"""As `trust`: everything that can be imported."""
 
 
-def check_config(composed: Mapping[str, object]) -> None:
-    """Checks a resolved configuration: every key is one that something takes, and has a value of its type.
+@dataclass(frozen=True)
+class Kind:
+    """What may be named at one place of a configuration.
 
-    Raises:
-        ConfigError: names the key.
+    Attributes:
+        names: path of a function or class by name; or the path of a module, whose public functions and classes are
+            meant by their own names.
+        tag: the key that holds the name. Without it the name is the node's own key.
+        built: whether it is called at once; otherwise it is left to the caller, with its parameters.
+        given: number of arguments that the caller adds; None: any.
     """
-    groups = {path.name for path in CONFIG_DIR.iterdir() if path.is_dir()} - set(OPTIONAL_GROUPS)
-    for key, value in composed.items():
-        if key not in TOP and key not in groups:
-            raise UnknownKey(key, {*TOP, *groups})
-        check_value(value, TOP.get(key, dict[str, Any] | None), key)
-    check_tree(composed)
+
+    names: Mapping[str, str] | str
+    tag: str = "type"
+    built: bool = True
+    given: int | None = 0
 
 
-def check_tree(node: object, key: str = "") -> None:
-    """Checks every node with a `_target_` in a resolved configuration.
-
-    Raises:
-        ConfigError: names the key; a target does not take it, or takes a value of another type.
-    """
-    if isinstance(node, Mapping):
-        if "_target_" in node:
-            arguments = {str(name): value for name, value in node.items() if not str(name).startswith("_")}
-            check_call(get_object(node["_target_"]), arguments, key)
-        for name, value in node.items():
-            check_tree(value, f"{key}.{name}" if key else str(name))
+def _members(module: str, **names: str) -> dict[str, str]:
+    return {name: f"omniperception.{module}.{member}" for name, member in names.items()}
 
 
-def check_call(target: Callable[..., Any], arguments: Mapping[str, object], key: str, skip: int = 0) -> None:
-    """Checks names and types of arguments that a configuration gives.
+_PATTERNS = "airy avia custom grid hap hdl32e hdl64e height_scanner horizon mid360 mid40 mid70 os0 os1 os2 spinning"
+_PATTERNS += " tele15 vlp16 vlp32c xt16 xt32"
+
+NAMES: dict[str, Kind] = {
+    "rewards.terms.*": Kind("omniperception.env.mdp.rewards", "func", built=False, given=1),
+    "observations.groups.*.terms.*": Kind("omniperception.env.mdp.observations", "func", built=False, given=1),
+    "commands": Kind(_members("env.mdp.commands", velocity="VelocityCommandConfig", goal="GoalCommandConfig")),
+    "terrain": Kind(
+        _members("scene.terrain", flat="TerrainConfig") | _members("scene.tiled_terrain", tiled="TiledTerrainConfig")
+    ),
+    "terrain.tiles.*": Kind(_members("scene.tiles", rough="Rough", slope="Slope", stairs="Stairs", stones="Stones")),
+    "sim": Kind(_members("sim.base", mujoco="SimConfig") | _members("sim.mujoco_warp", mujoco_warp="MujocoWarpConfig")),
+    "lidar.pattern": Kind(_members("lidar", **{name: name for name in _PATTERNS.split()}), built=False),
+    "perception.sampler": Kind(
+        _members("perception", raw="RawSampler", fps="FpsSampler", pd="PdSampler", proximity="ProximitySampler"),
+        built=False,
+    ),
+    "perception.network": Kind(
+        _members("perception", direct_mlp="DirectMlp", fps_mlp="FpsMlp", fps_gru="FpsGru", pd_risknet="PdRiskNet"),
+        built=False,
+        given=None,
+    ),
+    "perception.network.rings": Kind(_members("perception", rings="RingPath"), built=False, given=None),
+}
+"""What may be named, by key; `*` is any one name."""
+
+
+def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -> Any:
+    """The object that a value of a configuration stands for.
 
     Args:
-        target: a class or a function with annotations; what is not annotated is not checked.
-        arguments: by name.
-        key: where they stand, such as `lidar.sensor`.
-        skip: how many leading parameters the configuration does not give, such as a term's state.
+        hint: its type, as annotated; a mapping becomes a dataclass, or what it names.
+        value: plain data. In a mapping of objects null leaves one out.
+        key: where it stands, such as `lidar` or `rewards.terms.alive`.
+        trust: modules of the user's own that dotted paths may name, with what is below them; ANYTHING: all.
+
+    Raises:
+        ConfigError: one line with the key, what was given and what was expected.
     """
-    parameters = list(inspect.signature(target).parameters.values())[skip:]
-    hints = _hints(target)
-    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        known = [parameter.name for parameter in parameters]
-        for name in arguments:
-            if name not in known:
-                raise UnknownKey(f"{key}.{name}", known)
-    for name, value in arguments.items():
-        check_value(value, hints.get(name, Any), f"{key}.{name}")
-
-
-def check_value(value: object, hint: Any, key: str) -> None:
-    """Checks one value; what is built from a node of its own, and types that YAML does not have, are left alone."""
+    kind = _kind(key)
+    if isinstance(value, Mapping) and (kind is not None or hint is RewardTerm):
+        return _named(kind, hint, dict(value), key, trust)
+    options = [option for option in _options(hint) if option is not types.NoneType]
+    if isinstance(value, Mapping):
+        for option in options:
+            if typing.get_origin(option) in (Mapping, dict):
+                item_hint = typing.get_args(option)[1]
+                given = {name: item for name, item in value.items() if item is not None}
+                items = {name: make(item_hint, item, f"{key}.{name}", trust) for name, item in given.items()}
+                return {name: item for name, item in items.items() if item is not None}
+            if inspect.isclass(option) and option is not Any and option not in _WORDS:
+                return call(option, arguments(option, value, key, trust), key)
     if not _fits(value, hint):
-        shown = yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
-        raise ConfigError(f"{key}={shown} must be {_expected(hint)}")
+        raise ConfigError(f"{key}={_shown(value)} must be {_expected(hint)}")
+    return tuple(make(Any, item, key, trust) for item in value) if isinstance(value, list) else value
+
+
+def arguments(
+    target: Callable,
+    values: Mapping[str, object],
+    key: str,
+    trust: Sequence[str] | None = (),
+    given: int | None = 0,
+    others: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Keyword arguments of a function or class from plain data, checked against its signature.
+
+    Args:
+        target: a function, or a class.
+        values: by name.
+        key: where they stand.
+        trust: see `make`.
+        given: number of leading arguments that somebody else adds; None: any, and none counts as missing.
+        others: keys that stand beside them, for suggestions.
+    """
+    parameters = list(inspect.signature(target).parameters.values())[given or 0 :]
+    named = [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+        for name in values:
+            if name not in named:
+                raise UnknownKey(f"{key}.{name}", (*named, *others))
+    missing = [p.name for p in parameters if p.default is p.empty and p.name in named and p.name not in values]
+    if missing and given is not None:
+        raise ConfigError(f"{key} lacks {', '.join(missing)}: give {key}.{missing[0]}=...")
+    hints = _hints(target)
+    return {name: make(hints.get(name, Any), item, f"{key}.{name}", trust) for name, item in values.items()}
+
+
+def call(target: Callable, keywords: Mapping[str, Any], key: str) -> Any:
+    """Calls a dataclass or function; a value that it refuses is a ConfigError that begins with the key."""
+    try:
+        return target(**keywords)
+    except (TypeError, ValueError, OSError, ImportError) as error:
+        text = str(error)
+        raise ConfigError(text if text.startswith(key.partition(".")[0]) else f"{key}: {text}") from None
+
+
+def look_up(kind: Kind, name: str, key: str, trust: Sequence[str] | None = ()) -> Callable:
+    """The function or class that a name or a dotted path stands for.
+
+    Args:
+        kind: what may be named there.
+        name: one of its names, or a dotted path.
+        key: of the name, for errors.
+        trust: see `make`.
+    """
+    names = _names(kind)
+    if name in names or name in names.values():
+        return _imported(names.get(name, name), key)
+    if "." not in name:
+        given = key if key.endswith(f".{name}") else f"{key}={name}"
+        raise ConfigError(
+            f"{given} is unknown; {suggest(name, tuple(names))}, or {kind.tag}: a dotted path to your own"
+        )
+    if trust is not ANYTHING and not any(name.startswith(f"{prefix}.") for prefix in trust):
+        raise ConfigError(
+            f"{key}={name} is not built: a run's file names it, and it is outside of this package; if you trust it, add"
+            f" trust={name.partition('.')[0]}"
+        )
+    return _imported(name, key)
+
+
+def _named(kind: Kind, hint: Any, values: dict[str, object], key: str, trust: Sequence[str] | None) -> Any:
+    """What a mapping names, with its parameters: called, or left to be called."""
+    names, own = _names(kind), key.rpartition(".")[2]
+    if len(names) == 1:
+        own = next(iter(names))
+    name = values.pop(kind.tag, own)
+    if not isinstance(name, str):
+        raise ConfigError(f"{key}.{kind.tag}={_shown(name)} must be text")
+    if name == own not in names and key in NAMES:
+        raise ConfigError(f"{key} lacks its {kind.tag}: give {key}.{kind.tag}=..., one of {', '.join(names)}")
+    target = look_up(kind, name, key if name == own else f"{key}.{kind.tag}", trust)
+    if hint is RewardTerm:
+        return _reward(kind, target, values, key, trust)
+    given = 0 if kind.given == 1 and inspect.isclass(target) else kind.given
+    keywords = arguments(target, values, key, trust, given, (kind.tag,))
+    return call(target, keywords, key) if kind.built else _bound(target, keywords)
+
+
+def _reward(kind: Kind, target: Callable, values: dict[str, object], key: str, trust: Sequence[str] | None) -> Any:
+    """A weighted term; None where its weight is 0 or null."""
+    if "weight" not in values:
+        raise ConfigError(f"{key} lacks its weight: give {key}.weight=...")
+    weight = make(float | None, values.pop("weight"), f"{key}.weight")
+    if not weight:
+        return None
+    given = 0 if inspect.isclass(target) else kind.given
+    return RewardTerm(weight, _bound(target, arguments(target, values, key, trust, given, (kind.tag, "weight"))))
+
+
+def _bound(target: Callable, keywords: dict[str, Any]) -> Callable:
+    return partial(target, **keywords) if keywords else target
+
+
+def _kind(key: str) -> Kind | None:
+    depth = key.count(".")
+    found = (kind for place, kind in NAMES.items() if place.count(".") == depth and fnmatchcase(key, place))
+    return next(found, None)
 
 
 @cache
-def _hints(target: Callable[..., Any]) -> dict[str, Any]:
+def _public(module: str) -> dict[str, str]:
+    """Path of every function and class that a module defines and does not hide."""
+    members = vars(importlib.import_module(module)).items()
+    own = [name for name, member in members if callable(member) and getattr(member, "__module__", None) == module]
+    return {name: f"{module}.{name}" for name in own if not name.startswith("_")}
+
+
+def _names(kind: Kind) -> Mapping[str, str]:
+    return _public(kind.names) if isinstance(kind.names, str) else kind.names
+
+
+def _imported(path: str, key: str) -> Callable:
+    module, _, name = path.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError as error:
+        raise ConfigError(f"{key}={path} cannot be imported: {error}") from None
+    if not callable(found):
+        raise ConfigError(f"{key}={path}: {module} has no function or class {name}")
+    return found
+
+
+@cache
+def _hints(target: Callable) -> dict[str, Any]:
     """Types of the parameters, but for those that name what only type checkers import."""
     sources: list[Any] = [target]
     if inspect.isclass(target):
@@ -96,46 +249,53 @@ def _hints(target: Callable[..., Any]) -> dict[str, Any]:
     return hints
 
 
+_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+_PLURALS = {int: "whole numbers", float: "numbers", str: "texts"}
+
+
+def _options(hint: Any) -> Sequence[Any]:
+    """Members of a union, or the type alone."""
+    return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+
+
 def _fits(value: object, hint: Any) -> bool:
+    """Whether plain data that is no mapping may stand for a type."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if isinstance(value, Mapping) and "_target_" in value:
-        return hint not in _NAMES
+    if hint is Any or isinstance(hint, typing.TypeVar):
+        return not isinstance(value, Mapping)
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, part) for part in args)
+        return any(_fits(value, option) for option in args)
     if origin is typing.Literal:
         return value in args
     if hint is types.NoneType:
         return value is None
-    if hint is bool or hint is str:
-        return isinstance(value, hint)
-    if hint is int or hint is float:
+    if hint in (int, float):
         return isinstance(value, (int, hint)) and not isinstance(value, bool)
-    if origin is tuple and isinstance(value, list):
-        if args[-1] is Ellipsis:
-            return all(_fits(item, args[0]) for item in value)
-        return len(value) == len(args) and all(map(_fits, value, args))
-    if origin in _SEQUENCES:
-        return isinstance(value, list) and all(_fits(item, args[0]) for item in value)
-    if origin in _MAPPINGS:  # an item of null is left out
-        return isinstance(value, Mapping) and all(item is None or _fits(item, args[1]) for item in value.values())
-    if hint is Any or origin is not None or isinstance(hint, typing.TypeVar):
-        return True
-    return isinstance(value, Mapping)  # an object is built from a node of its own
+    if origin in (tuple, list, Sequence):
+        if not isinstance(value, (list, tuple)):
+            return False
+        items = args if origin is tuple and args[-1] is not Ellipsis else args[:1] * len(value)
+        return len(value) == len(items) and all(map(_fits, value, items))
+    return inspect.isclass(hint) and isinstance(value, hint)
 
 
 def _expected(hint: Any) -> str:
     """A type in words."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if hint in _NAMES:
-        return _NAMES[hint]
+    if hint in _WORDS:
+        return _WORDS[hint]
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_expected(part) for part in args)
+        return " or ".join(_expected(option) for option in args)
     if hint is types.NoneType:
         return "null"
     if origin is typing.Literal:
         return f"one of {', '.join(map(str, args))}"
-    if origin in _SEQUENCES:
+    if origin in (tuple, list, Sequence):
         count = f"{len(args)} " if origin is tuple and args[-1] is not Ellipsis else ""
-        plural = {bool: "of true or false", int: "whole numbers", float: "numbers", str: "texts"}.get(args[0], "values")
-        return f"a list of {count}{plural}"
+        return f"a list of {count}{_PLURALS.get(args[0], 'lists')}"
     return "a group of settings"
+
+
+def _shown(value: object) -> str:
+    """A value as it is written on a command line."""
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()

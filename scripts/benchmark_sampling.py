@@ -26,9 +26,9 @@ def main() -> None:
         )
         for rays in own["rays"].split(","):
             num_rays = int(config.positive("rays", rays, int))
-            given = ["num_envs=64", "perception=pd_risknet", f"lidar.sensor.num_rays={num_rays}", *overrides]
+            given = ["num_envs=64", "perception=pd_risknet", f"lidar.num_rays={num_rays}", *overrides]
             run = build.assemble(config.compose(given))
-            frame, max_range = clouds(run), run.env.lidar.sensor.max_range
+            frame, max_range = clouds(run), run.env.lidar.max_range
             print(
                 f"\n{len(frame.ranges)} environments x {num_rays} rays, {hits_per_environment(frame, max_range):.0f}"
                 f" proximal hits each, to {points} points, {threads} threads\n"

@@ -1,6 +1,6 @@
 """What training each perception network needs: parameters, optimiser, rollout, and whether it fits.
 
-    python scripts/network_memory.py [budget_gb=24] [overrides, e.g. experiment=paper lidar.sensor.num_rays=20000]
+    python scripts/network_memory.py [budget_gb=24] [overrides, e.g. experiment=paper lidar.num_rays=20000]
 
 Nothing is allocated: networks run on torch's meta device. Policy, critic, physics and rays are not counted. Of the raw
 cloud there is a second row, as a storage without shared frames would have it: every control step's whole window kept.
@@ -14,6 +14,7 @@ import omniperception  # noqa: F401  before torch, whose threads it sets up
 from benchmarks.network_memory import footprint_of_windows, largest_cloud
 from omniperception import build, config
 from omniperception.build import steps_per_frame
+from omniperception.evaluation.ablation import VARIANTS, overrides_of
 from omniperception.learning.memory import GB, Footprint, footprint
 
 COLUMNS = ("parameters", "weights, Adam", "sensor", "rollout", "mini-batch", "total", "verdict")
@@ -26,19 +27,16 @@ def row(name: str, needs: Footprint, budget: float) -> str:
     return f"| {name} | {' | '.join(cells)} | {verdict} |"
 
 
-def presets() -> list[str]:
-    names = (path.stem for path in (config.CONFIG_DIR / "perception").glob("*.yaml"))
-    return sorted(name for name in names if name != "none")
-
-
 def main() -> None:
     with config.one_line_errors():
         own, overrides = config.split_arguments(sys.argv[1:], {"budget_gb": "24"})
         budget = config.positive("budget_gb", own["budget_gb"], float) * GB
         overrides = overrides or ["experiment=paper"]
         lines, largest = [], []
-        for name in presets():
-            run = build.assemble(config.compose([*overrides, f"perception={name}"]))
+        for name in sorted({*config.presets("perception"), *VARIANTS}):
+            if name == "none":
+                continue
+            run = build.assemble(config.compose([*overrides, *overrides_of(name)]))
             sizes = (run.perception, run.ppo, run.env.num_envs, steps_per_frame(run))
             lines.append(row(name, footprint(*sizes), budget))
             if name == "direct_mlp":
@@ -46,7 +44,7 @@ def main() -> None:
                 largest = [largest_cloud(*sizes, budget), largest_cloud(*sizes, budget, footprint_of_windows)]
     print(
         f"{' '.join(overrides)}: {sizes[2]} environments x {run.ppo.num_steps_per_env} steps, a frame every {sizes[3]},"
-        f" {run.ppo.num_mini_batches} mini-batches, {run.env.lidar.sensor.num_rays} rays; GB (10^9 bytes), limit"
+        f" {run.ppo.num_mini_batches} mini-batches, {run.env.lidar.num_rays} rays; GB (10^9 bytes), limit"
         f" {budget / GB:g}\n"
     )
     print(f"| perception | {' | '.join(COLUMNS)} |\n|{'---|' * (1 + len(COLUMNS))}")

@@ -142,7 +142,7 @@ def test_flat_ground_and_shapes_have_no_tree_mesh_or_height_field(quick_run):
 
 
 def test_tiled_ground_is_a_height_field_in_the_rays_and_their_kernel(make_env):
-    env = make_env("terrain=rough", "perception=none", "lidar.sensor.num_rays=50")
+    env = make_env("terrain=rough", "perception=none", "lidar.num_rays=50")
     assert env.sensing.scene.geometry.field_height.size > 0
     assert "heightfield" in code_of_scan(env)
 
@@ -200,7 +200,7 @@ def test_geoms_left_out_of_the_rays_are_never_met(name, make_config):
     """Casting everything meets no geom that was left out, at random and extreme joint angles beyond the limits."""
     config = make_config(f"lidar={name}", "perception=none", "obstacles=none").env
     world = build_world(config.robot, config.terrain, config.obstacles)
-    sensor, pattern = config.lidar.sensor, config.lidar.pattern()
+    sensor, pattern = config.lidar, config.lidar.pattern()
     hidden = hidden_geoms(world, (), sensing_module.field_of_view(sensor, pattern, ()))
     assert bool(hidden) == (name in ("avia", "depth_camera"))
     poses = random_postures(world.model, NUM_POSTURES)
@@ -249,7 +249,7 @@ def test_an_unknown_link_counts_as_within_reach():
 
 
 def test_poses_of_base_and_obstacles_are_read_off_the_state(make_env, monkeypatch):
-    env = make_env("lidar=depth_camera", "perception=none", "lidar.sensor.num_rays=50")
+    env = make_env("lidar=depth_camera", "perception=none", "lidar.num_rays=50")
     legs = [body for body in env.sensing._bodies if body not in env.sim._roots]
     assert legs == [env.world.model.body(f"{side}_{link}").id for side in ("FL", "FR") for link in ("thigh", "calf")]
     calls = []
@@ -267,7 +267,7 @@ def test_poses_of_base_and_obstacles_are_read_off_the_state(make_env, monkeypatc
 
 
 def test_contact_sensors_and_torques_exist_for_terms_that_read_them(make_env):
-    paper = make_env("rewards=paper", "perception=none", "lidar.sensor.num_rays=50")
+    paper = make_env("rewards=paper", "perception=none", "lidar.num_rays=50")
     assert paper.world.sensors == {"foot_force", "link_force", "obstacle_contact"} and "sensordata" in paper.sim._record
     assert "actuator_force" in paper.sim.batch._bound
     blind = make_env("obstacles=none", blind=True)
@@ -280,7 +280,7 @@ def test_contact_sensors_and_torques_exist_for_terms_that_read_them(make_env):
     [("foot_stumble", "foot_force"), ("joint_torques", None)],
 )
 def test_weight_0_removes_term_input_and_sensor(term, sensor, make_env):
-    base = ("rewards=paper", "perception=none", "lidar.sensor.num_rays=50", "obstacles=none")
+    base = ("rewards=paper", "perception=none", "lidar.num_rays=50", "obstacles=none")
     for weight, there in ((-1.0, True), (0.0, False)):
         env = make_env(*base, f"rewards.terms.{term}.weight={weight}")
         assert (term in env.config.rewards.terms) == there
@@ -294,7 +294,7 @@ def test_weight_0_removes_term_input_and_sensor(term, sensor, make_env):
 
 @pytest.mark.parametrize(("overrides", "read"), [((), False), (("observations=paper",), True)])
 def test_heights_are_looked_up_for_critic_or_supervision_only(overrides, read, make_env, launched):
-    env = make_env("terrain=rough", "perception=none", "lidar.sensor.num_rays=50", *overrides)
+    env = make_env("terrain=rough", "perception=none", "lidar.num_rays=50", *overrides)
     launched.clear()
     env.step(torch.zeros(env.num_envs, env.num_actions))
     assert "base_heights" in launched and ("heights_around" in launched) == read
@@ -310,7 +310,7 @@ def test_only_what_is_randomized_is_a_field_of_its_own(make_env):
 
 
 def test_only_noise_that_is_configured_is_compiled(make_env):
-    rays = ("perception=none", "lidar.sensor.num_rays=50")
+    rays = ("perception=none", "lidar.num_rays=50")
     assert "rand" not in code_of_scan(make_env(*rays)).replace("operand", "")
     noisy = make_env(*rays, "randomization=lidar")
     assert noisy.sensing.lidar.variant.noise == {"mask", "distance"} and "randf" in code_of_scan(noisy)
@@ -319,9 +319,11 @@ def test_only_noise_that_is_configured_is_compiled(make_env):
 def test_no_history_is_longer_than_its_longest_reader(make_env):
     walk_env = make_env(blind=True)
     assert len(walk_env.actions) == 2 and walk_env._groups["command"].buffer is None
-    without = make_env("rewards.terms.action_rate.weight=0", "rewards.terms.joint_accelerations.weight=0", blind=True)
+    without = make_env(
+        "rewards.terms.action_rate_squared.weight=0", "rewards.terms.joint_acceleration_squared.weight=0", blind=True
+    )
     assert len(without.actions) == 1 and not hasattr(without, "last_joint_vel")
-    assert len(make_env("rewards=paper", "perception=none", "lidar.sensor.num_rays=50").actions) == 3
+    assert len(make_env("rewards=paper", "perception=none", "lidar.num_rays=50").actions) == 3
     history = walk_env.config.observations.groups["proprioception"].history
     assert walk_env._groups["proprioception"].buffer.shape[1] == history
 
@@ -396,7 +398,7 @@ def test_memory_counts_every_byte_once_and_grows_with_the_environments():
 
 
 def test_a_plan_tells_the_parts_of_the_run_not_of_what_was_built_to_describe_it():
-    run, runner = built("experiment=quickstart", "num_envs=8", "ppo.num_steps_per_env=4", "lidar.sensor.num_rays=500")
+    run, runner = built("experiment=quickstart", "num_envs=8", "ppo.num_steps_per_env=4", "lidar.num_rays=500")
     bytes_per_env = 500 * ray_bytes(runner.env.sensing.lidar.outputs)
     fitting = int(1e9 / bytes_per_env)
     for num_envs, exists in ((fitting, False), (fitting + 1, True)):

@@ -14,7 +14,7 @@ from omniperception.learning.checkpoint import checkpoint_path, latest_checkpoin
 @pytest.fixture
 def run(make_config, tmp_path):
     """A run directory with a checkpoint of everything."""
-    run = make_config("experiment=avoid", "init=unread", "terrain=flat", "num_envs=2", "lidar.sensor.num_rays=200")
+    run = make_config("experiment=avoid", "init=unread", "terrain=flat", "num_envs=2", "lidar.num_rays=200")
     config.save(run.composed, tmp_path / "run")
     build_runner(run, None).save(str(checkpoint_path(tmp_path / "run", 0)))
     return tmp_path / "run"

@@ -66,7 +66,7 @@ class Bench:
     """The moving scene of a configuration, its sensor and the truth about both."""
 
     def __init__(self, run: RunConfig, sizes: Sizes) -> None:
-        self.sizes, self.sensor = sizes, run.env.lidar.sensor
+        self.sizes, self.sensor = sizes, run.env.lidar
         self.pattern: ScanPattern = run.env.lidar.pattern()
         self.num_sectors = run.env.rewards.avoidance.num_sectors
         self.scene: MovingScene = moving_scene(run.env.obstacles, sizes.num_envs)

@@ -114,7 +114,7 @@ class Recorder:
     def _look_everywhere(self) -> tuple[Lidar, SectorDistances]:
         """A sensor at the same place with rays all over its field of view."""
         sensing, shapes = self.env.sensing, ray_shapes(self.env.world)
-        elevation, config = sensing.lidar.pattern.elevation, sensing.config.sensor
+        elevation, config = sensing.lidar.pattern.elevation, sensing.config
         directions = dense_directions((float(elevation.min()), float(elevation.max())), DENSE_DEG)
         pattern = ScanPattern.from_directions(directions, len(directions) / config.period_s)
         config = replace(config, num_rays=len(directions), selection="every_kth", motion_segments=0)
@@ -139,10 +139,10 @@ class Recorder:
 
     @property
     def frames_per_episode(self) -> int:
-        return round(EPISODE_S / self.run.env.lidar.sensor.period_s)
+        return round(EPISODE_S / self.run.env.lidar.period_s)
 
     def _cloud(self) -> Cloud:
-        sensor, frame = self.env.sensing.config.sensor, self.env.sensing.frame
+        sensor, frame = self.env.sensing.config, self.env.sensing.frame
         rays = (frame.true_ranges, frame.directions_s, frame.elevation, frame.azimuth)
         self._dense.cast(self.env.step_count * self.env.control_dt)
         quat = self.env.kinematics.base_quat_w.float().contiguous().clone()

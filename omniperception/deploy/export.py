@@ -179,7 +179,7 @@ def _command_ranges(run: RunConfig) -> dict[str, list[float]]:
 
 
 def _lidar(run: RunConfig) -> Lidar:
-    sensor, pattern = run.env.lidar.sensor, run.env.lidar.pattern()
+    sensor, pattern = run.env.lidar, run.env.lidar.pattern()
     every_kth = sensor.selection == "every_kth"
     return Lidar(
         period_s=sensor.period_s,

@@ -598,7 +598,7 @@ class OmniEnv(VecEnv):
         ray_terms = [term for term in config.terms() if "rays" in fields_read(term)]
         needs = SensingNeeds(
             sectors=config.rewards.avoidance.num_sectors if "sectors" in fields else 0,
-            sector_max=config.lidar.sensor.max_range,
+            sector_max=config.lidar.max_range,
             distal_caps=distal_caps(ray_terms),
             whole="rays" in fields and (not ray_terms or any(plain(t) is not capped_ray_distance for t in ray_terms)),
             obstacles=self.true_sectors.names if self.true_sectors is not None else (),

@@ -34,12 +34,11 @@ NEVER = 2**31
 
 
 @dataclass(frozen=True)
-class SensorConfig:
+class SensorConfig(LidarConfig):
     """A LiDAR on the robot.
 
     Attributes:
-        sensor: rays, rate, range limits and mount.
-        pattern: makes the scan pattern.
+        pattern: makes the scan pattern; None: the device's.
         exclude_geoms: geoms of the robot that its rays pass through: the housing around the sensor.
         device: name in `omniperception.lidar.DEVICES` of the sensor whose own noise `randomization.lidar_device` puts
             on, or None.
@@ -48,18 +47,22 @@ class SensorConfig:
             environments are cast and sampled in parts.
     """
 
-    sensor: LidarConfig
-    pattern: Callable[[], ScanPattern]
+    pattern: Callable[[], ScanPattern] | None = None
     exclude_geoms: Sequence[str] = ()
     device: str | None = None
     distal_below_deg: float = 20.0
     cloud_mb: float = 1000.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.cloud_mb > 0:
             raise ValueError(f"lidar.cloud_mb={self.cloud_mb} must be positive")
         if self.device is not None and self.device not in DEVICES:
             raise ValueError(f"lidar.device={self.device} is unknown; known: {', '.join(DEVICES)}, or null")
+        if self.pattern is None:
+            if self.device is None:
+                raise ValueError("lidar.pattern must be given where lidar.device is null")
+            object.__setattr__(self, "pattern", DEVICES[self.device].pattern)
 
 
 @dataclass(frozen=True)
@@ -119,20 +122,18 @@ class LidarSensing:
         history: int = 0,
         base_motion: bool = False,
     ) -> None:
-        if config.sensor.motion_segments > 1:
+        if config.motion_segments > 1:
             raise ValueError(
-                f"lidar.sensor.motion_segments={config.sensor.motion_segments} must be 0 or 1: the task gives the LiDAR"
+                f"lidar.motion_segments={config.motion_segments} must be 0 or 1: the task gives the LiDAR"
                 " the poses of its frames only"
             )
-        ratio = config.sensor.period_s / control_dt
+        ratio = config.period_s / control_dt
         self.period_steps = round(ratio)
         if abs(ratio - self.period_steps) > 1e-6 or self.period_steps < 1:
-            raise ValueError(
-                f"lidar.sensor.period_s={config.sensor.period_s} must be a multiple of the control step {control_dt} s"
-            )
+            raise ValueError(f"lidar.period_s={config.period_s} must be a multiple of the control step {control_dt} s")
         self._sim, self.needs, self.sampler = sim, needs, sampler
         self.config, pattern = config, config.pattern()
-        self.hidden = hidden_geoms(sim.world, config.exclude_geoms, field_of_view(config.sensor, pattern, noise))
+        self.hidden = hidden_geoms(sim.world, config.exclude_geoms, field_of_view(config, pattern, noise))
         shapes = ray_shapes(sim.world, self.hidden)
         self._bodies, self.base = shapes.bodies, shapes.base
         self.scene = RayScene(
@@ -140,7 +141,7 @@ class LidarSensing:
         )
         outputs = _outputs_read(needs, sampler is not None)
         self.lidar = Lidar(
-            config.sensor,
+            config,
             pattern,
             self.scene,
             mount_body=self.base,
@@ -243,7 +244,7 @@ class LidarSensing:
         self.unseen[part] = torch.where(seen[:, :-1], 0, self.unseen[part] + 1)
 
     def _sample(self, part: slice, frame: LidarFrame, base_quat: torch.Tensor) -> None:
-        sensor, points = self.config.sensor, self._newest[part, : self.sampler.num_points]
+        sensor, points = self.config, self._newest[part, : self.sampler.num_points]
         attitude = Attitude(base_quat[part].contiguous(), sensor.mount_pos, sensor.quat)
         self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
 
@@ -311,7 +312,7 @@ class LidarSensing:
 
     def _record_sectors(self, num_threads: int | None) -> list[SectorDistances]:
         """A launch for each part."""
-        sensor = self.config.sensor
+        sensor = self.config
         return [
             SectorDistances(
                 frame.true_ranges,
@@ -354,4 +355,4 @@ def _outputs_read(needs: SensingNeeds, sampled: bool) -> tuple[str, ...]:
 
 def envs_at_once(config: SensorConfig, outputs: Sequence[str]) -> int:
     """Environments whose clouds fit into `cloud_mb`, at least one."""
-    return max(int(min(1e6 * config.cloud_mb / (config.sensor.num_rays * ray_bytes(outputs)), 2**31)), 1)
+    return max(int(min(1e6 * config.cloud_mb / (config.num_rays * ray_bytes(outputs)), 2**31)), 1)

@@ -89,7 +89,7 @@ def _true_avoidance(env: OmniEnv, avoidance: AvoidanceConfig) -> Callable[[], to
 
 def _empty_points(env: OmniEnv) -> torch.Tensor:
     """(1, 1, num_points, 3) what the run's sampler makes of a frame without a hit."""
-    sampler, sensor = env.config.sampler(), env.config.lidar.sensor
+    sampler, sensor = env.config.sampler(), env.config.lidar
     rays = sampler.num_points  # as many as the raw sampler needs; any number of misses is the same to the others
     points = torch.zeros(1, rays, 3, device=env.device)
     directions, angles = torch.zeros_like(points), torch.zeros(1, rays, device=env.device)

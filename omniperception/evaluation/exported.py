@@ -101,7 +101,7 @@ def _whole_device(env: OmniEnv) -> Lidar:
     """The environment's LiDAR with every point that it measures."""
     config, sensing, pattern = env.config.lidar, env.sensing, env.config.lidar.pattern()
     lidar = Lidar(
-        replace(config.sensor, num_rays=pattern.points_per_frame(config.sensor.period_s), selection="every_kth"),
+        replace(config, num_rays=pattern.points_per_frame(config.period_s), selection="every_kth"),
         pattern,
         sensing.scene,
         mount_body=sensing.base,

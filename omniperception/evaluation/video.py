@@ -147,7 +147,7 @@ class Recorder:
         sensing, device = self._env.sensing, self._env.device
         if sensing is None or sensing.frame is None or sensing.tick < self._blind_until:
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
-        frame, config = sensing.frame, sensing.config.sensor
+        frame, config = sensing.frame, sensing.config
         if frame.ranges is None:  # no network looks at points
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         hit = frame.ranges[self._id].isfinite()

@@ -68,6 +68,11 @@ class DeviceSpec:
         """Height of the field of view."""
         return self.elevation_deg[1] - self.elevation_deg[0]
 
+    @property
+    def period_s(self) -> float:
+        """Time between frames at the usual rate, seconds."""
+        return 1.0 / self.frame_hz
+
     def noise(self) -> tuple[Noise, ...]:
         """The maker's figures as noise models: normal ranges, and normal directions where a figure is given."""
         models: list[Noise] = [GaussianNoise(self.range_sigma)]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from omniperception.scene.build import World, build_world
 from omniperception.scene.obstacle_field import ObstacleField
 from omniperception.scene.obstacles import ApproachConfig, FreePathConfig, ObstacleGroup, ObstaclesConfig
-from omniperception.scene.robot import RobotConfig
+from omniperception.scene.robot import Mount, RobotConfig
 from omniperception.scene.terrain import TerrainConfig
 from omniperception.scene.tiled_terrain import TerrainCurriculumConfig, TiledTerrainConfig
 
@@ -23,6 +23,7 @@ __all__ = [
     "ApproachConfig",
     "FreePathConfig",
     "Ground",
+    "Mount",
     "ObstacleField",
     "ObstacleGroup",
     "ObstaclesConfig",

@@ -72,7 +72,7 @@ def hidden_geoms(world: World, exclude: Collection[str], view: FieldOfView) -> d
     known = [model.geom(k).name for k in range(model.ngeom)]
     unknown = sorted(set(exclude) - set(known))
     if unknown:
-        raise ValueError(f"lidar.exclude_geoms names {unknown}; known: {', '.join(known)}")
+        raise ValueError(f"robot.mounts: exclude_geoms names {unknown}; known: {', '.join(known)}")
     beyond = unreachable_geoms(model, world.base_body, view)
     hidden = {known[k]: "out of the reach of every ray, however the joints stand" for k in sorted(beyond)}
     return hidden | dict.fromkeys(exclude, "named in lidar.exclude_geoms")

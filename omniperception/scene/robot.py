@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A place for a LiDAR on the base.
+
+    Attributes:
+        pos: (x, y, z) of the sensor in the base frame (m).
+        rpy: orientation of the sensor in the base frame: roll, pitch, yaw about fixed axes (rad).
+        exclude_geoms: geoms of the robot that the rays pass through: the housing around the sensor.
+    """
+
+    pos: Sequence[float]
+    rpy: Sequence[float] = (0.0, 0.0, 0.0)
+    exclude_geoms: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -28,6 +43,7 @@ class RobotConfig:
         foot_geoms: geoms that carry the robot.
         penalized_geoms: links whose contact forces the link-collision reward penalises.
         frictionloss: dry friction (N m) of every joint.
+        mounts: places for a LiDAR, by name.
     """
 
     mjcf: str
@@ -42,6 +58,7 @@ class RobotConfig:
     foot_geoms: tuple[str, ...]
     penalized_geoms: tuple[str, ...]
     frictionloss: float = 0.0
+    mounts: Mapping[str, Mount] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("joints", "foot_geoms", "penalized_geoms"):

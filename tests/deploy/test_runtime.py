@@ -23,6 +23,7 @@ pytest.importorskip("onnxruntime", reason="extra deploy")
 pytest.importorskip("onnx", reason="extra export")
 
 from omniperception.deploy import DeployError, Description, ExportedPolicy, RobotState
+from omniperception.evaluation.ablation import VARIANTS, overrides_of
 from omniperception.evaluation.exported import ExportedPolicies, raw_points, record
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,18 +35,17 @@ RECIPES = {
     "direct_mlp": ("perception=direct_mlp", "perception.history=3"),
     "pd_risknet": ("perception=pd_risknet", "obstacles=static"),
     "pd_risknet_small": ("perception=pd_risknet_small", "randomization=paper"),
-    "pd_risknet_no_distal": ("perception=pd_risknet_no_distal",),
-    "pd_risknet_small_no_proximal": ("perception=pd_risknet_small_no_proximal",),
+    "pd_risknet_no_distal": overrides_of("pd_risknet_no_distal"),
+    "pd_risknet_small_no_proximal": overrides_of("pd_risknet_small_no_proximal"),
     "pd_risknet_rings": ("experiment=avoid", "init=unread"),
-    "motion_by_fps": ("experiment=avoid", "init=unread", "perception=fps_gru_small", "perception.base_motion=true"),
-    "motion_by_proximal": ("experiment=avoid", "init=unread", "perception=pd_risknet_small_no_distal"),
+    "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
+    "motion_by_proximal": ("experiment=avoid", "init=unread", *overrides_of("pd_risknet_no_distal")),
 }
 ALIKE = {
     "fps_mlp_small": "fps_mlp",
     "fps_gru_small": "fps_gru",
     "direct_mlp_small": "direct_mlp",
     "pd_risknet_no_proximal": "pd_risknet_small_no_proximal",
-    "pd_risknet_small_no_distal": "pd_risknet_no_distal",
     "pd_risknet_rings_no_height": "pd_risknet_rings",
     "pd_risknet_rings_no_match": "pd_risknet_rings",
     "pd_risknet_rings_no_proximal": "pd_risknet_rings",
@@ -90,8 +90,7 @@ def trained(run_dir, *overrides):
 
 
 def test_every_preset_is_tried():
-    presets = {path.stem for path in (config.CONFIG_DIR / "perception").glob("*.yaml")}
-    assert presets == {*RECIPES, *ALIKE} - {"motion_by_fps", "motion_by_proximal"}
+    assert {*config.presets("perception"), *VARIANTS} == {*RECIPES, *ALIKE} - {"motion_by_fps", "motion_by_proximal"}
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ TASKS = {
     "paper": ("experiment=paper",),
     "avoid": ("experiment=avoid", "terrain=mixed", "randomization=paper", "lidar.cloud_mb=0.02"),
 }
-SIZES = ("num_envs=6", "lidar.sensor.num_rays=200", "ppo.num_steps_per_env=6", "ppo.num_mini_batches=2", "seed=3")
+SIZES = ("num_envs=6", "lidar.num_rays=200", "ppo.num_steps_per_env=6", "ppo.num_mini_batches=2", "seed=3")
 OTHERS = [0, 1, 3, 4, 5]
 
 

@@ -302,7 +302,7 @@ def test_nearest_obstacles_by_hand(make_env):
     env.obstacles.velocity_w[0] = torch.tensor([[0.0, -1.0], [0.0, 0.0]])
     observations = env.step(torch.zeros(1, 12))[0]
     group = env._groups["privileged"]
-    seen = observations["privileged"][0, group.slices["obstacles"]].unflatten(0, (2, 6))
+    seen = observations["privileged"][0, group.slices["nearest_obstacles"]].unflatten(0, (2, 6))
     radius = env.obstacles.radius.float()
     velocity = env.kinematics.base_lin_vel_yaw[0]
     near, ahead = seen

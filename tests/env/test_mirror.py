@@ -89,8 +89,7 @@ def test_updates_see_both_sides():
             (
                 "experiment=walk",
                 "ppo.symmetry=true",
-                "+observations.groups.privileged.terms.heights._target_=omniperception.env.mdp.observations.heights",
-                "+observations.groups.privileged.terms.heights._partial_=true",
+                "+observations.groups.privileged.terms.heights={}",
             ),
             "privileged.terms.heights does not say how it looks in the mirror",
         ),

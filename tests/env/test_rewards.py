@@ -10,17 +10,17 @@ from omniperception.env.mdp import rewards
 from omniperception.env.mdp.rewards import AvoidanceConfig, avoidance_velocity, sector_bearings
 
 PAPER_WEIGHTS = {
-    "velocity_avoid": 2.0,
-    "ray_distance": 1.5,
-    "vertical_velocity": -3e-4,
+    "velocity_tracking_with_avoidance": 2.0,
+    "capped_ray_distance": 1.5,
+    "vertical_velocity_squared": -3e-4,
     "foot_stumble": -2e-2,
     "link_collision": -2e-2,
-    "joint_limits": -0.2,
-    "joint_torques": -1e-6,
-    "joint_velocities": -1e-6,
-    "joint_accelerations": -2.5e-7,
-    "action_rate": -5e-3,
-    "action_acceleration": -5e-3,
+    "joint_limit_violation": -0.2,
+    "joint_torque_squared": -1e-6,
+    "joint_velocity_squared": -1e-6,
+    "joint_acceleration_squared": -2.5e-7,
+    "action_rate_squared": -5e-3,
+    "action_acceleration_squared": -5e-3,
 }
 """Table 'Reward structure for Omni-Perception'."""
 
@@ -198,21 +198,14 @@ class TestConfiguration:
         assert {name: term.weight for name, term in terms.items()} == PAPER_WEIGHTS
 
     def test_yaw_is_not_in_the_papers_table_and_is_in_the_default(self, make_config):
-        assert "yaw_rate" not in make_config("rewards=paper").env.rewards.terms
-        assert make_config("rewards=default").env.rewards.terms["yaw_rate"].weight > 0
+        assert "yaw_rate_tracking" not in make_config("rewards=paper").env.rewards.terms
+        assert make_config("rewards=default").env.rewards.terms["yaw_rate_tracking"].weight > 0
 
     def test_weight_zero_removes_a_term_and_what_only_it_reads(self, make_env):
         """Walking on free ground with the paper's contact terms, and without."""
-        contact_terms = (
-            "+rewards.terms.{0}._target_=omniperception.env.mdp.terms.RewardTerm",
-            "+rewards.terms.{0}.weight={1}",
-            "+rewards.terms.{0}.func._target_=omniperception.env.mdp.rewards.{0}",
-            "+rewards.terms.{0}.func._partial_=true",
-            "+rewards.terms.{0}.func.unit=1.0",
-        )
 
         def sensors(weight):
-            overrides = [o.format("link_collision", weight) for o in contact_terms]
+            overrides = [f"+rewards.terms.link_collision={{weight: {weight}, unit: 1.0}}"]
             env = make_env("obstacles=none", *overrides, blind=True)
             return env.world.model.nsensor, "link_collision" in env.config.rewards.terms
 
@@ -220,16 +213,16 @@ class TestConfiguration:
         assert sensors(0.0) == (0, False)
 
     def test_only_the_terms_with_weight_need_the_lidar(self, make_env):
-        zero = "rewards.terms.velocity_avoid.weight=0"
+        zero = "rewards.terms.velocity_tracking_with_avoidance.weight=0"
         env = make_env("perception=none", "observations=walk", zero)
         assert env.sensing is None
         env = make_env("perception=none", "observations=walk")
         assert env.sensing is not None and env.sensing.frames is None
 
     def test_sum_of_terms_times_the_control_step(self, make_env):
-        env = make_env("obstacles=none", "rewards.terms.tilt=null", blind=True)
+        env = make_env("obstacles=none", "rewards.terms.tilt_squared=null", blind=True)
         torch.manual_seed(0)
         _, reward, _, _ = env.step(torch.randn(4, 12))
         by_hand = sum(0.02 * term.weight * term.func(env) for term in env.config.rewards.terms.values())
         torch.testing.assert_close(reward, by_hand)
-        assert "tilt" not in env.config.rewards.terms
+        assert "tilt_squared" not in env.config.rewards.terms

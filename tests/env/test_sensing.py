@@ -32,7 +32,7 @@ def test_frames_come_at_tick_times_only(make_env):
 
 
 def test_frame_count_stops_at_the_history(make_env):
-    env = make_env("obstacles=static", "perception.history=3", "lidar.sensor.period_s=0.02")
+    env = make_env("obstacles=static", "perception.history=3", "lidar.period_s=0.02")
     counts = [int(env.step(still(env))[0]["frame_count"][0]) for _ in range(5)]
     assert counts == [2, 3, 3, 3, 3]
     assert env.sensing.frames.shape[:2] == (4, 3)
@@ -70,7 +70,7 @@ def test_points_lie_within_the_range_in_units_of_it(make_env):
 
 def test_sector_distance_of_a_pillar_by_hand(make_env):
     """A pillar of known radius 2 m to the left: 36 sectors from -180 deg, so sectors 26 and 27 see it."""
-    env = make_env("obstacles=static", "lidar.sensor.num_rays=20000", num_envs=1)
+    env = make_env("obstacles=static", "lidar.num_rays=20000", num_envs=1)
     env.sim.qpos[0, 3:7] = torch.tensor([math.cos(0.4), 0.0, 0.0, math.sin(0.4)])  # yaw 0.8
     left = 0.8 + math.pi / 2
     env.sim.mocap_pos[0, :, 2] = -100.0
@@ -124,8 +124,8 @@ def test_sector_target_is_the_nearness_of_obstacles(make_env):
 
 @pytest.mark.parametrize("period", ["0.03", "0.005"])
 def test_a_period_between_control_steps_is_refused(make_env, period):
-    with pytest.raises(ValueError, match=rf"lidar\.sensor\.period_s={period} must be a multiple"):
-        make_env(f"lidar.sensor.period_s={period}")
+    with pytest.raises(ValueError, match=rf"lidar\.period_s={period} must be a multiple"):
+        make_env(f"lidar.period_s={period}")
 
 
 def test_the_lidar_sleeps_until_the_curriculum_lets_obstacles_in(make_env):
@@ -158,7 +158,7 @@ def take_frame(env, time_s):
 
 def test_motion_distortion_forgets_the_last_episode(make_env):
     """A robot that is placed anew has not swept there; a robot that turns has."""
-    env = make_env("obstacles=static", "lidar.sensor.motion_segments=1", "lidar.sensor.motion_jump=100.0", num_envs=2)
+    env = make_env("obstacles=static", "lidar.motion_segments=1", "lidar.motion_jump=100.0", num_envs=2)
     still_env = make_env("obstacles=static", num_envs=2)
     for each in (env, still_env):
         each.sim.qpos[:, :2] += 3.0
@@ -171,7 +171,7 @@ def test_motion_distortion_forgets_the_last_episode(make_env):
 
 def test_a_saved_state_goes_on_with_its_motion(make_env):
     """The frame after a resumption starts where the frame before it ended."""
-    whole, resumed = (make_env("obstacles=static", "lidar.sensor.motion_segments=1", num_envs=2) for _ in range(2))
+    whole, resumed = (make_env("obstacles=static", "lidar.motion_segments=1", num_envs=2) for _ in range(2))
     whole.sim.qpos[:, :2] += 0.3
     take_frame(whole, 0.1)
     resumed.sensing.load_state_dict(whole.sensing.state_dict())
@@ -186,8 +186,8 @@ def test_a_saved_state_goes_on_with_its_motion(make_env):
 
 
 def test_more_pieces_than_the_task_knows_poses_for_are_refused(make_env):
-    with pytest.raises(ValueError, match=r"lidar\.sensor\.motion_segments=2 must be 0 or 1"):
-        make_env("lidar.sensor.motion_segments=2")
+    with pytest.raises(ValueError, match=r"lidar\.motion_segments=2 must be 0 or 1"):
+        make_env("lidar.motion_segments=2")
 
 
 class TestParts:
@@ -196,7 +196,7 @@ class TestParts:
     TASKS = (
         ("rewards=paper", "obstacles=moving"),
         ("experiment=avoid", "terrain=flat", "obstacles=crowd", "randomization=device"),
-        ("obstacles=static", "perception=fps_gru_small", "lidar.sensor.motion_segments=1"),
+        ("obstacles=static", "perception=fps_gru", "lidar.motion_segments=1"),
     )
 
     @pytest.mark.parametrize("task", TASKS)

@@ -12,8 +12,8 @@ FULL = (
     "randomization=paper",
     "perception=pd_risknet",
     "rewards=paper",
-    "lidar.sensor.num_rays=200",
-    "lidar.sensor.period_s=0.04",
+    "lidar.num_rays=200",
+    "lidar.period_s=0.04",
 )
 OTHERS = torch.tensor([0, 2, 3])
 

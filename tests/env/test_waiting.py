@@ -13,11 +13,11 @@ from omniperception.env.env import OmniEnv
 
 pytest.importorskip("mujoco_warp")
 
-ON_WARP = ("sim=mujoco_warp", "sim.device=cpu", "num_envs=6", "lidar.sensor.num_rays=150", "seed=5")
+ON_WARP = ("sim=mujoco_warp", "sim.device=cpu", "num_envs=6", "lidar.num_rays=150", "seed=5")
 TASKS = {
     "paper": ("experiment=paper",),
     "blind": ("experiment=walk",),
-    "rough": ("experiment=avoid", "terrain=mixed", "lidar.sensor.motion_segments=1", "randomization=paper"),
+    "rough": ("experiment=avoid", "terrain=mixed", "lidar.motion_segments=1", "randomization=paper"),
     "crowd": ("experiment=avoid", "terrain=flat", "obstacles=crowd", "rewards.avoidance.risk.sideways=1.0"),
     "goal": ("experiment=avoid", "scenario=moving", "commands.radius=0.5"),
 }

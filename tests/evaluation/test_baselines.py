@@ -83,7 +83,7 @@ class TestCovered:
         frame = env.sensing.frame
         misses = torch.full_like(frame.ranges, torch.inf)
         expected = torch.zeros_like(env.sensing.frames[:, 0])
-        sensor = env.config.lidar.sensor
+        sensor = env.config.lidar
         attitude = Attitude(env.kinematics.base_quat_w.contiguous(), sensor.mount_pos, sensor.quat)
         env.config.sampler()(misses, frame.directions_s, frame.elevation, frame.azimuth, expected, attitude)
         assert heard[0].shape == env.sensing.frames.shape
@@ -92,7 +92,7 @@ class TestCovered:
         assert not torch.equal(heard[0][:, -1], env.sensing.frames[:, -1])
 
     def test_how_the_base_moved_is_still_known(self):
-        given = ("experiment=avoid", "scenario=static", "num_envs=3", "lidar.sensor.num_rays=200")
+        given = ("experiment=avoid", "scenario=static", "num_envs=3", "lidar.num_rays=200")
         env = OmniEnv(build.assemble(config.compose(given)).env)
         for _ in range(12):
             env.step(torch.randn(3, env.num_actions))

@@ -27,7 +27,7 @@ def fling(observations):
 def run_dir(tmp_path_factory):
     """A run with some settings of its own."""
     path = tmp_path_factory.mktemp("run")
-    given = ["experiment=quickstart", "rewards.avoidance.alpha=1.7", "seed=5", "lidar.sensor.max_range=5.0"]
+    given = ["experiment=quickstart", "rewards.avoidance.alpha=1.7", "seed=5", "lidar.max_range=5.0"]
     config.save(build.assemble(config.compose(given)).composed, path)
     return path
 
@@ -40,7 +40,7 @@ class TestOverlay:
             assert loaded[key] == (fresh if key in config.FIXED_BY_SCENARIO else before)[key], key
         run = build.assemble(loaded).env
         assert run.seed == 1007 and run.terminations.episode_length_s == 9.0 and run.obstacles.num_obstacles == 8
-        assert run.rewards.avoidance.alpha == 1.7 and run.lidar.sensor.max_range == 5.0
+        assert run.rewards.avoidance.alpha == 1.7 and run.lidar.max_range == 5.0
         assert run.obstacles.curriculum is None and before.obstacles.curriculum is not None
 
     def test_overrides_go_on_top(self, run_dir):

@@ -11,7 +11,7 @@ from omniperception.learning.checkpoint import checkpoint_path
 
 SMALL = ("num_envs=8", "ppo.hidden_dims=[32,16]", "ppo.num_mini_batches=2", "ppo.num_steps_per_env=10")
 BLIND = ("experiment=walk", *SMALL)
-SEEING = ("experiment=avoid", *SMALL, "lidar.sensor.num_rays=200", "perception.supervised_epochs=1")
+SEEING = ("experiment=avoid", *SMALL, "lidar.num_rays=200", "perception.supervised_epochs=1")
 
 
 @pytest.fixture

@@ -13,10 +13,10 @@ from omniperception.scene import TerrainCurriculumConfig, TiledTerrainConfig, bu
 from omniperception.scene.rays import HitClass
 from omniperception.scene.tiles import Rough, Slope, Stairs, Stones, TileGrid
 
+HEIGHTS = "+observations.groups.privileged.terms.heights={}"
 SMALL = ("terrain=mixed", "terrain.levels=3", "terrain.border=3.0", "terrain.curriculum=null")
 """A terrain of 30 x 86 m on which every episode starts anywhere."""
 FREE = (*SMALL, "obstacles=none")
-HEIGHTS = "{_target_:omniperception.env.mdp.observations.heights,_partial_:true}"
 ALL_KINDS = {
     "rough": Rough([0.02, 0.1]),
     "slope": Slope([5.0, 25.0]),
@@ -203,8 +203,7 @@ class TestSurface:
         assert env.ground.height(xy[:, :0]).shape == (20, 0) and env.ground.height(xy[:0]).shape == (0, 3)
 
     def test_the_height_grid_is_the_robots_view_of_them(self, make_env):
-        seen = f"+observations.groups.privileged.terms.heights={HEIGHTS}"
-        env = make_env(*FREE, "commands.spawn.x=[2.5,2.5]", seen, num_envs=10, blind=True)
+        env = make_env(*FREE, "commands.spawn.x=[2.5,2.5]", HEIGHTS, num_envs=10, blind=True)
         env.step(0.3 * torch.ones(10, 12))
         k = env.kinematics
         for i in range(10):
@@ -292,7 +291,7 @@ def _ground_body(run):
 class TestSupervision:
     def test_heights_are_those_of_the_newest_frame(self, make_env):
         """The base's height at the LiDAR's ticks, held until the next; where a term reads them, of the moment."""
-        for terms, fresh in (((), False), ((f"+observations.groups.privileged.terms.heights={HEIGHTS}",), True)):
+        for terms, fresh in (((), False), ((HEIGHTS,), True)):
             env = make_env(*SMALL, "obstacles=mixed", "perception=pd_risknet_small", *terms, num_envs=3)
             env.obstacles.level = 1.0
             at_tick = None

@@ -76,9 +76,9 @@ def take_scan(
         num_rays: How many of the points of that time are kept; all if None.
         seed: Of the time at which the device is, and of random choices.
     """
-    seconds = seconds or sensor.sensor.period_s
+    seconds = seconds or sensor.period_s
     pattern = sensor.pattern()
-    config = replace(sensor.sensor, period_s=seconds, num_rays=num_rays or pattern.points_per_frame(seconds))
+    config = replace(sensor, period_s=seconds, num_rays=num_rays or pattern.points_per_frame(seconds))
     unknown = sorted(set(sensor.exclude_geoms) - set(demo.robot_geoms))
     if unknown:
         raise ValueError(f"lidar.exclude_geoms names {unknown}; known: {', '.join(demo.robot_geoms)}")

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from omniperception.avoidance.sector_motion import sector_bearings
+from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.env.state import plain, reads
 
 if TYPE_CHECKING:
-    from omniperception.avoidance.velocity_risk import VelocityRisk
     from omniperception.env.env import OmniEnv
 
 
