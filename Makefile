@@ -1,16 +1,17 @@
-# make setup | train | test | lint      overrides and options go in ARGS, e.g. make train ARGS="seed=3"
+# make setup | train | test | test-fast | lint      overrides and options go in ARGS, e.g. make train ARGS="seed=3"
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin/python
 
-.PHONY: setup train test lint
+.PHONY: setup train test test-fast lint
 setup: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml requirements.txt
+$(VENV)/.installed: pyproject.toml requirements.txt requirements-no-deps.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed, $$($(PYTHON) -V) was found; name another: make PYTHON=python3.12" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(RUN) -m pip install --quiet --upgrade pip
 	$(RUN) -m pip install --quiet --requirement requirements.txt
+	$(RUN) -m pip install --quiet --no-deps --requirement requirements-no-deps.txt
 	$(RUN) -m pip install --quiet --no-deps --editable .
 	@touch $@
 
@@ -20,6 +21,10 @@ train: setup
 test: setup
 	$(RUN) -m pytest $(ARGS)
 
+test-fast: setup
+	$(RUN) -m pytest -m "not slow and not integration" $(ARGS)
+
 lint: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
+	$(RUN) -m mypy
