@@ -1,4 +1,4 @@
-"""The README's code runs as it stands, and its blocks stay short."""
+"""The guide's code runs as it stands, its blocks stay short, and every page links to what exists."""
 
 import re
 import subprocess
@@ -11,8 +11,9 @@ import torch
 
 from omniperception.lidar import Lidar, vlp16
 
-README = Path(__file__).resolve().parents[1] / "README.md"
-SECTION = "## The LiDAR by itself"
+ROOT = Path(__file__).resolve().parents[1]
+LIDAR = ROOT / "docs" / "guide" / "lidar.md"
+PAGES = sorted((*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/**/*.md")))
 MAX_LINES = 15
 
 ROBOT = """
@@ -44,9 +45,8 @@ FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
 
 
 def blocks() -> dict[str, str]:
-    """The section's blocks of Python, by what is in and out of them."""
-    section = README.read_text().split(SECTION)[1].split("\n## ")[0]
-    found = re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)
+    """The blocks of Python of the LiDAR's page, by what is in and out of them."""
+    found = re.findall(r"```python\n(.*?)```", LIDAR.read_text(), flags=re.DOTALL)
     return dict(zip(("numpy", "torch", "mujoco", "simulators", "mesh", "table"), found, strict=True))
 
 
@@ -65,7 +65,7 @@ def run(tmp_path, monkeypatch):
 
     def execute(name: str) -> dict:
         names: dict = {}
-        exec(compile(blocks()[name], f"README.md, {name}", "exec"), names)
+        exec(compile(blocks()[name], f"lidar.md, {name}", "exec"), names)
         return names
 
     return execute
@@ -76,11 +76,17 @@ def test_blocks_are_short():
         assert len(code.splitlines()) <= MAX_LINES, name
 
 
-def test_what_it_links_to_and_runs_exists():
-    text = README.read_text()
-    named = re.findall(r"\]\((?!http)([^)#]+)\)", text) + re.findall(r"python (\S+\.py)", text)
-    assert len(named) > 20
-    assert [path for path in named if not (README.parent / path).exists()] == []
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_what_a_page_links_to_and_runs_exists(page):
+    text = page.read_text()
+    links = [page.parent / path for path in re.findall(r"\]\((?!http)([^)#]+)", text)]
+    scripts = [ROOT / path for path in re.findall(r"python (\S+\.py)", text)]
+    assert [str(path) for path in (*links, *scripts) if not path.exists()] == []
+
+
+def test_the_readme_names_every_page():
+    text = (ROOT / "README.md").read_text()
+    assert [page.name for page in PAGES if page.parent.parent == ROOT / "docs" and page.name not in text] == []
 
 
 def test_numpy(run):
