@@ -1,36 +1,48 @@
-"""What memory a run needs, by part: predicted from two small builds, and what a run of the real size uses."""
+"""How much memory a run needs, by part, predicted from two small builds, and how much it uses.
+
+    python scripts/memory.py experiment=paper sim=mujoco_warp num_envs=4096
+    python scripts/memory.py measure=true num_envs=256
+
+Physics, rays, environment, rollout and networks are counted from two builds with a handful of environments, so that a
+run can be judged that fits nowhere; the update's mini-batch is computed. Not counted: what the engines take for the
+duration of a call. `measure=true` trains the run at its real size for two iterations and says what it has used.
+"""
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 import warp as wp
 from tensordict import TensorDictBase
 
-from benchmarks.lidar_benchmark.memory import buffer_bytes
-from benchmarks.resident import resident_bytes
+from benchmarks.harness.memory import buffer_bytes, resident_bytes
+from benchmarks.harness.table import Table, about, report
+from omniperception import build, config
 from omniperception.build import RunConfig, build_runner, steps_per_frame
+from omniperception.cli import Command, argument
 from omniperception.env.env import OmniEnv
 from omniperception.learning import Runner
-from omniperception.learning.memory import FLOAT, footprint
+from omniperception.learning.memory import FLOAT, device_bytes, footprint
 
 SMALL = (4, 8)
 """Environments of the two builds; all buffers grow evenly with their number."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command line."""
+
+    measure: bool = argument(False, "also train at the real size for two iterations")
+    out: Path = argument(Path("outputs/memory"), "folder of the results")
+
+
 @dataclass(frozen=True)
 class Part:
-    """One part's memory.
-
-    Attributes:
-        name: physics, rays, task, rollout, networks or mini-batch.
-        shared: bytes that do not depend on the number of environments.
-        per_env: bytes that every environment adds.
-    """
+    """One part's memory: bytes that do not depend on the number of environments, and that every environment adds."""
 
     name: str
     shared: float
@@ -38,21 +50,6 @@ class Part:
 
     def total(self, num_envs: int) -> float:
         return self.shared + self.per_env * num_envs
-
-
-@dataclass(frozen=True)
-class Used:
-    """Bytes that a run took.
-
-    Attributes:
-        held: by tensors and engines between two iterations.
-        peak: at most, an update included.
-        source: what was asked.
-    """
-
-    held: int
-    peak: int
-    source: str
 
 
 def predict(run: RunConfig) -> list[Part]:
@@ -81,14 +78,32 @@ def held_bytes(runner: Runner) -> dict[str, int]:
     rollout = [dict(v.items()) if isinstance(v, TensorDictBase) else v for v in storage.values()]
     physics = buffer_bytes(env.sim) + _native_bytes(env.sim)
     rays = buffer_bytes(env.sim, env.sensing) - buffer_bytes(env.sim)
-    task = buffer_bytes(env) - buffer_bytes(env.sim, env.sensing)
+    rest = buffer_bytes(env) - buffer_bytes(env.sim, env.sensing)
     models = (runner.alg.actor, runner.alg.critic)
     weights = sum(p.numel() * p.element_size() for model in models for p in model.parameters())
-    return {"physics": physics, "rays": rays, "task": task, "rollout": buffer_bytes(*rollout), "networks": 4 * weights}
+    return {
+        "physics": physics,
+        "rays": rays,
+        "environment": rest,
+        "rollout": buffer_bytes(*rollout),
+        "networks": 4 * weights,
+    }
 
 
-def measure(run: RunConfig) -> Used:
-    """Builds the run at its real size and trains it for two iterations."""
+def prediction(parts: list[Part], num_envs: int) -> Table:
+    """The parts and their sum."""
+    rows = [(p.name, p.shared / 1e6, p.per_env / 1e3, p.total(num_envs) / 1e6) for p in parts]
+    rows.append(("sum", *(sum(row[k] for row in rows) for k in (1, 2, 3))))
+    columns = ("part", "MB shared", "kB per environment", "MB")
+    return Table("memory", f"memory by part, predicted for {num_envs} environments", columns, rows)
+
+
+def measure(run: RunConfig) -> tuple[int, int, str]:
+    """Builds the run at its real size and trains it for two iterations.
+
+    Returns:
+        Bytes held between two iterations, bytes at most, and what was asked.
+    """
     before, device = resident_bytes(), run.env.sim.torch_device
     on_gpu = device.type == "cuda"
     if on_gpu:
@@ -99,18 +114,10 @@ def measure(run: RunConfig) -> Used:
     if on_gpu:
         torch.cuda.synchronize(device)
         engine = wp.get_device(str(device))
-        pool, most = wp.get_mempool_used_mem_current(engine), wp.get_mempool_used_mem_high(engine)
-        held, peak = torch.cuda.memory_allocated(device) + pool, torch.cuda.max_memory_allocated(device) + most
-        return Used(held, peak, "PyTorch's and Warp's allocators")
-    return Used(
-        resident_bytes() - before, resident_bytes(peak=True) - before, "growth of the process's resident memory"
-    )
-
-
-def table(parts: Sequence[Part], num_envs: int) -> list[tuple[str, float, float, float]]:
-    """(part, MB shared, kB per environment, MB altogether) rows, the sum last."""
-    rows = [(p.name, p.shared / 1e6, p.per_env / 1e3, p.total(num_envs) / 1e6) for p in parts]
-    return [*rows, ("sum", *(sum(row[k] for row in rows) for k in (1, 2, 3)))]
+        held = torch.cuda.memory_allocated(device) + wp.get_mempool_used_mem_current(engine)
+        peak = torch.cuda.max_memory_allocated(device) + wp.get_mempool_used_mem_high(engine)
+        return held, peak, "PyTorch's and Warp's allocators"
+    return resident_bytes() - before, resident_bytes(peak=True) - before, "growth of the process's resident memory"
 
 
 def _clouds_at_once(env: OmniEnv, num_envs: int) -> int:
@@ -139,3 +146,23 @@ def _update_bytes(run: RunConfig) -> int:
     if run.perception is None:
         return layers
     return layers + footprint(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run)).mini_batch
+
+
+def main(given: Arguments, overrides: list[str]) -> None:
+    """Predicts, measures if asked, prints and writes."""
+    run = build.assemble(config.compose(overrides or ["experiment=paper"]))
+    table, device = prediction(predict(run), run.env.num_envs), run.env.sim.torch_device
+    total = table.rows[-1][-1]
+    if everything := device_bytes(device):
+        table.notes.append(f"{total / 1e3:.2f} GB of {everything / 1e9:.1f} GB on {device}")
+    if given.measure:
+        held, peak, source = measure(run)
+        ratio = peak / 1e6 / total
+        table.notes.append(f"used: {held / 1e6:.0f} MB held, {peak / 1e6:.0f} MB at most ({source}): {ratio:.2f} times")
+    report([table], about(torch.get_num_threads(), str(device)), given.out)
+
+
+command = Command(main, Arguments, __doc__, "of the run; experiment=paper without any")
+
+if __name__ == "__main__":
+    command()

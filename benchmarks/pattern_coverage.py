@@ -1,4 +1,9 @@
-"""How much of its field of view a pattern covers in a time, and how alike two patterns are.
+"""How well the closed-form Livox scans match the makers' tables, and what each way of keeping fewer rays sees.
+
+    python scripts/pattern_coverage.py sensors=mid360,avia num_rays=1000
+
+Any LiDAR preset will do; only Livox scanners have tables (extra `tables`), which are left out where they are not
+installed. The picture (extra `plots`) shows each pattern after 0.1, 0.5 and 1 s.
 
 A pattern's field of view is the set of cells that its whole table touches. Counts are per cell of ``SphereCells``,
 averaged over several windows of the table.
@@ -7,16 +12,23 @@ averaged over several windows of the table.
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import torch
 
+from benchmarks.harness.table import Table, about, report
+from omniperception.cli import Command, argument
+from omniperception.common.figures import PlotsUnavailable, new_figure
+from omniperception.lidar import DEVICES, LIVOX
 from omniperception.lidar.patterns.cells import SphereCells
 from omniperception.lidar.patterns.selection import Selection, Strategy, make_selection
 from omniperception.lidar.patterns.table import ScanPattern
 
 DURATIONS_S = (0.1, 0.5, 1.0)
+SLACK_ROWS = {"hap": 1000}
+"""Sensors whose model fires in an order that drifts from the table's, and by how many rows at most."""
 WINDOWS = 4
 """Windows of the table over which figures are averaged, evenly placed."""
 
@@ -179,3 +191,75 @@ def _seen(
     rays = _take(pattern, rows.unique())
     seen = len(np.unique(cells.of(rays))) / len(field[0])
     return seen, largest_gap_deg(field[1], rays.directions_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command line."""
+
+    sensors: tuple[str, ...] = argument(tuple(LIVOX), "sensors", choices=tuple(DEVICES))
+    num_rays: int = argument(1000, "rays kept of a frame", least=1)
+    period_s: float = argument(0.1, "length of a frame (s)", positive=True)
+    cell_deg: float = argument(2.0, "size of a cell of the field of view (deg)", positive=True)
+    out: Path = argument(Path("outputs/pattern_coverage"), "folder of the results")
+
+
+def load(name: str) -> tuple[ScanPattern, ScanPattern | None]:
+    """A sensor's closed form, and its table where there is one."""
+    if name not in LIVOX:
+        return DEVICES[name].pattern(), None
+    try:
+        return LIVOX[name]("model"), LIVOX[name]("table")
+    except ModuleNotFoundError as error:
+        print(f"{name}: {error}")
+        return LIVOX[name]("model"), None
+
+
+def tables(patterns: dict[str, tuple[ScanPattern, ScanPattern | None]], given: Arguments) -> list[Table]:
+    """Models against their tables, and what the strategies see."""
+    matches, seen, notes = [], [], []
+    for name, (model, table) in patterns.items():
+        for strategy, rows in strategy_coverage(model, given.period_s, given.num_rays, cell_deg=given.cell_deg).items():
+            for row in rows:
+                seen.append({"sensor": name, "rays kept": strategy, "s": row.seconds, "seen": row.seen})
+                seen[-1]["largest gap, deg"] = row.gap_deg
+        if table is not None:
+            mean, largest = angle_to_table(model, table, SLACK_ROWS.get(name, 0))
+            notes.append(f"{name}: angle to the table mean {mean:.4f} deg, largest {largest:.4f} deg")
+            matches += [{"sensor": name, **vars(row)} for row in compare(model, table, cell_deg=given.cell_deg)]
+    title = f"share of the field of view that {given.num_rays} rays every {given.period_s:g} s see"
+    found = [Table.of("pattern_coverage", title, seen)]
+    if matches:
+        found.append(Table.of("pattern_models", "closed forms against the makers' tables", matches, notes))
+    return found
+
+
+def draw(patterns: dict[str, tuple[ScanPattern, ScanPattern | None]], path: Path) -> None:
+    """Azimuth and elevation of each pattern's points after each duration."""
+    figure = new_figure(5.0 * len(DURATIONS_S), 3.2 * len(patterns))
+    axes = figure.subplots(len(patterns), len(DURATIONS_S), squeeze=False)
+    for (name, (model, table)), line in zip(patterns.items(), axes, strict=True):
+        for seconds, axis in zip(DURATIONS_S, line, strict=True):
+            for label, pattern, colour, size in (("table", table, "orange", 1.2), ("model", model, "navy", 0.15)):
+                if pattern is not None:
+                    count = pattern.points_per_frame(seconds)
+                    rows = slice(0, min(count, pattern.num_rows), max(1, count // 60_000))
+                    azimuth = (pattern.azimuth[rows].rad2deg() + 180.0) % 360.0 - 180.0
+                    elevation = pattern.elevation[rows].rad2deg()
+                    axis.scatter(azimuth, elevation, s=size, c=colour, linewidths=0, label=f"{label}, {count:,} points")
+            axis.set(title=f"{name}, {seconds:g} s", xlabel="azimuth, deg", ylabel="elevation, deg")
+            axis.legend(loc="lower right", fontsize=6, markerscale=8)
+    figure.savefig(path, dpi=110)
+
+
+def main(given: Arguments) -> None:
+    """Prints and writes the tables and the picture."""
+    patterns = {name: load(name) for name in given.sensors}
+    report(tables(patterns, given), about(1), given.out)
+    draw(patterns, given.out / "patterns.png")
+
+
+command = Command(main, Arguments, __doc__, errors=(PlotsUnavailable,))
+
+if __name__ == "__main__":
+    command()

@@ -10,7 +10,6 @@ from functools import partial
 import torch
 from tensordict import TensorDict
 
-from benchmarks.stability.report import Row
 from omniperception import build, config
 from omniperception.build import build_runner
 from omniperception.learning import PerceptivePpo, RolloutTooSmall, Runner, TrainingDiverged
@@ -92,7 +91,7 @@ _ONE = ("ppo.num_mini_batches=1",)
 _MASKED = tuple(f"randomization.lidar_mask.{key}" for key in ("ratio=1.0", "low=0.0", "high=0.0"))
 
 
-def run_case(case: Case, iterations: int) -> Row:
+def run_case(case: Case, iterations: int) -> dict[str, object]:
     """Trains `iterations` and says how it ended, and whether that is right."""
     outcome, runner = "survives", None
     try:
@@ -109,7 +108,7 @@ def run_case(case: Case, iterations: int) -> Row:
     return {"case": case.name, "good": good, "weights finite": weights, "outcome": outcome}
 
 
-def precision(seed: int = 0, num_envs: int = 16) -> list[Row]:
+def precision(seed: int = 0, num_envs: int = 16) -> list[dict[str, object]]:
     """Relative error of float32 against float64 by layer of the paper's PD-RiskNet actor, and of PPO's loss.
 
     The error of a tensor is |a - b| / |b| in the Euclidean norm; `gradient` is that of the layer's parameters.
@@ -133,7 +132,7 @@ def precision(seed: int = 0, num_envs: int = 16) -> list[Row]:
     ]
 
 
-def clouds() -> list[Row]:
+def clouds() -> list[dict[str, object]]:
     """Samplers on clouds that are empty, of one point, of equal points, or of fewer points than wanted."""
     samplers: list[tuple[str, Sampler]] = [
         ("FPS", FpsSampler(16, max_range=20.0)),

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import torch
 
-from benchmarks.stability.report import Row
+from benchmarks.harness.meshes import tessellate
+from benchmarks.harness.reference import box_ranges, sphere_ranges, triangle_ranges
+from benchmarks.harness.rotations import matrices, random_unit
 from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, TriangleMesh, grid
 
 K = ShapeKind
-CUBE = TriangleMesh(
-    np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float),
-    np.array(
-        [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-         (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-    ),
-)  # fmt: skip
+CUBE = TriangleMesh(*tessellate("box", (1.0, 1.0, 1.0)))
+Row = dict[str, object]
+"""A row of the table."""
 Rays = tuple[np.ndarray, np.ndarray]
 """Origins and unit directions, (R, 3) float64 each."""
 Truth = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -139,7 +137,7 @@ def inside(count: int, rng: np.random.Generator) -> list[Row]:
     """A sensor inside a body meets its far side."""
     rows = []
     for name, shape, truth in _bodies(1.0):
-        origins, directions = 0.3 * rng.uniform(-1, 1, (count, 3)), _directions(count, rng)
+        origins, directions = 0.3 * rng.uniform(-1, 1, (count, 3)), random_unit(rng, count, 3)
         ranges = _cast(RayScene([shape], 1, 0), origins, directions)
         rows.append(_row(f"inside a {name}", ranges, truth(origins, directions), 2e-5))
     return rows
@@ -176,8 +174,7 @@ def poses(count: int, rng: np.random.Generator) -> list[Row]:
         "quaternion of norm 1 - 1e-3": (0.0, 1 - 1e-3),
         "quaternion of norm 1 + 1e-3": (0.0, 1 + 1e-3),
     }
-    inverse = quat * [1, -1, -1, -1]
-    turned = [_rotate(inverse, v) for v in (origins, directions)]
+    turned = [v @ matrices(quat) for v in (origins, directions)]  # into the body's frame
     true = box_ranges(*turned, np.array([1, 0.5, 0.25]))
     for name, (x, norm) in settings.items():
         scene = RayScene([box], 2, 1)
@@ -201,7 +198,7 @@ def crowds(num_bodies: int, count: int, rng: np.random.Generator) -> list[Row]:
     scene = RayScene([Shape(K.SPHERE, (0.05,), body=k) for k in range(num_bodies)], 1, num_bodies)
     scene.body_pos[0] = torch.from_numpy(centres).float()
     count = min(count, 300)
-    origins, directions = np.zeros((count, 3)), _directions(count, rng)
+    origins, directions = np.zeros((count, 3)), random_unit(rng, count, 3)
     true = np.full(count, math.inf)
     for centre in centres:
         true = np.minimum(true, sphere_ranges(origins - centre, directions, 0.05))
@@ -217,51 +214,11 @@ def crowds(num_bodies: int, count: int, rng: np.random.Generator) -> list[Row]:
 def counts(count: int, rng: np.random.Generator) -> list[Row]:
     """One ray, and very many."""
     scene = RayScene([Shape(K.SPHERE, (1.0,))], 1, 0)
-    origins, directions = np.tile([0.0, 0.0, 3.0], (count, 1)), _directions(count, rng)
+    origins, directions = np.tile([0.0, 0.0, 3.0], (count, 1)), random_unit(rng, count, 3)
     directions[: (count + 1) // 2] = [0.0, 0.1, -1.0] / np.sqrt(1.01)
     true = sphere_ranges(origins, directions, 1.0)
     loose = _near_silhouette(lambda o, d: sphere_ranges(o, d, 1.0), origins, directions, 2e-5)
     return [_row("1 ray" if count == 1 else f"{count} rays", _cast(scene, origins, directions), true, 2e-5, loose)]
-
-
-# ---- truth in float64 ------------------------------------------------------------------------------------------------
-
-
-def sphere_ranges(origins: np.ndarray, directions: np.ndarray, radius: float) -> np.ndarray:
-    """The smallest non-negative root of |o + t d| = radius, (R,); inf without one."""
-    along = (origins * directions).sum(1)
-    foot = origins - along[:, None] * directions
-    half = radius**2 - (foot**2).sum(1)
-    root = np.sqrt(np.maximum(half, 0.0))
-    first, second = -along - root, -along + root
-    met = np.where(first >= 0, first, second)
-    return np.where((half >= 0) & (met >= 0), met, math.inf)
-
-
-def box_ranges(origins: np.ndarray, directions: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Slabs: (R,) ranges to a box of half extents (3,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (-half - origins) / directions, (half - origins) / directions
-    low, high = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-    met = np.where(low >= 0, low, high)
-    return np.where((low <= high) & (met >= 0), met, math.inf)
-
-
-def triangle_ranges(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(R,) ranges to the nearest of triangles (T, 3, 3), each by Cramer's rule; those without area are not there."""
-    nearest = np.full(len(origins), math.inf)
-    for a, b, c in triangles:
-        side, other = b - a, c - a
-        across = np.cross(directions, other)
-        determinant = across @ side
-        with np.errstate(divide="ignore", invalid="ignore"):
-            from_a = origins - a
-            u = (from_a * across).sum(1) / determinant
-            q = np.cross(from_a, side)
-            v, t = (directions * q).sum(1) / determinant, q @ other / determinant
-        met = (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & np.isfinite(t)
-        nearest = np.where(met, np.minimum(nearest, t), nearest)
-    return nearest
 
 
 def _bodies(size: float) -> list[tuple[str, Shape, Truth]]:
@@ -278,15 +235,10 @@ def _bodies(size: float) -> list[tuple[str, Shape, Truth]]:
 # ---- rays and rows ---------------------------------------------------------------------------------------------------
 
 
-def _directions(count: int, rng: np.random.Generator) -> np.ndarray:
-    directions = rng.normal(size=(count, 3))
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
 def _around(count: int, size: float, rng: np.random.Generator) -> Rays:
     """Rays from within four sizes, half of them aimed at the body."""
     origins = size * rng.uniform(-4, 4, (count, 3))
-    directions = _directions(count, rng)
+    directions = random_unit(rng, count, 3)
     aimed = size * rng.uniform(-1, 1, (count, 3)) - origins
     half = count // 2
     directions[:half] = (aimed / np.linalg.norm(aimed, axis=1, keepdims=True))[:half]
@@ -311,9 +263,7 @@ def _near_silhouette(truth: Truth, origins: np.ndarray, directions: np.ndarray, 
     return loose
 
 
-def _row(
-    case: str, ranges: np.ndarray, true: np.ndarray, allowed: float, loose: np.ndarray | None = None
-) -> dict[str, object]:
+def _row(case: str, ranges: np.ndarray, true: np.ndarray, allowed: float, loose: np.ndarray | None = None) -> Row:
     """Ranges against the truth, but for rays that may go either way; NaN is wrong everywhere."""
     strict = np.ones(len(true), bool) if loose is None else ~loose
     missed = (np.isinf(ranges) != np.isinf(true)) & strict
@@ -324,12 +274,5 @@ def _row(
     return _judged(case, len(true), wrong, worst, f"within {allowed:.2g} m") | {"either way": int((~strict).sum())}
 
 
-def _judged(case: str, count: int, wrong: int, worst: float, expected: str) -> dict[str, object]:
+def _judged(case: str, count: int, wrong: int, worst: float, expected: str) -> Row:
     return {"case": case, "good": wrong == 0, "rays": count, "wrong": wrong, "worst error": worst, "expected": expected}
-
-
-def _rotate(quat: Sequence[float], vectors: np.ndarray) -> np.ndarray:
-    """Vectors (R, 3) turned by a unit quaternion (w, x, y, z)."""
-    w, axis = quat[0], np.asarray(quat[1:])
-    twice = 2 * np.cross(axis, vectors)
-    return vectors + w * twice + np.cross(axis, twice)

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import torch
 
-from benchmarks.stability.report import Row
 from omniperception.common.random import EnvRandom
 from omniperception.env.env import EnvConfig
 from omniperception.env.mdp.randomization import RandomizationConfig, Randomizer
@@ -237,7 +236,7 @@ def scenes(env: EnvConfig, num_envs: int, paper: RandomizationConfig) -> list[Sc
     return listed
 
 
-def play(scene: Scene, seconds: float, gains_of: tuple[float, float]) -> Row:
+def play(scene: Scene, seconds: float, gains_of: tuple[float, float]) -> dict[str, object]:
     """Runs a scene; simulations that fail are counted by cause, put back on their feet and go on.
 
     Energies are kinetic and potential, above that of the standing robot; penetration is the deepest contact.

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import new_figure
 from benchmarks.stability.physics import INTEGRATORS, Map
-from benchmarks.stability.report import Row
+from omniperception.common.figures import new_figure
 
 
 def draw_maps(maps: Sequence[Map], label: str, bounds: tuple[float, float], path: Path) -> None:
@@ -63,7 +62,7 @@ def _panel(axis, found: Map, bounds: tuple[float, float]):
     return image
 
 
-def draw_precision(rows: Sequence[Row], path: Path) -> None:
+def draw_precision(rows: Sequence[Mapping[str, object]], path: Path) -> None:
     """Relative error of float32 by layer, of outputs and of gradients."""
     figure = new_figure(6.0, 3.2)
     axis = figure.subplots()

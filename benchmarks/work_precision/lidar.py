@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 
-from benchmarks.lidar_benchmark.rotations import matrices
-from benchmarks.lidar_benchmark.timing import paired_timings
+from benchmarks.harness.meshes import join, tessellate_to
+from benchmarks.harness.pareto import Choice, Study
+from benchmarks.harness.rotations import matrices
+from benchmarks.harness.timing import paired_timings
 from omniperception.build import RunConfig
 from omniperception.lidar import (
     Lidar,
@@ -25,9 +27,7 @@ from omniperception.lidar import (
     TriangleMesh,
 )
 
-from .pareto import Choice, Study, least_s
 from .scene import GROUND, OBSTACLE, MovingScene, Truth, dense_directions, moving_scene
-from .tessellation import join, tessellate
 
 COST = "CPU time per frame (us per environment)"
 RANGE = "range RMSE (m)"
@@ -83,6 +83,10 @@ class Bench:
         elevation = self.pattern.elevation
         return dense_directions((float(elevation.min()), float(elevation.max())), step_deg)
 
+    def true_ranges(self, time_s: float, directions_s: np.ndarray) -> np.ndarray:
+        """Of rays (E, N, 3) in the sensors' frames, (E, N)."""
+        return np.stack([self.truth.scan(time_s, env, d)[0] for env, d in enumerate(directions_s)])
+
     def true_sectors(self, time_s: float, step_deg: float | None = None) -> np.ndarray:
         """By the dense reference, (E, num_sectors)."""
         directions = self.dense if step_deg is None else self.dense_at(step_deg)
@@ -91,7 +95,7 @@ class Bench:
     def costs(self, casts: Mapping[str, Callable[[int], None]]) -> dict[str, float]:
         """CPU time of a call, us per environment, timed in turn."""
         timings = paired_timings(casts, self.sizes.rounds, block_s=self.sizes.block_s)
-        return {name: 1e6 * least_s(timing) / self.scene.num_envs for name, timing in timings.items()}
+        return {name: 1e6 * timing.least_cpu_s / self.scene.num_envs for name, timing in timings.items()}
 
 
 class Caster:
@@ -119,9 +123,9 @@ class Caster:
             self._poses[key] = tuple(torch.from_numpy(part).float() for part in both)
         return self._poses[key]
 
-    def cast(self, time_s: float, posed_at: float | None = None) -> LidarFrame:
-        """The frame that ends at ``time_s``, with the poses of that time or of another."""
-        self.rays.set_poses(*self.poses(time_s if posed_at is None else posed_at))
+    def cast(self, time_s: float) -> LidarFrame:
+        """The frame that ends at ``time_s``, with the poses of that time."""
+        self.rays.set_poses(*self.poses(time_s))
         return self.lidar.cast(time_s)
 
     def distorted(self, time_s: float) -> LidarFrame:
@@ -133,10 +137,9 @@ class Caster:
             self.lidar.record_poses()
         return self.cast(time_s)
 
-    def timed(self, cast: Callable[[float], object] | None = None) -> Callable[[int], None]:
-        """Casts the frame of a given number, again and again those of the bench."""
-        times, cast = self.bench.times, cast or self.cast
-        return lambda frame: cast(times[frame % len(times)])
+    def frame(self, number: int) -> LidarFrame:
+        """The frame of a given number, again and again those of the bench."""
+        return self.cast(self.bench.times[number % len(self.bench.times)])
 
 
 def ray_shapes(scene: MovingScene, triangles: int = 0) -> list[Shape]:
@@ -144,7 +147,7 @@ def ray_shapes(scene: MovingScene, triangles: int = 0) -> list[Shape]:
     obstacles = []
     for k, (kind, size) in enumerate(zip(scene.kinds, scene.sizes, strict=True)):
         if triangles:
-            mesh = TriangleMesh(*tessellate(kind, size, triangles))
+            mesh = TriangleMesh(*tessellate_to(kind, size, triangles))
             obstacles.append(Shape(ShapeKind.MESH, asset=mesh, body=k, class_id=OBSTACLE))
         else:
             sizes = tuple(size[size > 0.0])
@@ -175,14 +178,16 @@ def sector_errors(distances: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     }
 
 
-def frame_errors(bench: Bench, caster: Caster, cast: Callable[[float], LidarFrame]) -> dict[str, float]:
-    """Of ranges and sector distances against the truth along the very rays that were cast."""
+def frame_errors(
+    bench: Bench, caster: Caster, cast: Callable[[int], LidarFrame], times: Sequence[float] = ()
+) -> dict[str, float]:
+    """Of ranges and sector distances against the truth along the very rays that were cast in each of the frames."""
     found, true, sectors, true_sectors = [], [], [], []
-    for time_s in bench.times:
-        frame = cast(time_s)
+    for k, time_s in enumerate(times or bench.times):
+        frame = cast(k)
         directions = frame.directions_s.numpy()
-        found.append(frame.true_ranges.numpy().astype(np.float64))
-        true.append(np.stack([bench.truth.scan(time_s, env, d)[0] for env, d in enumerate(directions)]))
+        found.append(frame.true_ranges.double().numpy())
+        true.append(bench.true_ranges(time_s, directions))
         sectors.append(caster.sectors().numpy().copy())
         true_sectors.append(bench.truth.sectors(time_s, directions, bench.num_sectors, NEAR))
     errors = sector_errors(np.stack(sectors), np.stack(true_sectors))
@@ -192,9 +197,9 @@ def frame_errors(bench: Bench, caster: Caster, cast: Callable[[float], LidarFram
 def shapes_study(bench: Bench, triangles: Sequence[int] = (8, 32, 128, 512, 2048, 4096)) -> Study:
     """Exact shapes against tessellations."""
     casters = {"exact": Caster(bench)} | {f"{n} triangles": Caster(bench, triangles=n) for n in triangles}
-    costs = bench.costs({name: caster.timed() for name, caster in casters.items()})
+    costs = bench.costs({name: caster.frame for name, caster in casters.items()})
     choices = [
-        Choice(name, costs[name], frame_errors(bench, caster, caster.cast), name == "exact", name.split(" ")[-1])
+        Choice(name, costs[name], frame_errors(bench, caster, caster.frame), name == "exact", name.split(" ")[-1])
         for name, caster in casters.items()
     ]
     note = "Corners of a tessellation lie on the true surface. Boxes have 12 triangles, which are exact."
@@ -202,7 +207,7 @@ def shapes_study(bench: Bench, triangles: Sequence[int] = (8, 32, 128, 512, 2048
 
 
 def updates_study(bench: Bench, triangles: int = 128) -> Study:
-    """Bodies that move as instances with a pose, against one mesh that is refitted, against trees built anew."""
+    """Bodies that move as instances with a pose, against one mesh that is refitted, against trees that are rebuilt."""
     methods = {"exact shapes": Instances(bench, 0), "instances": Instances(bench, triangles)}
     methods |= {"refit": Refitted(bench, triangles), "rebuild": Rebuilt(bench, triangles)}
     rays = [_general_rays(bench, time_s) for time_s in bench.times]
@@ -216,7 +221,7 @@ def updates_study(bench: Bench, triangles: int = 128) -> Study:
     choices = []
     for name, method in methods.items():
         pairs = [
-            (cast(method, k).double().numpy(), _true_ranges(bench, time_s, directions[k]))
+            (cast(method, k).double().numpy(), bench.true_ranges(time_s, directions[k]))
             for k, time_s in enumerate(bench.times)
         ]
         errors = range_errors(*(np.stack(column) for column in zip(*pairs, strict=True)))
@@ -235,23 +240,14 @@ def staleness_study(bench: Bench, every: Sequence[int] = (1, 2, 5, 10)) -> Study
     times = [(k + 1) * period for k in range(num_frames)]
 
     def cast(n: int, k: int) -> LidarFrame:
-        if k % n:
-            return caster.lidar.cast(times[k])
-        return caster.cast(times[k])
+        time_s = times[k % num_frames]
+        return caster.lidar.cast(time_s) if k % num_frames % n else caster.cast(time_s)
 
-    costs = bench.costs({f"every {n}": lambda frame, n=n: cast(n, frame % num_frames) for n in every})
-    choices = []
-    for n in every:
-        found, true, sectors, true_sectors = [], [], [], []
-        for k, time_s in enumerate(times):
-            frame = cast(n, k)
-            found.append(frame.true_ranges.double().numpy())
-            true.append(_true_ranges(bench, time_s, frame.directions_s.numpy()))
-            sectors.append(caster.sectors().numpy().copy())
-            true_sectors.append(bench.truth.sectors(time_s, frame.directions_s.numpy(), bench.num_sectors, NEAR))
-        errors = range_errors(np.stack(found), np.stack(true))
-        errors[SECTOR] = sector_errors(np.stack(sectors), np.stack(true_sectors))[SECTOR]
-        choices.append(Choice(f"every {n}", costs[f"every {n}"], errors, n == 1))
+    costs = bench.costs({f"every {n}": partial(cast, n) for n in every})
+    choices = [
+        Choice(f"every {n}", costs[f"every {n}"], frame_errors(bench, caster, partial(cast, n), times), n == 1)
+        for n in every
+    ]
     note = f"Frames of {period:g} s; the robot walks at 0.8 m/s. The cost includes copying the poses."
     return Study("poses", "Poses updated in every n-th frame", COST, SECTOR, choices, 1e-6, (note, _reference(bench)))
 
@@ -268,7 +264,7 @@ def rays_study(
         for strategy in strategies[:1] if count == points else strategies:
             config = replace(bench.sensor, num_rays=count, selection=strategy, motion_segments=0)
             casters[f"{count} {strategy}"] = Caster(bench, config)
-    costs = bench.costs({name: caster.timed() for name, caster in casters.items()})
+    costs = bench.costs({name: caster.frame for name, caster in casters.items()})
     true = np.stack([bench.true_sectors(time_s) for time_s in bench.times])
     choices = []
     for name, caster in casters.items():
@@ -301,7 +297,7 @@ def rates_study(
         return coarse[key]
 
     casters = {p: Caster(bench, replace(bench.sensor, period_s=p, motion_segments=0)) for p in periods_s}
-    costs = bench.costs({str(p): caster.timed() for p, caster in casters.items()})
+    costs = bench.costs({str(p): caster.frame for p, caster in casters.items()})
     choices = []
     for period, caster in casters.items():
         sectors, stale = [], []
@@ -331,7 +327,8 @@ def motion_study(bench: Bench, segments: Sequence[int] = (0, 1, 2, 5, 10)) -> St
         n: Caster(bench, replace(bench.sensor, motion_segments=n), outputs=(*OUTPUTS, "time_s")) for n in segments
     }
     cast = {n: caster.distorted if n else caster.cast for n, caster in casters.items()}
-    costs = bench.costs({str(n): caster.timed(cast[n]) for n, caster in casters.items()})
+    times = bench.times
+    costs = bench.costs({str(n): lambda k, n=n: cast[n](times[k % len(times)]) for n in casters})
     choices = []
     for n, caster in casters.items():
         found, true = [], []
@@ -355,24 +352,18 @@ def precision_study(bench: Bench) -> Study:
     """Ranges kept in float32 against a copy in half precision."""
     caster = Caster(bench)
     half = torch.empty_like(caster.lidar.frame.ranges, dtype=torch.float16)
-    caster.cast(bench.times[0])
-
-    def cast_half(time_s: float) -> None:
-        half.copy_(caster.cast(time_s).ranges)
-
-    costs = bench.costs({"float32": caster.timed(), "float16": caster.timed(cast_half)})
+    costs = bench.costs({"float32": caster.frame, "float16": lambda k: half.copy_(caster.frame(k).ranges)})
     found, true = [], []
     for time_s in bench.times:
         frame = caster.cast(time_s)
         found.append(frame.true_ranges.clone())
-        true.append(_true_ranges(bench, time_s, frame.directions_s.numpy()))
+        true.append(bench.true_ranges(time_s, frame.directions_s.numpy()))
     choices = []
-    for name, dtype, size in (("float32", torch.float32, 4), ("float16", torch.float16, 2)):
-        ranges = torch.stack(found).to(dtype).double().numpy()
-        bytes_per_env = {"bytes per environment": size * caster.config.num_rays}
-        choices.append(
-            Choice(name, costs[name], range_errors(ranges, np.stack(true)), name == "float32", facts=bytes_per_env)
-        )
+    for name, dtype in (("float32", torch.float32), ("float16", torch.float16)):
+        ranges = torch.stack(found).to(dtype)
+        facts = {"bytes per environment": ranges.element_size() * caster.config.num_rays}
+        errors = range_errors(ranges.double().numpy(), np.stack(true))
+        choices.append(Choice(name, costs[name], errors, name == "float32", facts=facts))
     note = "float16 is a copy: the sensor itself writes float32 only. It halves what a stored frame takes."
     return Study("precision", "Precision of the ranges", COST, RANGE, choices, 1e-6, (note, _reference(bench)))
 
@@ -423,7 +414,7 @@ class Refitted:
 
 
 class Rebuilt:
-    """All bodies of an environment as one mesh, whose tree is built anew for every frame."""
+    """All bodies of an environment as one mesh, whose tree is rebuilt for every frame."""
 
     def __init__(self, bench: Bench, triangles: int) -> None:
         self._bodies, self._reach = Vertices(bench.scene, triangles), bench.sensor.max_range
@@ -442,7 +433,7 @@ class Vertices:
     """The triangles of all bodies of a scene and where their vertices are."""
 
     def __init__(self, scene: MovingScene, triangles: int) -> None:
-        parts = [tessellate(kind, size, triangles) for kind, size in zip(scene.kinds, scene.sizes, strict=True)]
+        parts = [tessellate_to(kind, size, triangles) for kind, size in zip(scene.kinds, scene.sizes, strict=True)]
         self._scene, self._parts = scene, [vertices for vertices, _ in parts]
         self.faces = join(parts)[1]
 
@@ -466,10 +457,6 @@ def _general_rays(bench: Bench, time_s: float) -> tuple[torch.Tensor, torch.Tens
     pos, turn = bench.scene.sensor(time_s, bench.sensor)
     turned = torch.from_numpy(np.einsum("eij,enj->eni", turn, directions)).float()
     return torch.from_numpy(pos).float()[:, None].expand_as(turned).contiguous(), turned
-
-
-def _true_ranges(bench: Bench, time_s: float, directions: np.ndarray) -> np.ndarray:
-    return np.stack([bench.truth.scan(time_s, env, d)[0] for env, d in enumerate(directions)])
 
 
 def _reference(bench: Bench) -> str:

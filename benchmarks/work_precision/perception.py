@@ -7,9 +7,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import torch
 
-from benchmarks.lidar_benchmark.timing import paired_timings
+from benchmarks.harness.pareto import Choice, Study
+from benchmarks.harness.rotations import matrices
+from benchmarks.harness.timing import paired_timings
 from omniperception.build import RunConfig, assemble
 from omniperception.common.rotations import yaw_quat
 from omniperception.config import compose
@@ -20,7 +23,6 @@ from omniperception.perception import Attitude, PdRiskNet, PdSampler, ProximityS
 from omniperception.scene import ray_shapes
 from omniperception.scene.rays import HitClass
 
-from .pareto import Choice, Study, least_s
 from .scene import dense_directions
 
 SAMPLING = "CPU time of sampling a frame (us per environment)"
@@ -92,16 +94,16 @@ class Cloud:
 
     def level(self, points: torch.Tensor) -> torch.Tensor:
         """Points (E, P, 3) of the sensor's frame, m, in the levelled, yaw-aligned frame of the base."""
-        base = _rotation(self.attitude.base_quat)
+        base = torch.from_numpy(matrices(self.attitude.base_quat.numpy()))
         yaw = torch.atan2(base[:, 1, 0], base[:, 0, 0])
-        level = _rotation(yaw_quat(-yaw)) @ base
-        mount = _rotation(torch.tensor([self.attitude.mount_quat]))
-        in_base = points.double() @ mount[0].T + torch.tensor(self.attitude.mount_pos, dtype=torch.float64)
+        level = torch.from_numpy(matrices(yaw_quat(-yaw).numpy())) @ base
+        mount = torch.from_numpy(matrices(np.array(self.attitude.mount_quat)))
+        in_base = points.double() @ mount.T + torch.tensor(self.attitude.mount_pos, dtype=torch.float64)
         return in_base @ level.transpose(1, 2)
 
 
 class Recorder:
-    """An environment of a configuration whose robots are put down anew every ``EPISODE_S`` seconds."""
+    """An environment of a configuration whose robots are put down again every ``EPISODE_S`` seconds."""
 
     def __init__(self, overrides: Sequence[str], num_envs: int, extra: Sequence[str]) -> None:
         given = [*overrides, "randomization=none", f"num_envs={num_envs}", "sim.num_threads=1"]
@@ -169,28 +171,45 @@ CROWD = ("obstacles=mixed",)
 
 
 def farthest_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] = (32, 64, 128, 256)) -> Study:
-    """Proximal points kept by farthest point sampling: how well they cover the cloud."""
+    """Proximal points kept by farthest point sampling, and by what is cheaper: how well they cover the cloud."""
     recorder = Recorder(overrides, sizes.num_envs, CROWD)
     cloud, configured = recorder.frames(2)[-1], recorder.run.perception.sampler()
     options = {"max_range": cloud.max_range, "split_deg": math.degrees(configured.split), "num_threads": 1}
-    samplers = {}
-    for count in sorted({*counts, configured.num_proximal}):
-        samplers[f"{count} exact"] = PdSampler(count, 0, **options)
-    costs, kept = _sampled(cloud, samplers, sizes)
     near = torch.isfinite(cloud.ranges) & (cloud.elevation > configured.split)
+    in_order, shuffled = torch.arange(near.shape[1]), torch.randperm(near.shape[1], generator=recorder.generator)
+    samplers, clouds = {}, {}
+    for count in sorted({*counts, configured.num_proximal}):
+        ways = {"farthest": cloud, "farthest of 4 times as many": _thinned(cloud, near, 4 * count, in_order)}
+        ways |= {"every k-th": _thinned(cloud, near, count, in_order), "random": _thinned(cloud, near, count, shuffled)}
+        for way, thinned in ways.items():
+            samplers[f"{count} {way}"], clouds[f"{count} {way}"] = PdSampler(count, 0, **options), thinned
+    costs, kept = _sampled(clouds, samplers, sizes)
     hits = cloud.ranges.clamp(max=cloud.max_range)[..., None] * cloud.directions_s
-    default = f"{configured.num_proximal} exact"
     choices = []
     for name, points in kept.items():
         radius = [_radius(h[m], p) for h, m, p in zip(hits, near, points * cloud.max_range, strict=True) if m.any()]
         errors = {COVERAGE: float(torch.stack(radius).mean())}
         facts = {FRAME_BYTES: points[0].numel() * 4}
-        choices.append(Choice(name, costs[name], errors, name == default, name.split(" ", 1)[1], facts))
+        default = name == f"{configured.num_proximal} farthest"
+        choices.append(Choice(name, costs[name], errors, default, name.split(" ", 1)[1], facts))
     notes = (
         f"{float(near.sum(1).float().mean()):.0f} proximal hits of {cloud.ranges.shape[1]} rays on average, {len(hits)}"
-        " environments. The coverage radius is the largest distance of a hit to its nearest sample, in float64.",
+        " environments. The coverage radius is the largest distance of a hit to its nearest sample, in float64."
+        " Thinning before sampling is not timed.",
     )
     return Study("farthest", "Farthest point sampling of the near cloud", SAMPLING, COVERAGE, choices, 1e-4, notes)
+
+
+def _thinned(cloud: Cloud, near: torch.Tensor, num_hits: int, order: torch.Tensor) -> Cloud:
+    """The cloud with only so many of the ``near`` hits (E, R), evenly spaced in an order of the rays."""
+    ranges = cloud.ranges.clone()
+    for row, mask in zip(ranges, near, strict=True):
+        hits = order[mask[order]]
+        if len(hits) > num_hits:
+            kept = torch.zeros_like(mask)
+            kept[hits[torch.linspace(0, len(hits) - 1, num_hits).round().long()]] = True
+            row[mask & ~kept] = math.inf
+    return replace(cloud, ranges=ranges)
 
 
 def heights_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] = (16, 32, 64, 128, 256, 512)) -> Study:
@@ -199,7 +218,7 @@ def heights_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] 
     cloud, configured = recorder.frames(2)[-1], recorder.run.perception.sampler()
     options = {"max_range": cloud.max_range, "split_deg": math.degrees(configured.split), "num_threads": 1}
     samplers = {f"{n} points": PdSampler(n, 0, **options) for n in sorted({*counts, configured.num_proximal})}
-    costs, kept = _sampled(cloud, samplers, sizes)
+    costs, kept = _sampled(dict.fromkeys(samplers, cloud), samplers, sizes)
     choices = []
     for name, points in kept.items():
         read = read_heights(cloud.level(points * cloud.max_range), points.abs().sum(-1) > 0)
@@ -236,7 +255,7 @@ def sectors_study(overrides: Sequence[str], sizes: Sizes, counts: Sequence[int] 
     default = f"{configured.num_distal} average"
     if isinstance(configured, ProximitySampler):
         default = f"{configured.num_sectors} x {len(configured.edges) - 1} proximity"
-    costs, kept = _sampled(cloud, samplers, sizes)
+    costs, kept = _sampled(dict.fromkeys(samplers, cloud), samplers, sizes)
     every = cloud.sectors.clamp(max=NEARNESS_RANGE)
     choices = []
     for name, points in kept.items():
@@ -349,13 +368,13 @@ def read_proximity(points: torch.Tensor, sampler: ProximitySampler, height: torc
 
 
 def _sampled(
-    cloud: Cloud, samplers: Mapping[str, Sampler], sizes: Sizes
+    clouds: Mapping[str, Cloud], samplers: Mapping[str, Sampler], sizes: Sizes
 ) -> tuple[dict[str, float], dict[str, torch.Tensor]]:
-    """CPU time per environment, us, and the points (E, P, 3) of every sampler."""
-    outs = {name: torch.empty(len(cloud.ranges), s.num_points, 3) for name, s in samplers.items()}
-    calls = {name: (lambda _, n=name: cloud.sample(samplers[n], outs[n])) for name in samplers}
+    """CPU time per environment, us, and the points (E, P, 3) of every sampler of its cloud."""
+    outs = {name: torch.empty(len(clouds[name].ranges), s.num_points, 3) for name, s in samplers.items()}
+    calls = {name: (lambda _, n=name: clouds[n].sample(samplers[n], outs[n])) for name in samplers}
     timings = paired_timings(calls, sizes.rounds, block_s=sizes.block_s)
-    return {name: 1e6 * least_s(t) / len(cloud.ranges) for name, t in timings.items()}, outs
+    return {name: 1e6 * t.least_cpu_s / len(clouds[name].ranges) for name, t in timings.items()}, outs
 
 
 def _embedding_costs(networks: Mapping[str, PdRiskNet], frames: torch.Tensor, sizes: Sizes) -> dict[str, float]:
@@ -370,7 +389,7 @@ def _embedding_costs(networks: Mapping[str, PdRiskNet], frames: torch.Tensor, si
 
     calls = {name: (lambda _, n=network: embed(n)) for name, network in networks.items()}
     timings = paired_timings(calls, sizes.rounds, block_s=sizes.block_s)
-    return {name: 1e6 * least_s(t) / num_envs for name, t in timings.items()}
+    return {name: 1e6 * t.least_cpu_s / num_envs for name, t in timings.items()}
 
 
 def _fit(network: PdRiskNet, frames: torch.Tensor, targets: torch.Tensor, sizes: Sizes) -> None:
@@ -396,17 +415,6 @@ def _radius(hits: torch.Tensor, samples: torch.Tensor) -> torch.Tensor:
     used = samples[samples.abs().sum(-1) > 0]
     away = torch.cdist(hits.double(), used.double(), compute_mode="donot_use_mm_for_euclid_dist")
     return away.min(-1).values.max()
-
-
-def _rotation(quat: torch.Tensor) -> torch.Tensor:
-    """Matrices (N, 3, 3) of quaternions (N, 4), float64."""
-    w, x, y, z = quat.double().unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def _rmse(read: torch.Tensor, truth: torch.Tensor) -> float:

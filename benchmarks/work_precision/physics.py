@@ -14,14 +14,14 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from benchmarks.lidar_benchmark.timing import paired_timings
+from benchmarks.harness.pareto import Choice, Study
+from benchmarks.harness.timing import paired_timings
 from omniperception.build import RunConfig
+from omniperception.config import ConfigError
 from omniperception.scene import ObstacleGroup, ObstaclesConfig, World, build_world
 from omniperception.scene.build import FOOT_FORCE, LINK_FORCE
 from omniperception.sim import SimConfig
 from omniperception.sim.mujoco import apply_options
-
-from .pareto import Choice, Study, least_s
 
 GAIT = Path(__file__).with_name("gait.json")
 COST = "CPU time per control step (us per environment)"
@@ -152,7 +152,7 @@ class Bench:
         self.sizes, self.sim, self.robot, self.terrain = sizes, run.env.sim, run.env.robot, run.env.terrain
         self.default = default_method(self.sim)
         if abs(self.sim.control_dt - CONTROL_DT) > 1e-9:
-            raise ValueError(
+            raise ConfigError(
                 f"sim.timestep * sim.decimation = {self.sim.control_dt:g} s must be {CONTROL_DT:g} s, the period of the"
                 " recorded gait"
             )
@@ -198,7 +198,7 @@ class Bench:
         """CPU time of a control step of the gait, us per environment, in turn."""
         steppers = {name: Stepper(self, method) for name, method in methods.items()}
         timings = paired_timings(steppers, self.sizes.rounds, block_s=self.sizes.block_s)
-        return {name: 1e6 * least_s(timing) / TIMED_ENVS for name, timing in timings.items()}
+        return {name: 1e6 * timing.least_cpu_s / TIMED_ENVS for name, timing in timings.items()}
 
     def notes(self) -> tuple[str, ...]:
         """The trajectories' horizons and the reference's own error."""

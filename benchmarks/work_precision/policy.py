@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from benchmarks.lidar_benchmark.timing import paired_timings
+from benchmarks.harness.pareto import Choice, Study
+from benchmarks.harness.timing import paired_timings
 from omniperception import build, config
 from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.export import FOLDER as EXPORTED
@@ -18,8 +19,6 @@ from omniperception.evaluation.exported import record
 from omniperception.evaluation.suite import FOLDER as EVALUATION
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
-
-from .pareto import Choice, Study, least_s
 
 COST = "CPU time of a control step, exported (us)"
 FAILED = "trials without success or with a touch (%)"
@@ -147,7 +146,7 @@ def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> Iterator[S
         choices = [
             Choice(
                 run.name,
-                1e6 * least_s(timings[run.name]),
+                1e6 * timings[run.name].least_cpu_s,
                 rates_of(reports[run.name][scenario]),
                 run.path.resolve() == chosen,
                 facts={**facts[run.name], "trials": reports[run.name][scenario]["episodes"]},

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from benchmarks.lidar_benchmark.reference import compile_model
-from benchmarks.lidar_benchmark.rotations import about, matrices, quat_multiply
+from benchmarks.harness.reference import compile_model, mujoco_ranges
+from benchmarks.harness.rotations import matrices, quat_about, quat_multiply, unit_vectors
 from omniperception.lidar import LidarConfig
 from omniperception.scene import ObstaclesConfig
 
@@ -54,7 +54,7 @@ class MovingScene:
 
     def obstacles(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Positions (E, S, 3) and quaternions (E, S, 4)."""
-        return self.start + time_s * self.velocity, about(Z, self.heading + time_s * self.spin)
+        return self.start + time_s * self.velocity, quat_about(Z, self.heading + time_s * self.spin)
 
     def base(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Position (E, 3) and quaternion (E, 4) of the robot's base."""
@@ -63,8 +63,8 @@ class MovingScene:
         pos = np.zeros((self.num_envs, 3))
         pos[:, 0] = WALK * time_s
         pos[:, 2] = HEIGHT + BOB * np.sin(2.0 * stride)
-        tilt = quat_multiply(about(Y, SWAY * np.sin(2.0 * stride)), about(X, SWAY * np.sin(stride)))
-        return pos, quat_multiply(about(Z, yaw), tilt)
+        tilt = quat_multiply(quat_about(Y, SWAY * np.sin(2.0 * stride)), quat_about(X, SWAY * np.sin(stride)))
+        return pos, quat_multiply(quat_about(Z, yaw), tilt)
 
     def sensor(self, time_s: float, config: LidarConfig) -> tuple[np.ndarray, np.ndarray]:
         """Position (E, 3) and rotation matrix (E, 3, 3) of the sensor in the environment's frame."""
@@ -144,10 +144,7 @@ class Truth:
         model, data, config = self._model, self._data, self.config
         data.mocap_pos[:], data.mocap_quat[:] = pos, quat
         mujoco.mj_kinematics(model, data)
-        count = len(directions)
-        geom, ranges = np.empty(count, np.int32), np.empty(count)
-        along = np.ascontiguousarray(directions).reshape(-1)
-        mujoco.mj_multiRay(model, data, origin, along, None, 1, -1, geom, ranges, None, count, 10.0 * config.max_range)
+        ranges, geom = mujoco_ranges(model, data, origin, directions)
         seen = (ranges >= config.min_range) & (ranges <= config.max_range)
         return np.where(seen, ranges, math.inf), seen & (geom > 0)
 
@@ -158,5 +155,4 @@ def dense_directions(elevation: Sequence[float], step_deg: float) -> np.ndarray:
     rows = math.ceil((high - low) / math.radians(step_deg)) + 1
     columns = math.ceil(360.0 / step_deg)
     theta, phi = np.meshgrid(np.linspace(low, high, rows), np.arange(columns) * 2.0 * math.pi / columns, indexing="ij")
-    flat = np.cos(theta)
-    return np.stack([flat * np.cos(phi), flat * np.sin(phi), np.sin(theta)], axis=-1).reshape(-1, 3)
+    return unit_vectors(theta, phi).reshape(-1, 3)

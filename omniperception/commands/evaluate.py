@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 from omniperception import config
 from omniperception.cli import Command, argument, trust
-from omniperception.evaluation.plots import PlotsUnavailable
+from omniperception.common.figures import PlotsUnavailable
 from omniperception.evaluation.suite import POLICIES, Evaluation, evaluate
 from omniperception.learning import CheckpointError
 

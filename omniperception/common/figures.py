@@ -1,4 +1,4 @@
-"""Empty matplotlib figures; the one place of this folder that imports it."""
+"""Empty matplotlib figures, and a refusal at once where it is not installed."""
 
 from __future__ import annotations
 

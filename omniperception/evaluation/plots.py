@@ -1,14 +1,14 @@
-"""Draws the robots' ways through a scenario, coloured by outcome; the only user of matplotlib."""
+"""Draws the robots' paths through a scenario, coloured by outcome."""
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 
+from omniperception.common.figures import new_figure
 from omniperception.evaluation.episodes import VERDICTS, Episodes
 from omniperception.evaluation.tracks import Tracks
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
@@ -21,28 +21,16 @@ EXAMPLES = 3
 """Single trials drawn with their obstacles."""
 
 
-class PlotsUnavailable(RuntimeError):
-    """matplotlib is not installed."""
-
-
-def check_available() -> None:
-    """Refuses at once what would fail after hours."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise PlotsUnavailable("plots need matplotlib: pip install 'omniperception[plots]', or give plots=false")
-
-
 def draw_tracks(path: Path, scenario: str, by_policy: Mapping[str, Episodes], obstacles: ObstaclesConfig) -> None:
     """A row per policy: all ways with the places of the first touches, then single trials with their obstacles.
 
     The single trials are of the outcomes that are not a clean success, as far as there are such, and show the obstacles
     where they were at the start; dashed ones move.
     """
-    from matplotlib.figure import Figure
-
     bounds = _bounds(list(by_policy.values()))
     width, height = bounds[1] - bounds[0], bounds[3] - bounds[2]
     columns, rows = 1 + EXAMPLES, len(by_policy)
-    figure = Figure(figsize=(4.2 * columns, rows * (4.2 * height / width + 0.9)), layout="constrained")
+    figure = new_figure(4.2 * columns, rows * (4.2 * height / width + 0.9))
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for row, (policy, episodes) in zip(axes, by_policy.items(), strict=True):
         _draw_all(row[0], policy, episodes, obstacles)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
+from omniperception.common.figures import new_figure
 from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
@@ -17,6 +18,7 @@ from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.evaluation.baselines import Limits, covered, steered
 from omniperception.evaluation.episodes import Episodes, run_episodes
 from omniperception.evaluation.exported import ExportedPolicies
+from omniperception.evaluation.plots import draw_tracks
 from omniperception.evaluation.report import DEFINITIONS, table, times_line, write_trials
 
 FOLDER = "evaluation"
@@ -92,9 +94,7 @@ def evaluate(evaluation: Evaluation) -> dict[str, dict]:
         What <scenario>.json holds, by scenario.
     """
     if evaluation.plots:
-        from omniperception.evaluation import plots
-
-        plots.check_available()
+        new_figure(1.0, 1.0)  # refuses now what would fail after hours
     folder = evaluation.run_dir / FOLDER
     folder.mkdir(exist_ok=True)
     reports = {}
@@ -105,7 +105,7 @@ def evaluate(evaluation: Evaluation) -> dict[str, dict]:
         written = [f"{scenario}.json", f"{scenario}.csv"]
         if evaluation.plots:
             obstacles = _assemble(evaluation, scenario, evaluation.run_dir).env.obstacles
-            plots.draw_tracks(folder / f"{scenario}.png", scenario, episodes, obstacles)
+            draw_tracks(folder / f"{scenario}.png", scenario, episodes, obstacles)
             written.append(f"{scenario}.png")
         print(f"{scenario}, {report['num_envs']} environments, seed {report['seed']}:")
         print(table(report["policies"]))

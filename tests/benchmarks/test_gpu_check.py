@@ -1,30 +1,25 @@
 """The GPU's check and the memory command at tiny size on a CPU, and what they say without a GPU."""
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from benchmarks import memory
-from benchmarks.gpu_check import CheckOptions, Table, execute
+from benchmarks.gpu_check import Arguments, command, execute
+from benchmarks.harness.table import Table
 from omniperception.build import build_runner
 
-ROOT = Path(__file__).parents[2]
 TINY = ("experiment=walk", "ppo.num_steps_per_env=4", "ppo.hidden_dims=[32,16]", "ppo.num_mini_batches=2")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_it_says_so_in_one_line(tmp_path):
-    command = [sys.executable, str(ROOT / "scripts" / "gpu_check.py"), f"out={tmp_path}"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].startswith("error: device=cuda:0")
-    assert "device=cpu size=small" in done.stderr and "Traceback" not in done.stderr
+def test_without_a_gpu_it_says_so_in_one_line(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        command([f"out={tmp_path}"])
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and error.startswith("error: device=cuda:0") and error.count("\n") == 1
 
 
 def test_a_part_that_fails_is_told_and_the_others_run(tmp_path, monkeypatch):
@@ -35,7 +30,7 @@ def test_a_part_that_fails_is_told_and_the_others_run(tmp_path, monkeypatch):
         return [Table("fine", "All is well", ("n",), [(1,)])]
 
     monkeypatch.setattr("benchmarks.gpu_check.PARTS", {"first": fails, "second": runs})
-    assert not execute(CheckOptions("cpu", True, tmp_path))
+    assert not execute(Arguments(device="cpu", size="small", only=("first", "second"), out=tmp_path))
     summary = json.loads((tmp_path / "summary.json").read_text())["rows"]
     assert [row["result"] for row in summary] == ["FAILED: RuntimeError: out of order", "done"]
     assert (tmp_path / "fine.csv").is_file()
@@ -43,7 +38,7 @@ def test_a_part_that_fails_is_told_and_the_others_run(tmp_path, monkeypatch):
 
 def test_parts_that_would_begin_too_late_are_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr("benchmarks.gpu_check.PARTS", {"late": None})
-    assert execute(CheckOptions("cpu", True, tmp_path, minutes=-1.0))
+    assert execute(Arguments(device="cpu", size="small", only=("late",), out=tmp_path, minutes=-1.0))
     (row,) = json.loads((tmp_path / "summary.json").read_text())["rows"]
     assert row["result"].startswith("left out")
 
@@ -51,8 +46,8 @@ def test_parts_that_would_begin_too_late_are_left_out(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_everything_runs_tiny_on_a_cpu(tmp_path):
     pytest.importorskip("mujoco_warp")
-    assert execute(CheckOptions("cpu", True, tmp_path))
-    names = {"tests", "lidar_accuracy", "step_errors", "waits", "paper_table", "paper_table_peers", "env_stages"}
+    assert execute(Arguments(device="cpu", size="small", out=tmp_path))
+    names = {"tests", "lidar_accuracy", "step_errors", "syncs", "paper_table", "paper_table_peers", "env_stages"}
     names |= {"env_stages_whole_clouds"}
     assert names | {"training", "memory", "summary"} <= {path.stem for path in tmp_path.glob("*.csv")}
 

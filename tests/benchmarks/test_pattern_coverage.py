@@ -1,9 +1,6 @@
 """Coverage figures on cases with known answers, and the command that prints them."""
 
 import math
-import runpy
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +9,7 @@ import torch
 from benchmarks.pattern_coverage import (
     angle_to_table,
     cell_share,
+    command,
     compare,
     largest_gap_deg,
     overlap,
@@ -20,8 +18,6 @@ from benchmarks.pattern_coverage import (
 )
 from omniperception.lidar import ScanPattern, make_selection
 from omniperception.lidar.patterns.cells import SphereCells
-
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "pattern_coverage.py"
 
 
 def circle(count=360, rate=360.0, start_deg=0.5):
@@ -87,29 +83,16 @@ def test_every_strategy_is_measured_beside_all_points():
     assert all(0.0 < rows[0].seen <= 0.5 + 1e-9 for rows in figures.values())
 
 
-@pytest.fixture
-def command(monkeypatch):
-    """Runs the script in this process with arguments."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["pattern_coverage.py", *arguments])
-        runpy.run_path(str(SCRIPT), run_name="__main__")
-
-    return run
-
-
-def test_the_command_prints_and_draws(command, capsys, tmp_path):
-    pytest.importorskip("matplotlib")
-    command("sensors=mid40,xt16", "num_rays=100", f"out={tmp_path / 'a' / 'coverage.png'}")
+def test_the_command_prints_and_draws(capsys, tmp_path):
+    command(["sensors=xt16", "num_rays=100", "cell_deg=10", f"out={tmp_path}"])
     printed = capsys.readouterr().out
-    assert "mid40: 100 of 10000 points every 0.1 s" in printed and "xt16: 100 of 32000" in printed
-    assert printed.count("stratified") == 2
-    assert (tmp_path / "a" / "coverage.png").stat().st_size > 10_000
+    assert "100 rays every 0.1 s" in printed and printed.count("stratified") == 3
+    assert (tmp_path / "patterns.png").stat().st_size > 10_000 and (tmp_path / "pattern_coverage.csv").is_file()
 
 
-@pytest.mark.parametrize(("argument", "named"), [("sensors=nose", "sensors=nose is not one of"), ("foo=1", "foo=1")])
-def test_the_command_tells_what_is_wrong_in_one_line(command, capsys, argument, named):
+@pytest.mark.parametrize(("argument", "named"), [("sensors=nose", "sensors=nose must be one of"), ("foo=1", "foo=1")])
+def test_the_command_tells_what_is_wrong_in_one_line(capsys, argument, named):
     with pytest.raises(SystemExit, match="2"):
-        command(argument)
+        command([argument])
     (line,) = capsys.readouterr().err.splitlines()
     assert named in line

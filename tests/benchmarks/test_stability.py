@@ -1,17 +1,13 @@
 """The stability report: its theory against closed forms and simulation, and that its cases hold."""
 
 import math
-import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.stability import learning, lidar, physics
-from benchmarks.stability.report import table, write
-from omniperception.config import ConfigError
+from benchmarks.stability.__main__ import command
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts/stability.py"
 M, H = 0.02, 0.005
 """Inertia (kg m^2) and step (s)."""
 
@@ -92,22 +88,25 @@ def test_float32_is_precise_enough_in_every_layer():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "told"),
     [
         (["subject=weather"], "subject=weather must be one of physics, lidar, learning"),
         (["subject=lidar", "sim.timestep=0.1"], "sim.timestep=0.1 is unknown for subject=lidar"),
-        (["subject=lidar", "rays=0"], "rays=0 must be a positive whole number"),
+        (["subject=lidar", "rays=0"], "rays=0 must be"),
     ],
 )
-def test_wrong_arguments_are_refused(arguments, message):
-    parse = runpy.run_path(str(SCRIPT))["parse"]
-    with pytest.raises(ConfigError, match=message):
-        parse(arguments)
-    subject, options = parse(["subject=physics", "sim.timestep=0.002", "size=5"])
-    assert subject == "physics" and options.overrides == ("sim.timestep=0.002",) and options.size == 5
+def test_wrong_arguments_are_refused(arguments, told, capsys):
+    with pytest.raises(SystemExit) as ended:
+        command(arguments)
+    assert ended.value.code == 2 and told in capsys.readouterr().err
 
 
-def test_tables_are_written(tmp_path):
-    write(tmp_path, "t", [{"a": 1, "good": True}, {"a": 2.34567, "b": "x"}], {"date": "today"})
-    assert (tmp_path / "t.csv").read_text() == "a,good,b\n1,True,\n2.34567,,x\n"
-    assert table([{"a": 2.34567, "good": False}], ["a", "good"]).splitlines()[-1] == "| 2.35 | NO |"
+def test_the_exit_status_says_whether_all_is_well(tmp_path, monkeypatch, capsys):
+    arguments = ["subject=lidar", f"out={tmp_path}", "rays=50", "many=100"]
+    monkeypatch.setattr(lidar, "run", lambda rays, many: [{"case": "a", "good": True}])
+    with pytest.raises(SystemExit, match="0"):
+        command(arguments)
+    monkeypatch.setattr(lidar, "run", lambda rays, many: [{"case": "a", "good": True}, {"case": "b", "good": False}])
+    with pytest.raises(SystemExit, match="1"):
+        command(arguments)
+    assert "| b    | NO   |" in capsys.readouterr().out and (tmp_path / "lidar.csv").is_file()

@@ -11,8 +11,9 @@ import torch
 
 from omniperception import build, config
 from omniperception.build import build_runner
+from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
-from omniperception.evaluation import plots, suite
+from omniperception.evaluation import suite
 from omniperception.evaluation.baselines import steered
 from omniperception.evaluation.suite import Evaluation, evaluate
 
@@ -130,8 +131,8 @@ def test_a_blind_run_cannot_be_blinded(walker):
 
 
 def test_missing_matplotlib_is_told_first(walker, monkeypatch):
-    monkeypatch.setattr(plots.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(plots.PlotsUnavailable, match=r"pip install 'omniperception\[plots\]', or give plots=false"):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(PlotsUnavailable, match=r"pip install 'omniperception\[plots\]'"):
         evaluate(Evaluation(walker, ["static"], trials=1))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.lidar_accuracy import mj_ray
+from benchmarks.harness.reference import mujoco_ranges
 from omniperception.lidar import MujocoScene, RayScene, ShapeKind, geom_shapes
 
 XML = """
@@ -89,7 +89,7 @@ def test_rays_meet_what_mj_ray_meets(model, seed):
     directions = aims - origins
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     hits = scene.cast(*(torch.from_numpy(v).expand(2, -1, 3) for v in (origins, directions)))
-    ranges, geoms = mj_ray(model, data, origins, directions)
+    ranges, geoms = mujoco_ranges(model, data, origins, directions)
     for env in range(2):
         shape = hits.shape_id[env].numpy()
         np.testing.assert_array_equal(np.array([*scene.geom_ids, -1])[shape], geoms)

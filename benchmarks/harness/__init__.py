@@ -1,0 +1,1 @@
+"""What all studies share: timer, tables, Pareto fronts, float64 reference, rotations, meshes, figures, command line."""
