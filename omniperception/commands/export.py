@@ -18,8 +18,7 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.cli import Command, argument, trust
-from omniperception.deploy.export import FORMATS, Export, export
-from omniperception.deploy.modules import ExportUnavailable
+from omniperception.deploy.export import FOLDER, FORMATS, export
 from omniperception.learning import CheckpointError
 
 
@@ -35,13 +34,14 @@ class Arguments:
 
 def main(arguments: Arguments) -> None:
     """Exports and tells what was written."""
-    request = Export(config.find_run(arguments.run), arguments.out, arguments.formats, arguments.trust)
-    described = export(request)
+    run_dir = config.find_run(arguments.run)
+    folder = arguments.out or run_dir / FOLDER
+    described = export(run_dir, folder, arguments.formats, arguments.trust)
     inputs = ", ".join(f"{name} {list(shape)}" for name, shape in described.inputs.items())
     print(f"{described.provenance['checkpoint']}: {inputs} -> {len(described.joints.names)} actions")
     lidar = f"LiDAR {1 / described.lidar.period_s:g} Hz" if described.lidar else "blind"
     print(f"control {1 / described.control_period_s:g} Hz, {lidar}")
-    print(f"wrote {', '.join(str(request.folder / name) for name in [*described.files.values(), 'policy.json'])}")
+    print(f"wrote {', '.join(str(folder / name) for name in [*described.files.values(), 'policy.json'])}")
 
 
-command = Command(main, Arguments, __doc__, errors=(CheckpointError, ExportUnavailable))
+command = Command(main, Arguments, __doc__, errors=(CheckpointError,))

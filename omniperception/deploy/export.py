@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import copy
+import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import torch
+from rsl_rl.models import MLPModel
+from torch import nn
 
 from omniperception import build, config
-from omniperception.build import RunConfig, build_runner
+from omniperception.build import RunConfig
 from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
 from omniperception.deploy.description import Description, Group, Joints, Lidar, Perception, Term
-from omniperception.deploy.modules import BlindNetwork, exportable, write_onnx, write_torchscript
 from omniperception.env.env import MAX_ACTION, OmniEnv
 from omniperception.env.mdp import observations
 from omniperception.env.mdp.commands import VelocityCommandConfig
-from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
+from omniperception.learning.models import PerceptionActor
 from omniperception.learning.read_out import MotionReadOut
 from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler
 
@@ -37,49 +40,44 @@ STEEP_TOLERANCE = 2e-4
 multiply the rounding of what perception says (1e-7) some hundred times."""
 
 
-@dataclass(frozen=True)
-class Export:
-    """What to export.
+OPSET = 18
+"""ONNX operator set."""
 
-    Attributes:
+
+def export(
+    run_dir: Path, folder: Path | None = None, formats: Sequence[str] = tuple(FORMATS), trust: Sequence[str] = ()
+) -> Description:
+    """Write the policy of a run's newest checkpoint and check the written networks against the actor.
+
+    Args:
         run_dir: the run.
-        out: folder for the files; None: FOLDER in the run directory.
+        folder: for the files; None: FOLDER in the run directory.
         formats: names from FORMATS.
         trust: packages of one's own whose names the run's configuration may build.
+
+    Raises:
+        ConfigError: the policy observes what no robot measures, a written network acts otherwise, or onnx is missing.
+        CheckpointError: the run has no checkpoint.
     """
-
-    run_dir: Path
-    out: Path | None = None
-    formats: Sequence[str] = tuple(FORMATS)
-    trust: Sequence[str] = ()
-
-    @property
-    def folder(self) -> Path:
-        """Where the files go."""
-        return self.out if self.out is not None else self.run_dir / FOLDER
-
-
-def export(request: Export) -> Description:
-    """Writes the policy of the newest checkpoint and checks the written networks against the actor."""
-    run = build.assemble(config.load(request.run_dir, ["num_envs=1"]), request.trust)
-    checkpoint = latest_checkpoint(request.run_dir)
-    runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0)), None)
-    runner.load_policy(checkpoint)
-    actor, env = runner.alg.actor.eval(), runner.env
-    sizes = {name: env.get_observations()[name].shape[1] for name in run.env.observations.actor}
-    network = exportable(actor, sizes)
-    described = describe(run, env)
+    run = build.assemble(config.load(run_dir, ["num_envs=1"]), trust)
+    trained = build.load_policy(run, run_dir)
+    sizes = {name: trained.env.get_observations()[name].shape[1] for name in run.env.observations.actor}
+    network = network_of(trained.policy, sizes)
     described = replace(
-        described,
-        files={name: FORMATS[name] for name in request.formats},
+        describe(run, trained.env),
+        files={name: FORMATS[name] for name in formats},
         provenance={
-            "run": request.run_dir.resolve().name,
-            "checkpoint": checkpoint.name,
-            "iteration": load_checkpoint(checkpoint, "cpu")["iteration"],
+            "run": run_dir.resolve().name,
+            "checkpoint": trained.checkpoint.name,
+            "iteration": load_checkpoint(trained.checkpoint, "cpu")["iteration"],
             **provenance("cpu"),
         },
     )
-    _write(request, network, described)
+    folder = run_dir / FOLDER if folder is None else folder
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, file in described.files.items():
+        check(network, *_WRITERS[name](network, folder / file))
+    described.write(folder)
     return described
 
 
@@ -105,48 +103,6 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         lidar=_lidar(run) if run.perception is not None else None,
         perception=_perception(run) if run.perception is not None else None,
     )
-
-
-def _write(request: Export, network: BlindNetwork, described: Description) -> None:
-    folder = request.folder
-    folder.mkdir(parents=True, exist_ok=True)
-    if "torchscript" in request.formats:
-        path = folder / FORMATS["torchscript"]
-        write_torchscript(network, path)
-        _check(network, torch.jit.load(str(path)), path)
-    if "onnx" in request.formats:
-        path = folder / FORMATS["onnx"]
-        write_onnx(network, path)
-        session = _onnx_session(path)
-        if session is not None:
-            _check(network, session, path)
-    described.write(folder)
-
-
-def _check(network: BlindNetwork, written: Callable, path: Path) -> None:
-    """A written network gives the actions of the one it was written from, for another batch size, too."""
-    inputs = network.examples(23)
-    with torch.no_grad():
-        error = float((written(*inputs) - network(*inputs)).abs().max())
-    steep = isinstance(getattr(network.actor, "read_out", None), MotionReadOut)
-    if not error <= (STEEP_TOLERANCE if steep else TOLERANCE):
-        raise ConfigError(f"{path} differs from the policy by {error:.1e} in an action: not exportable")
-
-
-def _onnx_session(path: Path) -> Callable | None:
-    """The ONNX network as a function of tensors; None without onnxruntime, which only running it needs."""
-    try:
-        from onnxruntime import InferenceSession
-    except ImportError:
-        return None
-    session = InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    names = [item.name for item in session.get_inputs()]
-
-    def run(*inputs: torch.Tensor) -> torch.Tensor:
-        feed = {name: tensor.numpy() for name, tensor in zip(names, inputs, strict=True)}
-        return torch.from_numpy(session.run(None, feed)[0])
-
-    return run
 
 
 _QUANTITIES = ("joint_pos_offset", "joint_vel", "base_lin_vel", "base_ang_vel", "projected_gravity", "command")
@@ -196,11 +152,11 @@ def _lidar(run: RunConfig) -> Lidar:
 def _perception(run: RunConfig) -> Perception:
     sampler = run.perception.sampler()
     moves = run.perception.base_motion
-    return Perception(run.perception.history, sampler.num_points + moves, sampler_figures(sampler), moves)
+    return Perception(run.perception.history, sampler.num_points + moves, sampler_parameters(sampler), moves)
 
 
-def sampler_figures(sampler: Sampler) -> dict:
-    """Kind and figures of a sampler, as `omniperception.deploy.sampling.make_sampler` takes them."""
+def sampler_parameters(sampler: Sampler) -> dict:
+    """Kind and parameters of a sampler, as `omniperception.deploy.sampling.make_sampler` takes them."""
     if isinstance(sampler, RawSampler):
         return {"kind": "raw", "num_points": sampler.num_points, "max_range": sampler.max_range}
     if not isinstance(sampler, PdSampler):
@@ -222,3 +178,130 @@ def sampler_figures(sampler: Sampler) -> dict:
         "blind": sampler.blind,
         "body": list(sampler.body),
     }
+
+
+class BlindNetwork(nn.Module):
+    """Flat observations -> actions; the observations' normalisation is part of it."""
+
+    input_names = ("observations",)
+
+    def __init__(self, actor: MLPModel) -> None:
+        """Args: actor: copied, on the CPU."""
+        super().__init__()
+        self.actor = copy.deepcopy(actor).cpu().eval().requires_grad_(False)
+        self.output = actor.distribution.as_deterministic_output_module() if actor.distribution else nn.Identity()
+        self.observation_size = actor.obs_dim
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """(B, observation_size), the actor's groups in order -> (B, num_actions)."""
+        return self.output(self.actor.mlp(self.actor.obs_normalizer(observations)))
+
+    def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
+        """Random inputs."""
+        return (torch.randn(batch, self.observation_size),)
+
+
+class PerceptiveNetwork(BlindNetwork):
+    """Flat observations and a history of sampled frames -> actions."""
+
+    input_names = ("observations", "frames", "frame_count")
+
+    def __init__(self, actor: PerceptionActor, command_start: int) -> None:
+        """Args: actor: copied, on the CPU; command_start: where (v_x, v_y) begin in the observations."""
+        super().__init__(actor)
+        self.command_start = command_start
+
+    def forward(self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor) -> torch.Tensor:
+        """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> (B, num_actions)."""
+        features = self.actor.perception(frames, frame_count)[:, 0]
+        if self.actor.read_out is not None:
+            start, stop = self.command_start, self.command_start + 2
+            command = observations[:, start:stop]
+            command = command + self.actor.read_out.velocity(features, command) * (frame_count > 0)
+            observations = torch.cat((observations[:, :start], command, observations[:, stop:]), 1)
+        return self.output(self.actor.mlp(torch.cat((self.actor.obs_normalizer(observations), features), 1)))
+
+    def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
+        """Random inputs, with every number of valid frames in turn."""
+        history, points = self.actor.perception.history, self.actor.perception.num_points
+        count = torch.arange(batch)[:, None] % (history + 1)
+        bearing, nearness = 2 * torch.pi * torch.rand(2, batch, history, points)
+        nearness = (-nearness).exp()  # a place in the plane and its proximity, as rows of a grid are
+        rows = torch.stack((nearness * bearing.cos(), nearness * bearing.sin(), nearness), -1)
+        rows[:, :, -1] *= 0.1  # motion from frame to frame is small
+        return *super().examples(batch), rows, count
+
+
+def network_of(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
+    """The actor as a network of plain tensors.
+
+    Args:
+        actor: of a runner.
+        group_sizes: numbers in each of its observation groups, in order.
+    """
+    if not isinstance(actor, PerceptionActor):
+        return BlindNetwork(actor)
+    names, command_start = list(group_sizes), 0
+    if actor.read_out is not None:
+        command_start = sum(group_sizes[name] for name in names[: names.index(actor.command_group)])
+    return PerceptiveNetwork(actor, command_start)
+
+
+def write_torchscript(network: BlindNetwork, path: Path) -> tuple[Path, Callable]:
+    """Write the network as TorchScript, for any batch size; returns the path and what it runs as."""
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that tracing is deprecated, and that checks of shapes are not traced
+        torch.jit.trace(network, network.examples(2), check_trace=False).save(str(path))
+    return path, torch.jit.load(str(path))
+
+
+def write_onnx(network: BlindNetwork, path: Path) -> tuple[Path, Callable | None]:
+    """Write the network as ONNX, for any batch size; returns the path and what it runs as, None without onnxruntime.
+
+    torch's TorchScript-based exporter is used: the other one's packages, onnxscript and onnx-ir, are not needed then.
+    """
+    try:
+        import onnx  # noqa: F401  torch's exporter needs it
+    except ImportError:
+        raise ConfigError(
+            "ONNX export needs onnx: pip install 'omniperception[export]', or give formats=torchscript"
+        ) from None
+    names = list(network.input_names)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network,
+            network.examples(2),
+            str(path),
+            input_names=names,
+            output_names=["actions"],
+            dynamic_axes={name: {0: "batch"} for name in (*names, "actions")},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+    try:
+        from onnxruntime import InferenceSession
+    except ImportError:
+        return path, None
+    session = InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+    def run(*inputs: torch.Tensor) -> torch.Tensor:
+        feed = {name: tensor.numpy() for name, tensor in zip(names, inputs, strict=True)}
+        return torch.from_numpy(session.run(None, feed)[0])
+
+    return path, run
+
+
+_WRITERS = {"onnx": write_onnx, "torchscript": write_torchscript}
+
+
+def check(network: BlindNetwork, path: Path, written: Callable | None) -> None:
+    """A written network gives the actions of the one it was written from, for another batch size, too."""
+    if written is None:
+        return
+    inputs = network.examples(23)
+    with torch.no_grad():
+        error = float((written(*inputs) - network(*inputs)).abs().max())
+    steep = isinstance(getattr(network.actor, "read_out", None), MotionReadOut)
+    if not error <= (STEEP_TOLERANCE if steep else TOLERANCE):
+        raise ConfigError(f"{path} differs from the policy by {error:.1e} in an action: not exportable")

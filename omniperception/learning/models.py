@@ -123,9 +123,9 @@ class PerceptionActor(MLPModel):
         return torch.where(count > 0, features, empty)
 
     @property
-    def tick(self) -> int:
-        """Number of the newest LiDAR frame acted on."""
-        return self._newest[0]
+    def tick(self) -> int | None:
+        """Number of the newest LiDAR frame acted on; None after a reset."""
+        return None if self._newest is None else self._newest[0]
 
     def embed(self, obs: WindowedObservations) -> torch.Tensor:
         """(B, D) embeddings of the steps of an update, or (B, D + K) those that were acted on; each window is embedded

@@ -13,7 +13,7 @@ import torch
 
 from omniperception import build, config
 from omniperception.build import build_runner, load_policy
-from omniperception.deploy.export import Export, describe, export
+from omniperception.deploy.export import describe, export
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.learning import CheckpointError
@@ -78,7 +78,7 @@ def exported_run(tmp_path_factory):
         runner = build_runner(run, run_dir)
         stir(runner.alg.actor)
         runner.save(str(checkpoint_path(run_dir, 7)))
-        export(Export(run_dir))
+        export(run_dir)
         return run_dir
 
     return make
@@ -300,9 +300,7 @@ def test_the_commands(exported_run, tmp_path):
 def test_what_cannot_be_exported_is_named(exported_run, tmp_path):
     (tmp_path / "config.yaml").write_bytes((exported_run("none") / "config.yaml").read_bytes())
     with pytest.raises(CheckpointError, match="no checkpoint in"):
-        export(Export(tmp_path))
-    with pytest.raises(config.ConfigError, match="pickle is unknown; known: onnx, torchscript"):
-        Export(tmp_path, formats=("pickle",))
+        export(tmp_path)
     privileged = ("experiment=walk", "observations.actor=[privileged,command]", "num_envs=1")
     run = build.assemble(config.compose(privileged))
     with pytest.raises(config.ConfigError, match=r"privileged\.terms\.proprioception cannot be exported"):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from omniperception.deploy import DeployError
-from omniperception.deploy.export import sampler_figures
+from omniperception.deploy.export import sampler_parameters
 from omniperception.deploy.sampling import Attitude, farthest_points, make_sampler
 from omniperception.lidar.sensor import quat_from_rpy
 from omniperception.perception import Attitude as TorchAttitude
@@ -74,7 +74,7 @@ def by_training(sampler, points, base_quat):
 
 
 def by_robot(sampler, points, base_quat):
-    return make_sampler(sampler_figures(sampler))(points, Attitude(np.array(base_quat), MOUNT_POS, MOUNT_QUAT))
+    return make_sampler(sampler_parameters(sampler))(points, Attitude(np.array(base_quat), MOUNT_POS, MOUNT_QUAT))
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
@@ -91,7 +91,7 @@ def test_robot_and_training_sample_alike(name, scene):
 
 def test_points_on_the_split_go_where_their_elevation_says():
     """To the last bit of a float32 angle, at all ranges, as in training."""
-    rng, sampler = np.random.default_rng(11), make_sampler(sampler_figures(SAMPLERS["pd"]()))
+    rng, sampler = np.random.default_rng(11), make_sampler(sampler_parameters(SAMPLERS["pd"]()))
     theta = math.radians(20.0) + rng.uniform(-3e-7, 3e-7, 20_000)
     phi, far = rng.uniform(0.0, 2 * math.pi, (2, len(theta)))
     unit = np.stack((np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.sin(theta)), 1)
