@@ -268,8 +268,6 @@ def _kernels_of_policy(runner: Runner) -> Iterator[tuple[str, str]]:
     rings = getattr(getattr(actor, "perception", None), "rings", None)
     if rings is not None:
         yield "write_rings", "perception.network.rings"
-    if rings is not None and rings.match is not None:
-        yield "match_motion", "perception.network.rings.match"
     if isinstance(getattr(actor, "read_out", None), MotionReadOut):
         yield "worst_sectors", "perception.motion_weight: risks follow from what is perceived"
 

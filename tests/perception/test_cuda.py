@@ -10,11 +10,10 @@ from omniperception.avoidance.velocity_risk import worst_sectors
 from omniperception.lidar import sector_distances
 from omniperception.lidar.kernels.sectors import sector_minima
 from omniperception.perception import FpsSampler, PdSampler
-from omniperception.perception.networks.motion_match import match_motion
 from omniperception.perception.networks.rings import write_rings
 from omniperception.perception.samplers import kernels, sorting
 
-MODULES = [kernels, sorting, *(k.module for k in (match_motion, write_rings, worst_sectors, sector_minima))]
+MODULES = [kernels, sorting, *(k.module for k in (write_rings, worst_sectors, sector_minima))]
 
 
 @pytest.mark.parametrize("module", MODULES)

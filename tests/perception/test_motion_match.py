@@ -56,19 +56,6 @@ def test_a_match_fades_with_distance():
     assert MATCH(distance, bearing, VELOCITIES)[0, 0, 18].item() == pytest.approx(0.0, abs=1e-5)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_kernel_agrees_with_what_is_exported(seed):
-    torch.manual_seed(seed)
-    distance = 6 * torch.rand(50, HISTORY, SECTORS)
-    distance[torch.rand(distance.shape) < 0.4] = NOTHING
-    bearing = (torch.rand(50, SECTORS) - 0.5) * 2 * math.pi / SECTORS
-    scores = MATCH(distance, bearing, VELOCITIES)
-    assert scores.shape == (50, (HISTORY - 1) * MATCH.num_velocities, SECTORS)
-    expected = MATCH._match(distance, bearing, VELOCITIES)
-    assert ((scores - expected).abs() > 1e-5).float().mean() < 1e-4  # on the border of two sectors
-    assert (scores > 0).float().mean() > 0.01
-
-
 def test_ground_is_not_matched():
     """What lies in the lowest bands alone is nothing to match, unless they are told to be no ground."""
     cells = torch.zeros(1, 5, 2 * SECTORS, 3)

@@ -7,9 +7,6 @@ import math
 from dataclasses import dataclass
 
 import torch
-import warp as wp
-
-from omniperception.common.launch import launch_over_envs, view
 
 NOTHING = 50.0
 """Distance (m) of an empty sector."""
@@ -65,24 +62,6 @@ class MotionMatch:
             (n, (H - 1) * K, S): 1 where the frame has a hit just where the velocity says, falling to 0 at `width` from
             there.
         """
-        if torch.jit.is_tracing() or torch.onnx.is_in_onnx_export() or distance.is_meta:
-            return self._match(distance, bearing, velocities)
-        number, history, sectors = distance.shape
-        distance, bearing = distance.contiguous(), bearing.contiguous()
-        out = distance.new_zeros(number, (history - 1) * self.num_velocities, sectors)
-        inputs = [
-            view(distance, wp.float32),
-            view(bearing, wp.float32),
-            view(velocities, wp.vec2),
-            self.period_s,
-            self.width,
-            view(out, wp.float32),
-        ]
-        launch_over_envs(match_motion, number, inputs, distance.device)
-        return out
-
-    def _match(self, distance: torch.Tensor, bearing: torch.Tensor, velocities: torch.Tensor) -> torch.Tensor:
-        """As :meth:`__call__`, of operations that can be exported."""
         history, sectors = distance.shape[1:]
         now = distance[:, -1]
         here = torch.stack((now * bearing.cos(), now * bearing.sin()), 1)[:, :, None]  # (n, 2, 1, S)
@@ -96,32 +75,3 @@ class MotionMatch:
             off = (there - (x * x + y * y).sqrt()).abs() / self.width
             scores.append((1.0 - off).clamp(min=0.0) * (now < NOTHING)[:, None])
         return torch.cat(scores, 1)
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def match_motion(
-    env_offset: int,
-    distance: wp.array3d(dtype=wp.float32),
-    bearing: wp.array2d(dtype=wp.float32),
-    velocities: wp.array(dtype=wp.vec2),
-    period: float,
-    width: float,
-    # out
-    scores: wp.array3d(dtype=wp.float32),
-):
-    """Of one window; see `MotionMatch`."""
-    window = wp.tid() + env_offset
-    newest = distance.shape[1] - 1
-    num_sectors = distance.shape[2]
-    for s in range(num_sectors):
-        now = distance[window, newest, s]
-        if now < wp.static(NOTHING):
-            here = now * wp.vec2(wp.cos(bearing[window, s]), wp.sin(bearing[window, s]))
-            for k in range(newest):
-                age = period * float(newest - k)
-                for v in range(velocities.shape[0]):
-                    place = here - age * velocities[v]
-                    beside = wp.round(wp.atan2(place[1], place[0]) * float(num_sectors) / wp.static(2.0 * math.pi))
-                    there = distance[window, k, (s + int(beside) + num_sectors) % num_sectors]
-                    off = wp.abs(there - wp.length(place)) / width
-                    scores[window, k * velocities.shape[0] + v, s] = wp.max(1.0 - off, 0.0)
