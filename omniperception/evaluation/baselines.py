@@ -28,11 +28,14 @@ def covered(env: OmniEnv, policy: Policy) -> Policy:
     if env.sensing is None or env.sensing.frames is None:
         raise ValueError("this policy does not look at the LiDAR, there is nothing to cover; leave policy=blind out")
     nothing = _empty_points(env)
+    given = frames = None
 
     def blind(observations: TensorDict) -> torch.Tensor:
+        nonlocal given, frames
+        if observations["frames"] is not given:  # a new frame; a policy embeds each tensor of frames once
+            given, frames = observations["frames"], observations["frames"].clone()
+            frames[:, :, : nothing.shape[2]] = nothing
         observations = observations.clone(recurse=False)
-        frames = observations["frames"].clone()
-        frames[:, :, : nothing.shape[2]] = nothing
         observations["frames"] = frames
         return policy(observations)
 

@@ -21,10 +21,10 @@ from omniperception.perception import PerceptionNetwork
 class PerceptionActor(MLPModel):
     """An MLP on one-dimensional observation groups and the embedding of the LiDAR history.
 
-    While it acts, the embedding is computed without gradients, once per LiDAR frame (``frame_tick``); :meth:`reset`
-    forgets it, which is due when weights or environments change. In updates each distinct window of a
-    :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the network's
-    embedding of an empty history.
+    While it acts, the embedding is computed without gradients, once per LiDAR frame: as long as it is given the same
+    tensor of frames with the same ``frame_tick``. :meth:`reset` forgets it, which is due when weights change. In an
+    update each distinct window of a :class:`WindowedObservations` is embedded once. An environment without a frame
+    since its reset gets the network's embedding of an empty history.
 
     With ``end_to_end`` the supervised loss joins whatever loss is back-propagated through the actor (paper, Sec. 3.3.1:
     privileged height supervision). It is the mean squared error between an observation group and the part of the
@@ -85,7 +85,7 @@ class PerceptionActor(MLPModel):
             self.read_out_target = MOTION_TARGET
             self.read_out = MotionReadOut(self._feature_dim, num_values, part, velocity_risk)
         self._check_supervision(obs)
-        self._newest: tuple[int, torch.Tensor, torch.Tensor] | None = None
+        self._newest: tuple[int, torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # tick, frames, embeddings
         self._losses: dict[str, list[torch.Tensor]] = {target: [] for target in self.supervision}
 
     def get_latent(
@@ -115,11 +115,12 @@ class PerceptionActor(MLPModel):
 
     def embed_newest(self, obs: TensorDict) -> torch.Tensor:
         """(N, D) embeddings of the current histories, extended for the read-out; the empty one without a frame."""
-        count, tick = obs["frame_count"], int(obs["frame_tick"][0])
-        if self._newest is None or self._newest[0] != tick:
-            features, empty = self.perception(obs["frames"], count)[:, 0], self.perception.empty(obs["frames"])
-            self._newest = (tick, self._extend(features), self._extend(empty))
-        _, features, empty = self._newest
+        frames, count, tick = obs["frames"], obs["frame_count"], int(obs["frame_tick"][0])
+        if self._newest is None or self._newest[0] != tick or self._newest[1] is not frames:
+            self._newest = None  # frees the old frames
+            features, empty = self.perception(frames, count)[:, 0], self.perception.empty(frames)
+            self._newest = (tick, frames, self._extend(features), self._extend(empty))
+        features, empty = self._newest[2:]
         return torch.where(count > 0, features, empty)
 
     @property

@@ -103,6 +103,16 @@ def test_weights_that_learn_or_are_loaded_are_used_at_once():
             before = now
 
 
+def test_another_environment_of_the_same_tick_is_embedded():
+    a, b = ToyEnv(4, seed=0), ToyEnv(4, seed=1)
+    advance(a, 10)
+    advance(b, 10)
+    actor = actor_for(a)
+    with torch.no_grad():
+        first, second = actor.embed_newest(a.get_observations()), actor.embed_newest(b.get_observations())
+    assert not torch.allclose(first, second)
+
+
 def test_a_reset_alone_embeds_nothing_anew():
     env = ToyEnv(4)
     advance(env, 10)
