@@ -1,0 +1,158 @@
+"""What pip installs: the LiDAR toolkit by itself, the extras, the console command with its presets."""
+
+import ast
+import importlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from omniperception.commands import COMMANDS, main
+from omniperception.commands import EXTRAS as EXTRA_OF
+from omniperception.common.figures import PlotsUnavailable, new_figure
+from omniperception.lidar import TriangleMesh, mid360
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MODULES = {
+    "hydra-core": "hydra",
+    "mujoco-core": "mujoco",
+    "pyyaml": "yaml",
+    "rsl-rl-lib": "rsl_rl",
+    "warp-lang": "warp",
+}
+BLOCK = """
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {names}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Blocked())
+"""
+EXTRAS = {"hydra", "omegaconf", "yaml", "mujoco", "rsl_rl", "tensordict", "tensorboard", "matplotlib", "trimesh"}
+CAST = """
+import numpy as np
+from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, vlp16
+
+ball = Shape(ShapeKind.SPHERE, (0.5,), pos=(3.0, 0.0, 1.0))
+scene = RayScene([Shape(ShapeKind.PLANE), ball], num_envs=1, num_bodies=0)
+hits = scene.cast(np.array([[[0.0, 0.0, 1.0]]]), np.array([[[1.0, 0.0, 0.0]]]), max_range=20.0)
+assert abs(float(hits.ranges[0, 0]) - 2.5) < 1e-5
+outside = [m for m in sys.modules if m.startswith("omniperception.") and not m.startswith("omniperception.lidar")]
+assert not outside, outside
+"""
+
+
+def python(code, **options):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, **options)
+
+
+def test_the_toolkit_casts_without_what_training_needs():
+    done = python(BLOCK.format(names=EXTRAS) + CAST)
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+
+
+def test_a_command_names_the_extra_that_it_lacks():
+    code = BLOCK.format(names={"hydra"}) + "from omniperception.commands import main; main(['train', 'num_envs=2'])"
+    done = python(code)
+    assert done.returncode == 2
+    assert done.stderr == "error: train needs hydra: pip install 'omniperception[train]'\n"
+
+
+def test_the_console_command_lists_and_explains_all_commands(capsys):
+    main(["--help"])
+    listed = capsys.readouterr().out
+    for name in COMMANDS:
+        assert f"\n  {name} " in listed
+        main([name, "--help"])
+        shown = capsys.readouterr().out
+        module = importlib.import_module(f"omniperception.commands.{name}")
+        assert shown.startswith(f"usage: omniperception {name} ") and module.__doc__.splitlines()[0] in shown
+    with pytest.raises(SystemExit, match="2"):
+        main(["trian"])
+    assert "trian is unknown; known: train, play" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("door", ["train.py", "play.py", "scripts/evaluate.py", "scripts/view_scan.py"])
+def test_doors_of_a_checkout_run_the_commands(door):
+    text = (ROOT / door).read_text()
+    names = [name for name in COMMANDS if f'main(["{name}", *sys.argv[1:]])' in text]
+    assert len(names) == 1
+
+
+@pytest.mark.slow
+def test_the_wheel_trains_and_plays_in_an_empty_folder(tmp_path):
+    source, site, empty = tmp_path / "source", tmp_path / "site", tmp_path / "empty"
+    for name in ("omniperception", "conf"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "setup.py", "README.md"):
+        shutil.copy(ROOT / name, source)
+    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", ".", "-w", str(tmp_path)]
+    done = subprocess.run(pip, cwd=source, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(site)
+    presets = {path.relative_to(ROOT) for path in (ROOT / "conf").rglob("*.yaml")}
+    assert {path.relative_to(site / "omniperception") for path in site.rglob("*.yaml")} == presets
+    (entry,) = site.glob("*.dist-info/entry_points.txt")
+    assert "omniperception = omniperception.commands:main" in entry.read_text()
+    empty.mkdir()
+    for line in (
+        ["train", "experiment=walk", "ppo.max_iterations=1", "num_envs=4", "ppo.num_steps_per_env=4"],
+        ["play", "trials=2", "viewer=none", "terminations.episode_length_s=0.2"],
+    ):
+        code = f"import omniperception.commands as c; print(c.__file__); c.main({line})"
+        done = python(code, cwd=empty, env={**os.environ, "PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"})
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith(str(site))
+    assert list(empty.glob("outputs/*/*/replay.json"))
+
+
+@pytest.mark.parametrize(
+    ("modules", "use", "extra"),
+    [
+        (("trimesh",), lambda: TriangleMesh.from_file("rock.stl"), "meshes"),
+        (("mujoco_lidar",), lambda: mid360("table"), "tables"),
+        (("matplotlib", "matplotlib.figure"), lambda: new_figure(1.0, 1.0), "plots"),
+    ],
+)
+def test_a_missing_library_names_its_extra(monkeypatch, modules, use, extra):
+    for module in modules:
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError, match=rf"pip install 'omniperception\[{extra}\]'") as error:
+        use()
+    assert "\n" not in str(error.value)
+    assert extra != "plots" or isinstance(error.value, PlotsUnavailable)
+
+
+def test_every_extra_that_is_named_exists():
+    texts = [path.read_text() for path in (*ROOT.glob("omniperception/**/*.py"), ROOT / "README.md")]
+    named = {extra for text in texts for extra in re.findall(r"omniperception\[(\w+)\]", text)} | set(EXTRA_OF.values())
+    assert {"meshes", "tables", "plots", "gpu"} <= named <= set(PROJECT["optional-dependencies"])
+
+
+def imported_at_once(path):
+    """Libraries that a module imports when it is imported."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield node.module.split(".")[0]
+
+
+@pytest.mark.parametrize(("folder", "extras"), [("lidar", ()), ("", ("train",))])
+def test_only_dependencies_are_imported_before_they_are_used(folder, extras):
+    required = [*PROJECT["dependencies"], *(r for e in extras for r in PROJECT["optional-dependencies"][e])]
+    names = [re.match(r"[\w-]+", requirement).group() for requirement in required]
+    allowed = {MODULES.get(name, name.replace("-", "_")) for name in names} | {"omniperception"}
+    for path in (ROOT / "omniperception" / folder).rglob("*.py"):
+        for name in imported_at_once(path):
+            assert name in allowed or name in sys.stdlib_module_names, f"{path}: {name}"
