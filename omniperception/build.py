@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from omniperception.config import ConfigError, compose, is_composed, one_line
+from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.env import EnvConfig, OmniEnv
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.env.mdp.randomization import RandomizationConfig
@@ -138,21 +135,6 @@ def _names(value: object) -> tuple[str, ...]:
     if not all(isinstance(name, str) for name in names):
         raise ConfigError(f"init={value} must be a run directory, a list of them, or null")
     return tuple(names)
-
-
-def check(overrides: Sequence[str]) -> None:
-    """Composes and validates every job that command-line overrides (with sweeps) stand for, before any is started."""
-    values = [o for o in overrides if not o.startswith("-")]
-    try:
-        parsed = OverridesParser.create().parse_overrides(values)
-    except HydraException as error:
-        raise ConfigError(one_line(error)) from None
-    if "-m" in overrides or "--multirun" in overrides:
-        jobs = [list(job) for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
-    else:
-        jobs = [values]
-    for job in jobs:
-        assemble(compose([o for o in job if not o.startswith("hydra")]))
 
 
 def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:

@@ -98,8 +98,8 @@ class Command:
             arguments, overrides = self.parse(argv)
             self.main(arguments, overrides) if self.overrides else self.main(arguments)
         except UnknownKey as error:
-            own = [field.name for field in dataclasses.fields(self.arguments)]
-            fail(UnknownKey(error.given, (*error.known, *own) if "." not in error.given else error.known))
+            own = () if "." in error.given else [field.name for field in dataclasses.fields(self.arguments)]
+            fail(UnknownKey(error.given, (*error.known, *own), error.name))
         except (ConfigError, *self.errors) as error:
             fail(error)
 

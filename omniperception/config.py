@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib.util
-import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -331,46 +330,3 @@ def one_line(error: BaseException) -> str:
     """The message of an error without line breaks."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines) or type(error).__name__
-
-
-# Replaced by omniperception/cli.py; goes when the last script is converted.
-
-
-def scenarios() -> tuple[str, ...]:
-    """Names of the scenarios in conf/scenario."""
-    return presets("scenario")
-
-
-def split_arguments(arguments: Sequence[str], known: dict[str, str]) -> tuple[dict[str, str], list[str]]:
-    """Takes an entry point's own `key=value` arguments (with defaults) out of a list of overrides."""
-    own, overrides = dict(known), []
-    for argument in arguments:
-        key, separator, value = argument.partition("=")
-        if not separator and not argument.startswith("-"):
-            raise ConfigError(f"argument '{argument}' is not of the form key=value")
-        if key in own:
-            own[key] = value
-        else:
-            overrides.append(argument)
-    return own, overrides
-
-
-def positive(key: str, text: str, kind: type) -> float:
-    """The positive number, int or float, that an entry point's own argument stands for."""
-    try:
-        value = kind(text)
-    except ValueError:
-        value = 0
-    if not 0 < value < float("inf"):
-        raise ConfigError(f"{key}={text} must be a positive {'whole ' if kind is int else ''}number")
-    return value
-
-
-@contextlib.contextmanager
-def one_line_errors(*also: type[Exception]) -> Iterator[None]:
-    """Turns a wrong configuration, or one of `also`, into one line on standard error and exit code 2."""
-    try:
-        yield
-    except (ConfigError, *also) as error:
-        print(f"error: {one_line(error)}", file=sys.stderr, flush=True)
-        sys.exit(2)

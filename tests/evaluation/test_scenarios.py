@@ -60,14 +60,14 @@ class TestOverlay:
         with pytest.raises(ConfigError, match="abs_hard aerial corridor"):
             config.load(run_dir, ["scenario=dragons"])
 
-    @pytest.mark.parametrize("scenario", config.scenarios())
+    @pytest.mark.parametrize("scenario", config.presets("scenario"))
     def test_an_experiment_leaves_no_trace_in_the_scene(self, scenario):
         alone, mixed = (config.compose([*given, f"scenario={scenario}"]) for given in ([], ["experiment=quickstart"]))
         for key in config.FIXED_BY_SCENARIO:
             assert alone[key] == mixed[key], key
 
     def test_every_scenario_has_a_seed_of_its_own(self):
-        seeds = [config.compose([f"scenario={name}"]).seed for name in config.scenarios()]
+        seeds = [config.compose([f"scenario={name}"]).seed for name in config.presets("scenario")]
         assert len(set(seeds)) == len(seeds) == 7
 
 

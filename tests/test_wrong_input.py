@@ -1,0 +1,225 @@
+"""A hundred wrong command lines over all commands and groups: each ends with exit code 2 and one line that names the key."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from omniperception import build, config
+from omniperception.commands import COMMANDS, main
+from omniperception.learning import Runner
+
+ROOT = Path(__file__).resolve().parents[1]
+GROUPS = sorted(path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir())
+
+
+def wrong_shape(state):
+    """A reward of a shape that no reward has."""
+    return torch.zeros(3, 5)
+
+
+def not_a_tensor(state):
+    """A reward that is none."""
+    return 1.0
+
+
+# The command line, and what the message must name. RUN is a run directory of experiment=walk.
+LINES = [
+    # words
+    ("trian", "trian"),
+    ("train num_envs", "num_envs"),
+    ("train --fast", "--fast"),
+    ("train num_envs=2 num_envs=3", "num_envs is given twice"),
+    ("train --config-dir nowhere", "nowhere"),
+    ("train seed=1,2", "seed=1,2"),
+    ("train commands.lin_vel_x=[1", "commands.lin_vel_x=[1"),
+    ("train hydra.searchpath=[nowhere]", "nowhere"),
+    ("train hydra/launcher=rocket", "rocket"),
+    ("train hydra.run.dri=x", "hydra.run.dri"),
+    ("train run=nowhere", "run=nowhere"),
+    ("train run=", "run="),
+    ("train run=RUN -m", "-m"),
+    ("train run=RUN experiment=paper", "experiment=paper"),
+    ("train run=RUN episodes=3", "episodes=3"),
+    # keys that nothing takes
+    ("train num_env=64", "did you mean num_envs?"),
+    ("train +num_env=64", "did you mean num_envs?"),
+    ("train ++num_env=64", "did you mean num_envs?"),
+    ("train sede=1", "did you mean seed?"),
+    ("train obstacle=static", "did you mean obstacles?"),
+    ("train ~nothing", "nothing"),
+    ("train ~obstacles", "~obstacles"),
+    ("train obstacles=null", "obstacles=null"),
+    ("train lidar.max_rage=3", "did you mean max_range?"),
+    ("train +lidar.rate=3", "lidar.rate"),
+    ("train robot.kq=3", "robot.kq"),
+    ("train rewards.terms.tilt_squred.weight=1", "did you mean tilt_squared?"),
+    ("train +rewards.terms.tilt_squred.weight=1", "did you mean tilt_squared?"),
+    ("train rewards.terms.yaw_rate_tracking.sigma=1.0", "rewards.terms.yaw_rate_tracking.sigma"),
+    ("train +observations.groups.proprioception.terms.smell={}", "smell"),
+    ("train +obstacles.groups.box={kind:cone,count:1,size:[[1,1]]}", "cone"),
+    ("train seed.x=3", "seed.x=3"),
+    # values of another type
+    ("train seed=abc", "seed=abc must be a whole number"),
+    ("train num_envs=2.5", "num_envs=2.5 must be a whole number"),
+    ("train num_envs=true", "num_envs=true must be a whole number"),
+    ("train init=3", "init=3"),
+    ("train ppo.learning_rate=fast", "ppo.learning_rate=fast must be a number"),
+    ("train ppo.hidden_dims=64", "ppo.hidden_dims=64"),
+    ("train ppo.hidden_dims=[a]", "ppo.hidden_dims=[a]"),
+    ("train ppo.symmetry=maybe", "ppo.symmetry=maybe must be true or false"),
+    ("train commands.lin_vel_x=1.0", "commands.lin_vel_x=1.0 must be a list"),
+    ("train commands.lin_vel_x=[1.0]", "commands.lin_vel_x=[1.0] must be [low, high]"),
+    ("train terminations.on_collision=3", "terminations.on_collision=3 must be true or false"),
+    ("train rewards.terms.tilt_squared.weight=heavy", "rewards.terms.tilt_squared.weight=heavy must be a number"),
+    ("train rewards.terms.tilt_squared=3", "rewards.terms.tilt_squared=3"),
+    ("train rewards=3", "rewards=3"),
+    ("train robot.joints=none", "robot.joints=none"),
+    ("train robot.kp=[1,2]", "robot.kp"),
+    ("train lidar.mount=3", "lidar.mount=3"),
+    ("train randomization.latency_s=0.02", "randomization.latency_s=0.02"),
+    ("train terrain.friction=ice", "terrain.friction=ice"),
+    ("train perception.history=long", "perception.history=long"),
+    ("train sim.cone=round", "sim.cone=round"),
+    ("train obstacles.boundary=3", "obstacles.boundary=3"),
+    # values out of range
+    ("train num_envs=0", "num_envs=0 must be at least 1"),
+    ("train sim.timestep=nan", "sim.timestep=nan"),
+    ("train sim.timestep=-1", "sim.timestep=-1"),
+    ("train sim.decimation=0", "sim.decimation=0"),
+    ("train ppo.num_mini_batches=0", "ppo.num_mini_batches=0"),
+    ("train ppo.gamma=1.5", "ppo.gamma=1.5"),
+    ("train ppo.activation=foo", "ppo.activation=foo"),
+    ("train ppo.max_iterations=-1", "ppo.max_iterations=-1"),
+    ("train commands.lin_vel_x=[1.0,-1.0]", "lin_vel_x"),
+    ("train terrain.restitution=1.5", "terrain.restitution=1.5"),
+    ("train terrain.friction=-1", "terrain.friction=-1"),
+    ("train terrain=mixed terrain.levels=0", "terrain.levels=0"),
+    ("train robot.kp=-1", "robot.kp=-1"),
+    ("train lidar.period_s=-0.1", "period_s=-0.1"),
+    ("train lidar.period_s=0.03", "lidar.period_s=0.03"),
+    ("train lidar.max_range=-1", "max_range=-1"),
+    ("train lidar.num_rays=0", "num_rays=0"),
+    ("train lidar.selection=best", "lidar.selection=best"),
+    ("train obstacles.groups.walker.count=-1", "count=-1"),
+    ("train obstacles.area=[5,-5,5,-5]", "area=[5.0, -5.0"),
+    ("train observations.actor=[smell]", "smell"),
+    ("train perception.sampler.num_proximal=0", "perception.sampler.num_proximal=0"),
+    ("train perception.memory_gb=0.001", "0.0 GB"),
+    ("train randomization.latency_s=[0.02,0.01]", "latency_s"),
+    ("train terminations.episode_length_s=0", "episode_length_s=0"),
+    # parts that do not fit together
+    ("train lidar=none", "perception=none"),
+    ("train lidar=none perception=none", "rewards=walk observations=walk"),
+    ("train scenario=corridor obstacles=static", "scenario=corridor defines the obstacles"),
+    ("train commands=corridor obstacles=corridor obstacles.free_path=3", "free_path"),
+    ("train robot.base=trunk", "robot.base=trunk"),
+    ("train robot.joints=[a,b]", "robot.joints"),
+    ("train robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),
+    ("train robot.mounts.head.exclude_geoms=[nose]", "nose"),
+    ("train init=nowhere", "init=nowhere"),
+    ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape,weight:1.0}", "rewards.terms.mine"),
+    ("train +rewards.terms.mine={func:wrong_input_terms.not_a_tensor,weight:1.0}", "rewards.terms.mine"),
+    ("train +rewards.terms.mine={func:wrong_input_terms.missing,weight:1.0}", "rewards.terms.mine"),
+    ("train +rewards.terms.mine={func:nowhere.at_all,weight:1.0}", "nowhere"),
+    ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape}", "rewards.terms.mine"),
+    # the other commands
+    ("play run=nowhere", "run=nowhere"),
+    ("play run=EMPTY", "is not a run directory"),
+    ("play run=RUN viewer=hologram", "viewer=hologram must be one of video, none"),
+    ("play run=RUN trials=many", "trials=many must be a whole number >= 1"),
+    ("play run=RUN trails=3", "did you mean trials?"),
+    ("play run=RUN video_s=0", "video_s=0"),
+    ("play run=RUN speed=3", "speed=3"),
+    ("play run=RUN rewards.terms.tilt_squared.weight=1e-9 robot.kp=x", "robot.kp=x"),
+    ("play run=RUN obstacles=dragons", "obstacles=dragons"),
+    ("play run=RUN", "checkpoint"),
+    ("evaluate run=RUN scenario=statik", "scenario=statik is unknown; did you mean static?"),
+    ("evaluate run=RUN scenario=static,static", "scenario=static,static"),
+    ("evaluate run=RUN policy=magic", "policy=magic"),
+    ("evaluate run=RUN policy=command", "walker="),
+    ("evaluate run=RUN walker=nowhere", "walker=nowhere"),
+    ("evaluate run=RUN plots=maybe", "plots=maybe must be true or false"),
+    ("evaluate run=RUN obstacles=moving plots=false", "scenario=corridor defines the obstacles"),
+    ("evaluate run=RUN num_envs=0", "num_envs=0"),
+    ("ablate stage=dance", "stage=dance"),
+    ("ablate variants=fps_mlpp", "did you mean fps_mlp?"),
+    ("ablate seeds=a", "seeds=a"),
+    ("ablate scenarios=statik", "scenarios=statik"),
+    ("ablate seed=3", "seed=3"),
+    ("ablate stage=table out=EMPTY variants=fps_mlp seeds=1", "has not been evaluated"),
+    ("export run=RUN formats=tarball", "formats=tarball"),
+    ("export run=RUN num_envs=3", "num_envs=3"),
+    ("export run=EMPTY", "is not a run directory"),
+    ("publish run=RUN", "to=... must be given"),
+    ("publish run=RUN to=EMPTY precision=float8", "precision=float8"),
+    ("scan lidar=none", "lidar=none"),
+    ("scan lidar=sonar", "lidar=sonar"),
+    ("scan colour=pink", "colour=pink"),
+    ("scan rays=0", "rays=0"),
+    ("scan seed=-1", "seed=-1"),
+    ("plan num_envs=x", "num_envs=x"),
+    *((f"train {group}=dragons", f"{group}=dragons is unknown") for group in GROUPS),
+    *((f"{command} --wrong", "--wrong is unknown") for command in COMMANDS),
+]
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    config.save(build.assemble(config.compose(["experiment=walk", "num_envs=2"])).composed, folder)
+    return folder
+
+
+@pytest.fixture
+def one_line(monkeypatch, tmp_path, run_dir, capfd):
+    """Runs a command line in-process, and gives its one line."""
+
+    def never(*_, **__):
+        raise AssertionError("this line was accepted")
+
+    def run(text):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.setattr(Runner, "learn", never)
+        monkeypatch.setattr(subprocess, "Popen", never)
+        shutil.copy(__file__, tmp_path / "wrong_input_terms.py")
+        (tmp_path / "EMPTY").mkdir()
+        words = [word.replace("=RUN", f"={run_dir}") for word in text.split()]
+        if words[0] in ("train", "plan") and "run=" not in text:
+            words.append("num_envs=2") if "num_envs" not in text else None
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        error = capfd.readouterr().err
+        assert stopped.value.code == 2 and error.count("\n") == 1 and error.startswith("error: "), error
+        return error
+
+    return run
+
+
+def test_there_are_a_hundred():
+    assert len(LINES) >= 100 and len({line for line, _ in LINES}) == len(LINES)
+
+
+@pytest.mark.parametrize(("line", "named"), LINES, ids=[line.replace(" ", "_") for line, _ in LINES])
+def test_wrong_input_is_one_line(one_line, line, named):
+    assert named in one_line(line)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("door", "line", "named"),
+    [
+        ("train.py", "num_env=3", "did you mean num_envs?"),
+        ("play.py", "run=nowhere", "run=nowhere does not exist"),
+        ("scripts/evaluate.py", "trials=0", "trials=0"),
+        ("scripts/export.py", "seed=3", "seed=3"),
+    ],
+)
+def test_doors_do_as_well(tmp_path, door, line, named):
+    command = [sys.executable, str(ROOT / door), line]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and named in done.stderr, done.stderr
