@@ -1,7 +1,5 @@
-"""Every preset composes and builds; the paper's numbers; wrong configurations are told in one line."""
+"""Every preset composes and builds; the paper's numbers; run directories."""
 
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 from types import FunctionType
@@ -11,6 +9,7 @@ import torch
 
 from omniperception import build, config
 from omniperception.build import build_runner
+from omniperception.commands.train import check_jobs
 from omniperception.config import ConfigError
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
@@ -106,84 +105,10 @@ class TestRates:
         assert env.lidar.mount_pos == (0.28945, 0.0, -0.046825)
 
 
-WRONG = [
-    (["foo=1"], "foo"),
-    (["num_env=64"], "did you mean num_envs?"),
-    (["+num_env=64"], "did you mean num_envs?"),
-    (["+lidar.rate=3"], "lidar.rate is unknown"),
-    (["obstacles=dragons"], "dragons"),
-    (["num_envs=0"], "num_envs=0 must be at least 1"),
-    (["perception=pd_risknet", "lidar=none"], "perception=none"),
-    (["lidar=none", "perception=none"], "rewards=walk observations=walk"),
-    (["lidar.period_s=-0.1"], "period_s=-0.1"),
-    (["lidar.max_range=-1"], "max_range=-1"),
-    (["lidar.num_rays=0"], "num_rays=0"),
-    (["commands.lin_vel_x=[1.0,-1.0]"], "lin_vel_x"),
-    (["terrain.restitution=1.5"], "terrain.restitution=1.5"),
-    (["ppo.num_mini_batches=0"], "ppo.num_mini_batches=0"),
-    (["sim.decimation=0"], "sim.decimation=0"),
-    (["robot.kp=-1"], "robot.kp=-1"),
-    (["observations.actor=[smell]"], "smell"),
-    (["seed=abc"], "seed=abc must be a whole number"),
-    (["num_envs=2.5"], "num_envs=2.5 must be a whole number"),
-    (["ppo.learning_rate=fast"], "ppo.learning_rate=fast must be a number"),
-    (["commands.lin_vel_x=1.0"], "commands.lin_vel_x=1.0 must be a list"),
-    (["terminations.on_collision=3"], "terminations.on_collision=3 must be true or false"),
-    (["rewards.terms.yaw_rate_tracking.weight=heavy"], "rewards.terms.yaw_rate_tracking.weight=heavy must be a number"),
-    (["sim.timestep=nan"], "sim.timestep=nan must be positive"),
-    (["rewards.terms.yaw_rate_tracking.sigma=1.0"], "rewards.terms.yaw_rate_tracking.sigma is unknown"),
-]
-
-
-@pytest.mark.parametrize(("overrides", "named"), WRONG)
-def test_wrong_configurations_name_the_key_in_one_line(overrides, named):
-    with pytest.raises(ConfigError) as error:
-        build.check(overrides)
-    assert named in str(error.value) and "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "named"),
-    [
-        (["foo=1"], "foo"),
-        (["lidar=none"], "perception=none"),
-        (["lidar.period_s=0.03"], "lidar.period_s=0.03"),
-        (["terrain.friction=-1"], "terrain.friction=-1"),
-        (["run=no/such/run"], "run=latest"),
-    ],
-)
-def test_the_program_tells_what_is_wrong_in_one_line(tmp_path, overrides, named):
-    command = [sys.executable, str(ROOT / "train.py"), *overrides, "hydra.run.dir=run"]
-    if overrides[0].startswith("run="):
-        command.pop()
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    lines = [line for line in result.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
-    assert result.returncode == 2, result.stderr
-    assert len(lines) == 1 and named in lines[0] and "Traceback" not in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("override", "named"),
-    [
-        ("perception.sampler.num_proximal=0", "perception.sampler.num_proximal=0 must be at least 1"),
-        ("ppo.activation=foo", "foo"),
-        ("lidar.period_s=0.03", "lidar.period_s=0.03 must be a multiple"),
-        ("robot.mounts.head.exclude_geoms=[nose]", "exclude_geoms"),
-        ("robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),
-        ("perception.memory_gb=0.001", "but there are 0.0 GB"),
-    ],
-)
-def test_what_only_the_compiled_world_can_judge_is_a_config_error_too(override, named):
-    run = build.assemble(config.compose([override, "num_envs=1"]))
-    with pytest.raises(ConfigError) as error:
-        build_runner(run, None)
-    assert named in str(error.value)
-
-
 def test_every_job_of_a_sweep_is_checked_before_the_first_starts():
-    build.check(["-m", "num_envs=2,4", "obstacles=static,moving"])
+    check_jobs(["num_envs=2,4", "obstacles=static,moving"])
     with pytest.raises(ConfigError, match="num_envs=0"):
-        build.check(["--multirun", "num_envs=2,0"])
+        check_jobs(["num_envs=2,0"])
 
 
 class TestRunDirectories:
@@ -263,13 +188,6 @@ class TestRunDirectories:
             path = tmp_path / "outputs" / name / config.CONFIG_FILE
             os.utime(path, (path.stat().st_atime, path.stat().st_mtime - age))
         assert config.find_run("latest") == Path("outputs/a")
-
-
-def test_entry_points_take_their_own_arguments_out():
-    own, overrides = config.split_arguments(["run=x", "num_envs=2", "-m"], {"run": "", "steps": "5"})
-    assert own == {"run": "x", "steps": "5"} and overrides == ["num_envs=2", "-m"]
-    with pytest.raises(ConfigError, match="'video' is not of the form key=value"):
-        config.split_arguments(["video"], {"run": ""})
 
 
 @pytest.mark.parametrize("variant", sorted({*config.presets("perception"), *VARIANTS} - {"none", "direct_mlp"}))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from rsl_rl.utils import resolve_nn_activation
 
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.env.env import AVOIDANCE_TARGET, HEIGHT_TARGET, MOTION_TARGET, SECTOR_TARGET
@@ -169,6 +170,10 @@ class PPOConfig:
             raise ValueError(f"ppo.max_minutes={self.max_minutes} must be positive or null")
         if self.schedule not in ("adaptive", "fixed"):
             raise ValueError(f"ppo.schedule={self.schedule} must be adaptive or fixed")
+        try:
+            resolve_nn_activation(self.activation)
+        except ValueError as error:
+            raise ValueError(f"ppo.activation={self.activation} is unknown: {error}") from None
 
     @property
     def mlp(self) -> dict[str, Any]:
