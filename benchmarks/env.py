@@ -108,7 +108,7 @@ def physics_of(env: OmniEnv, num_steps: int) -> Timed:
     """Bare `Batch.step` from the environment's current states, nothing bound but the controls."""
     batch = Batch(env.world.model, env.num_envs, env.config.sim.num_threads)
     ctrl = batch.bind("ctrl")
-    targets = (env.default_joint_pos + 0.1 * torch.randn(num_steps, env.num_envs, env.num_actions)).numpy()
+    targets = (env.state.default_joint_pos + 0.1 * torch.randn(num_steps, env.num_envs, env.num_actions)).numpy()
 
     def block(_: int) -> None:
         batch.state[:] = env.sim.batch.state

@@ -14,7 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from omniperception.config import ConfigError, is_composed, one_line
-from omniperception.env.env import EnvConfig, OmniEnv
+from omniperception.env.config import EnvConfig
+from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mdp.terminations import TerminationsConfig

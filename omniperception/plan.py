@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +14,9 @@ import torch
 import yaml
 
 from omniperception.build import RunConfig
+from omniperception.env.config import HEIGHT_TARGET
 from omniperception.env.env import OmniEnv
-from omniperception.env.state import fields_read
+from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, requirements
 from omniperception.inventory import Buffer, buffers_of, is_launch, walk
 from omniperception.learning import Runner
 from omniperception.learning.read_out import MotionReadOut
@@ -36,21 +37,6 @@ OPTIONAL_PACKAGES = {
     "onnxruntime": "runs exported policies",
 }
 """Packages that no run needs altogether, and what for."""
-
-OPTIONAL_FIELDS: dict[str, tuple[str, Callable[[OmniEnv], bool]]] = {
-    "foot_force": ("forces on the feet", lambda env: hasattr(env, "foot_force")),
-    "link_force": ("forces on the penalised links", lambda env: hasattr(env, "link_force")),
-    "obstacle_contact": ("contacts with obstacles", lambda env: "obstacle_contact" in env.world.sensors),
-    "joint_torque": ("actuator torques", lambda env: hasattr(env, "joint_torque")),
-    "heights": ("heights of the ground around the robot", lambda env: env.heights.shape[1] > 0),
-    "obstacles": ("places and velocities of obstacles", lambda env: hasattr(env, "obstacle_rel_pos_yaw")),
-    "sectors": ("distances to obstacles by sector", lambda env: _sensing(env, "sector_distance") is not None),
-    "rays": ("noise-free ranges, for their mean", lambda env: env.sensing is not None and env.sensing.needs.rays),
-    "last_action": ("the action before the newest", lambda env: len(env.actions) > 1),
-    "action_before_last": ("the action before that", lambda env: len(env.actions) > 2),
-    "last_joint_vel": ("joint velocities one step ago", lambda env: hasattr(env, "last_joint_vel")),
-}
-"""Parts of the task's state that exist only where something reads them, what they are and how to tell."""
 
 _LISTED_FROM = 0.01
 """Share of the memory from which on a buffer has a line of its own in the text."""
@@ -190,7 +176,6 @@ def describe(run: RunConfig, runner: Runner) -> Plan:
         _kernels(run, runner, things),
         _rays(run, env),
         _physics(run, env),
-        _fields(run, env),
         _rewards(run),
         _observations(run, env),
         _randomization(run),
@@ -219,13 +204,14 @@ def _stages(run: RunConfig, env: OmniEnv) -> Section:
     section.add("state")
     every = f"every {sensing.period_steps} steps" if sensing else ""
     section.either(sensing is not None, "rays", every, _readers_of_rays(run), blind)
-    sampled, measured = (_sensing(env, name) is not None for name in ("frames", "sector_distance"))
+    sampled = _sensing(env, "frames") is not None
+    measured = env.avoidance is not None and env.avoidance.sector_distance is not None
     section.either(sampled, "sampling", every, "the network reads points", blind or "no network reads points")
-    section.either(measured, "sectors", every, _readers(run, "sectors"), blind or "nothing reads sectors")
-    followed = env.true_sectors is not None
-    section.either(followed, "risk", every, "rewards.avoidance.risk is a law", "rewards.avoidance.risk is null")
-    late = env.heights.shape[1] > 0 and not env.heights_every_step
-    section.either(late, "heights", every, _readers(run, "heights"), "no network is supervised with them alone")
+    section.either(measured, "sectors", every, _readers(run, AVOIDANCE), blind or "nothing reads sectors")
+    avoided = env.avoidance is not None
+    section.either(avoided, "avoidance", every, _readers(run, AVOIDANCE), blind or "nothing reads V_avoid")
+    late = run.env.targets and HEIGHT_TARGET in run.env.targets and not env.heights_each_step
+    section.either(bool(late), "heights", every, "supervision", "no network is supervised with them alone")
     section.either(env.ground is not None, "terrain", "", "levels follow how far robots walk", "flat ground")
     section.add("rewards", f"{len(run.env.rewards.terms)} terms, and terminations")
     section.add("resets")
@@ -240,23 +226,24 @@ def _kernels(run: RunConfig, runner: Runner, things: dict[str, object]) -> Secti
         section.add(name, _variant(sensing) if name == "cast_scan" else "")
     for name in _sensing(env, "sampler").kernels if _sensing(env, "frames") is not None else ():
         section.add(name, "", type(sensing.sampler).__name__)
-    for name, why in dict((*_kernels_of_policy(runner), *_kernels_beside(env))).items():
+    for name, why in dict((*_kernels_of_policy(runner), *_kernels_beside(run, env))).items():
         section.add(name, "", why)
     if sensing is None:
         section.leave_out("those of the LiDAR", _why_blind(run))
     return section
 
 
-def _kernels_beside(env: OmniEnv) -> Iterator[tuple[str, str]]:
+def _kernels_beside(run: RunConfig, env: OmniEnv) -> Iterator[tuple[str, str]]:
     """Kernels that are launched on tensors which come with each call, and why."""
-    if env.true_sectors is not None:
+    avoidance = env.avoidance
+    if avoidance is not None and avoidance.true_sectors is not None:
         yield "nearest_by_sector", "rewards.avoidance.risk is a law"
-    if env.risk is not None:
+    if avoidance is not None and avoidance.risk is not None:
         yield "worst_sectors", "rewards.avoidance.risk is a law"
     if env.ground is not None:
         yield "heights_at", "robots and obstacles start on the ground"
         yield "base_heights", "height above ground that is not flat"
-    if env.ground is not None and env.heights.shape[1] > 0:
+    if env.ground is not None and (env.heights_each_step or HEIGHT_TARGET in run.env.targets):
         yield "heights_around", "the heights are read"
     if env.ground is not None and env.obstacles is not None:
         yield "lift", "obstacles move over ground that is not flat"
@@ -342,20 +329,13 @@ def contact_pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     return pairs
 
 
-def _fields(run: RunConfig, env: OmniEnv) -> Section:
-    section = Section("fields of the state")
-    for name, (what, exists) in OPTIONAL_FIELDS.items():
-        section.either(exists(env), name, what, _readers(run, name), "nothing reads it")
-    return section
-
-
 def _rewards(run: RunConfig) -> Section:
     section, kept = Section("reward terms"), run.env.rewards.terms
     given = run.composed["rewards"]["terms"]
     for name in dict.fromkeys((*given, *kept)):
         if name in kept:
-            read = ", ".join(sorted(fields_read(kept[name].func))) or "what is always there"
-            section.add(name, f"weight {kept[name].weight:g}", f"reads {read}")
+            needed = ", ".join(sorted(requirements(kept[name].func)))
+            section.add(name, f"weight {kept[name].weight:g}", needed and f"requires {needed}")
         else:
             section.leave_out(name, "null" if given[name] is None else "weight 0")
     return section
@@ -436,14 +416,19 @@ def _sensing(env: OmniEnv, name: str) -> object | None:
     return getattr(env.sensing, name, None)
 
 
-def _readers(run: RunConfig, field: str) -> str:
-    return "read by " + ", ".join(run.env.readers().get(field, ("nothing",)))
+def _readers(run: RunConfig, *names: str) -> str:
+    """The terms that require one of the names, and the network."""
+    rewards = {f"rewards.{name}": term.func for name, term in run.env.rewards.terms.items()}
+    groups = run.env.observations.groups.items()
+    seen = {f"observations.{group}.{name}": term for group, its in groups for name, term in its.terms.items()}
+    readers = [name for name, term in (rewards | seen).items() if requirements(term) & set(names)]
+    readers += [f"supervision.{target}" for target in run.env.targets if target != HEIGHT_TARGET]
+    return "read by " + (", ".join(readers) or "nothing")
 
 
 def _readers_of_rays(run: RunConfig) -> str:
-    readers = [name for field in ("sectors", "rays") for name in run.env.readers().get(field, ())]
-    readers += ["the perception network"] if run.env.sampler is not None else []
-    return "read by " + (", ".join(dict.fromkeys(readers)) or "nothing")
+    network = ", the perception network" if run.env.sampler is not None else ""
+    return _readers(run, AVOIDANCE, DISTAL_RANGE, CLOUD) + network
 
 
 def _why_blind(run: RunConfig) -> str:

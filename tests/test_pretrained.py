@@ -28,7 +28,7 @@ def test_a_pretrained_policy_follows_its_command(run_dir):
             env.step(trained.policy(env.get_observations()))
             if step >= 50:
                 command = env.command.value[:, :2]
-                missed += float((env.kinematics.base_lin_vel_yaw[:, :2] - command).norm(dim=1).mean())
+                missed += float((env.state.kinematics.base_lin_vel_yaw[:, :2] - command).norm(dim=1).mean())
                 commanded += float(command.norm(dim=1).mean())
     assert missed < 0.6 * commanded
 

@@ -29,7 +29,7 @@ from omniperception import build, config
 from omniperception.cli import Command, argument
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
-from omniperception.env.env import EnvConfig
+from omniperception.env.config import EnvConfig
 
 BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
 AGREEMENT = 0.99

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from omniperception.common.random import EnvRandom
-from omniperception.env.env import EnvConfig
+from omniperception.env.config import EnvConfig
 from omniperception.env.mdp.randomization import RandomizationConfig, Randomizer
 from omniperception.scene import build_world
 from omniperception.sim import Failure, MujocoSimulator, SimConfig

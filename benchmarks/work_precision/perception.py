@@ -13,10 +13,13 @@ import torch
 from benchmarks.harness.pareto import Choice, Study
 from benchmarks.harness.rotations import matrices
 from benchmarks.harness.timing import paired_timings
+from omniperception.avoidance.sector_motion import NEARNESS_RANGE
+from omniperception.avoidance.velocity import SECTOR_TARGET
 from omniperception.build import RunConfig, assemble
 from omniperception.common.rotations import yaw_quat
 from omniperception.config import compose
-from omniperception.env.env import HEIGHT_TARGET, NEARNESS_RANGE, SECTOR_TARGET, OmniEnv
+from omniperception.env.config import HEIGHT_TARGET
+from omniperception.env.env import OmniEnv
 from omniperception.env.heights import height_grid
 from omniperception.lidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
 from omniperception.perception import Attitude, PdRiskNet, PdSampler, ProximitySampler, Sampler
@@ -147,12 +150,12 @@ class Recorder:
         sensor, frame = self.env.sensing.config, self.env.sensing.frame
         rays = (frame.true_ranges, frame.directions_s, frame.elevation, frame.azimuth)
         self._dense.cast(self.env.step_count * self.env.control_dt)
-        quat = self.env.kinematics.base_quat_w.float().contiguous().clone()
+        quat = self.env.state.kinematics.base_quat_w.float().contiguous().clone()
         return Cloud(
             *(tensor.clone() for tensor in rays),
             Attitude(quat, sensor.mount_pos, sensor.mount_quat or quat_from_rpy(*sensor.mount_rpy)),
-            self.env.heights.clone(),
-            self.env.sensing.sector_distance.clone(),
+            self.env.get_observations()[HEIGHT_TARGET].clone(),
+            self.env.avoidance.sector_distance.clone(),
             self._dense_sectors().clone(),
             sensor.max_range,
         )

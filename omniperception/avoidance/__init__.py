@@ -1,1 +1,1 @@
-"""What avoiding obstacles asks of the robot: true obstacles by sector, the risk of velocities, V_avoid."""
+"""What avoiding obstacles asks of the robot: distances by sector, the risk of velocities, the avoidance velocity."""

@@ -10,11 +10,7 @@ import warp as wp
 from omniperception.avoidance.sector_motion import nothing_near
 from omniperception.common.launch import launch_over_envs, view
 from omniperception.common.rotations import rotate_yaw
-from omniperception.env.state import Kinematics
 from omniperception.scene import ObstacleField, ObstaclesConfig
-
-HEADROOM = 0.45
-"""What hangs at least this high (m) above the ground lets the robot pass."""
 
 
 class TrueSectors:
@@ -23,8 +19,8 @@ class TrueSectors:
     Sector j of S holds the bearings [-pi + j 2 pi / S, -pi + (j + 1) 2 pi / S) of the yaw-aligned frame. An obstacle is
     in a sector if the sector's middle points at it, at the distance along the middle, or if its nearest point lies
     there; one that reaches in from the side alone is not, so that wide things do not look wider than they are. Outlines
-    are circles and rectangles, seen from above. Obstacles that do not take part, or that hang above HEADROOM, do not
-    count.
+    are circles and rectangles, seen from above. Obstacles that do not take part, or that hang at least
+    `ObstaclesConfig.headroom` above the ground, do not count.
 
     Attributes:
         names: of the obstacles, in the order of the masks.
@@ -40,6 +36,7 @@ class TrueSectors:
     ) -> None:
         """Args: num_sectors: S; obstacles: every obstacle; field: where the placed ones are, or None without any."""
         self.num_sectors, self._field, self._num_envs, self._device = num_sectors, field, num_envs, device
+        self._headroom = obstacles.headroom
         slots = obstacles.slots()
         placed = [slot for slot in slots if slot.pose is None]
         fixed = [slot for slot in slots if slot.pose is not None]
@@ -49,11 +46,12 @@ class TrueSectors:
         poses = torch.tensor([slot.pose for slot in fixed], device=device).reshape(-1, 3)
         self._fixed_xy, self._fixed_yaw = poses[:, :2], torch.deg2rad(poses[:, 2])
 
-    def measure(self, kinematics: Kinematics, known: torch.Tensor | None = None) -> torch.Tensor:
-        """Distances and velocities at the present state.
+    def measure(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, known: torch.Tensor | None = None) -> torch.Tensor:
+        """Distances and velocities at the present state of the obstacles.
 
         Args:
-            kinematics: of the robots.
+            base_pos_w: (num_envs, 3) m, where the robots are.
+            yaw: (num_envs,) rad, their headings.
             known: (num_envs, O) bool the obstacles that count; None for all.
 
         Returns:
@@ -61,12 +59,12 @@ class TrueSectors:
         """
         out = nothing_near(self._num_envs, self.num_sectors, self._device)
         if len(self._outline):
-            xy, yaw, velocity, counts = self._obstacles()
+            xy, obstacle_yaw, velocity, counts = self._obstacles()
             if known is not None:
                 counts = counts & known
-            place = rotate_yaw(-kinematics.yaw, xy - kinematics.base_pos_w[:, None, :2])
-            velocity = rotate_yaw(-kinematics.yaw, velocity)
-            heading = yaw - kinematics.yaw[:, None]
+            place = rotate_yaw(-yaw, xy - base_pos_w[:, None, :2])
+            velocity = rotate_yaw(-yaw, velocity)
+            heading = obstacle_yaw - yaw[:, None]
             axis = torch.stack((heading.cos(), heading.sin()), -1)
             inputs = [
                 view(place, wp.vec2),
@@ -86,7 +84,7 @@ class TrueSectors:
         still, always = torch.zeros_like(fixed_xy), torch.ones_like(fixed_yaw, dtype=torch.bool)
         if field is None:
             return fixed_xy, fixed_yaw, still, always
-        counts = field.active & (field.bottom_above_ground() < HEADROOM)
+        counts = field.active & (field.bottom_above_ground() < self._headroom)
         return (
             torch.cat((field.pos_w[..., :2].float(), fixed_xy), 1),
             torch.cat((field.yaw.float(), fixed_yaw), 1),

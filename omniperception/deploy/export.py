@@ -92,8 +92,8 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         kp=robot.kp,
         kd=robot.kv,
         torque_limits=[robot.torque_limits[name] for name in robot.joints],
-        lower=env.joint_lower.tolist(),
-        upper=env.joint_upper.tolist(),
+        lower=env.state.joint_lower.tolist(),
+        upper=env.state.joint_upper.tolist(),
     )
     return Description(
         control_period_s=env.control_dt,
@@ -111,7 +111,7 @@ _MEASURABLE = {getattr(observations, name): name for name in (*_QUANTITIES, "pre
 
 
 def _group(name: str, env: OmniEnv) -> Group:
-    group = env.config.observations.groups[name]
+    group, widths = env.config.observations.groups[name], env.observation_widths(name)
     terms = []
     for term_name, term in group.terms.items():
         function, options = (term.func, dict(term.keywords)) if isinstance(term, partial) else (term, {})
@@ -120,8 +120,7 @@ def _group(name: str, env: OmniEnv) -> Group:
                 f"observations.groups.{name}.terms.{term_name} cannot be exported: a robot can measure"
                 f" {', '.join(_MEASURABLE.values())}"
             )
-        size = term(env).shape[1]
-        terms.append(Term(_MEASURABLE[function], size, float(options.get("scale", 1.0))))
+        terms.append(Term(_MEASURABLE[function], widths[term_name], float(options.get("scale", 1.0))))
     return Group(name, group.history, tuple(terms))
 
 

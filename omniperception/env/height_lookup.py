@@ -7,7 +7,7 @@ import warp as wp
 
 from omniperception.common.launch import view
 from omniperception.env.heights import MAX_HEIGHT, NUM_HEIGHTS, footprint_grid, height_grid
-from omniperception.env.state import Kinematics
+from omniperception.env.kinematics import Kinematics
 from omniperception.scene import Ground
 from omniperception.scene.ground_kernels import base_heights, heights_around
 
@@ -22,21 +22,18 @@ class HeightLookup:
         self._base_height = torch.zeros(num_envs, device=device)
         self._heights = torch.zeros(num_envs, NUM_HEIGHTS, device=device)
 
-    def place(self, kinematics: Kinematics) -> None:
-        """Where the robots are, for the look-ups that follow."""
-        self._base_pos_w.copy_(kinematics.base_pos_w)
-        self._yaw.copy_(kinematics.yaw)
-
-    def base_height(self) -> torch.Tensor:
+    def base_height(self, kinematics: Kinematics) -> torch.Tensor:
         """(num_envs,) height (m) of the base's origin above the mean of the ground at `footprint_grid`."""
-        self._launch(base_heights, self._footprint, [view(self._base_height, wp.float32)])
+        self._launch(base_heights, kinematics, self._footprint, [view(self._base_height, wp.float32)])
         return self._base_height.clone()
 
-    def around(self) -> torch.Tensor:
+    def around(self, kinematics: Kinematics) -> torch.Tensor:
         """(num_envs, 187) height (m) of the base's origin above the ground at `height_grid`, clipped to +-1 m."""
-        self._launch(heights_around, self._grid, [MAX_HEIGHT, view(self._heights, wp.float32)])
+        self._launch(heights_around, kinematics, self._grid, [MAX_HEIGHT, view(self._heights, wp.float32)])
         return self._heights.clone()
 
-    def _launch(self, kernel: wp.Kernel, points: torch.Tensor, outputs: list) -> None:
+    def _launch(self, kernel: wp.Kernel, kinematics: Kinematics, points: torch.Tensor, outputs: list) -> None:
+        self._base_pos_w.copy_(kinematics.base_pos_w)
+        self._yaw.copy_(kinematics.yaw)
         robots = [view(self._base_pos_w, wp.float32), view(self._yaw, wp.float32), view(points, wp.vec2)]
         self._ground.launch(kernel, [*robots, *outputs], self._num_envs, len(points))

@@ -2,37 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-from omniperception.env.state import Term, plain
+from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.terms import JOINTS, ROTATION, VECTOR
 from omniperception.scene import RobotConfig
-
-if TYPE_CHECKING:
-    from omniperception.env.env import OmniEnv
-
-JOINTS = "joints"
-"""A part of a term that has a number for each joint."""
-VECTOR = (1.0, -1.0, 1.0)
-"""Signs of x, y, z under the reflection that maps left to right."""
-ROTATION = (-1.0, 1.0, -1.0)
-"""Likewise of an axial vector, such as an angular velocity."""
-
-
-def mirrors(*parts: str | Sequence[float]) -> Callable[[Term], Term]:
-    """Declares how an observation term looks in the mirror: JOINTS, or signs, part by part. A part that is the only one
-    is repeated as often as the term is wide."""
-
-    def mark(term: Term) -> Term:
-        term.mirror = parts
-        return term
-
-    return mark
 
 
 class Mirror:
@@ -120,7 +100,7 @@ def _parts(
     name: str, term: Callable, width: int, joints: tuple[np.ndarray, np.ndarray]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Index and sign of each part of a term."""
-    declared = getattr(plain(term), "mirror", None)
+    declared = getattr(term.func if isinstance(term, partial) else term, "mirror", None)
     if declared is None:
         raise ValueError(
             f"ppo.symmetry=true: {name} does not say how it looks in the mirror; declare it with @mirrors(...), or set"

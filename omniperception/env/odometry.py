@@ -5,12 +5,11 @@ from __future__ import annotations
 import torch
 
 from omniperception.common.rotations import rotate_yaw
-from omniperception.common.rows import replaced, take
-from omniperception.env.state import Kinematics
+from omniperception.env.kinematics import Kinematics
 
 
 class Odometry:
-    """Adds up the sensed velocity from one frame to the next; the heading is the IMU's."""
+    """Adds up the measured velocity from one frame to the next; the heading is the IMU's."""
 
     def __init__(self, num_envs: int, control_dt: float, device: torch.device) -> None:
         self._dt = control_dt
@@ -18,16 +17,17 @@ class Odometry:
         self._yaw = torch.zeros(num_envs, device=device)
         self._yaw_before = torch.zeros(num_envs, device=device)
 
-    def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
-        """The robots of `envs` (see `rows`) stand elsewhere; `sensed` of all."""
-        self._yaw = replaced(self._yaw, envs, take(sensed.yaw, envs))
-        self._yaw_before = replaced(self._yaw_before, envs, take(sensed.yaw, envs))
-        self._travelled_w = replaced(self._travelled_w, envs, 0.0)
+    def start(self, env_ids: torch.Tensor, measured: Kinematics) -> None:
+        """The robots of some environments (n,) stand elsewhere; `measured` of all."""
+        yaw = measured.yaw[env_ids]
+        self._yaw = self._yaw.index_copy(0, env_ids, yaw)
+        self._yaw_before = self._yaw_before.index_copy(0, env_ids, yaw)
+        self._travelled_w = self._travelled_w.index_fill(0, env_ids, 0.0)
 
-    def advance(self, sensed: Kinematics) -> None:
+    def advance(self, measured: Kinematics) -> None:
         """One control step."""
-        self._yaw = sensed.yaw
-        self._travelled_w = self._travelled_w + rotate_yaw(sensed.yaw, sensed.base_lin_vel_yaw) * self._dt
+        self._yaw = measured.yaw
+        self._travelled_w = self._travelled_w + rotate_yaw(measured.yaw, measured.base_lin_vel_yaw) * self._dt
 
     def since_last_frame(self) -> torch.Tensor:
         """(num_envs, 3) x, y (m) and yaw (rad) since the call before, in the levelled base of then."""

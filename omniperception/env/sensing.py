@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import torch
 
-from omniperception.common.rows import put
 from omniperception.common.timing import StageTimer
+from omniperception.env.kinematics import Kinematics
 from omniperception.env.odometry import Odometry
-from omniperception.env.state import Kinematics
 from omniperception.lidar import (
     DEVICES,
     Lidar,
@@ -65,48 +64,22 @@ class SensorConfig(LidarConfig):
             object.__setattr__(self, "pattern", DEVICES[self.device].pattern)
 
 
-@dataclass(frozen=True)
-class SensingNeeds:
-    """What the composed task reads from the LiDAR; nothing else is computed.
-
-    Attributes:
-        sectors: number of azimuth sectors of obstacle distances, or 0.
-        sector_max: distance (m) of a sector without an obstacle.
-        distal_caps: distances (m) at which ranges are capped whose mean is read.
-        whole: whether something reads `LidarSensing.frame`, the clouds of all environments.
-        obstacles: geoms of the obstacles whose sightings are noted, none by default.
-    """
-
-    sectors: int
-    sector_max: float
-    distal_caps: Sequence[float] = ()
-    whole: bool = False
-    obstacles: Sequence[str] = ()
-
-    @property
-    def rays(self) -> bool:
-        """Whether ranges are read, beside what is sampled."""
-        return bool(self.distal_caps) or self.whole
-
-
 class LidarSensing:
     """Casts a frame every `period_steps` control steps, for all environments at the same moment.
 
-    Clouds are reduced to what is read of them as soon as they are cast, in as many parts as `cloud_mb` asks for: those
-    of all environments never have to exist at the same time. A reset empties an environment's history; its next frame
-    comes with the sensor's next tick.
+    Clouds are reduced to what is read of them as soon as they are cast, in as many slices of environments as
+    `cloud_mb` asks for: those of all environments never have to exist at the same time. A reset empties an
+    environment's history; its next frame comes with the sensor's next tick.
 
     Attributes:
-        hidden: geoms that are not in the ray scene because no ray meets them, and why.
+        hidden: geoms that are not in the ray scene, and why.
         base: index of the robot's base among the bodies of the ray scene.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
             newest last, with `base_motion` one row more: how the base moved since the frame before; None without a
             sampler.
         frame_count: (num_envs, 1) int64 how many of the newest frames are valid.
         frame_tick: (num_envs, 1) int64 number of the newest frame, the same for all environments.
-        sector_distance: (num_envs, num_sectors) horizontal distance (m) from the base to the nearest obstacle hit,
-            without noise, in the yaw-aligned frame; None when nobody reads it.
-        unseen: (num_envs, O) int64 frames since a ray last hit each of the obstacles of the needs; None without any.
+        unseen: (num_envs, O) int64 frames since a ray last hit each of `obstacles`; None without any.
     """
 
     def __init__(
@@ -114,24 +87,46 @@ class LidarSensing:
         config: SensorConfig,
         sim: Simulator,
         control_dt: float,
-        needs: SensingNeeds,
         noise: Sequence[Noise],
         seed: int,
         num_threads: int | None,
         sampler: Callable | None = None,
         history: int = 0,
         base_motion: bool = False,
+        sector_distance: torch.Tensor | None = None,
+        obstacles: Sequence[str] = (),
+        distal: bool = False,
+        whole: bool = False,
     ) -> None:
-        if config.motion_segments > 1:
-            raise ValueError(
-                f"lidar.motion_segments={config.motion_segments} must be 0 or 1: the task gives the LiDAR"
-                " the poses of its frames only"
-            )
+        """
+        Args:
+            config: the sensor.
+            sim: whose bodies the rays hit.
+            control_dt: s.
+            noise: models of its noise.
+            seed: of the noise.
+            num_threads: CPU threads; None for all cores.
+            sampler: what a network sees of a cloud; None: nothing.
+            history: frames kept for the network.
+            base_motion: whether a frame's last row is the base's motion since the frame before.
+            sector_distance: (num_envs, num_sectors) memory for the horizontal distance (m) from the base to the nearest
+                obstacle hit by sector, without noise; None: not measured.
+            obstacles: geoms whose sightings are noted.
+            distal: whether `mean_distal_range` is read.
+            whole: whether `frame` is read, the clouds of all environments.
+        """
         ratio = config.period_s / control_dt
         self.period_steps = round(ratio)
         if abs(ratio - self.period_steps) > 1e-6 or self.period_steps < 1:
             raise ValueError(f"lidar.period_s={config.period_s} must be a multiple of the control step {control_dt} s")
-        self._sim, self.needs, self.sampler = sim, needs, sampler
+        segments = max(config.motion_segments, 1)
+        if self.period_steps % segments:
+            raise ValueError(
+                f"lidar.motion_segments={segments} must be 0 or divide the {self.period_steps} control steps"
+                " of a frame evenly"
+            )
+        self._steps_per_segment = self.period_steps // segments
+        self._sim, self.sampler, self.whole = sim, sampler, whole
         self.config, pattern = config, config.pattern()
         self.hidden = hidden_geoms(sim.world, config.exclude_geoms, field_of_view(config, pattern, noise))
         shapes = ray_shapes(sim.world, self.hidden)
@@ -139,7 +134,7 @@ class LidarSensing:
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
         )
-        outputs = _outputs_read(needs, sampler is not None)
+        outputs = _outputs(sampler is not None, sector_distance is not None, bool(obstacles), distal, whole)
         self.lidar = Lidar(
             config,
             pattern,
@@ -148,29 +143,28 @@ class LidarSensing:
             noise=tuple(noise),
             seed=seed,
             outputs=outputs,
-            envs_at_once=None if needs.whole else envs_at_once(config, outputs),
+            envs_at_once=None if whole else envs_at_once(config, outputs),
         )
-        self._time = torch.zeros(sim.num_envs, dtype=torch.float64, device=sim.device)
+        n, device = sim.num_envs, sim.device
+        self._time = torch.zeros(n, dtype=torch.float64, device=device)
         self.tick, self._is_cast = 0, False
-        self.frame_count = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
-        self.frame_tick = torch.zeros(sim.num_envs, 1, dtype=torch.int64, device=sim.device)
+        self.frame_count, self.frame_tick = torch.zeros(2, n, 1, dtype=torch.int64, device=device).unbind(0)
         self.frames: torch.Tensor | None = None
         if sampler is not None:
-            self._newest = torch.zeros(sim.num_envs, sampler.num_points + base_motion, 3, device=sim.device)
+            self._newest = torch.zeros(n, sampler.num_points + base_motion, 3, device=device)
             self.frames = self._newest[:, None].repeat(1, history, 1, 1)
-        self.odometry = Odometry(sim.num_envs, control_dt, sim.device) if base_motion else None
-        self.sector_distance: torch.Tensor | None = None
-        if needs.sectors:
-            self.sector_distance = torch.empty(sim.num_envs, needs.sectors, device=sim.device)
-            self._measure_sectors = self._record_sectors(num_threads)
-        self._distal_range = {cap: torch.full((sim.num_envs,), cap, device=sim.device) for cap in needs.distal_caps}
+        self.odometry = Odometry(n, control_dt, device) if base_motion else None
+        self._sectors: list[SectorDistances] = []
+        if sector_distance is not None:
+            self._sectors = self._record_sectors(sector_distance, num_threads)
+        self._distal_range: dict[float, torch.Tensor] = {}
         self.unseen: torch.Tensor | None = None
-        if needs.obstacles:
-            self._obstacle_of = torch.full((len(shapes.shapes) + 1,), len(needs.obstacles), device=sim.device)
-            self._obstacle_of[1 + torch.tensor(shapes.indices(tuple(needs.obstacles)))] = torch.arange(
-                len(needs.obstacles), device=sim.device
-            )  # row 0 is a miss; all other shapes are one more obstacle, which is left out
-            self.unseen = torch.full((sim.num_envs, len(needs.obstacles)), NEVER, device=sim.device)
+        if obstacles:
+            count = len(obstacles)
+            self._obstacle_of = torch.full((len(shapes.shapes) + 1,), count, device=device)
+            index = 1 + torch.tensor(shapes.indices(tuple(obstacles)))  # 0 is a miss; all else is one obstacle more
+            self._obstacle_of[index] = torch.arange(count, device=device)
+            self.unseen = torch.full((n, count), NEVER, device=device)
 
     @property
     def frame(self) -> LidarFrame | None:
@@ -188,35 +182,38 @@ class LidarSensing:
 
     def parts_of(self, num_envs: int) -> tuple[slice, ...]:
         """The parts in which the clouds of a run with so many environments are cast."""
-        most = num_envs if self.needs.whole else envs_at_once(self.config, self.lidar.outputs)
+        most = num_envs if self.whole else envs_at_once(self.config, self.lidar.outputs)
         return env_slices(num_envs, most)
 
-    def start(self, envs: torch.Tensor, sensed: Kinematics) -> None:
-        """Notes where the base of some environments, see `rows`, starts; call after their reset."""
+    def follow(self, measured: Kinematics) -> None:
+        """Notes how the base moves, as measured; call at every control step."""
         if self.odometry is not None:
-            self.odometry.start(envs, sensed)
+            self.odometry.advance(measured)
 
-    def follow(self, sensed: Kinematics) -> None:
-        """Notes how the base moves; call at every control step."""
-        if self.odometry is not None:
-            self.odometry.advance(sensed)
+    def seen_within(self, frames: int) -> torch.Tensor | None:
+        """(num_envs, O) bool: which obstacles a ray has hit in the last `frames` frames; None without any."""
+        return None if self.unseen is None else self.unseen < frames
 
     def due(self, step: int) -> bool:
         """Whether a frame ends with control step number `step`."""
         return step % self.period_steps == 0
+
+    def record_motion(self, step: int) -> None:
+        """Notes where the bodies are in control step number `step` within a frame, where a segment of motion ends."""
+        if self._steps_per_segment < self.period_steps and step % self._steps_per_segment == 0:
+            self._place_bodies()
+            self.lidar.record_poses()
 
     def take_frame(self, time_s: float, base_quat: torch.Tensor, timer: StageTimer) -> None:
         """Casts the frame that ends at simulation time `time_s` from the current poses, and takes what is read from it.
 
         Args:
             time_s: of all environments.
-            base_quat: (num_envs, 4) as sensed; samplers need it.
+            base_quat: (num_envs, 4) as measured; samplers need it.
             timer: of the stages "rays", "sampling" and "sectors".
         """
         with timer.stage("rays"):
-            pos, quat = self._sim.body_poses(self._bodies)
-            self.scene.body_pos.copy_(pos)
-            self.scene.body_quat.copy_(quat)
+            self._place_bodies()
         parts = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
             with timer.stage("rays"):
@@ -228,14 +225,19 @@ class LidarSensing:
             if self.frames is not None:
                 with timer.stage("sampling"):
                     self._sample(part, frame, base_quat)
-            if self.sector_distance is not None:
+            if self._sectors:
                 with timer.stage("sectors"):
-                    self._measure_sectors[index]()
+                    self._sectors[index]()
         next(parts, None)  # the frame has been cast
         self.tick, self._is_cast = self.tick + 1, True
         self.frame_tick.fill_(self.tick)
         if self.frames is not None:
             self._append_newest()
+
+    def _place_bodies(self) -> None:
+        pos, quat = self._sim.body_poses(self._bodies)
+        self.scene.body_pos.copy_(pos)
+        self.scene.body_quat.copy_(quat)
 
     def _note_sightings(self, part: slice, frame: LidarFrame) -> None:
         hit = self._obstacle_of[frame.shape_id.long() + 1]
@@ -256,13 +258,11 @@ class LidarSensing:
         self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
 
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
-        """(num_envs,) mean of the noise-free distal ranges (m), each capped at `max_distance`."""
-        if max_distance not in self._distal_range:  # neither declared nor asked for before
-            nothing = torch.full((self._sim.num_envs,), max_distance, device=self._sim.device)
-            frame = self.frame
-            self._distal_range[max_distance] = (
-                nothing if frame is None else self._mean_distal_range(frame, max_distance)
-            )
+        """(num_envs,) mean of the noise-free distal ranges (m) of the newest frame, each capped at `max_distance`; the
+        cap before the first frame. A cap is averaged from the first frame on that follows its first read."""
+        if max_distance not in self._distal_range:
+            cap = torch.full((self._sim.num_envs,), max_distance, device=self._sim.device)
+            self._distal_range[max_distance] = cap
         return self._distal_range[max_distance]
 
     def _mean_distal_range(self, frame: LidarFrame, max_distance: float) -> torch.Tensor:
@@ -276,7 +276,6 @@ class LidarSensing:
             "lidar": self.lidar.state_dict(),
             "frame_count": self.frame_count,
             "frames": self.frames,
-            "sector_distance": None if self.sector_distance is None else self.sector_distance.clone(),
             "distal_range": {str(key): value.clone() for key, value in self._distal_range.items()},
             "unseen": None if self.unseen is None else self.unseen.clone(),
             "odometry": self.odometry.state_dict() if self.odometry is not None else None,
@@ -289,29 +288,32 @@ class LidarSensing:
         self.frame_count.copy_(state["frame_count"])
         if self.frames is not None:
             self.frames = state["frames"].clone()
-        if self.sector_distance is not None:
-            self.sector_distance.copy_(state["sector_distance"])
         if self.unseen is not None:
             self.unseen = state["unseen"].clone()
         if self.odometry is not None:
             self.odometry.load_state_dict(state["odometry"])
         self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
 
-    def reset(self, envs: torch.Tensor) -> None:
-        """Forgets what some environments, see `rows`, have seen, and how their bodies moved."""
-        self.lidar.forget_motion(envs)
-        put(self.frame_count, envs, 0)
-        if self.frames is not None:
-            put(self.frames, envs, 0.0)
-        if self.sector_distance is not None:
-            put(self.sector_distance, envs, self.needs.sector_max)
-        if self.unseen is not None:
-            put(self.unseen, envs, NEVER)
-        for max_distance, mean in self._distal_range.items():
-            put(mean, envs, max_distance)
+    def reset(self, env_ids: torch.Tensor, measured: Kinematics) -> None:
+        """Forgets what some environments (n,) have seen, and how their bodies moved.
 
-    def _record_sectors(self, num_threads: int | None) -> list[SectorDistances]:
-        """A launch for each part."""
+        Args:
+            env_ids: which.
+            measured: base of all environments as measured, where their episodes begin.
+        """
+        if self.odometry is not None:
+            self.odometry.start(env_ids, measured)
+        self.lidar.forget_motion(env_ids)
+        self.frame_count[env_ids] = 0
+        if self.frames is not None:
+            self.frames[env_ids] = 0.0
+        if self.unseen is not None:
+            self.unseen[env_ids] = NEVER
+        for max_distance, mean in self._distal_range.items():
+            mean[env_ids] = max_distance
+
+    def _record_sectors(self, out: torch.Tensor, num_threads: int | None) -> list[SectorDistances]:
+        """A launch for each slice of environments."""
         sensor = self.config
         return [
             SectorDistances(
@@ -323,10 +325,10 @@ class LidarSensing:
                 sensor.mount_pos,
                 sensor.quat,
                 obstacle_class=int(HitClass.OBSTACLE),
-                max_distance=self.needs.sector_max,
-                num_sectors=self.needs.sectors,
+                max_distance=sensor.max_range,
+                num_sectors=out.shape[1],
                 num_threads=num_threads,
-                out=self.sector_distance[part],
+                out=out[part],
             )
             for part, frame in zip(self.lidar.env_slices, self.lidar.slice_frames, strict=True)
         ]
@@ -339,18 +341,16 @@ def field_of_view(sensor: LidarConfig, pattern: ScanPattern, noise: Sequence[Noi
     return FieldOfView.of(sensor.mount_pos, sensor.quat, directions, max_deviation(noise), reach)
 
 
-def _outputs_read(needs: SensingNeeds, sampled: bool) -> tuple[str, ...]:
-    """The outputs of the LiDAR that the task reads."""
-    outputs: set[str] = set()
-    if sampled:
-        outputs |= {"ranges", "directions_s", "elevation", "azimuth"}
-    if needs.sectors:
-        outputs |= {"true_ranges", "directions_s", "class_id"}
-    if needs.obstacles:
-        outputs |= {"shape_id"}
-    if needs.rays:
-        outputs |= {"true_ranges", "elevation"}
-    return tuple(sorted(outputs))
+def _outputs(sampled: bool, sectors: bool, sightings: bool, distal: bool, whole: bool) -> tuple[str, ...]:
+    """The outputs of the LiDAR that are read."""
+    read = {
+        ("ranges", "directions_s", "elevation", "azimuth"): sampled,
+        ("true_ranges", "directions_s", "class_id"): sectors,
+        ("shape_id",): sightings,
+        ("true_ranges", "elevation"): distal,
+        ("true_ranges", "directions_s", "elevation"): whole,
+    }
+    return tuple(sorted({name for names, is_read in read.items() if is_read for name in names}))
 
 
 def envs_at_once(config: SensorConfig, outputs: Sequence[str]) -> int:

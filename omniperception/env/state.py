@@ -1,98 +1,376 @@
-"""What the terms of the task can read about the robot, as float32 tensors."""
+"""What terms read: the robot and what is around it at the end of a control step, computed when it is first read."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
-from typing import TypeVar
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
 
-from omniperception.common.rotations import rotate_inverse, rotate_yaw, yaw_of
+from omniperception.common.rotations import rotate_yaw
+from omniperception.env.heights import flat_heights
+from omniperception.env.kinematics import Kinematics
+from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
 
-Term = TypeVar("Term", bound=Callable)
+if TYPE_CHECKING:  # parts that not every task has
+    from omniperception.avoidance.avoidance import Avoidance
+    from omniperception.env.height_lookup import HeightLookup
+    from omniperception.env.mdp.commands import Command
+    from omniperception.env.mdp.randomization import Randomizer
+    from omniperception.env.sensing import LidarSensing
+    from omniperception.lidar import LidarFrame
+    from omniperception.scene import ObstacleField
+    from omniperception.sim import Simulator
+
+AVOIDANCE, DISTAL_RANGE, CLOUD = "avoidance", "distal_range", "cloud"
+"""What is taken from the LiDAR where a term requires it: V_avoid and sector distances, mean distal ranges, clouds."""
+CONTACT_SENSORS = frozenset({FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT})
+REQUIREMENTS = (*sorted(CONTACT_SENSORS), AVOIDANCE, DISTAL_RANGE, CLOUD)
+"""What has to be there before the world is compiled."""
+
+CONTACT_FORCE = 1.0
+"""Vertical force (N) from which on a foot is in contact."""
+
+Marked = TypeVar("Marked", bound=Callable)
 
 
-def reads(*fields: str) -> Callable[[Term], Term]:
-    """Declares the optional parts of the task that a term reads; only what somebody reads is built."""
+def requires(*names: str) -> Callable[[Marked], Marked]:
+    """Declares which of REQUIREMENTS a term (a function or a class) reads; everything else is computed when read."""
+    unknown = set(names) - set(REQUIREMENTS)
+    if unknown:
+        raise ValueError(f"@requires({', '.join(sorted(unknown))}) is unknown; known: {', '.join(REQUIREMENTS)}")
 
-    def mark(term: Term) -> Term:
-        term.reads = frozenset(fields)
+    def mark(term: Marked) -> Marked:
+        term.requires = frozenset(names)
         return term
 
     return mark
 
 
-def fields_read(term: Callable) -> frozenset[str]:
-    """The optional fields that a term (or a partial of one) declared."""
-    return getattr(plain(term), "reads", frozenset())
-
-
-def plain(term: Callable) -> Callable:
-    """The function below partials."""
+def requirements(term: Callable) -> frozenset[str]:
+    """What a term (or a partial of one) declared with `requires`."""
     while isinstance(term, partial):
         term = term.func
-    return term
+    return getattr(term, "requires", frozenset())
 
 
-def checked_term(name: str, term: Term) -> Term:
-    """The term as a plain function or partial; refuses one that the environment alone cannot call, such as one with a
-    misspelt parameter.
-
-    The partials that Hydra makes check their target anew in every call (0.25 ms); a term is called in every step.
-    """
-    try:
-        inspect.signature(term).bind(None)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: {error}") from None
-    return partial(term.func, *term.args, **term.keywords) if isinstance(term, partial) else term
-
-
-@dataclass
-class Kinematics:
-    """Base and joint state at one moment, every field (num_envs, ...).
+class Obstacles(NamedTuple):
+    """The obstacles that are placed at resets; without any, O = 0.
 
     Attributes:
-        base_pos_w: (n, 3) m, environment frame.
-        base_quat_w: (n, 4).
-        yaw: (n,) rad.
-        base_lin_vel_b: (n, 3) m/s, base frame.
-        base_lin_vel_yaw: (n, 2) m/s, horizontal velocity in the yaw-aligned frame.
-        base_ang_vel_b: (n, 3) rad/s, base frame.
-        projected_gravity_b: (n, 3) unit vector of gravity in the base frame.
-        joint_pos: (n, num_joints) rad.
-        joint_vel: (n, num_joints) rad/s.
+        pos_yaw: (n, O, 2) m, from the base's origin, in the yaw-aligned frame.
+        vel_yaw: (n, O, 2) m/s, in the yaw-aligned frame.
+        radius: (O,) m, of the circles around the footprints.
+        active: (n, O) bool: which take part in the episode.
     """
 
-    base_pos_w: torch.Tensor
-    base_quat_w: torch.Tensor
-    yaw: torch.Tensor
-    base_lin_vel_b: torch.Tensor
-    base_lin_vel_yaw: torch.Tensor
-    base_ang_vel_b: torch.Tensor
-    projected_gravity_b: torch.Tensor
-    joint_pos: torch.Tensor
-    joint_vel: torch.Tensor
+    pos_yaw: torch.Tensor
+    vel_yaw: torch.Tensor
+    radius: torch.Tensor
+    active: torch.Tensor
 
-    @classmethod
-    def of(cls, qpos: torch.Tensor, qvel: torch.Tensor) -> Kinematics:
-        """From `Simulator.robot_state`: (n, 7 + joints) and (n, 6 + joints)."""
-        qpos, qvel = qpos.float(), qvel.float()
-        quat = qpos[:, 3:7]
-        yaw = yaw_of(quat)
-        down = torch.zeros_like(qvel[:, :3])
-        down[:, 2] = -1.0
-        in_base = rotate_inverse(quat.repeat(2, 1), torch.cat((qvel[:, :3], down)))
-        return cls(
-            base_pos_w=qpos[:, :3],
-            base_quat_w=quat,
-            yaw=yaw,
-            base_lin_vel_b=in_base[: len(quat)],
-            base_lin_vel_yaw=rotate_yaw(-yaw, qvel[:, :2]),
-            base_ang_vel_b=qvel[:, 3:6],
-            projected_gravity_b=in_base[len(quat) :],
-            joint_pos=qpos[:, 7:],
-            joint_vel=qvel[:, 6:],
-        )
+
+class EnvState:
+    """State of all environments, (num_envs, ...): read it freely, what nobody reads is never computed.
+
+    Quantities are computed at first use and hold until the environment calls `invalidate`, after the physics steps of a
+    control step and again after resets. They describe the newest moment but for these: contact forces and torques are
+    those of the last physics step, which describes the state before it (one physics step old); `measured` is as old
+    as the randomized latency; `before` is the start of the control step; V_avoid, sector distances and clouds are those
+    of the newest LiDAR frame.
+
+    What a term keeps of earlier steps belongs to the term, but for the times of the feet's contacts: they are followed
+    from the first read on, at every control step.
+
+    Attributes:
+        actions: (num_envs, num_actions) each: those applied, the newest first, and the two before; 0 after a reset.
+        before: kinematics at the start of the control step.
+        default_joint_pos, joint_lower, joint_upper: (num_joints,) rad.
+        default_base_height: m, of the default pose.
+    """
+
+    def __init__(
+        self,
+        sim: Simulator,
+        control_dt: float,
+        command: Command,
+        randomizer: Randomizer,
+        obstacles: ObstacleField | None = None,
+        height_lookup: HeightLookup | None = None,
+        avoidance: Avoidance | None = None,
+        sensing: LidarSensing | None = None,
+    ) -> None:
+        """
+        Args:
+            sim: the physics.
+            control_dt: s.
+            command: source of the commands.
+            randomizer: tells how late `measured` is.
+            obstacles: those that are placed at resets.
+            height_lookup: heights above ground that is not flat; None on a plane at 0.
+            avoidance: source of V_avoid.
+            sensing: the LiDAR.
+        """
+        self._sim, self._command, self._obstacles, self._height_lookup = sim, command, obstacles, height_lookup
+        self.num_envs, self.device, self.control_dt = sim.num_envs, sim.device, control_dt
+        self._avoidance, self._sensing = avoidance, sensing
+        robot, model = sim.world.robot, sim.world.model
+        limits = model.jnt_range[[model.joint(name).id for name in robot.joints]]
+        self.joint_lower, self.joint_upper = torch.tensor(limits, dtype=torch.float32, device=self.device).unbind(1)
+        self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
+        self.default_base_height = robot.base_height
+        self._foot_geoms = tuple(model.geom(name).id for name in robot.foot_geoms)
+        self.actions = (torch.zeros(self.num_envs, robot.num_joints, device=self.device),) * 3
+        self._history = None if randomizer.delay is None else StateHistory(sim, randomizer)
+        self._foot_times: ContactTimes | None = None
+        self.before = self.kinematics
+
+    # ---- followed by the environment ---------------------------------------------------------------------------------
+
+    def begin_step(self, actions: torch.Tensor) -> None:
+        """Takes in the actions (num_envs, num_actions) of the control step that begins."""
+        self.before, self.actions = self.kinematics, (actions, *self.actions[:-1])
+
+    def end_step(self) -> None:
+        """Takes in the physics steps of the control step."""
+        self.invalidate()
+        if self._history is not None:
+            self._history.record()
+        if self._foot_times is not None:
+            self._foot_times.advance(self.foot_contact, self.control_dt)
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Forgets earlier steps of environments (n,) whose physics has been reset."""
+        self.invalidate()
+        self.actions = tuple(action.index_fill(0, env_ids, 0.0) for action in self.actions)
+        if self._history is not None:
+            self._history.reset(env_ids)
+        if self._foot_times is not None:
+            self._foot_times.reset(env_ids)
+
+    def invalidate(self) -> None:
+        """Forgets what has been computed, because the simulation has changed."""
+        for name in _CACHED & self.__dict__.keys():
+            del self.__dict__[name]
+
+    def has_computed(self, name: str) -> bool:
+        """Whether somebody has read a quantity since the last `invalidate`."""
+        return name in self.__dict__
+
+    def state_dict(self) -> dict:
+        """What earlier steps leave behind."""
+        return {
+            "actions": list(self.actions),
+            "history": self._history and self._history.state_dict(),
+            "foot_times": self._foot_times and self._foot_times.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        self.invalidate()
+        self.actions = tuple(state["actions"])
+        if self._history is not None:
+            self._history.load_state_dict(state["history"])
+        if self._foot_times is not None:
+            self._foot_times.load_state_dict(state["foot_times"])
+
+    # ---- the robot ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """Base and joints."""
+        return Kinematics(*self._sim.robot_state())
+
+    @cached_property
+    def measured(self) -> Kinematics:
+        """Base and joints as the robot's sensors give them, with latency where it is randomized."""
+        return self.kinematics if self._history is None else self._history.delayed()
+
+    @property
+    def command(self) -> torch.Tensor:
+        """(num_envs, 3) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame."""
+        return self._command.value
+
+    @cached_property
+    def base_lin_acc_b(self) -> torch.Tensor:
+        """(num_envs, 3) m/s^2: change of the linear velocity in the base frame over the control step."""
+        return (self.kinematics.base_lin_vel_b - self.before.base_lin_vel_b) / self.control_dt
+
+    @cached_property
+    def joint_acc(self) -> torch.Tensor:
+        """(num_envs, num_joints) rad/s^2: change of the joint velocity over the control step."""
+        return (self.kinematics.joint_vel - self.before.joint_vel) / self.control_dt
+
+    @cached_property
+    def joint_torque(self) -> torch.Tensor:
+        """(num_envs, num_joints) N m."""
+        return self._sim.joint_torque()
+
+    @cached_property
+    def base_height(self) -> torch.Tensor:
+        """(num_envs,) m: the base's origin above the ground, the mean of what lies below it and below the hips."""
+        if self._height_lookup is None:
+            return self.kinematics.base_pos_w[:, 2]
+        return self._height_lookup.base_height(self.kinematics)
+
+    @cached_property
+    def heights(self) -> torch.Tensor:
+        """(num_envs, 187) m: the base's origin above the ground at `height_grid`, clipped to +-1 m."""
+        if self._height_lookup is None:
+            return flat_heights(self.base_height)
+        return self._height_lookup.around(self.kinematics)
+
+    # ---- contacts ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def foot_force(self) -> torch.Tensor:
+        """(num_envs, F, 3) N, environment frame: of each foot on what it touches, so that a foot that stands pushes
+        down. Requires "foot_force"."""
+        return self._contact_force(FOOT_FORCE)
+
+    @cached_property
+    def link_force(self) -> torch.Tensor:
+        """(num_envs, L, 3) N, environment frame: likewise of the robot's penalised links. Requires "link_force"."""
+        return self._contact_force(LINK_FORCE)
+
+    @cached_property
+    def obstacle_contact(self) -> torch.Tensor:
+        """(num_envs,) bool: whether a link touched an obstacle in any physics step of the control step. Requires
+        "obstacle_contact"; False for all without obstacles."""
+        if OBSTACLE_CONTACT not in self._sim.world.sensors:
+            return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        return self._sim.touched(OBSTACLE_CONTACT)
+
+    def _contact_force(self, kind: str) -> torch.Tensor:
+        _check(kind in self._sim.world.sensors, kind)
+        return self._sim.contact_sensor(kind).unflatten(1, (-1, 3))
+
+    # ---- feet, in the order of robot.foot_geoms ----------------------------------------------------------------------
+
+    @cached_property
+    def foot_pos_w(self) -> torch.Tensor:
+        """(num_envs, F, 3) m, environment frame: centres of the foot geoms."""
+        return self._sim.geom_poses(self._foot_geoms)[0]
+
+    @cached_property
+    def foot_vel_w(self) -> torch.Tensor:
+        """(num_envs, F, 3) m/s, environment frame: of the same points."""
+        return self._sim.geom_velocities(self._foot_geoms)
+
+    @cached_property
+    def foot_contact(self) -> torch.Tensor:
+        """(num_envs, F) bool: which feet push down with more than CONTACT_FORCE. Requires "foot_force"."""
+        return self.foot_force[..., 2].abs() > CONTACT_FORCE
+
+    @property
+    def foot_times(self) -> ContactTimes:
+        """How long the feet have been in the air and in contact. Requires "foot_force"."""
+        if self._foot_times is None:
+            self._foot_times = ContactTimes(self.foot_contact)
+        return self._foot_times
+
+    # ---- around the robot --------------------------------------------------------------------------------------------
+
+    @cached_property
+    def obstacles(self) -> Obstacles:
+        """Where the obstacles are and how they move."""
+        n, field, yaw = self.num_envs, self._obstacles, self.kinematics.yaw
+        if field is None:
+            nothing = torch.zeros(n, 0, 2, device=self.device)
+            return Obstacles(nothing, nothing, nothing[0, :, 0], nothing[..., 0].bool())
+        offset = field.pos_w[..., :2].float() - self.kinematics.base_pos_w[:, None, :2]
+        velocity = rotate_yaw(-yaw, field.velocity_w.float())
+        return Obstacles(rotate_yaw(-yaw, offset), velocity, field.radius.float(), field.active)
+
+    @property
+    def avoidance_velocity(self) -> torch.Tensor:
+        """(num_envs, 2) m/s, yaw-aligned frame: V_avoid, chosen at the control step's end. Requires "avoidance"."""
+        _check(self._avoidance is not None, AVOIDANCE)
+        return self._avoidance.velocity
+
+    @property
+    def cloud(self) -> LidarFrame | None:
+        """The newest frame of the LiDAR, with noise-free ranges; None before the first. Requires "cloud"."""
+        _check(self._sensing is not None, CLOUD)
+        return self._sensing.frame
+
+    def mean_distal_range(self, max_distance: float) -> torch.Tensor:
+        """(num_envs,) m: mean of the noise-free distal ranges of the newest frame, each capped at `max_distance` (m);
+        the cap before the first frame. Requires "distal_range"."""
+        _check(self._sensing is not None, DISTAL_RANGE)
+        return self._sensing.mean_distal_range(max_distance)
+
+
+_CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance(value, cached_property))
+
+
+def _check(there: bool, name: str) -> None:
+    if not there:
+        raise ValueError(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
+
+
+class StateHistory:
+    """The physics states that a delayed measurement may show."""
+
+    def __init__(self, sim: Simulator, randomizer: Randomizer) -> None:
+        self._sim, self._delay = sim, randomizer.delay
+        self._past = tuple(x[:, None].repeat(1, randomizer.max_delay + 1, 1) for x in sim.robot_state())
+        self._all_envs = torch.arange(sim.num_envs, device=sim.device)
+
+    def record(self) -> None:
+        """Takes in the states after each physics step of the last control step."""
+        for past, recorded in zip(self._past, self._sim.recorded_states(), strict=True):
+            past.copy_(torch.cat((past[:, recorded.shape[1] :], recorded), 1)[:, -past.shape[1] :])
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        for past, now in zip(self._past, self._sim.robot_state(), strict=True):
+            past[env_ids] = now[env_ids, None]
+
+    def delayed(self) -> Kinematics:
+        """The state `delay` physics steps ago, by environment."""
+        qpos, qvel = self._past
+        index = qpos.shape[1] - 1 - self._delay
+        return Kinematics(qpos[self._all_envs, index], qvel[self._all_envs, index])
+
+    def state_dict(self) -> dict:
+        return {"past": list(self._past)}
+
+    def load_state_dict(self, state: dict) -> None:
+        for past, saved in zip(self._past, state["past"], strict=True):
+            past.copy_(saved)
+
+
+class ContactTimes:
+    """How long each foot has been in the air or in contact, told at every control step; all (num_envs, F).
+
+    Attributes:
+        air, contact: s: of the present phase in the air and in contact; 0 in the other one.
+        last_air, last_contact: s: of the last phase that has ended in this episode; 0 before.
+        touched_down: bool: contact began in this control step.
+    """
+
+    def __init__(self, contact: torch.Tensor) -> None:
+        """Nothing has lasted yet; `contact` (num_envs, F) bool gives the shape."""
+        self.air, self.contact, self.last_air, self.last_contact = torch.zeros(
+            4, *contact.shape, device=contact.device
+        ).unbind(0)
+        self.touched_down = torch.zeros_like(contact)
+
+    def advance(self, contact: torch.Tensor, dt: float) -> None:
+        """Takes in a control step of `dt` (s) at whose end the feet are in `contact` (num_envs, F) bool or not."""
+        self.touched_down = contact & (self.air > 0)
+        lifted_off = ~contact & (self.contact > 0)
+        self.last_air = torch.where(self.touched_down, self.air, self.last_air)
+        self.last_contact = torch.where(lifted_off, self.contact, self.last_contact)
+        self.air = torch.where(contact, 0.0, self.air + dt)
+        self.contact = torch.where(contact, self.contact + dt, 0.0)
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        for name, value in vars(self).items():
+            setattr(self, name, value.index_fill(0, env_ids, 0))
+
+    def state_dict(self) -> dict:
+        return dict(vars(self))
+
+    def load_state_dict(self, state: dict) -> None:
+        vars(self).update(state)

@@ -5,20 +5,19 @@ from __future__ import annotations
 import torch
 
 from omniperception.common.random import EnvRandom
-from omniperception.common.rows import put, take
-from omniperception.env.state import Kinematics
+from omniperception.env.kinematics import Kinematics
 from omniperception.scene.ground import Ground
 
 _MIN_SPEED = 1e-3
-"""Commands slower than this (m/s) command no way."""
+"""Commands slower than this (m/s) have no direction."""
 
 
 class TerrainLevels:
     """Follows each environment's episode and chooses the tile of its next one; see `TerrainCurriculumConfig`.
 
     Attributes:
-        walked: (num_envs,) way (m) along the commanded direction in this episode.
-        commanded: (num_envs,) way (m) that was commanded.
+        walked: (num_envs,) distance (m) along the commanded direction in this episode.
+        commanded: (num_envs,) distance (m) that was commanded.
         reach: (num_envs,) largest horizontal distance (m) from where the episode started.
     """
 
@@ -46,34 +45,34 @@ class TerrainLevels:
         from_start = (kinematics.base_pos_w[:, :2] - self._start).norm(dim=1)
         torch.maximum(self.reach, torch.where(healthy, from_start, 0.0), out=self.reach)
 
-    def start(self, envs: torch.Tensor, xy_w: torch.Tensor, complete: torch.Tensor | None = None) -> None:
-        """Begins new episodes in some environments, whose robots stand at (n, 2) m, on the tiles that they deserve.
+    def start(self, env_ids: torch.Tensor, xy_w: torch.Tensor, complete: torch.Tensor | None = None) -> None:
+        """Begins new episodes and chooses their tiles.
 
         Args:
-            envs: which, see `rows`.
-            xy_w: (n, 2) m.
+            env_ids: (n,) environments whose episodes begin.
+            xy_w: (n, 2) m, where their robots stand.
             complete: (n,) bool: whether the last episode ended as planned, so that it commanded no more; None before
                 the first episode.
         """
         config, ground = self._ground.config, self._ground
-        draw = self._random.uniform(envs)
+        draw = self._random.uniform(env_ids)
         if config.curriculum is None:
             level = (draw * config.levels).long()
         elif complete is None:
             level = (draw * (config.curriculum.start_level + 1)).long()
         else:
-            level = (take(ground.level, envs) + self.steps_up(envs, complete)).clamp(min=0)
+            level = (ground.level[env_ids] + self.steps_up(env_ids, complete)).clamp(min=0)
             level = torch.where(level < config.levels, level, (draw * config.levels).long())
-        ground.move(envs, level)
-        put(self._start, envs, xy_w)
+        ground.move(env_ids, level)
+        self._start[env_ids] = xy_w
         for total in (self.walked, self.commanded, self.reach, self._steps):
-            put(total, envs, 0.0)
+            total[env_ids] = 0.0
 
-    def steps_up(self, envs: torch.Tensor, complete: torch.Tensor) -> torch.Tensor:
+    def steps_up(self, env_ids: torch.Tensor, complete: torch.Tensor) -> torch.Tensor:
         """(n,) int64: 1 for environments that move up a level, -1 for those that move down; see `start`."""
         config, curriculum = self._ground.config, self._ground.config.curriculum
         walked, commanded, reach, steps = (
-            take(values, envs) for values in (self.walked, self.commanded, self.reach, self._steps)
+            values[env_ids] for values in (self.walked, self.commanded, self.reach, self._steps)
         )
         rest = (self._max_steps / steps.clamp(min=1.0)).clamp(min=1.0)
         commanded = torch.where(complete, commanded, commanded * rest)

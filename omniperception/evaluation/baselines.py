@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 
 from omniperception.avoidance.true_sectors import TrueSectors
+from omniperception.avoidance.velocity import AvoidanceConfig, avoidance_velocity
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.rewards import AvoidanceConfig, avoidance_velocity
 from omniperception.evaluation.episodes import Policy
 from omniperception.perception import Attitude
 
@@ -77,17 +77,18 @@ def steered(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Li
 
 def _true_avoidance(env: OmniEnv, avoidance: AvoidanceConfig) -> Callable[[], torch.Tensor]:
     """V_avoid of the moment, from where the obstacles are."""
-    law = avoidance.risk
     sectors = TrueSectors(avoidance.num_sectors, env.world.obstacles, env.obstacles, env.num_envs, env.device)
-    if law is None:
-        return lambda: avoidance_velocity(sectors.measure(env.kinematics)[..., 0], avoidance)
-    candidates = law.candidates(env.device)
+    candidates = None if avoidance.risk is None else avoidance.risk.candidates(env.device)
 
-    def from_risk() -> torch.Tensor:
-        risk = law.risk(sectors.measure(env.kinematics), candidates)
-        return law.avoidance(risk, env.command.value[:, :2], candidates)
+    def velocity() -> torch.Tensor:
+        kinematics = env.state.kinematics
+        motion = sectors.measure(kinematics.base_pos_w, kinematics.yaw)
+        if avoidance.risk is None:
+            return avoidance_velocity(motion[..., 0], avoidance)
+        risk = avoidance.risk.risk(motion, candidates)
+        return avoidance.risk.avoidance(risk, env.command.value[:, :2], candidates)
 
-    return from_risk
+    return velocity
 
 
 def _empty_points(env: OmniEnv) -> torch.Tensor:

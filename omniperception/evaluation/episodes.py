@@ -167,8 +167,8 @@ def run_episodes(
     per_env = math.ceil(num_episodes / env.num_envs)
     tally, clock = _Tally(env, per_env), _StageClock(env)
     tracks = TrackRecorder(env, per_env) if keep_tracks else None
-    probes = [tally.record] + ([tracks.record] if tracks is not None else [])
-    env.probes.extend(probes)
+    hooks = [tally.record] + ([tracks.record] if tracks is not None else [])
+    env.step_hooks.extend(hooks)
     try:
         with torch.no_grad():
             observations = env.get_observations()
@@ -180,8 +180,8 @@ def run_episodes(
                 if on_step is not None:
                     on_step()
     finally:
-        for probe in probes:
-            env.probes.remove(probe)
+        for hook in hooks:
+            env.step_hooks.remove(hook)
     return tally.episodes(clock.us_per_env_step(), tracks.tracks() if tracks is not None else None)
 
 
@@ -200,7 +200,7 @@ class _Tally:
         self._clearance = Clearance(env) if env.config.obstacles.num_obstacles else None
         self._least = torch.full(shape, CLEARANCE_CAP, device=env.device)
         self._filed_least = torch.zeros(*shape, per_env, device=env.device)
-        env.sim.joint_torque()  # recorded from now on
+        _ = env.state.joint_torque  # recorded from now on
         self._was_touching = torch.zeros(shape, dtype=torch.bool, device=env.device)
         self._knows_free = True
 
@@ -216,10 +216,10 @@ class _Tally:
 
     def _add_step(self) -> None:
         env, dt = self._env, self._env.control_dt
-        self._knows_free = env.free is not None
-        free = env.free if env.free is not None else torch.zeros_like(env.done)
+        self._knows_free = env.no_obstacle_near is not None
+        free = env.no_obstacle_near if self._knows_free else torch.zeros_like(env.done)
         began = env.contacts & ~self._was_touching
-        motion = env.kinematics
+        kinematics = env.state.kinematics
         step = {
             "steps": torch.ones_like(free),
             "velocity_error": env.velocity_error,
@@ -227,8 +227,8 @@ class _Tally:
             "free": free,
             "free_velocity_error": env.velocity_error * free,
             "contacts": began,
-            "energy": (env.sim.joint_torque() * motion.joint_vel).abs().sum(1) * dt,
-            "path": motion.base_lin_vel_yaw.norm(dim=1) * dt,
+            "energy": (env.state.joint_torque * kinematics.joint_vel).abs().sum(1) * dt,
+            "path": kinematics.base_lin_vel_yaw.norm(dim=1) * dt,
         }
         healthy = ~env.sim.failed
         self._sums += torch.stack([torch.where(healthy, step[name].double(), 0.0) for name in _SUMS], 1)

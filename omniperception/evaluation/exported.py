@@ -53,7 +53,7 @@ class ExportedPolicies:
 
 def robot_states(env: OmniEnv) -> list[RobotState]:
     """What each robot senses of itself, with the latency that the environment gives it."""
-    sensed = env.sensed
+    sensed = env.state.measured
     tensors = (
         sensed.joint_pos,
         sensed.joint_vel,

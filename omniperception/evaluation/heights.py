@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import torch
 
-from omniperception.env.env import HEIGHT_TARGET, OmniEnv
+from omniperception.env.config import HEIGHT_TARGET
+from omniperception.env.env import OmniEnv
 from omniperception.env.heights import height_grid
 from omniperception.evaluation.episodes import Policy
 from omniperception.learning.models import PerceptionActor

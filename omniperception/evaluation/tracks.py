@@ -47,7 +47,7 @@ class TrackRecorder:
         """Takes in the control step that has just been done, before finished environments are reset."""
         env = self._env
         running = self._episode < self._per_env
-        xy = env.kinematics.base_pos_w[:, :2]
+        xy = env.state.kinematics.base_pos_w[:, :2]
         first = (running & (env.episode_length_buf == 1)).nonzero().flatten()
         if len(first):
             self._keep_scene(first, self._episode[first])

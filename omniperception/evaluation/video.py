@@ -125,10 +125,10 @@ class Recorder:
         return Renderer(self._shapes, width, height, samples, device=self._env.device, num_threads=threads)
 
     def _view(self) -> View:
-        env, state = self._env, self._env.kinematics
+        env, state = self._env, self._env.state.kinematics
         pos, quat = env.sim.body_poses(self._shapes.bodies)
         base, yaw = state.base_pos_w[self._id], state.yaw[self._id]
-        below = torch.stack((base[0], base[1], base[2] - env.base_height[self._id]))
+        below = torch.stack((base[0], base[1], base[2] - env.state.base_height[self._id]))
         eye, target = self._camera.follow(below, yaw)
         if env.ground is not None:
             ground = env.ground.height(eye[None, :2], torch.tensor([self._id], device=env.device))[0]
@@ -162,7 +162,7 @@ class Recorder:
     def _interest(self) -> float:
         """How much there is to see: the robot walks ahead, and its LiDAR sees obstacles."""
         env = self._env
-        speed = float(env.kinematics.base_lin_vel_yaw[self._id, 0])
+        speed = float(env.state.kinematics.base_lin_vel_yaw[self._id, 0])
         value = min(max(speed, 0.0), 0.8) + float(env.episode_length_buf[self._id] * env.control_dt > 2.0)
         frame = env.sensing.frame if env.sensing is not None else None
         if frame is not None and frame.class_id is not None:

@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from rsl_rl.utils import resolve_nn_activation
 
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
-from omniperception.env.env import AVOIDANCE_TARGET, HEIGHT_TARGET, MOTION_TARGET, SECTOR_TARGET
+from omniperception.env.config import HEIGHT_TARGET
 from omniperception.perception import PerceptionNetwork, Sampler
 
 

@@ -11,8 +11,8 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
-from omniperception.env.env import AVOIDANCE_TARGET, MOTION_TARGET
 from omniperception.learning.read_out import MotionReadOut, VelocityReadOut
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork

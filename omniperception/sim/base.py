@@ -154,6 +154,9 @@ class Simulator(Protocol):
     def geom_poses(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions (num_envs, n, 3) (m) and rotation matrices (num_envs, n, 3, 3) of geoms, likewise."""
 
+    def geom_velocities(self, geoms: tuple[int, ...]) -> torch.Tensor:
+        """Linear velocities (num_envs, n, 3) (m/s, world) of the centres of geoms at the current state, float32."""
+
     def model_field(self, name: str) -> torch.Tensor:
         """(num_envs, ...) per-environment values of a model field, made per-environment on the first call."""
 

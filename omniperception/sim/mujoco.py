@@ -18,7 +18,7 @@ _INTEGRATORS = {
 }
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 _MOCAP_POS = int(mujoco.mjtState.mjSTATE_MOCAP_POS)
-_STAGE_POS = mujoco.mjtStage.mjSTAGE_POS.value
+_STAGE_POS, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_POS.value, mujoco.mjtStage.mjSTAGE_VEL.value
 
 
 class MujocoSimulator:
@@ -53,6 +53,7 @@ class MujocoSimulator:
         self._torque: torch.Tensor | None = None
         self._poses: tuple[np.ndarray, np.ndarray] | None = None
         self._geom_poses: tuple[np.ndarray, np.ndarray] | None = None
+        self._velocities: tuple[np.ndarray, ...] | None = None
         self._roots = self._find_roots()
 
     def _find_roots(self) -> dict[int, tuple[torch.Tensor, torch.Tensor]]:
@@ -179,6 +180,17 @@ class MujocoSimulator:
         index = np.asarray(geoms)
         pos, mat = (field[:, index].astype(np.float32) for field in self._geom_poses)
         return torch.from_numpy(pos), torch.from_numpy(mat.reshape(*pos.shape, 3))
+
+    def geom_velocities(self, geoms: tuple[int, ...]) -> torch.Tensor:
+        if self._velocities is None:
+            self._velocities = tuple(self.batch.bind(name) for name in ("geom_xpos", "cvel", "subtree_com"))
+        self.batch.forward(stage=_STAGE_VEL)
+        index, model = np.asarray(geoms), self.world.model
+        body = model.geom_bodyid[index]
+        pos, velocity, centre = self._velocities
+        offset = pos[:, index] - centre[:, model.body_rootid[body]]  # velocities are those at the tree's centre of mass
+        linear = velocity[:, body, 3:] + np.cross(velocity[:, body, :3], offset)
+        return torch.from_numpy(linear.astype(np.float32))
 
     def model_field(self, name: str) -> torch.Tensor:
         if name not in self._fields:

@@ -215,6 +215,15 @@ class MujocoWarpSimulator:
         index = self._index(geoms)
         return self._geom_pos[:, index], self._geom_mat[:, index]
 
+    def geom_velocities(self, geoms: tuple[int, ...]) -> torch.Tensor:
+        self._launch("velocities", self._kinematics_and_velocities)
+        model = self.world.model
+        index, body = self._index(geoms), self._index(tuple(int(b) for b in model.geom_bodyid[list(geoms)]))
+        root = self._index(tuple(int(b) for b in model.body_rootid[model.geom_bodyid[list(geoms)]]))
+        velocity, centre = wp.to_torch(self.data.cvel)[:, body], wp.to_torch(self.data.subtree_com)[:, root]
+        offset = self._geom_pos[:, index] - centre  # velocities are those at the tree's centre of mass
+        return velocity[..., 3:] + torch.linalg.cross(velocity[..., :3], offset)
+
     def model_field(self, name: str) -> torch.Tensor:
         if name not in self._fields:
             self._expand(name)
@@ -285,6 +294,11 @@ class MujocoWarpSimulator:
 
     def _kinematics(self) -> None:
         self._engine.kinematics(self.model, self.data)
+
+    def _kinematics_and_velocities(self) -> None:
+        self._engine.kinematics(self.model, self.data)
+        self._engine.com_pos(self.model, self.data)
+        self._engine.com_vel(self.model, self.data)
 
     def _constants(self) -> None:
         groups = self._engine.SetConstGroup

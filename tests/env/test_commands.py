@@ -7,8 +7,8 @@ import torch
 
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import yaw_quat
+from omniperception.env.kinematics import Kinematics
 from omniperception.env.mdp.commands import GoalCommandConfig, SpawnConfig, VelocityCommandConfig
-from omniperception.env.state import Kinematics
 
 N = 4000
 
@@ -84,7 +84,7 @@ def robots(positions, yaws):
     qpos = torch.zeros(n, 19)
     qpos[:, :2] = torch.tensor(positions)
     qpos[:, 3:7] = yaw_quat(torch.tensor(yaws))
-    return Kinematics.of(qpos, torch.zeros(n, 18))
+    return Kinematics(qpos, torch.zeros(n, 18))
 
 
 class TestGoal:
@@ -164,6 +164,6 @@ class TestGoal:
 def test_robots_start_where_the_preset_says(make_env):
     env = make_env("commands=corridor", "obstacles=corridor", blind=True, num_envs=200)
     pos = env.sim.qpos
-    assert (pos[:, 0] == -0.5).all() and (env.kinematics.yaw.abs() < 1e-6).all()
+    assert (pos[:, 0] == -0.5).all() and (env.state.kinematics.yaw.abs() < 1e-6).all()
     assert pos[:, 1].min() < -0.45 and pos[:, 1].max() > 0.45 and pos[:, 1].abs().max() <= 0.5
     assert torch.equal(pos[:, 2], torch.full((200,), 0.33, dtype=torch.float32).double())

@@ -236,8 +236,8 @@ class TestYawEquivariance:
             assert env.sensing.due(env.step_count) and not done.any()
             outcomes.append({**rows(observations, [0]), "reward": reward})
         straight, turned = outcomes
-        assert (envs[0].sensing.sector_distance < 1).any()
-        assert envs[0].avoidance_velocity.norm() > 0.1
+        assert (envs[0].avoidance.sector_distance < 1).any()
+        assert envs[0].avoidance.velocity.norm() > 0.1
         for name in ("proprioception", "command", "privileged", "reward"):
             torch.testing.assert_close(straight[name], turned[name], atol=2e-4, rtol=0, msg=name)
         ahead, aside = (env.sensing.frame.true_ranges for env in envs)
@@ -304,7 +304,7 @@ def test_nearest_obstacles_by_hand(make_env):
     group = env._groups["privileged"]
     seen = observations["privileged"][0, group.slices["nearest_obstacles"]].unflatten(0, (2, 6))
     radius = env.obstacles.radius.float()
-    velocity = env.kinematics.base_lin_vel_yaw[0]
+    velocity = env.state.kinematics.base_lin_vel_yaw[0]
     near, ahead = seen
     assert near[:2].tolist() == pytest.approx([0.0, -0.5], abs=2e-3)  # to its right
     assert near[2:4].tolist() == pytest.approx((-velocity).tolist(), abs=1e-6)

@@ -61,7 +61,7 @@ def test_trajectory_observations_and_rewards_are_those_of_the_same_robot(make_en
             assert torch.equal(group, found[name]), name
         resets += int(done.sum())
     assert resets
-    assert torch.equal(plain.joint_upper[ORDER], permuted.joint_upper)
+    assert torch.equal(plain.state.joint_upper[ORDER], permuted.state.joint_upper)
 
 
 def test_training_is_that_of_the_same_robot(monkeypatch):

@@ -25,7 +25,7 @@ def test_mirrored_physics_gives_mirrored_observations(make_env):
     mirror = Mirror(env)
     index, sign = (torch.as_tensor(part) for part in mirrored_joints(env.robot))
     torch.manual_seed(0)
-    joints = env.default_joint_pos[0] + 0.1 * torch.randn(12)
+    joints = env.state.default_joint_pos[0] + 0.1 * torch.randn(12)
     velocity, turning = torch.tensor([0.4, 0.3, 0.1]), torch.tensor([0.5, -0.4, 0.7])
     flip = torch.tensor([1.0, -1.0, 1.0])
     roll = 0.1

@@ -74,7 +74,7 @@ def test_none_changes_no_model_field(make_env):
     env.step(torch.zeros(4, 12))
     assert all(env.sim.batch.expanded(name) is None for name in MODEL_FIELDS)
     assert env.randomizer.joint_offset is None and env.randomizer.delay is None
-    assert env.sensed is env.kinematics
+    assert env.state.measured is env.state.kinematics
     assert env.sensing.frame.ranges is env.sensing.frame.true_ranges
 
 
@@ -163,7 +163,7 @@ def test_motor_strength_scales_the_torque_and_not_its_limit(one_row):
     for action in (0.4 * torch.ones(N, 12), 100.0 * torch.ones(N, 12)):
         torques = []
         for each in (env, nominal):
-            each.sim.step(each.default_joint_pos + 0.25 * action)
+            each.sim.step(each.state.default_joint_pos + 0.25 * action)
             torques.append(each.sim.joint_torque().clone())
         ratio.append(torques[0] / torques[1])
     assert_fills(ratio[0], 0.8, 1.2)
@@ -175,7 +175,7 @@ def test_joint_offset_shifts_the_targets(one_row):
     env = one_row("joint_offset", -0.02, 0.02)
     assert_fills(env.randomizer.joint_offset, -0.02, 0.02)
     env.step(torch.full((N, 12), 0.4))
-    expected = env.default_joint_pos.double() + 0.1 + env.randomizer.joint_offset.double()
+    expected = env.state.default_joint_pos.double() + 0.1 + env.randomizer.joint_offset.double()
     ctrl = torch.from_numpy(env.sim.batch.bind("ctrl"))
     torch.testing.assert_close(ctrl, expected, atol=1e-6, rtol=0)
 
@@ -186,7 +186,7 @@ def test_gravity_offset(one_row):
     for axis in range(3):
         assert_fills(offset[:, axis], -1, 1)
     env.sim.qpos[:, 2] = 3.0
-    env.sim.step(env.default_joint_pos.expand(N, -1))
+    env.sim.step(env.state.default_joint_pos.expand(N, -1))
     gravity = env.sim.model_field("opt.gravity")
     torch.testing.assert_close(env.sim.qvel[:, :3], 0.005 * gravity, atol=1e-6, rtol=0)
 
@@ -214,16 +214,18 @@ class TestLatency:
             env.step(torch.randn(64, 12, generator=generator))
             assert (env.episode_length_buf > 0).all()
         for i, delay in enumerate(env.randomizer.delay.tolist()):
-            assert torch.equal(env.sensed.joint_pos[i], history[-1 - delay][i, 7:])
-            assert not torch.equal(env.sensed.joint_pos[i], env.kinematics.joint_pos[i])
+            assert torch.equal(env.state.measured.joint_pos[i], history[-1 - delay][i, 7:])
+            assert not torch.equal(env.state.measured.joint_pos[i], env.state.kinematics.joint_pos[i])
 
     def test_observations_are_late_and_privileged_ones_are_not(self, one_row):
         env = one_row("latency_s", 0.03, 0.03, num_envs=3)
         for _ in range(4):
             observations = env.step(torch.ones(3, 12))[0]
         newest = observations["proprioception"].unflatten(1, (10, 33))[:, -1, :12]
-        torch.testing.assert_close(newest, env.sensed.joint_pos - env.default_joint_pos)
-        torch.testing.assert_close(observations["privileged"][:, :12], env.kinematics.joint_pos - env.default_joint_pos)
+        torch.testing.assert_close(newest, env.state.measured.joint_pos - env.state.default_joint_pos)
+        torch.testing.assert_close(
+            observations["privileged"][:, :12], env.state.kinematics.joint_pos - env.state.default_joint_pos
+        )
 
     def test_a_reset_has_no_past(self, one_row):
         env = one_row("latency_s", 0.045, 0.045, num_envs=3)
@@ -231,8 +233,8 @@ class TestLatency:
             env.step(torch.ones(3, 12))
         env.sim.qpos[1, 2] = 0.05
         env.step(torch.ones(3, 12))
-        assert torch.equal(env.sensed.joint_pos[1], env.default_joint_pos)
-        assert (env.sensed.joint_pos[0] != env.default_joint_pos).any()
+        assert torch.equal(env.state.measured.joint_pos[1], env.state.default_joint_pos)
+        assert (env.state.measured.joint_pos[0] != env.state.default_joint_pos).any()
 
 
 def test_a_reset_draws_anew_for_that_environment_only(make_env):
@@ -249,7 +251,7 @@ def test_a_reset_draws_anew_for_that_environment_only(make_env):
 def test_a_reset_starts_in_the_default_pose_at_rest(make_env):
     """Recomputing the engine's constants for new masses must not disturb the state."""
     env = make_env("randomization=paper", "obstacles=none", blind=True, num_envs=20)
-    default = env.default_joint_pos.double().expand(20, -1)
+    default = env.state.default_joint_pos.double().expand(20, -1)
     assert torch.equal(env.sim.qpos[:, 7:], default) and (env.sim.qvel == 0).all()
 
 

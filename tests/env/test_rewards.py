@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from omniperception.avoidance.sector_motion import sector_bearings
+from omniperception.avoidance.velocity import AvoidanceConfig, avoidance_velocity
 from omniperception.env.mdp import rewards
-from omniperception.env.mdp.rewards import AvoidanceConfig, avoidance_velocity, sector_bearings
+from omniperception.env.state import Obstacles
 
 PAPER_WEIGHTS = {
     "velocity_tracking_with_avoidance": 2.0,
@@ -30,7 +32,7 @@ def tensor(*rows):
 
 
 def given(**fields):
-    """The documented inputs of a term: attributes of the environment."""
+    """The documented inputs of a term: attributes of the state."""
     kinematics = SimpleNamespace(**fields.pop("kinematics", {}))
     return SimpleNamespace(kinematics=kinematics, **fields)
 
@@ -94,93 +96,89 @@ class TestAvoidanceVelocity:
 
 class TestTerms:
     def test_velocity_tracking_with_avoidance(self):
-        env = given(
+        state = given(
             kinematics={"base_lin_vel_yaw": tensor([0.5, 0.0], [0.2, -0.3])},
-            command=SimpleNamespace(value=tensor([1.0, 0.0, 9.0], [0.0, 0.0, 9.0])),
+            command=tensor([1.0, 0.0, 9.0], [0.0, 0.0, 9.0]),
             avoidance_velocity=tensor([-0.5, 0.0], [0.0, 0.1]),
         )
-        got = rewards.velocity_tracking_with_avoidance(env, beta=4.0)
+        got = rewards.velocity_tracking_with_avoidance(state, beta=4.0)
         assert got.tolist() == pytest.approx([1.0, math.exp(-4 * (0.04 + 0.16))])
 
     def test_velocity_and_yaw_tracking(self):
-        env = given(
+        state = given(
             kinematics={"base_lin_vel_yaw": tensor([0.7, 0.4]), "base_ang_vel_b": tensor([5.0, 6.0, 0.1])},
-            command=SimpleNamespace(value=tensor([1.0, 0.0, 0.6])),
+            command=tensor([1.0, 0.0, 0.6]),
         )
-        assert rewards.velocity_tracking(env, beta=2.0).item() == pytest.approx(math.exp(-0.5))
-        assert rewards.yaw_rate_tracking(env, beta=2.0).item() == pytest.approx(math.exp(-0.5))
+        assert rewards.velocity_tracking(state, beta=2.0).item() == pytest.approx(math.exp(-0.5))
+        assert rewards.yaw_rate_tracking(state, beta=2.0).item() == pytest.approx(math.exp(-0.5))
 
     def test_capped_ray_distance_is_a_share(self):
-        sensing = SimpleNamespace(mean_distal_range=lambda limit: tensor(limit, 0.25 * limit)[0:2])
-        assert rewards.capped_ray_distance(given(sensing=sensing), max_distance=8.0).tolist() == [1.0, 0.25]
+        state = given(mean_distal_range=lambda limit: tensor(limit, 0.25 * limit)[0:2])
+        assert rewards.capped_ray_distance(state, max_distance=8.0).tolist() == [1.0, 0.25]
 
     def test_base_motion(self):
-        env = given(
+        state = given(
             kinematics={
                 "base_lin_vel_b": tensor([3.0, 4.0, -0.5]),
                 "base_ang_vel_b": tensor([0.3, -0.4, 7.0]),
                 "projected_gravity_b": tensor([0.6, 0.0, -0.8]),
             }
         )
-        assert rewards.vertical_velocity_squared(env).item() == pytest.approx(0.25)
-        assert rewards.roll_pitch_rate_squared(env).item() == pytest.approx(0.25)
-        assert rewards.tilt_squared(env).item() == pytest.approx(0.36)
+        assert rewards.vertical_velocity_squared(state).item() == pytest.approx(0.25)
+        assert rewards.roll_pitch_rate_squared(state).item() == pytest.approx(0.25)
+        assert rewards.tilt_squared(state).item() == pytest.approx(0.36)
 
     def test_foot_stumble(self):
         force = tensor([[[30.0, 40.0, 5.0], [3.0, 4.0, 50.0], [0.0, 0.0, 0.0]]])[0]  # one env, three feet
-        env = given(foot_force=force)
-        assert rewards.foot_stumble(env, ratio=5.0, unit=1.0).item() == pytest.approx(2500.0)
-        assert rewards.foot_stumble(env, ratio=0.0, unit=1.0).item() == pytest.approx(2525.0)
-        assert rewards.foot_stumble(env, ratio=5.0, unit=10.0).item() == pytest.approx(25.0)
+        state = given(foot_force=force)
+        assert rewards.foot_stumble(state, ratio=5.0, unit=1.0).item() == pytest.approx(2500.0)
+        assert rewards.foot_stumble(state, ratio=0.0, unit=1.0).item() == pytest.approx(2525.0)
+        assert rewards.foot_stumble(state, ratio=5.0, unit=10.0).item() == pytest.approx(25.0)
         down = given(foot_force=force * torch.tensor([1.0, 1.0, -1.0]))
         assert rewards.foot_stumble(down, ratio=5.0, unit=1.0).item() == pytest.approx(2500.0)
 
     def test_link_collision(self):
-        env = given(link_force=tensor([[[3.0, 4.0, 99.0], [0.0, 1.0, 0.0]]])[0])
-        assert rewards.link_collision(env, unit=1.0).item() == pytest.approx(26.0)
-        assert rewards.link_collision(env, unit=2.0).item() == pytest.approx(6.5)
+        state = given(link_force=tensor([[[3.0, 4.0, 99.0], [0.0, 1.0, 0.0]]])[0])
+        assert rewards.link_collision(state, unit=1.0).item() == pytest.approx(26.0)
+        assert rewards.link_collision(state, unit=2.0).item() == pytest.approx(6.5)
 
     def test_joint_limit_violation_counts_joints(self):
-        env = given(
+        state = given(
             kinematics={"joint_pos": tensor([0.0, -1.1, 1.1], [0.0, 0.0, 1.0])},
             joint_lower=torch.full((3,), -1.0),
             joint_upper=torch.full((3,), 1.0),
         )
-        assert rewards.joint_limit_violation(env).tolist() == [2.0, 0.0]
+        assert rewards.joint_limit_violation(state).tolist() == [2.0, 0.0]
 
     def test_joint_terms(self):
-        env = given(
+        state = given(
             kinematics={"joint_vel": tensor([1.0, -2.0]), "joint_pos": tensor([0.5, 0.0])},
             joint_torque=tensor([3.0, -4.0]),
-            last_joint_vel=tensor([0.98, -1.96]),
-            control_dt=0.02,
+            joint_acc=tensor([1.0, -2.0]),
             default_joint_pos=torch.tensor([0.2, 0.4]),
         )
-        assert rewards.joint_torque_squared(env).item() == pytest.approx(25.0)
-        assert rewards.joint_velocity_squared(env).item() == pytest.approx(5.0)
-        assert rewards.joint_acceleration_squared(env).item() == pytest.approx(1.0 + 4.0, rel=1e-4)
-        assert rewards.default_pose_deviation(env).item() == pytest.approx(0.25)
+        assert rewards.joint_torque_squared(state).item() == pytest.approx(25.0)
+        assert rewards.joint_velocity_squared(state).item() == pytest.approx(5.0)
+        assert rewards.joint_acceleration_squared(state).item() == pytest.approx(5.0)
+        assert rewards.default_pose_deviation(state).item() == pytest.approx(0.25)
 
     def test_action_terms(self):
         newest, before, oldest = tensor([1.0, 0.0]), tensor([0.5, 1.0]), tensor([0.0, -1.0])
-        env = given(actions=(newest, before, oldest))
-        assert rewards.action_rate_squared(env).item() == pytest.approx(0.25 + 1.0)
-        assert rewards.action_acceleration_squared(env).item() == pytest.approx(0.0 + 9.0)
+        state = given(actions=(newest, before, oldest))
+        assert rewards.action_rate_squared(state).item() == pytest.approx(0.25 + 1.0)
+        assert rewards.action_acceleration_squared(state).item() == pytest.approx(0.0 + 9.0)
 
     def test_contact_and_alive(self):
-        env = given(touching=torch.tensor([True, False]), num_envs=2, device="cpu")
-        assert rewards.obstacle_contact(env).tolist() == [1.0, 0.0]
-        assert rewards.alive(env).tolist() == [1.0, 1.0]
+        state = given(obstacle_contact=torch.tensor([True, False]), num_envs=2, device="cpu")
+        assert rewards.obstacle_contact(state).tolist() == [1.0, 0.0]
+        assert rewards.alive(state).tolist() == [1.0, 1.0]
 
     def closing(self, pos, vel, base_vel=(0.0, 0.0), active=True):
-        env = given(
+        state = given(
             kinematics={"base_lin_vel_yaw": tensor(base_vel)},
-            obstacle_rel_pos_yaw=tensor([pos]),
-            obstacle_vel_yaw=tensor([vel]),
-            obstacle_radius=torch.tensor([0.2]),
-            obstacle_active=torch.tensor([[active]]),
+            obstacles=Obstacles(tensor([pos]), tensor([vel]), torch.tensor([0.2]), torch.tensor([[active]])),
         )
-        return rewards.closing_speed(env, horizon=2.0, margin=0.5).item()
+        return rewards.closing_speed(state, horizon=2.0, margin=0.5).item()
 
     def test_closing_speed(self):
         assert self.closing((1.0, 0.0), (-1.0, 0.0)) == pytest.approx(0.5)  # meets after 1 s of 2
@@ -190,6 +188,31 @@ class TestTerms:
         assert self.closing((1.0, 0.0), (1.0, 0.0)) == 0.0  # goes away
         assert self.closing((3.0, 0.0), (-1.0, 0.0)) == 0.0  # beyond the horizon
         assert self.closing((1.0, 0.0), (-1.0, 0.0), active=False) == 0.0
+
+
+class TestFeet:
+    """Two robots with two feet; the numbers are worked out by hand."""
+
+    def test_air_time(self):
+        times = SimpleNamespace(
+            last_air=tensor([0.5, 0.2], [0.7, 0.0]), touched_down=torch.tensor([[True, True], [True, False]])
+        )
+        state = given(foot_times=times, command=tensor([0.3, 0.4, 0.0], [0.05, 0.0, 1.0]))
+        got = rewards.foot_air_time(state, target=0.3, min_speed=0.1)
+        assert got.tolist() == pytest.approx([0.2 - 0.1, 0.0])  # the second is commanded to stand
+
+    def test_clearance_is_counted_above_the_ground_below_the_base(self):
+        state = given(
+            kinematics={"base_pos_w": tensor([0.0, 0.0, 1.3])},
+            base_height=tensor(0.3),  # so the ground is at 1 m
+            foot_pos_w=tensor([[0.0, 0.0, 1.02], [0.0, 0.0, 1.1]]),
+            foot_vel_w=tensor([[0.3, -0.4, 9.0], [1.0, 0.0, 9.0]]),
+        )
+        assert rewards.foot_clearance(state, target=0.1).item() == pytest.approx(0.08**2 * 0.5, rel=1e-4)
+
+    def test_slip_is_of_feet_in_contact(self):
+        state = given(foot_vel_w=tensor([[0.3, 0.4, 5.0], [2.0, 0.0, 0.0]]), foot_contact=torch.tensor([[True, False]]))
+        assert rewards.foot_slip(state).item() == pytest.approx(0.25)
 
 
 class TestConfiguration:
@@ -223,6 +246,6 @@ class TestConfiguration:
         env = make_env("obstacles=none", "rewards.terms.tilt_squared=null", blind=True)
         torch.manual_seed(0)
         _, reward, _, _ = env.step(torch.randn(4, 12))
-        by_hand = sum(0.02 * term.weight * term.func(env) for term in env.config.rewards.terms.values())
+        by_hand = sum(0.02 * term.weight * term.func(env.state) for term in env.config.rewards.terms.values())
         torch.testing.assert_close(reward, by_hand)
         assert "tilt_squared" not in env.config.rewards.terms

@@ -8,8 +8,8 @@ import torch
 
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import RewardTerm
-from omniperception.env.state import reads
-from omniperception.lidar import OUTPUTS
+from omniperception.env.state import requires
+from omniperception.lidar import OUTPUTS, Lidar
 
 
 def still(env):
@@ -43,7 +43,7 @@ def test_a_reset_clears_that_environments_frames_only(make_env):
     for _ in range(6):
         env.step(still(env))
     before = env.sensing.frames.clone()
-    sectors = env.sensing.sector_distance.clone()
+    sectors = env.avoidance.sector_distance.clone()
     env.sim.qpos[1, 2] = 0.05
     observations, _, done, _ = env.step(still(env))
     assert done.tolist() == [0, 1, 0, 0]
@@ -51,8 +51,8 @@ def test_a_reset_clears_that_environments_frames_only(make_env):
     assert (observations["frames"][1] == 0).all()
     others = [0, 2, 3]
     assert torch.equal(observations["frames"][others], before[others])
-    assert torch.equal(env.sensing.sector_distance[others], sectors[others])
-    assert (env.sensing.sector_distance[1] == 6.0).all()
+    assert torch.equal(env.avoidance.sector_distance[others], sectors[others])
+    assert (env.avoidance.sector_distance[1] == 6.0).all()
     assert env.sensing.mean_distal_range(6.0)[1] == 6.0  # the last episode's distances are forgotten, too
     for _ in range(3):
         observations = env.step(still(env))[0]
@@ -77,9 +77,9 @@ def test_sector_distance_of_a_pillar_by_hand(make_env):
     env.sim.mocap_pos[0, 0] = torch.tensor([2 * math.cos(left), 2 * math.sin(left), 0.5])
     for _ in range(5):
         env.step(still(env))
-    sectors = env.sensing.sector_distance[0]
+    sectors = env.avoidance.sector_distance[0]
     radius = env.obstacles.radius[0].item()
-    base_shift = env.kinematics.base_pos_w[0, :2].norm().item()
+    base_shift = env.state.kinematics.base_pos_w[0, :2].norm().item()
     for sector in (26, 27):
         assert sectors[sector].item() == pytest.approx(2 - radius, abs=0.02 + base_shift)
     assert (sectors[[*range(20), *range(34, 36)]] == 6.0).all()
@@ -89,12 +89,15 @@ def test_ground_and_own_legs_never_count_as_obstacles(make_env):
     env = make_env("obstacles=none", "perception=none")
     for _ in range(10):
         env.step(still(env))
-    assert (env.sensing.sector_distance == 6.0).all()
+    assert (env.avoidance.sector_distance == 6.0).all()
     assert torch.isfinite(env.sensing.frame.true_ranges).float().mean() > 0.3  # though rays do hit the ground
 
 
 def test_distal_range_is_the_mean_of_capped_distances(make_env):
     env = make_env("obstacles=static", "rewards=paper")
+    assert (env.sensing.mean_distal_range(2.5) == 2.5).all()  # averaged from the next frame on
+    for _ in range(5):
+        env.step(still(env))
     frame = env.sensing.frame
     for i in range(env.num_envs):
         distances = [
@@ -108,7 +111,7 @@ def test_distal_range_is_the_mean_of_capped_distances(make_env):
 
 def test_noise_reaches_the_points_and_not_the_reward(make_env):
     clean, noisy = make_env("obstacles=static"), make_env("obstacles=static", "randomization=lidar")
-    torch.testing.assert_close(clean.sensing.sector_distance, noisy.sensing.sector_distance)
+    torch.testing.assert_close(clean.avoidance.sector_distance, noisy.avoidance.sector_distance)
     assert torch.equal(clean.sensing.frame.true_ranges, noisy.sensing.frame.true_ranges)
     assert not torch.equal(clean.sensing.frames, noisy.sensing.frames)
 
@@ -116,7 +119,7 @@ def test_noise_reaches_the_points_and_not_the_reward(make_env):
 def test_sector_target_is_the_nearness_of_obstacles(make_env):
     """1 - d / 4 m, and 0 from 4 m on."""
     env = make_env("obstacles=static", "perception.sector_weight=1.0")
-    env.sensing.sector_distance[0, :5] = torch.tensor([0.0, 1.0, 3.0, 4.0, 6.0])
+    env.avoidance.sector_distance[0, :5] = torch.tensor([0.0, 1.0, 3.0, 4.0, 6.0])
     target = env.step(still(env))[0]["sector_target"]
     assert target[0, :5].tolist() == pytest.approx([1.0, 0.75, 0.25, 0.0, 0.0])
     assert "sector_target" not in make_env("obstacles=static").get_observations().keys()  # noqa: SIM118
@@ -153,7 +156,7 @@ def test_nothing_is_computed_that_the_task_does_not_read(make_env):
 
 
 def take_frame(env, time_s):
-    env.sensing.take_frame(time_s, env.sensed.base_quat_w, env.timer)
+    env.sensing.take_frame(time_s, env.state.measured.base_quat_w, env.timer)
 
 
 def test_motion_distortion_forgets_the_last_episode(make_env):
@@ -162,7 +165,7 @@ def test_motion_distortion_forgets_the_last_episode(make_env):
     still_env = make_env("obstacles=static", num_envs=2)
     for each in (env, still_env):
         each.sim.qpos[:, :2] += 3.0
-        each.sensing.reset(torch.tensor([0]))
+        each.sensing.reset(torch.tensor([0]), each.state.measured)
         take_frame(each, 0.1)
     moving, still = env.sensing.frame.true_ranges, still_env.sensing.frame.true_ranges
     torch.testing.assert_close(moving[0], still[0], rtol=1e-6, atol=1e-6)
@@ -185,8 +188,30 @@ def test_a_saved_state_goes_on_with_its_motion(make_env):
     assert not torch.allclose(whole.sensing.frame.true_ranges, still.sensing.frame.true_ranges, rtol=1e-3)
 
 
-def test_more_pieces_than_the_task_knows_poses_for_are_refused(make_env):
-    with pytest.raises(ValueError, match=r"lidar\.motion_segments=2 must be 0 or 1"):
+def test_rays_within_a_frame_follow_the_robot_by_control_steps(make_env):
+    """As a LiDAR of its own on the same scene, given the bodies' poses after each of the frame's five control steps."""
+    env = make_env("obstacles=static", "lidar.motion_segments=5", "perception=none", num_envs=2)
+    sensing, outputs = env.sensing, env.sensing.lidar.outputs
+    lidar = Lidar(sensing.config, sensing.config.pattern(), sensing.scene, sensing.base, outputs=outputs)
+    lidar.phase_rows.copy_(sensing.lidar.phase_rows)
+    lidar.load_state_dict(sensing.lidar.state_dict())
+    for step in range(1, 6):
+        env.step(0.5 * torch.randn(2, 12, generator=torch.Generator().manual_seed(step)))
+        pos, quat = env.sim.body_poses(sensing._bodies)
+        sensing.scene.body_pos.copy_(pos)
+        sensing.scene.body_quat.copy_(quat)
+        if step < 5:
+            lidar.record_poses()
+    expected = lidar.cast(5 * env.control_dt).true_ranges
+    assert torch.equal(sensing.frame.true_ranges, expected)
+    straight = make_env("obstacles=static", "lidar.motion_segments=1", "perception=none", num_envs=2)
+    for step in range(1, 6):
+        straight.step(0.5 * torch.randn(2, 12, generator=torch.Generator().manual_seed(step)))
+    assert not torch.allclose(straight.sensing.frame.true_ranges, expected, rtol=1e-3)
+
+
+def test_segments_that_do_not_divide_a_frame_are_refused(make_env):
+    with pytest.raises(ValueError, match=r"motion_segments=2 must be 0 or divide the 5 control steps"):
         make_env("lidar.motion_segments=2")
 
 
@@ -226,12 +251,13 @@ class TestParts:
             make_env("obstacles=static", "lidar.cloud_mb=0.0")
 
     def test_a_term_of_ones_own_that_reads_rays_gets_whole_clouds(self, make_env):
-        @reads("rays")
-        def nearest(env):
-            return env.sensing.frame.true_ranges.amin(1)
+        @requires("cloud")
+        def nearest(state):
+            frame = state.cloud
+            return torch.ones(5) if frame is None else frame.true_ranges.amin(1)
 
         config = make_env("obstacles=static", "lidar.cloud_mb=0.1", num_envs=5).config
         terms = {**config.rewards.terms, "nearest": RewardTerm(1.0, nearest)}
         env = OmniEnv(replace(config, rewards=replace(config.rewards, terms=terms)))
         env.step(torch.zeros(5, 12))
-        assert len(env.sensing.lidar.env_slices) == 1 and env.weighted_rewards["nearest"].min() > 0
+        assert len(env.sensing.lidar.env_slices) == 1 and env.rewards.weighted["nearest"].min() > 0

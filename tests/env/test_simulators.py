@@ -103,6 +103,6 @@ def test_a_height_field_carries_the_robot_in_both(make_env):
         env = make_with(sim, make_env)("terrain=stairs", "terrain.levels=2", "terrain.curriculum=null")
         for action in actions(env, 5):
             env.step(0.1 * action)
-        assert (env.foot_force[..., 2].sum(1) < -20).all()  # all stand
-        heights.append(env.base_height)
+        assert (env.state.foot_force[..., 2].sum(1) < -20).all()  # all stand
+        heights.append(env.state.base_height)
     torch.testing.assert_close(*heights, atol=3e-3, rtol=0)

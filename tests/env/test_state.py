@@ -9,7 +9,7 @@ import torch
 
 from omniperception.common.rotations import rotate_inverse, rotate_yaw, yaw_of, yaw_quat
 from omniperception.env.heights import flat_heights, height_grid
-from omniperception.env.state import Kinematics, fields_read, reads
+from omniperception.env.kinematics import Kinematics
 
 
 def random_states(n=50, seed=0):
@@ -29,7 +29,7 @@ def rotated(vector, quat, inverse=False):
 
 def test_base_frame_quantities():
     qpos, qvel = random_states()
-    k = Kinematics.of(torch.tensor(qpos), torch.tensor(qvel))
+    k = Kinematics(torch.tensor(qpos), torch.tensor(qvel))
     for i in range(len(qpos)):
         velocity = rotated(qvel[i, :3], qpos[i, 3:7], inverse=True)
         gravity = rotated([0, 0, -1], qpos[i, 3:7], inverse=True)
@@ -52,7 +52,7 @@ def test_velocities_are_those_of_mujocos_sensors(make_config):
     model = spec.compile()
     data = mujoco.MjData(model)
     qpos, qvel = random_states(10, seed=1)
-    k = Kinematics.of(torch.tensor(qpos), torch.tensor(qvel))
+    k = Kinematics(torch.tensor(qpos), torch.tensor(qvel))
     for i in range(len(qpos)):
         data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
         mujoco.mj_forward(model, data)
@@ -62,7 +62,7 @@ def test_velocities_are_those_of_mujocos_sensors(make_config):
 
 def test_yaw_is_the_heading_of_the_x_axis():
     qpos, qvel = random_states()
-    k = Kinematics.of(torch.tensor(qpos), torch.tensor(qvel))
+    k = Kinematics(torch.tensor(qpos), torch.tensor(qvel))
     for i in range(len(qpos)):
         ahead = rotated([1, 0, 0], qpos[i, 3:7])
         assert k.yaw[i].item() == pytest.approx(math.atan2(ahead[1], ahead[0]), abs=1e-5)
@@ -79,7 +79,7 @@ def test_turning_about_the_vertical_changes_only_world_quantities():
     for i in range(len(qpos)):
         turned_qpos[i, :3], turned_qvel[i, :3] = rotated(qpos[i, :3], turn), rotated(qvel[i, :3], turn)
         mujoco.mju_mulQuat(turned_qpos[i, 3:7], turn, qpos[i, 3:7])
-    a, b = (Kinematics.of(torch.tensor(p), torch.tensor(v)) for p, v in ((qpos, qvel), (turned_qpos, turned_qvel)))
+    a, b = (Kinematics(torch.tensor(p), torch.tensor(v)) for p, v in ((qpos, qvel), (turned_qpos, turned_qvel)))
     for field in ("base_lin_vel_b", "base_lin_vel_yaw", "base_ang_vel_b", "projected_gravity_b"):
         torch.testing.assert_close(getattr(a, field), getattr(b, field), atol=1e-5, rtol=0)
     difference = torch.remainder(b.yaw - a.yaw - 1.2 + torch.pi, 2 * torch.pi) - torch.pi
@@ -94,17 +94,6 @@ def test_rotations_by_hand():
     torch.testing.assert_close(yaw_quat(torch.tensor([math.pi / 2])), quarter)
     turned = rotate_yaw(torch.tensor([math.pi / 2]), torch.tensor([[[1.0, 0.0], [0.0, 2.0]]]))
     torch.testing.assert_close(turned, torch.tensor([[[0.0, 1.0], [-2.0, 0.0]]]), atol=1e-6, rtol=0)
-
-
-def test_declared_reads_survive_partial():
-    from functools import partial
-
-    @reads("heights")
-    def term(env, scale):
-        return env.heights * scale
-
-    assert fields_read(partial(partial(term, scale=2.0))) == {"heights"}
-    assert fields_read(len) == frozenset()
 
 
 class TestHeights:

@@ -1,7 +1,6 @@
 """Obstacles by sector against rays through outlines, by hand and by search, and what the task makes of them."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -30,11 +29,11 @@ class Scene:
             self.field.active[:] = True
             self.field.velocity_w[:] = 0.0
         place = torch.tensor([[*base, 0.3]]).expand(num_envs, 3)
-        self.kinematics = SimpleNamespace(base_pos_w=place, yaw=torch.full((num_envs,), yaw))
+        self.base_pos_w, self.yaw = place, torch.full((num_envs,), yaw)
 
     def measure(self, num_sectors, known=None):
         sectors = TrueSectors(num_sectors, self.config, self.field, self.num_envs, CPU)
-        return sectors.measure(self.kinematics, known)
+        return sectors.measure(self.base_pos_w, self.yaw, known)
 
 
 def test_a_circle_by_hand():
@@ -144,44 +143,56 @@ def risky_env(make_config):
 
 
 def test_risk_is_of_what_a_ray_has_hit_alone(risky_env):
+    """A scene with a step after its newest frame: what is held is of the frame, not of now."""
     env = risky_env("scenario=moving")
-    for _ in range(12):
+    for _ in range(10):
         env.step(torch.zeros(5, 12))
+    assert env.sensing.due(env.step_count)
+    avoidance, kinematics = env.avoidance, env.state.kinematics
     known = env.sensing.unseen < env.config.remembered_frames
     assert known.any() and not known.all()  # the mount is blind behind
-    assert torch.equal(env.motion, env.true_sectors.measure(env.kinematics, known)) or env.step_count % 5
+
+    def measured(known):
+        return avoidance.true_sectors.measure(kinematics.base_pos_w, kinematics.yaw, known)
+
+    held = avoidance.motion
+    assert torch.equal(held, measured(known)) and not torch.equal(held, measured(None))
     hit = env.sensing.frame.shape_id
     names = ray_shapes(env.world, env.sensing.hidden).geom_names
     for env_id in range(5):
         seen = {names[k] for k in hit[env_id].unique().tolist() if k >= 0}
-        for o, name in enumerate(env.true_sectors.names):
+        for o, name in enumerate(avoidance.true_sectors.names):
             assert (env.sensing.unseen[env_id, o] == 0) == (name in seen)
+    env.step(torch.zeros(5, 12))
+    kinematics = env.state.kinematics
+    assert torch.equal(avoidance.motion, held) and not torch.equal(held, measured(known))
 
 
 def test_without_obstacles_there_is_no_risk(risky_env):
     env = risky_env("obstacles=none")
     env.step(torch.zeros(5, 12))
-    assert env.motion[..., 0].isinf().all() and not env.risk.any() and not env.avoidance_velocity.any()
+    avoidance = env.avoidance
+    assert avoidance.motion[..., 0].isinf().all() and not avoidance.risk.any() and not avoidance.velocity.any()
 
 
 def test_a_reset_forgets_one_environment_alone(risky_env):
     env = risky_env("scenario=corridor")
-    env.risk, env.motion = torch.rand_like(env.risk), torch.rand_like(env.motion)
-    before = env.risk.clone()
+    avoidance = env.avoidance
+    avoidance.risk, avoidance.motion = torch.rand_like(avoidance.risk), torch.rand_like(avoidance.motion)
+    before = avoidance.risk.clone()
     env._reset(torch.tensor([2]))
-    assert not env.risk[2].any() and not env.avoidance_velocity[2].any() and not encode(env.motion)[2].any()
-    assert torch.equal(env.risk[[0, 1, 3, 4]], before[[0, 1, 3, 4]])
+    assert not avoidance.risk[2].any() and not avoidance.velocity[2].any() and not encode(avoidance.motion)[2].any()
+    assert torch.equal(avoidance.risk[[0, 1, 3, 4]], before[[0, 1, 3, 4]])
     assert (env.sensing.unseen[2] > 1000).all()
 
 
-def test_the_papers_law_has_no_risk(make_config):
-    env = OmniEnv(make_config("rewards=default", "num_envs=2").env)
-    assert env.true_sectors is None and env.risk is None and env.sensing.unseen is None
-
-
-def test_perception_alone_needs_no_risk_of_the_task(make_config):
-    env = OmniEnv(make_config("experiment=avoid", "init=unread", "num_envs=2").env)
-    assert env.true_sectors is not None and env.risk is None and env.sensing.sector_distance is None
+def test_only_what_is_read_exists(make_config):
+    """V_avoid of the paper has no risk; perception alone needs no risk and no sectors; walking needs none of it."""
+    paper = OmniEnv(make_config("rewards=default", "num_envs=2").env)
+    assert paper.avoidance.motion is None and paper.avoidance.risk is None and paper.sensing.unseen is None
+    perceived = OmniEnv(make_config("experiment=avoid", "init=unread", "num_envs=2").env).avoidance
+    assert perceived.motion is not None and perceived.risk is None and perceived.sector_distance is None
+    assert OmniEnv(make_config("experiment=walk", "num_envs=2").env).avoidance is None
 
 
 def test_motion_needs_its_law(make_config):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from omniperception import config
+from omniperception import build, config
 from omniperception.env.env import OmniEnv
 
 MakeEnv = Callable[..., OmniEnv]
@@ -25,8 +25,8 @@ def one_thread():
 def make_env() -> MakeEnv:
     """Builds an environment from command-line overrides, with all obstacles."""
 
-    def build(*overrides: str) -> OmniEnv:
+    def make(*overrides: str) -> OmniEnv:
         run = build.assemble(config.compose(["rewards=default", "perception=none", *overrides]))
         return OmniEnv(replace(run.env, initial_obstacle_level=1.0))
 
-    return build
+    return make

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from omniperception import build, config
+from omniperception.avoidance.velocity import AvoidanceConfig
 from omniperception.build import build_runner, load_policy
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.rewards import AvoidanceConfig
 from omniperception.evaluation.baselines import covered, steered
 from omniperception.perception import Attitude
 
@@ -33,7 +33,7 @@ class TestSteered:
         given = env.get_observations()["command"].clone()
         assert torch.equal(self.told(env, None), given)  # nothing near: V_cmd alone
         side = max(slot.radius for slot in env.world.obstacles.slots())
-        env.sim.mocap_pos[1, 0, :2] = env.kinematics.base_pos_w[1, :2] + torch.tensor([0.0, side + 0.3])
+        env.sim.mocap_pos[1, 0, :2] = env.state.kinematics.base_pos_w[1, :2] + torch.tensor([0.0, side + 0.3])
         env.sim.mocap_pos[1, 0, 2] = 0.5  # to its left
         told = self.told(env, None)
         assert torch.equal(told[0], given[0])
@@ -84,7 +84,7 @@ class TestCovered:
         misses = torch.full_like(frame.ranges, torch.inf)
         expected = torch.zeros_like(env.sensing.frames[:, 0])
         sensor = env.config.lidar
-        attitude = Attitude(env.kinematics.base_quat_w.contiguous(), sensor.mount_pos, sensor.quat)
+        attitude = Attitude(env.state.kinematics.base_quat_w.contiguous(), sensor.mount_pos, sensor.quat)
         env.config.sampler()(misses, frame.directions_s, frame.elevation, frame.azimuth, expected, attitude)
         assert heard[0].shape == env.sensing.frames.shape
         for k in range(heard[0].shape[1]):

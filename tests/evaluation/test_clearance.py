@@ -76,7 +76,7 @@ def test_the_robot_as_mujoco_measures_it(make_env, scenario):
         env.sim.qpos[:, 2] = 0.33 + 0.1 * uniform[:, 2]
         quat = torch.cat((torch.ones(6, 1), uniform[:, 3:6]), 1)  # rolled, pitched and turned
         env.sim.qpos[:, 3:7] = quat / quat.norm(dim=1, keepdim=True)
-        env.sim.qpos[:, 7:] = env.default_joint_pos + 0.5 * uniform[:, 6:]
+        env.sim.qpos[:, 7:] = env.state.default_joint_pos + 0.5 * uniform[:, 6:]
         got = clearance.measure(torch.full((6,), 2.0))
         for i in range(6):
             data.qpos[:] = env.sim.qpos[i].numpy()

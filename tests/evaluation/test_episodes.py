@@ -65,7 +65,7 @@ def test_contacts_are_counted_when_they_begin(make_env):
 
     def put_on_robot(observations):
         step = int(env.episode_length_buf[2])
-        far, here = torch.tensor([50.0, 50.0]), env.kinematics.base_pos_w[2, :2]
+        far, here = torch.tensor([50.0, 50.0]), env.state.kinematics.base_pos_w[2, :2]
         env.obstacles.velocity_w[2] = 0.0
         env.obstacles.pos_w[2, :, :2] = far.double()
         env.obstacles.pos_w[2, 0, :2] = here.double() if step in (5, 6, 19) else far.double()
@@ -80,7 +80,7 @@ def test_contacts_are_counted_when_they_begin(make_env):
 def test_time_with_nothing_near_excludes_the_moments_with_an_obstacle(make_env):
     env = make_env("obstacles=moving", SHORT, "num_envs=4")
     free = []
-    episodes = run_episodes(env, stand, 4, on_step=lambda: free.append(env.free.clone()))
+    episodes = run_episodes(env, stand, 4, on_step=lambda: free.append(env.no_obstacle_near.clone()))
     assert torch.allclose(episodes.free_s, torch.stack(free).sum(0).double() * env.control_dt)
 
 

@@ -110,7 +110,7 @@ class TestMeasures:
             plain.step(fling(plain.get_observations()))
         assert torch.equal(measured.sim.qpos, plain.sim.qpos) and torch.equal(measured.sim.qvel, plain.sim.qvel)
         assert torch.equal(measured.observations["command"], plain.observations["command"])
-        assert not measured.probes
+        assert not measured.step_hooks
 
     def test_clearance_is_the_least_of_the_trial_and_0_with_a_touch(self, make_env):
         env = make_env(*BLIND, "scenario=static", SHORT, "num_envs=4", "commands.spawn.yaw_deg=[0,0]")
@@ -122,7 +122,9 @@ class TestMeasures:
             env.obstacles.pos_w[..., 0] = 50.0
             at = {1: {3: 0.9, 10: 0.6, 15: 0.8}, 2: {10: 0.0}, 3: {10: 3.0}}
             for env_id, steps in at.items():
-                beside = env.kinematics.base_pos_w[env_id, :2] + torch.tensor([0.0, radius + steps.get(step, 40.0)])
+                beside = env.state.kinematics.base_pos_w[env_id, :2] + torch.tensor(
+                    [0.0, radius + steps.get(step, 40.0)]
+                )
                 env.obstacles.pos_w[env_id, 0, :2] = beside.double()
                 env.obstacles.pos_w[env_id, 0, 2] = 0.3
             return torch.zeros(4, 12)
@@ -137,10 +139,10 @@ class TestMeasures:
     def test_energy_is_power_over_time(self, make_env):
         env = make_env(*BLIND, "scenario=static", SHORT, "num_envs=2")
         power, speed = [], []
-        env.probes.append(
-            lambda: power.append((env.sim.joint_torque() * env.kinematics.joint_vel).abs().sum(1).clone())
+        env.step_hooks.append(
+            lambda: power.append((env.sim.joint_torque() * env.state.kinematics.joint_vel).abs().sum(1).clone())
         )
-        env.probes.append(lambda: speed.append(env.sim.qvel[:, :2].norm(dim=1).clone()))
+        env.step_hooks.append(lambda: speed.append(env.sim.qvel[:, :2].norm(dim=1).clone()))
         episodes = run_episodes(env, fling, 2)
         steps = (episodes.length_s / 0.02).round().long()
         for i in range(2):
@@ -153,7 +155,7 @@ class TestMeasures:
     def test_tracks_end_where_the_episode_ends(self, make_env):
         env = make_env(*BLIND, "scenario=abs_hard", SHORT, "num_envs=2")
         ends = []
-        env.probes.append(lambda: ends.extend(env.kinematics.base_pos_w[env.done, :2].tolist()))
+        env.step_hooks.append(lambda: ends.extend(env.state.kinematics.base_pos_w[env.done, :2].tolist()))
         tracks = run_episodes(env, stand, 2, keep_tracks=True).tracks
         assert [len(way) for way in tracks.xy] == [1 + round(0.4 / PERIOD_S)] * 2
         for way, end in zip(tracks.xy, ends, strict=True):

@@ -5,7 +5,7 @@ import torch
 
 from omniperception import config
 from omniperception.build import build_runner
-from omniperception.env.env import HEIGHT_TARGET
+from omniperception.env.config import HEIGHT_TARGET
 from omniperception.learning import CheckpointError
 from omniperception.learning.checkpoint import checkpoint_path
 

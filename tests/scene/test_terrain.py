@@ -205,15 +205,15 @@ class TestSurface:
     def test_the_height_grid_is_the_robots_view_of_them(self, make_env):
         env = make_env(*FREE, "commands.spawn.x=[2.5,2.5]", HEIGHTS, num_envs=10, blind=True)
         env.step(0.3 * torch.ones(10, 12))
-        k = env.kinematics
+        k = env.state.kinematics
         for i in range(10):
             yaw = float(k.yaw[i])
             points = [(0.1 * (a - 8), 0.1 * (b - 5)) for a in range(17) for b in range(11)]
             turned = [(math.cos(yaw) * x - math.sin(yaw) * y, math.sin(yaw) * x + math.cos(yaw) * y) for x, y in points]
             below = looking_down(env, i, np.array(turned) + k.base_pos_w[i, :2].numpy())
             expected = np.clip(float(k.base_pos_w[i, 2]) - below, -1, 1)
-            np.testing.assert_allclose(env.heights[i], expected, atol=5e-5)
-        assert (env.heights.amax(1) - env.heights.amin(1)).max() > 0.02
+            np.testing.assert_allclose(env.state.heights[i], expected, atol=5e-5)
+        assert (env.state.heights.amax(1) - env.state.heights.amin(1)).max() > 0.02
 
     def test_rays_meet_the_surface_that_mj_ray_meets(self, make_config):
         run = make_config(*SMALL, "obstacles=mixed", "obstacles.groups.walker.count=1")
@@ -268,12 +268,12 @@ class TestSurface:
         for above, falls in ((0.30, False), (0.10, True)):
             env.sim.qpos[i, :2], env.sim.qpos[i, 2] = at.double(), height + above
             env.sim.qvel[i] = 0.0
-            env._read_state()
-            assert env.base_height[i].item() == pytest.approx(above, abs=1e-3)
-            _, done = env._terminate()
-            assert bool(done[i]) == falls
+            env.state.invalidate()
+            assert env.state.base_height[i].item() == pytest.approx(above, abs=1e-3)
+            env._terminate()
+            assert bool(env.done[i]) == falls
         env.sim.qpos.copy_(before)
-        env._read_state()
+        env.state.invalidate()
 
     def test_heights_far_from_the_middle_are_not_rounded(self, env):
         """Every environment counts from its own tile: float32 leaves 1e-6 m at 4 m, however far off the tile lies."""
@@ -298,11 +298,11 @@ class TestSupervision:
             for step in range(1, 13):
                 height = env.step(0.5 * torch.ones(3, 12))[0]["height_target"]
                 if step % env.sensing.period_steps == 0:
-                    at_tick = env._height_lookup.around()
+                    at_tick = env.state.heights
                 if at_tick is not None:
-                    expected = env._height_lookup.around() if fresh else at_tick
+                    expected = env.state.heights if fresh else at_tick
                     assert torch.equal(height, expected), (step, fresh)
-            assert not torch.equal(env._height_lookup.around(), at_tick) and env.episode_length_buf.min() == 12
+            assert not torch.equal(env.state.heights, at_tick) and env.episode_length_buf.min() == 12
 
 
 class TestRobots:
@@ -328,7 +328,7 @@ class TestRobots:
         for _ in range(50):
             env.step(torch.zeros(10, 12))
             flat.step(torch.zeros(1, 12))
-        torch.testing.assert_close(env.base_height, flat.base_height.expand(10), atol=5e-3, rtol=0)
+        torch.testing.assert_close(env.state.base_height, flat.state.base_height.expand(10), atol=5e-3, rtol=0)
 
     def test_at_the_outer_border_the_episode_times_out(self, make_env):
         env = make_env(*FREE, num_envs=4, blind=True)
@@ -389,4 +389,4 @@ def test_flat_ground_has_nothing_of_it(make_env):
     assert env.world.model.nhfield == 0 and env.world.ground_mocap is None
     env.step(torch.zeros(4, 12))
     assert "terrain" not in env.timer.seconds and not {"ground", "terrain_levels"} & set(env.state_dict())
-    assert env.base_height.data_ptr() == env.kinematics.base_pos_w[:, 2].data_ptr()
+    assert env.state.base_height.data_ptr() == env.state.kinematics.base_pos_w[:, 2].data_ptr()

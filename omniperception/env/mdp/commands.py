@@ -11,8 +11,7 @@ import torch
 
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import rotate_yaw
-from omniperception.common.rows import chosen, put
-from omniperception.env.state import Kinematics
+from omniperception.env.kinematics import Kinematics
 
 
 def _check_range(key: str, bounds: Sequence[float]) -> tuple[float, float]:
@@ -119,8 +118,8 @@ class Command(Protocol):
     value: torch.Tensor
     goal_w: torch.Tensor | None
 
-    def reset(self, envs: torch.Tensor, kinematics: Kinematics) -> None:
-        """Draws anew for some environments, see `rows`; `kinematics` of all."""
+    def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
+        """Draws new commands for some environments (n,); `kinematics` of all."""
 
     def advance(self, dt: float, kinematics: Kinematics) -> None: ...
 
@@ -145,12 +144,12 @@ class VelocityCommand:
         self._low = torch.tensor([r[0] for r in ranges], device=device)
         self._high = torch.tensor([r[1] for r in ranges], device=device)
 
-    def reset(self, envs: torch.Tensor, kinematics: Kinematics) -> None:
-        self._draw(envs)
+    def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
+        self._draw(env_ids)
 
     def advance(self, dt: float, kinematics: Kinematics) -> None:
         self.time_left -= dt
-        expired = chosen(self.time_left <= 0)
+        expired = (self.time_left <= 0).nonzero().flatten()
         if len(expired):
             self._draw(expired)
 
@@ -164,11 +163,11 @@ class VelocityCommand:
         self.value.copy_(state["value"])
         self.time_left.copy_(state["time_left"])
 
-    def _draw(self, envs: torch.Tensor) -> None:
-        u = self._random.uniform(envs, (4,))
+    def _draw(self, env_ids: torch.Tensor) -> None:
+        u = self._random.uniform(env_ids, (4,))
         velocity = self._low + u[:, :3] * (self._high - self._low)
-        put(self.value, envs, velocity * (u[:, 3:] >= self.config.standing))
-        put(self.time_left, envs, self.config.resample_s)
+        self.value[env_ids] = velocity * (u[:, 3:] >= self.config.standing)
+        self.time_left[env_ids] = self.config.resample_s
 
 
 class GoalCommand:
@@ -183,8 +182,8 @@ class GoalCommand:
         self._low = torch.tensor([r[0] for r in ranges], device=device)
         self._high = torch.tensor([r[1] for r in ranges], device=device)
 
-    def reset(self, envs: torch.Tensor, kinematics: Kinematics) -> None:
-        put(self.goal_w, envs, self._low + self._random.uniform(envs, (2,)) * (self._high - self._low))
+    def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
+        self.goal_w[env_ids] = self._low + self._random.uniform(env_ids, (2,)) * (self._high - self._low)
         self.advance(0.0, kinematics)
 
     def advance(self, dt: float, kinematics: Kinematics) -> None:

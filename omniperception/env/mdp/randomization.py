@@ -10,7 +10,6 @@ from operator import attrgetter
 import torch
 
 from omniperception.common.random import EnvRandom
-from omniperception.common.rows import put
 from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.scene.terrain import contact_solrefs
 from omniperception.sim import Simulator
@@ -139,26 +138,26 @@ class Randomizer:
         """The largest delay in physics steps that can be drawn."""
         return round(self.config.latency_s[1] / self._sim.world.model.opt.timestep) if self.config.latency_s else 0
 
-    def reset(self, envs: torch.Tensor) -> None:
-        """Draws new parameters for some environments, see `rows`."""
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Draws new parameters for some environments (n,)."""
         if not self._shapes:
             return
-        drawn = self._draw(envs)
+        drawn = self._draw(env_ids)
         if "ground_friction" in drawn:
-            self._write("geom_friction", envs, drawn["ground_friction"], self._ground, 0)
+            self._write("geom_friction", env_ids, drawn["ground_friction"], self._ground, 0)
         if "ground_restitution" in drawn:
-            self._write("geom_solref", envs, contact_solrefs(drawn["ground_restitution"]), self._ground)
+            self._write("geom_solref", env_ids, contact_solrefs(drawn["ground_restitution"]), self._ground)
         if "motor_strength" in drawn:
             for name in ("actuator_gainprm", "actuator_biasprm"):
-                self._write(name, envs, self._nominal_of(name) * drawn["motor_strength"])
+                self._write(name, env_ids, self._nominal_of(name) * drawn["motor_strength"])
         if "gravity_offset" in drawn:
-            self._write("opt.gravity", envs, self._nominal_of("opt.gravity") + drawn["gravity_offset"])
+            self._write("opt.gravity", env_ids, self._nominal_of("opt.gravity") + drawn["gravity_offset"])
         if self.joint_offset is not None:
-            put(self.joint_offset, envs, drawn["joint_offset"])
+            self.joint_offset[env_ids] = drawn["joint_offset"].float()
         if self.delay is not None:
-            put(self.delay, envs, (drawn["latency_s"] / self._model.opt.timestep).round())
+            self.delay[env_ids] = (drawn["latency_s"] / self._model.opt.timestep).round().long()
         if self._mass:
-            self._set_masses(envs, drawn)
+            self._set_masses(env_ids, drawn)
 
     def state_dict(self) -> dict:
         """Parameters that live outside the physics model."""
@@ -169,9 +168,10 @@ class Randomizer:
             if mine is not None:
                 mine.copy_(saved)
 
-    def _write(self, field: str, envs: torch.Tensor, values: torch.Tensor, *index: int) -> None:
+    def _write(self, field: str, env_ids: torch.Tensor, values: torch.Tensor, *index: int) -> None:
         """Writes float64 values into a model field of some environments, at an index, in the engine's precision."""
-        put(self._sim.model_field(field)[(slice(None), *index)], envs, values)
+        model_field = self._sim.model_field(field)
+        model_field[(env_ids, *index)] = values.to(model_field.dtype)
 
     def _check_mass(self) -> None:
         """Refuses ranges that can leave the base without mass, with which physics diverges at once."""
@@ -189,24 +189,24 @@ class Randomizer:
         shapes = {"motor_strength": (self._model.nu, 1), "gravity_offset": (3,), "joint_offset": (joints,)}
         return {name: shapes.get(name, ()) for name in _DRAWN if getattr(config, name) is not None}
 
-    def _draw(self, envs: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _draw(self, env_ids: torch.Tensor) -> dict[str, torch.Tensor]:
         """All parameters of some environments, float64, at once."""
-        u = self._random.uniform(envs, (len(self._low),))
+        u = self._random.uniform(env_ids, (len(self._low),))
         values = (self._low + self._span * u).double()
         parts = values.split([math.prod(shape) for shape in self._shapes.values()], 1)
         shapes = self._shapes.items()
         return {name: part.reshape(-1, *shape) for (name, shape), part in zip(shapes, parts, strict=True)}
 
-    def _set_masses(self, envs: torch.Tensor, drawn: dict[str, torch.Tensor]) -> None:
+    def _set_masses(self, env_ids: torch.Tensor, drawn: dict[str, torch.Tensor]) -> None:
         """Mass and centre of mass of base, added mass and payload together; the base's inertia stays nominal."""
-        nothing = torch.zeros(len(envs), dtype=torch.float64, device=envs.device)
+        nothing = torch.zeros(len(env_ids), dtype=torch.float64, device=env_ids.device)
         base_mass = float(self._model.body_mass[self._base])
         body = base_mass + drawn.get("added_mass", nothing)
         payload = drawn.get("payload_mass", nothing)
         offset = torch.stack([drawn.get(name, nothing) for name in ("com_x", "com_y", "com_z")], 1)
         centre = self._nominal_of("body_ipos")[self._base] + offset
         total = body + payload
-        self._write("body_mass", envs, total, self._base)
+        self._write("body_mass", env_ids, total, self._base)
         combined = (body[:, None] * centre + payload[:, None] * self._payload_position) / total[:, None]
-        self._write("body_ipos", envs, combined, self._base)
-        self._sim.update_model(envs)
+        self._write("body_ipos", env_ids, combined, self._base)
+        self._sim.update_model(env_ids)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from omniperception.env.state import Kinematics
+from omniperception.env.kinematics import Kinematics
 
 
 @dataclass(frozen=True)

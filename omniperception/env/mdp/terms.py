@@ -3,12 +3,65 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import torch
 
-from omniperception.env.mdp.rewards import AvoidanceConfig
-from omniperception.env.state import checked_term, fields_read
+from omniperception.avoidance.velocity import AvoidanceConfig
+from omniperception.env.state import EnvState, Marked, requirements
+
+Term = Callable[..., torch.Tensor]
+"""A function of the state, or a class: see `StatefulTerm`; or a partial of one with its parameters."""
+
+
+class StatefulTerm:
+    """Base of terms that keep something from step to step: built once per run with their parameters, then called with
+    the state in every step.
+
+    Tensors (num_envs, ...) among the attributes are saved with a checkpoint.
+    """
+
+    def __call__(self, state: EnvState) -> torch.Tensor:
+        raise NotImplementedError
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Forgets the episodes of some environments (n,)."""
+
+    def state_dict(self) -> dict:
+        return {name: value for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+
+    def load_state_dict(self, state: dict) -> None:
+        vars(self).update(state)
+
+
+def is_class(term: Term) -> bool:
+    """Whether a term is a class or a partial of one."""
+    return isinstance(term.func if isinstance(term, partial) else term, type)
+
+
+def build_term(term: Term) -> Callable[[EnvState], torch.Tensor]:
+    """The term as a function of the state alone."""
+    return term() if is_class(term) else term
+
+
+JOINTS = "joints"
+"""A part of a term that has a number for each joint."""
+VECTOR = (1.0, -1.0, 1.0)
+"""Signs of x, y, z under the reflection that maps left to right."""
+ROTATION = (-1.0, 1.0, -1.0)
+"""Likewise of an axial vector, such as an angular velocity."""
+
+
+def mirrors(*parts: str | Sequence[float]) -> Callable[[Marked], Marked]:
+    """Declares how an observation term looks in the mirror: JOINTS, or signs, part by part. A part that is the only one
+    is repeated as often as the term is wide."""
+
+    def mark(term: Marked) -> Marked:
+        term.mirror = parts
+        return term
+
+    return mark
 
 
 @dataclass(frozen=True)
@@ -16,7 +69,7 @@ class RewardTerm:
     """A weighted term; a weight of 0 means that the term, and what only it reads, does not exist in this run."""
 
     weight: float
-    func: Callable[..., torch.Tensor]
+    func: Term
 
 
 @dataclass(frozen=True)
@@ -32,19 +85,12 @@ class RewardsConfig:
     avoidance: AvoidanceConfig
 
     def __post_init__(self) -> None:
-        for name, term in self.terms.items():
-            if not isinstance(term, RewardTerm | None):
-                raise ValueError(
-                    f"terms.{name}={dict(term)} is no term, and these rewards have none of that name; use others, or"
-                    f" rewards.terms.{name}=null"
-                )
-        used = {name: term for name, term in self.terms.items() if term is not None and term.weight != 0}
-        checked = {name: replace(t, func=checked_term(f"terms.{name}.func", t.func)) for name, t in used.items()}
-        object.__setattr__(self, "terms", checked)
+        used = {name: term for name, term in self.terms.items() if term.weight != 0}
+        object.__setattr__(self, "terms", used)
 
-    def readers(self) -> dict[str, frozenset[str]]:
-        """The optional fields that each term reads."""
-        return {f"rewards.{name}": fields_read(term.func) for name, term in self.terms.items()}
+    def requirements(self) -> frozenset[str]:
+        """What the terms need before the world is compiled, see `requires`."""
+        return frozenset().union(*(requirements(term.func) for term in self.terms.values()))
 
 
 @dataclass(frozen=True)
@@ -52,16 +98,14 @@ class ObservationGroup:
     """Terms concatenated in order, `history` control steps of them (newest last).
 
     Attributes:
-        terms: functions of the environment that return (num_envs, width).
+        terms: functions of the state that return (num_envs, width).
         history: control steps kept; after a reset the first observation fills all of them.
     """
 
-    terms: Mapping[str, Callable[..., torch.Tensor]]
+    terms: Mapping[str, Term]
     history: int = 1
 
     def __post_init__(self) -> None:
-        used = {name: term for name, term in self.terms.items() if term is not None}
-        object.__setattr__(self, "terms", {name: checked_term(f"terms.{name}", term) for name, term in used.items()})
         if self.history < 1:
             raise ValueError(f"observations: history={self.history} must be at least 1")
 
@@ -83,7 +127,7 @@ class ObservationsConfig:
         object.__setattr__(self, "actor", tuple(self.actor))
         object.__setattr__(self, "critic", tuple(self.critic))
 
-    def readers(self) -> dict[str, frozenset[str]]:
-        """The optional fields that each term reads."""
-        terms = {f"{name}.{term}": f for name, group in self.groups.items() for term, f in group.terms.items()}
-        return {f"observations.{name}": fields_read(term) for name, term in terms.items()}
+    def requirements(self) -> frozenset[str]:
+        """What the terms need before the world is compiled, see `requires`."""
+        terms = (term for group in self.groups.values() for term in group.terms.values())
+        return frozenset().union(*map(requirements, terms))

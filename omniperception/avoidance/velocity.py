@@ -1,0 +1,58 @@
+"""The avoidance velocity of the paper, its settings, and the names of what a network is supervised with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from omniperception.avoidance.sector_motion import sector_bearings
+from omniperception.avoidance.velocity_risk import VelocityRisk
+
+SECTOR_TARGET, AVOIDANCE_TARGET, MOTION_TARGET = "sector_target", "avoidance_target", "motion_target"
+"""Supervision of a network: 1 - d / NEARNESS_RANGE by sector of what the LiDAR hits; the avoidance velocity; nearness
+and velocity of the true obstacles by sector."""
+
+
+@dataclass(frozen=True)
+class AvoidanceConfig:
+    """Avoidance velocity of the paper's section 'Risk-Aware Locomotion Policy'.
+
+    Attributes:
+        num_sectors: angular sectors around the robot.
+        threshold: sectors with an obstacle nearer than this (m) push.
+        alpha: decay (1/m) of the push with distance.
+        max_speed: bound (m/s) of the sum's magnitude; None leaves it as the paper has it.
+        risk: None: V_avoid is the paper's sum; otherwise it follows from the risk of velocities, and the sectors only
+            tell whether an obstacle is near.
+    """
+
+    num_sectors: int
+    threshold: float
+    alpha: float
+    max_speed: float | None = None
+    risk: VelocityRisk | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("num_sectors", "threshold", "alpha"):
+            if getattr(self, key) <= 0:
+                raise ValueError(f"rewards.avoidance.{key}={getattr(self, key)} must be positive")
+        if self.max_speed is not None and self.max_speed <= 0:
+            raise ValueError(f"rewards.avoidance.max_speed={self.max_speed} must be positive or null")
+
+
+def avoidance_velocity(distance: torch.Tensor, config: AvoidanceConfig) -> torch.Tensor:
+    """V_avoid = sum over sectors nearer than the threshold of exp(-d alpha), away from the sector.
+
+    Args:
+        distance: (n, num_sectors) horizontal distance (m) to the nearest obstacle hit in each sector.
+
+    Returns:
+        (n, 2) m/s in the yaw-aligned frame.
+    """
+    push = torch.exp(-config.alpha * distance) * (distance < config.threshold)
+    velocity = -push @ sector_bearings(distance.shape[1], distance.device)
+    if config.max_speed is not None:
+        speed = velocity.norm(dim=1, keepdim=True)
+        velocity = velocity * (config.max_speed / speed.clamp(min=config.max_speed))
+    return velocity

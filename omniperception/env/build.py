@@ -1,0 +1,91 @@
+"""Builds the parts of an environment that not every task has; what a part imports is loaded where it is built."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from omniperception.avoidance.velocity import MOTION_TARGET
+from omniperception.common.random import EnvRandom
+from omniperception.env.config import EnvConfig
+from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE
+from omniperception.scene import ObstacleField, TiledTerrainConfig
+from omniperception.sim import Simulator
+
+if TYPE_CHECKING:
+    from omniperception.avoidance.avoidance import Avoidance
+    from omniperception.env.height_lookup import HeightLookup
+    from omniperception.env.sensing import LidarSensing
+    from omniperception.env.terrain_levels import TerrainLevels
+    from omniperception.scene import Ground
+
+
+def build_ground(
+    config: EnvConfig, sim: Simulator, random: EnvRandom
+) -> tuple[Ground | None, TerrainLevels | None, HeightLookup | None]:
+    """A ground that is not flat, the curriculum over its tiles and the look-up of heights above it."""
+    if not isinstance(config.terrain, TiledTerrainConfig):
+        return None, None, None
+    from omniperception.env.height_lookup import HeightLookup
+    from omniperception.env.terrain_levels import TerrainLevels
+    from omniperception.scene import Ground
+
+    ground = Ground(config.terrain, sim.world.model, sim.ground_pos, config.sim.num_threads or None)
+    max_steps = round(config.terminations.episode_length_s / config.sim.control_dt)
+    levels = TerrainLevels(ground, random, config.sim.control_dt, max_steps)
+    return ground, levels, HeightLookup(ground, sim.num_envs, sim.device)
+
+
+def build_obstacles(
+    config: EnvConfig, sim: Simulator, random: EnvRandom, ground: Ground | None
+) -> ObstacleField | None:
+    """The obstacles that are placed at resets."""
+    if not config.obstacles.placed_slots():
+        return None
+    field = ObstacleField(config.obstacles, sim.mocap_pos, sim.mocap_quat, random, ground)
+    if config.initial_obstacle_level is not None:
+        field.level = config.initial_obstacle_level
+    return field
+
+
+def build_avoidance(config: EnvConfig, field: ObstacleField | None, device: torch.device) -> Avoidance | None:
+    """The avoidance velocity, where a term or a supervised network reads something of it."""
+    reads_velocity = AVOIDANCE in config.requirements()
+    if not config.uses_lidar or not (reads_velocity or MOTION_TARGET in config.targets):
+        return None
+    from omniperception.avoidance.avoidance import Avoidance
+
+    return Avoidance(
+        config.rewards.avoidance,
+        config.num_envs,
+        device,
+        config.lidar.max_range,
+        config.obstacles,
+        field,
+        reads_velocity,
+    )
+
+
+def build_sensing(config: EnvConfig, sim: Simulator, avoidance: Avoidance | None) -> LidarSensing | None:
+    """The LiDAR, where something reads it."""
+    if not config.uses_lidar:
+        return None
+    from omniperception.env.sensing import LidarSensing
+
+    needed = config.requirements()
+    return LidarSensing(
+        config.lidar,
+        sim,
+        config.sim.control_dt,
+        config.lidar_noise,
+        config.seed,
+        config.sim.num_threads or None,
+        config.sampler() if config.sampler is not None else None,
+        config.frame_history,
+        config.base_motion,
+        sector_distance=avoidance.sector_distance if avoidance is not None else None,
+        obstacles=avoidance.obstacle_names if avoidance is not None else (),
+        distal=DISTAL_RANGE in needed,
+        whole=CLOUD in needed,
+    )

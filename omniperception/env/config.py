@@ -1,0 +1,123 @@
+"""Everything that defines the task, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
+from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
+from omniperception.env.mdp.randomization import RandomizationConfig
+from omniperception.env.mdp.terminations import TerminationsConfig
+from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
+from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE
+from omniperception.lidar import DEVICES, Noise
+from omniperception.scene import ObstaclesConfig, RobotConfig, TerrainConfig, TiledTerrainConfig
+from omniperception.scene.build import OBSTACLE_CONTACT
+from omniperception.sim import SimConfig
+
+if TYPE_CHECKING:  # loaded where it is built
+    from omniperception.env.sensing import SensorConfig
+
+HEIGHT_TARGET = "height_target"
+"""Observation group with the height grid that a network can be supervised with."""
+
+FROM_LIDAR = frozenset({AVOIDANCE, DISTAL_RANGE, CLOUD})
+"""Requirements of terms that only a LiDAR meets."""
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Everything that defines the task.
+
+    Attributes:
+        num_envs: parallel environments.
+        seed: seed of every random stream of the task.
+        robot, terrain, obstacles, commands, observations, rewards, terminations, randomization, sim: the presets.
+        lidar: the sensor, or None.
+        sampler: makes the point sampler, or None when no network looks at the cloud.
+        frame_history: LiDAR frames kept for the network.
+        base_motion: whether a frame's last row is the base's motion since the frame before.
+        targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
+        log_interval: control steps between two reports of the metrics.
+        initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
+    """
+
+    num_envs: int
+    seed: int
+    robot: RobotConfig
+    terrain: TerrainConfig | TiledTerrainConfig
+    obstacles: ObstaclesConfig
+    commands: VelocityCommandConfig | GoalCommandConfig
+    observations: ObservationsConfig
+    rewards: RewardsConfig
+    terminations: TerminationsConfig
+    randomization: RandomizationConfig
+    sim: SimConfig
+    lidar: SensorConfig | None = None
+    sampler: Callable | None = None
+    frame_history: int = 0
+    base_motion: bool = False
+    targets: Sequence[str] = ()
+    log_interval: int = 24
+    initial_obstacle_level: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs={self.num_envs} must be at least 1")
+        if self.log_interval < 1:
+            raise ValueError(f"log_interval={self.log_interval} must be at least 1")
+        if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
+            raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
+        if MOTION_TARGET in self.targets and self.rewards.avoidance.risk is None:
+            raise ValueError(
+                "perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
+                " perception.motion_weight=0"
+            )
+        fixed = [name for name, group in self.obstacles.groups.items() if group.poses is not None]
+        if fixed and isinstance(self.terrain, TiledTerrainConfig):
+            raise ValueError(
+                f"obstacles: {', '.join(fixed)} with fixed poses stand on flat ground only; use terrain=flat"
+            )
+        if self.randomization.lidar_device and self.lidar is not None and self.lidar.device is None:
+            raise ValueError(
+                "randomization.lidar_device needs a sensor whose maker states its noise, but lidar.device is null; name"
+                " the device, or use randomization=lidar"
+            )
+        if self.lidar is None:
+            if self.sampler is not None:
+                raise ValueError(
+                    "lidar=none gives the perception network nothing to see; use lidar=mid360 or perception=none"
+                )
+            unmet = sorted(self.requirements() & FROM_LIDAR)
+            if unmet:
+                raise ValueError(
+                    f"rewards or observations require {', '.join(unmet)} from the LiDAR, but lidar=none;"
+                    " use lidar=mid360 or rewards=walk observations=walk"
+                )
+
+    def requirements(self) -> frozenset[str]:
+        """What has to be there before the world is compiled, see `state.requires`."""
+        needed = set(self.rewards.requirements() | self.observations.requirements())
+        if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
+            needed.add(AVOIDANCE)
+        if self.obstacles.num_obstacles:
+            needed.add(OBSTACLE_CONTACT)  # metrics count contacts
+        return frozenset(needed)
+
+    @property
+    def remembered_frames(self) -> int:
+        """LiDAR frames for which an obstacle that was seen counts in the velocity risk: those that the network sees."""
+        return max(self.frame_history, 1)
+
+    @property
+    def lidar_noise(self) -> tuple[Noise, ...]:
+        """The device's own noise, where asked for, and the randomization's."""
+        own = DEVICES[self.lidar.device].noise() if self.randomization.lidar_device else ()
+        return (*own, *self.randomization.noise)
+
+    @property
+    def uses_lidar(self) -> bool:
+        """Whether anything reads the LiDAR; otherwise it is not built."""
+        return self.lidar is not None and (self.sampler is not None or bool(self.requirements() & FROM_LIDAR))

@@ -1,0 +1,55 @@
+"""Base and joints of all robots at one moment, in the frames that terms need."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+
+from omniperception.common.rotations import rotate_inverse, rotate_yaw, yaw_of
+
+
+class Kinematics:
+    """Base and joint state at one moment; float32, (num_envs, ...), copies of the simulator's own.
+
+    Attributes:
+        base_pos_w: (n, 3) m, environment frame.
+        base_quat_w: (n, 4) wxyz.
+        base_ang_vel_b: (n, 3) rad/s, base frame.
+        joint_pos: (n, num_joints) rad.
+        joint_vel: (n, num_joints) rad/s.
+    """
+
+    def __init__(self, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        """From `Simulator.robot_state`: (n, 7 + joints) and (n, 6 + joints)."""
+        qpos, self._qvel = (values.to(torch.float32, copy=True) for values in (qpos, qvel))
+        self.base_pos_w, self.base_quat_w, self.joint_pos = qpos[:, :3], qpos[:, 3:7], qpos[:, 7:]
+        self.base_ang_vel_b, self.joint_vel = self._qvel[:, 3:6], self._qvel[:, 6:]
+
+    @cached_property
+    def yaw(self) -> torch.Tensor:
+        """(n,) rad: heading of the base."""
+        return yaw_of(self.base_quat_w)
+
+    @cached_property
+    def base_lin_vel_yaw(self) -> torch.Tensor:
+        """(n, 2) m/s: horizontal velocity in the yaw-aligned frame."""
+        return rotate_yaw(-self.yaw, self._qvel[:, :2])
+
+    @property
+    def base_lin_vel_b(self) -> torch.Tensor:
+        """(n, 3) m/s: linear velocity in the base frame."""
+        return self._in_base_frame[0]
+
+    @property
+    def projected_gravity_b(self) -> torch.Tensor:
+        """(n, 3) unit vector of gravity in the base frame."""
+        return self._in_base_frame[1]
+
+    @cached_property
+    def _in_base_frame(self) -> torch.Tensor:
+        """(2, n, 3) linear velocity and gravity, in one rotation."""
+        down = torch.zeros_like(self._qvel[:, :3])
+        down[:, 2] = -1.0
+        vectors = torch.cat((self._qvel[:, :3], down))
+        return rotate_inverse(self.base_quat_w.repeat(2, 1), vectors).unflatten(0, (2, -1))
