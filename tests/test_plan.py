@@ -373,7 +373,7 @@ def test_stages_and_kernels_are_those_that_run(overrides, launched):
 def test_readers_and_reasons_are_named(quick_run, walk_run):
     quick, blind = describe(*quick_run), describe(*walk_run)
     stages = {entry.name: entry.reason for entry in quick["stages of a step"].has}
-    assert stages["sectors"].startswith("read by rewards.velocity_avoid, observations.privileged.avoidance")
+    assert stages["sectors"].startswith("read by rewards.velocity_tracking_with_avoidance, obs")
     assert left_out(blind, "stages of a step")["rays"] == "lidar=none"
     assert left_out(quick, "ray geometry")["head_upper"] == "named in lidar.exclude_geoms"
     others = left_out(quick, "optional packages")  # of other tests in this process some may be imported
