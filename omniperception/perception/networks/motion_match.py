@@ -1,5 +1,5 @@
-"""How well moving at each of a few velocities explains what is in a sector: where it would then have been at each older
-frame, against what was there. A cost volume, as in stereo and optical flow, around the azimuth."""
+"""Scores of candidate velocities for the hit in each sector: where it would have been at each older frame, against the
+hits of that frame. A cost volume around the azimuth, as in stereo and optical flow."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ NOTHING = 50.0
 
 @dataclass(frozen=True)
 class MotionMatch:
-    """Velocities to try and what counts as a match.
+    """Candidate velocities and the width of a match.
 
     Attributes:
-        speeds: m/s; standing still is tried besides.
-        num_directions: of each speed, equally spaced around the line of sight.
-        width: difference of distances (m) from which on nothing matches.
-        period_s: time between two frames (s).
+        speeds: m/s; standing still is a candidate besides.
+        num_directions: candidates of each speed, equally spaced around the line of sight.
+        width: difference of distances at which the score falls to 0, metres.
+        period_s: time between two frames, seconds.
     """
 
     speeds: tuple[float, ...]
@@ -50,17 +50,17 @@ class MotionMatch:
         return torch.cat((ring.new_zeros(1, 2), *(speed * ring for speed in self.speeds)))
 
     def __call__(self, distance: torch.Tensor, bearing: torch.Tensor, velocities: torch.Tensor) -> torch.Tensor:
-        """What moved how, by sector.
+        """Scores of all candidates, in operations that can be exported.
 
         Args:
-            distance: (n, H, S) nearest hit of each sector (m, NOTHING without one), oldest frame first, all frames as
-                seen from the newest.
-            bearing: (n, S) of the newest frame's hits, from the middle of their sectors (rad).
-            velocities: those of :meth:`velocities`.
+            distance: (n, H, S) nearest hit of each sector, metres, NOTHING without one; oldest frame first, all frames
+                from the pose of the newest.
+            bearing: (n, S) azimuth of the newest frame's hits from the middle of their sectors, radians.
+            velocities: (K, 2), those of :meth:`velocities`.
 
         Returns:
-            (n, (H - 1) * K, S): 1 where the frame has a hit just where the velocity says, falling to 0 at `width` from
-            there.
+            (n, (H - 1) * K, S): 1 where a frame has a hit at the distance that the velocity predicts, falling linearly
+            to 0 at ``width`` from it; 0 in sectors that are empty now.
         """
         history, sectors = distance.shape[1:]
         now = distance[:, -1]

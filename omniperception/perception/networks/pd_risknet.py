@@ -1,5 +1,5 @@
-"""PD-RiskNet: a proximal and a distal GRU over sampled LiDAR frames (paper, Sec. 3.3.1 and App. architecture), and its
-variants for the ablation."""
+"""PD-RiskNet: a proximal and a distal GRU over sampled LiDAR frames (paper, Sec. 3.3.1 and App. 'PD-RiskNet
+Architecture')."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ class PdRiskNet(PerceptionNetwork):
     Beyond the paper, the first 36 distal values can be regressed on the nearness of obstacles by sector.
 
     A path of size 0 does not exist (ablation): the embedding is then the other path's alone. With ``rings`` the distal
-    path is a :class:`RingPath` instead of a GRU, and what it says of the obstacles is its part of the embedding.
+    path is a :class:`RingPath` instead of a GRU; nearness and motion of obstacles by sector are then its part of the
+    embedding.
     """
 
     def __init__(
@@ -47,8 +48,8 @@ class PdRiskNet(PerceptionNetwork):
             distal_dim: size of the distal embedding; 0 leaves the path out.
             distal_encoder: width of an ELU layer that each distal frame passes before its GRU; 0, as in the paper,
                 has none.
-            rings: makes the distal path, given the cells per frame and H; the last row of a frame must be the base's
-                motion (``perception.base_motion``), and ``distal_dim`` and ``distal_encoder`` say nothing.
+            rings: builds the distal path from the cells per frame and H; the last row of a frame must be the base's
+                motion (``perception.base_motion``), and ``distal_dim`` and ``distal_encoder`` are not read.
         """
         _check_path("proximal", num_proximal, proximal_dim)
         path = rings(num_distal=num_distal - 1, history=history) if rings is not None else None

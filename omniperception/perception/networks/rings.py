@@ -1,5 +1,5 @@
-"""Rings: what is around the levelled base by azimuth sector and band of height, seen over several frames from where the
-base is now, and convolutions around the azimuth."""
+"""Rings: the nearest hits around the levelled base by azimuth sector and band of height, over several frames that are
+moved to the present pose of the base, and convolutions around the azimuth."""
 
 from __future__ import annotations
 
@@ -20,35 +20,36 @@ MOTION_CHANNELS = 3
 """Per sector: nearness, radial and tangential velocity of the nearest obstacle (:mod:`sector_motion`)."""
 
 _FAINT = 1e-6
-"""Proximity below which a cell counts as empty; with a decay of 0.5 m that is a distance of 6.9 m."""
+"""Proximity below which a cell counts as empty; with a decay of 0.5 m, a distance of 6.9 m."""
 
 _NOTHING = 1e3
 """Distance (m) of an empty cell."""
 
 _GAIN = 8.0
-"""Of all inputs, which are small because most of what is around is far or empty; learning is several times faster."""
+"""Factor on all inputs, which are small because most cells are far or empty; speeds learning up several times."""
 
 _REACH, _NEARNESS = 6.0, 2.0
-"""Distance (m) from which on the nearest hit counts as nothing, and the number of one at the base."""
+"""Distance (m) at which the nearness of the nearest hit falls to 0, and the nearness of a hit at the base."""
 
 _LATERAL = 5.0
 """Scale of the sine of the bearing within a sector, which is at most 0.09 for 36 of them."""
 
 
 def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape) -> torch.Tensor:
-    """The frames of every window as seen from the base at the window's newest frame.
+    """The frames of every window, moved to the pose of the base at the window's newest frame.
 
     Args:
         cells: (B, F, bands * S, 3) cells of :class:`ProximitySampler`.
-        moved: (B, F, 3) how the base moved since the frame before, in the levelled base of that one: x, y (m), yaw
+        moved: (B, F, 3) motion of the base since the frame before, in the levelled base of that one: x, y (m), yaw
             (rad).
         count: (B, W) valid frames of each window; the others are empty.
-        shape: of the rings.
+        shape: sizes and lengths of the rings.
 
     Returns:
-        (B, W, H * bands * (len(decays) + 1), S), oldest frame first: for each band the proximities of the nearest hit
-        that is in the cell now, exp(-d / decay), and its bearing within the sector times the last of them; empty cells
-        are 0.
+        (B, W, H * bands * (len(decays) + 1), S), oldest frame first: for each band the proximities exp(-d / decay) of
+        the nearest hit in the cell, and its bearing within the sector times the last of them; empty cells are 0.
+
+    An exporter traces torch operations in place of the kernel, which is 3.5 times as fast (docs/lab/one_form.md).
     """
     if torch.jit.is_tracing() or torch.onnx.is_in_onnx_export() or cells.is_meta:
         return _moved_rings(cells, moved, count, shape)
@@ -76,7 +77,7 @@ def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, s
 
 
 def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape) -> torch.Tensor:
-    """As :func:`moved_rings`, of operations that can be exported."""
+    """:func:`moved_rings` in operations that can be exported."""
     bearing, proximity = cells[..., :2], cells[..., 2]
     hit = proximity > _FAINT
     known = proximity.clamp(min=_FAINT)
@@ -108,7 +109,7 @@ def _windows(frames: torch.Tensor, history: int) -> torch.Tensor:
 
 
 def _poses(moved: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Places (B, F, 2) and headings (B, F) of the base at each frame, from how it moved from frame to frame."""
+    """Positions (B, F, 2) and headings (B, F) of the base at each frame, from its motion between frames."""
     yaw = moved[..., 2].cumsum(1)
     step = _turned(yaw - moved[..., 2], moved[..., :2])  # given in the base of the frame before
     return step.cumsum(1), yaw
@@ -121,8 +122,8 @@ class RingShape:
     Attributes:
         num_sectors: S.
         history: H, frames per window.
-        decay: m, of the sampler's proximities.
-        decays: m, of the rings' proximities.
+        decay: decay of the sampler's proximities, metres.
+        decays: decays of the rings' proximities, metres.
     """
 
     num_sectors: int
@@ -151,7 +152,7 @@ def write_rings(
     # out
     rings_out: wp.array4d(dtype=wp.float32),
 ):
-    """The windows of one environment; see `moved_rings`."""
+    """The windows of one environment, see `moved_rings`."""
     env = wp.tid() + env_offset
     num_sectors = rings_out.shape[3]
     per_cell = decays.shape[0] + 1
@@ -190,10 +191,10 @@ def write_rings(
 
 
 class RingPath(nn.Module):
-    """A window's rings, one beside the other as channels, through convolutions around the azimuth.
+    """A window's rings, stacked as channels, through convolutions around the azimuth.
 
-    Nothing tells one azimuth from another, so what is learned about an obstacle ahead holds on either side as well, and
-    where an obstacle stood still all frames agree, because they are looked at from the same place.
+    The path is equivariant to turns by whole sectors, so what is learned about an obstacle ahead holds on either side
+    as well. All frames show an obstacle that stands still in the same cell, because they are moved to the same pose.
     """
 
     def __init__(
@@ -214,12 +215,12 @@ class RingPath(nn.Module):
             num_distal: cells of :class:`ProximitySampler`, bands x sectors.
             history: H, frames per window.
             num_sectors: S.
-            decay: m, the sampler's.
-            decays: m, of the proximities that the convolutions see.
-            channels: of the hidden layers.
-            kernel_sizes: sectors that each of them spans, odd.
-            match: velocities to try on the nearest hits; None leaves it to the convolutions to find motion.
-            ground_bands: lowest bands whose hits are not matched, because ground is in them.
+            decay: decay of the sampler's proximities, metres.
+            decays: decays of the proximities that the convolutions read, metres.
+            channels: widths of the hidden layers.
+            kernel_sizes: sectors that each hidden layer spans, odd.
+            match: candidate velocities, scored against the nearest hits; None: the convolutions find motion alone.
+            ground_bands: lowest bands whose hits are not matched, because they hold ground.
         """
         super().__init__()
         if num_distal % num_sectors:
@@ -244,7 +245,7 @@ class RingPath(nn.Module):
             self.register_buffer("_velocities", match.velocities(), persistent=False)
         layers: list[nn.Module] = []
         for size, span in zip(channels, kernel_sizes, strict=True):
-            layers += [_ring_conv(width, size, span), nn.ELU()]
+            layers += [_RingConv(width, size, span), nn.ELU()]
             width = size
         last = nn.Conv1d(width, MOTION_CHANNELS, 1)
         nn.init.zeros_(last.weight)
@@ -266,7 +267,8 @@ class RingPath(nn.Module):
         return motion.transpose(1, 2).flatten(1).unflatten(0, count.shape)
 
     def _matched(self, rings: torch.Tensor) -> torch.Tensor:
-        """(n, (H - 1) * K + 2 H, S): what moved how, and by frame the nearness and bearing of the nearest hit."""
+        """(n, (H - 1) * K + 2 H, S): scores of candidate velocities, then nearness and bearing of each frame's nearest
+        hit."""
         cells = rings.unflatten(1, (self.shape.history, -1, self.shape.channels))[:, :, self.ground_bands :]
         proximity, band = cells[:, :, :, -2].max(2)
         bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (_LATERAL * proximity.clamp(min=_FAINT))
@@ -279,15 +281,12 @@ class RingPath(nn.Module):
 
 
 class _RingConv(nn.Conv1d):
-    """A convolution whose ends meet."""
+    """A convolution around the azimuth; ``padding_mode="circular"`` does the same and takes a tenth longer."""
 
     def forward(self, ring: torch.Tensor) -> torch.Tensor:
         reach = self.kernel_size[0] // 2
-        return functional.conv1d(torch.cat((ring[..., -reach:], ring, ring[..., :reach]), -1), self.weight, self.bias)
-
-
-def _ring_conv(inputs: int, outputs: int, kernel_size: int) -> nn.Module:
-    return _RingConv(inputs, outputs, kernel_size) if kernel_size > 1 else nn.Conv1d(inputs, outputs, 1)
+        closed = torch.cat((ring[..., -reach:], ring, ring[..., :reach]), -1) if reach else ring
+        return functional.conv1d(closed, self.weight, self.bias)
 
 
 def _turned(yaw: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:

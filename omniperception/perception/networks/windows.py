@@ -1,7 +1,7 @@
 """Layers over sliding windows of frames: each frame enters a layer once, however many windows contain it.
 
-Window w of a (B, F, ...) sequence covers frames w .. w + H - 1, so W = F - H + 1 windows; count (B, W) says
-how many of a window's newest frames are valid.
+Window w of a (B, F, ...) sequence covers frames w .. w + H - 1, so W = F - H + 1 windows; count (B, W) is the number of
+a window's newest frames that are valid.
 """
 
 from __future__ import annotations

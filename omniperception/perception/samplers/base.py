@@ -12,7 +12,7 @@ import torch
 
 @dataclass(frozen=True)
 class Attitude:
-    """How the sensors of N robots stand.
+    """Orientation of N bases and the mount of their sensors.
 
     Attributes:
         base_quat: (N, 4) float32, (w, x, y, z), orientation of the bases in the world.
@@ -31,7 +31,7 @@ class Sampler(ABC):
     Attributes:
         num_points: P, points written per environment.
         max_range: metres; points are divided by it.
-        needs_attitude: whether it looks at the cloud from the levelled base.
+        needs_attitude: whether it needs the attitude of the base.
         sizes: P by the parts of a frame, named as the arguments of a network that reads them.
     """
 
@@ -75,7 +75,7 @@ class Sampler(ABC):
             azimuth: (N, R) float32, phi in the sensor frame, radians, any branch.
             out: (N, P, 3) float32, points in the sensor frame divided by ``max_range``; may be a strided
                 slice.
-            attitude: how the sensor stands, for a sampler with ``needs_attitude``.
+            attitude: orientation of base and sensor, for a sampler with ``needs_attitude``.
         """
         n, r = ranges.shape
         expected = {

@@ -214,12 +214,12 @@ class ProximitySampler(PdSampler):
             self.edges = self.edges.to(device)
         nearest = view(self._nearest[:n].zero_(), wp.int64)
         cloud, lanes = (view(ranges, wp.float32), view(directions_s, wp.vec3)), kernels.LANES[device.type]
-        stands = view(attitude.base_quat, wp.vec4), wp.vec3(*attitude.mount_pos), wp.vec4(*attitude.mount_quat)
+        mount = view(attitude.base_quat, wp.vec4), wp.vec3(*attitude.mount_pos), wp.vec4(*attitude.mount_quat)
         counts = view(elevation, wp.float32), self.split, self.blind, wp.vec2(*self.body)
         cells = view(self.edges, wp.float32), self.num_sectors, self.decay
         launch = _launcher(ranges, self.num_threads)
-        launch(kernels.find_nearest, lanes, *cloud, *stands, *counts, *cells, lanes, nearest)
-        launch(kernels.write_nearest, lanes, *cloud, *stands, nearest, self.num_proximal, lanes, view(out, wp.vec3))
+        launch(kernels.find_nearest, lanes, *cloud, *mount, *counts, *cells, lanes, nearest)
+        launch(kernels.write_nearest, lanes, *cloud, *mount, nearest, self.num_proximal, lanes, view(out, wp.vec3))
 
 
 class FpsSampler(PdSampler):
