@@ -83,7 +83,7 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path):
     assert done.returncode == 0, done.stderr
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
     table = (tmp_path / "ablation.md").read_text()
-    assert re.search(r"\| fps_mlp_small \| .*33\.3 \\\| 93\.3 \|", table) and re.search(
+    assert re.search(r"\| fps_mlp_small +\| .*33\.3 \\\| 93\.3 +\|", table) and re.search(
         r"pd_risknet_small .*76\.7", table
     )
     rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]

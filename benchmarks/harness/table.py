@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from omniperception.common import provenance
+from omniperception.common import provenance, tables
 
 LIBRARIES = (
     *provenance.LIBRARIES,
@@ -49,11 +49,8 @@ class Table:
 
     def markdown(self) -> str:
         """The table for people."""
-        cells = [list(self.columns), *([_show(value) for value in row] for row in self.rows)]
-        widths = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
-        lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in cells]
-        lines.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
-        return "\n".join([f"{self.title}\n", *lines, *(["", *self.notes] if self.notes else [])])
+        notes = ["", *self.notes] if self.notes else []
+        return "\n".join([f"{self.title}\n", tables.markdown(self.columns, self.rows), *notes])
 
 
 def about(num_threads: int, device: str = "cpu", **facts: object) -> dict:
@@ -98,17 +95,3 @@ def report(tables: Iterable[Table], where: Mapping, folder: Path) -> list[Table]
 
 def _json_value(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _show(value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "NO"
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "–"
-    if not isinstance(value, float):
-        return str(value)
-    if value == 0.0:
-        return "0"
-    if abs(value) < 1e-2 or abs(value) >= 1e6:
-        return f"{value:.1e}"
-    return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"

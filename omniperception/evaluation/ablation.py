@@ -11,6 +11,7 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.common.provenance import provenance
+from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
 from omniperception.evaluation.statistics import wilson
 from omniperception.evaluation.suite import FOLDER, Evaluation, evaluate
@@ -159,23 +160,17 @@ def _row(study: Ablation, variant: str) -> dict:
 
 def _table(scenario: str, rows: dict, study: Ablation) -> str:
     names = ("success", "success_untouched", "collision", "fall", "time_out")
-    paper = scenario == "corridor"
-    head = ["variant", *(name.replace("_", " ") + ", %" for name in names)] + [
-        "paper: success \\| collision, %"
-    ] * paper
-    lines = [
+    columns = ["variant", *(name.replace("_", " ") + ", %" for name in names)]
+    cells = [[variant, *(_cell(row[scenario][name]) for name in names)] for variant, row in rows.items()]
+    if scenario == "corridor":
+        columns.append("paper: success | collision, %")
+        for variant, row in zip(rows, cells, strict=True):
+            row.append(PAPER.get(variant.removesuffix("_small").removesuffix("_rings"), ""))
+    title = (
         f"**{scenario}**, {study.trials} trials of each of {len(study.seeds)} seeds: rate [95 % interval]"
-        " (least to most of the seeds)",
-        "",
-        "| " + " | ".join(head) + " |",
-        "|" + "---|" * len(head),
-    ]
-    for variant, row in rows.items():
-        cells = [variant, *(_cell(row[scenario][name]) for name in names)]
-        if paper:
-            cells.append(PAPER.get(variant.removesuffix("_small").removesuffix("_rings"), "").replace("|", "\\|"))
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        " (least to most of the seeds)"
+    )
+    return f"{title}\n\n{markdown(columns, cells)}"
 
 
 def _cell(rate: dict) -> str:

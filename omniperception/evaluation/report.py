@@ -6,6 +6,7 @@ import csv
 from collections.abc import Mapping
 from pathlib import Path
 
+from omniperception.common.tables import markdown
 from omniperception.evaluation.episodes import CLEARANCE_CAP, Episodes
 
 DEFINITIONS = {
@@ -26,21 +27,19 @@ DEFINITIONS = {
 def table(summaries: Mapping[str, dict]) -> str:
     """Summaries side by side, one column each."""
     first = next(iter(summaries.values()))
-    lines = [f"{first['episodes']} episodes, success: {first['success_means']}"]
-    if len(summaries) > 1:
-        lines.append(_line("", list(summaries)))
-    lines += _rate_lines("rates", summaries)
-    lines.append("  ending at the first contact:")
-    lines += _rate_lines("rates_to_first_contact", summaries, indent="  ")
-    for key, label, unit in _QUANTILES:
-        if any(summary[key] for summary in summaries.values()):
-            lines.append(_line(f"{label} ({unit})", [_spread(summary[key]) for summary in summaries.values()]))
-    for key, label, unit in _FIGURES:
-        values = [summary[key] for summary in summaries.values()]
-        if any(value is not None for value in values):
-            cells = ["" if value is None else f"{value:.3f}" for value in values]
-            lines.append(_line(f"{label} ({unit})" if unit else label, cells))
-    return "\n".join(lines)
+    rows = []
+    for group, when in (("rates", ""), ("rates_to_first_contact", ", ending at the first contact")):
+        for name in first[group]:
+            rows.append(
+                (name.replace("_", " ") + when, *(_rate(summary[group][name]) for summary in summaries.values()))
+            )
+    for parameters, shown in ((_QUANTILES, _spread), (_FIGURES, _figure)):
+        for key, label, unit in parameters:
+            values = [summary[key] for summary in summaries.values()]
+            if any(value is not None for value in values):
+                rows.append((f"{label} ({unit})" if unit else label, *map(shown, values)))
+    title = f"{first['episodes']} episodes, success: {first['success_means']}"
+    return f"{title}\n\n{markdown(['', *summaries], rows)}\n"
 
 
 def times_line(summary: dict) -> str:
@@ -86,28 +85,16 @@ _COLUMNS = {
 """Columns of the CSV file and the fields of Episodes they hold."""
 
 
-def _line(label: str, cells: list[str]) -> str:
-    return (f"  {label:<30}" + "".join(f"{cell:<26}" for cell in cells)).rstrip()
-
-
-def _rate_lines(group: str, summaries: Mapping[str, dict], indent: str = "") -> list[str]:
-    names = next(iter(summaries.values()))[group]
-    lines = []
-    for name in names:
-        cells = [_rate(summary[group][name]) for summary in summaries.values()]
-        lines.append(_line(indent + name.replace("_", " "), cells))
-    return lines
-
-
 def _rate(rate: dict) -> str:
-    interval = f"[{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
-    return f"{100 * rate['rate']:5.1f} %  {interval}"
+    return f"{100 * rate['rate']:.1f} % [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
 
 
 def _spread(spread: dict | None) -> str:
-    if spread is None:
-        return ""
-    return f"{spread['median']:.2f}  [{spread['p05']:.2f}, {spread['p95']:.2f}]"
+    return "" if spread is None else f"{spread['median']:.2f} [{spread['p05']:.2f}, {spread['p95']:.2f}]"
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
 
 
 def _plain(values: object, count: int) -> list:
