@@ -174,7 +174,7 @@ def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
     """
     for override in overrides:
         adds = override.is_add() or override.is_force_add()
-        if not adds and not _exists(config, override):
+        if not adds and (not _exists(config, override) or isinstance(override.value(), dict)):
             override = replace(override, type=OverrideType.FORCE_ADD)
         try:
             ConfigLoaderImpl._apply_overrides_to_config([override], config)
