@@ -42,18 +42,3 @@ def test_too_large_a_policy_is_refused(run, tmp_path, monkeypatch):
     monkeypatch.setattr(publish, "LIMIT", 1000)
     with pytest.raises(config.ConfigError, match=r"MB of weights, at most 0 MB are published"):
         publish.publish(run, tmp_path / "published")
-
-
-def test_half_precision_is_half_as_large_and_acts_nearly_alike(run, tmp_path):
-    sizes, actions = [], []
-    for precision in publish.PRECISIONS:
-        folder = tmp_path / precision
-        assert publish.publish(run, folder, precision)["precision"] == precision
-        sizes.append(latest_checkpoint(folder).stat().st_size)
-        trained = load_policy(build.assemble(config.load(folder)), folder)
-        with torch.no_grad():
-            actions.append(trained.policy(trained.env.get_observations()))
-    assert sizes[1] < 0.55 * sizes[0]
-    assert 0 < (actions[1] - actions[0]).abs().max() < 1e-2
-    with pytest.raises(config.ConfigError, match="precision=int8 must be one of float32, float16"):
-        publish.publish(run, tmp_path / "other", "int8")

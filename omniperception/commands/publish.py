@@ -1,6 +1,6 @@
 """Makes a small run directory of a run's newest policy, fit for a repository.
 
-    publish run=latest to=pretrained/mine precision=float16
+    publish run=latest to=pretrained/mine
 
 The folder holds weights, config.yaml and provenance.json; play, evaluate and export take it as run=<folder>, train as
 init=<folder>. At most 4 MB are published.
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.cli import Command, argument
-from omniperception.deploy.publish import PRECISIONS, publish
+from omniperception.deploy.publish import publish
 from omniperception.learning import CheckpointError
 
 
@@ -23,12 +23,11 @@ class Arguments:
 
     run: str = argument("latest", "run directory, or latest for the newest under outputs/")
     to: Path = argument(doc="folder that becomes a run directory")
-    precision: str = argument("float32", "of the weights; float16 rounds to three digits", choices=tuple(PRECISIONS))
 
 
 def main(arguments: Arguments) -> None:
     """Publishes and tells what the run was."""
-    record = publish(config.find_run(arguments.run), arguments.to, arguments.precision)
+    record = publish(config.find_run(arguments.run), arguments.to)
     print(f"{arguments.to}: {record['iterations']} iterations, {record['training_hours']} h of training")
 
 

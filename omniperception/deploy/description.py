@@ -84,7 +84,7 @@ class Lidar:
         max_range: points beyond are misses, m.
         num_rays: rays of a frame that training used.
         points_per_frame: points that the device measures in a frame.
-        keep_every: training used every so-manieth point of a frame; None where it chose otherwise.
+        keep_every: training used every keep_every-th point of a frame; None where it chose otherwise.
     """
 
     period_s: float
@@ -104,7 +104,7 @@ class Perception:
     Attributes:
         history: frames that the network sees.
         num_points: rows of a frame, sampled points and the base's motion.
-        sampler: kind and figures of the sampler, see `omniperception.deploy.sampling.make_sampler`.
+        sampler: kind and parameters of the sampler, see `omniperception.deploy.sampling.make_sampler`.
         base_motion: whether a frame's last row is how the base moved since the frame before.
     """
 
@@ -120,7 +120,7 @@ class Description:
 
     Attributes:
         control_period_s: seconds between two control steps.
-        joints: their names and figures.
+        joints: names, gains and limits.
         observations: groups in the order in which they are concatenated.
         command: range of each commanded value that training drew from, by name (m/s, rad/s).
         lidar: the sensor; None for a blind policy.
@@ -153,7 +153,7 @@ class Description:
         return shapes
 
     def write(self, folder: Path) -> None:
-        """Writes policy.json."""
+        """Write policy.json."""
         shapes = {name: ["batch", *shape] for name, shape in self.inputs.items()}
         network = {"inputs": shapes, "outputs": {"actions": ["batch", len(self.joints.names)]}}
         content = {"format": FORMAT, "version": VERSION, "network": network, **asdict(self)}
@@ -161,7 +161,7 @@ class Description:
 
     @classmethod
     def read(cls, folder: Path) -> Description:
-        """Reads policy.json from a folder."""
+        """Read policy.json from a folder."""
         path = Path(folder) / FILE
         if not path.is_file():
             raise DeployError(f"{folder} holds no exported policy ({FILE}); write it: scripts/export.py run=...")

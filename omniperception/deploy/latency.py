@@ -55,5 +55,5 @@ def measure(policy: ExportedPolicy, readings: Sequence[Reading], steps: int) -> 
 
 
 def _percentiles(times: np.ndarray) -> dict[str, float]:
-    figures = {f"p{p}_ms": float(np.percentile(times, p)) for p in PERCENTILES}
-    return {"steps": len(times), **figures, "max_ms": float(times.max())}
+    times_ms = {f"p{p}_ms": float(np.percentile(times, p)) for p in PERCENTILES}
+    return {"steps": len(times), **times_ms, "max_ms": float(times.max())}

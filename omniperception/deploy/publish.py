@@ -6,8 +6,6 @@ import json
 import shutil
 from pathlib import Path
 
-import torch
-
 from omniperception import config
 from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
@@ -19,12 +17,8 @@ LIMIT = 4_000_000
 """Most bytes of a published checkpoint: it goes into a repository."""
 
 
-PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
-"""How weights may be stored; float16 rounds them to three digits, and they are float32 again where they are used."""
-
-
-def publish(run_dir: Path, folder: Path, precision: str = "float32") -> dict:
-    """Writes a run directory that holds the newest weights, the configuration and where they come from.
+def publish(run_dir: Path, folder: Path) -> dict:
+    """Write a run directory that holds the newest weights, the configuration and where they come from.
 
     The critic stays, because a run that starts from this one may learn on; the optimisers, the environments' state and
     the logs go.
@@ -32,33 +26,28 @@ def publish(run_dir: Path, folder: Path, precision: str = "float32") -> dict:
     Args:
         run_dir: a run.
         folder: becomes a run directory; what it held of another run is replaced.
-        precision: one of PRECISIONS; what matrices of weights are stored in.
 
     Returns:
         What provenance.json holds.
 
     Raises:
-        ConfigError: the weights are larger than LIMIT, or the precision is unknown.
+        ConfigError: the weights are larger than LIMIT.
         CheckpointError: the run has no checkpoint.
     """
-    if precision not in PRECISIONS:
-        raise ConfigError(f"precision={precision} must be one of {', '.join(PRECISIONS)}")
     newest = latest_checkpoint(run_dir)
     state = load_checkpoint(newest, "cpu")
-    weights = {name: _stored(state[name], PRECISIONS[precision]) for name in ("actor_state_dict", "critic_state_dict")}
+    weights = {name: state[name] for name in ("actor_state_dict", "critic_state_dict")}
     size = sum(tensor.numel() * tensor.element_size() for part in weights.values() for tensor in part.values())
     if size > LIMIT:
         raise ConfigError(
-            f"{newest} has {size / 1e6:.1f} MB of weights, at most {LIMIT / 1e6:.0f} MB are published;"
-            " precision=float16 halves them"
+            f"{newest} has {size / 1e6:.1f} MB of weights, at most {LIMIT / 1e6:.0f} MB are published; train a smaller"
+            " network"
         )
     composed = config.load(run_dir)
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(run_dir / config.CONFIG_FILE, folder / config.CONFIG_FILE)
-    save_checkpoint(
-        checkpoint_path(folder, state["iteration"]), {**weights, "iteration": state["iteration"], "infos": None}
-    )
+    save_checkpoint(checkpoint_path(folder, state["iteration"]), {**weights, "iteration": state["iteration"]})
     steps = state["iteration"] * composed.num_envs * composed.ppo.num_steps_per_env
     record = {
         "run": str(run_dir),
@@ -67,14 +56,7 @@ def publish(run_dir: Path, folder: Path, precision: str = "float32") -> dict:
         "iterations": state["iteration"],
         "control_steps": steps,
         "training_hours": round(state["total_time"] / 3600, 3),
-        "precision": precision,
         **provenance("cpu"),
     }
     (folder / PROVENANCE).write_text(json.dumps(record, indent=2) + "\n")
     return record
-
-
-def _stored(part: dict[str, torch.Tensor], precision: torch.dtype) -> dict[str, torch.Tensor]:
-    """Matrices in a precision, all else that is not whole, such as statistics of observations, in float32."""
-    types = {name: precision if value.dim() > 1 else torch.float32 for name, value in part.items()}
-    return {name: value.to(types[name]) if value.is_floating_point() else value for name, value in part.items()}

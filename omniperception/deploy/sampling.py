@@ -200,9 +200,9 @@ class ProximitySampler(PdSampler):
 _KINDS = {"raw": RawSampler, "pd": PdSampler, "proximity": ProximitySampler}
 
 
-def make_sampler(figures: Mapping) -> CloudSampler:
+def make_sampler(parameters: Mapping) -> CloudSampler:
     """The sampler that a description names: its `kind`, one of "raw", "pd" and "proximity", and its arguments."""
-    arguments = dict(figures)
+    arguments = dict(parameters)
     kind = arguments.pop("kind", None)
     if kind not in _KINDS:
         raise DeployError(f"sampler '{kind}' is unknown; known: {', '.join(_KINDS)}")
