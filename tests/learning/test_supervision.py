@@ -1,5 +1,8 @@
 """A perception network that supervision alone trains, beside PPO."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 from test_ppo import collect
 from toy_env import ToyEnv, config
@@ -7,9 +10,9 @@ from toy_env import ToyEnv, config
 from omniperception.learning import PerceptivePpo
 
 
-def algorithm(env):
+def algorithm(env, **ppo):
     torch.manual_seed(0)
-    return PerceptivePpo.build(env, config(supervised=True), "cpu")
+    return PerceptivePpo.build(env, config(supervised=True, **ppo), "cpu")
 
 
 def parameters(module):
@@ -66,3 +69,29 @@ def test_a_rollout_without_a_frame_teaches_nothing():
     collect(alg, env, 8)
     assert "height_target" not in alg.update()
     assert all(map(torch.equal, before, parameters(alg.actor.perception)))
+
+
+def test_without_epochs_of_ppo_the_policy_stays_as_it_is():
+    env = ToyEnv(6)
+    alg = algorithm(env, num_learning_epochs=0)
+    before = {name: value.clone() for name, value in (alg.actor.state_dict() | alg.critic.state_dict()).items()}
+    errors = []
+    for _ in range(12):
+        collect(alg, env, 8)
+        losses = alg.update()
+        errors.append(losses["height_target"])
+    after = alg.actor.state_dict() | alg.critic.state_dict()
+    assert set(losses) == {"height_target"} and errors[-1] < 0.7 * errors[0]
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed and all(name.startswith("perception.proximal") for name in changed)
+
+
+def test_the_learning_rate_falls():
+    env, cfg = ToyEnv(4), config(max_iterations=4, num_learning_epochs=0)
+    perception = replace(cfg.perception, supervised_epochs=1, learning_rate=1e-3, final_learning_rate=2e-4)
+    alg, rates = PerceptivePpo.build(env, replace(cfg, perception=perception), "cpu"), []
+    for _ in range(5):
+        collect(alg, env, 8)
+        alg.update()
+        rates.append(alg.perception_optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4, 2e-4])

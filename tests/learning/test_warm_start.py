@@ -14,15 +14,25 @@ BLIND = ("experiment=walk", *SMALL)
 SEEING = ("experiment=avoid", *SMALL, "lidar.num_rays=200", "perception.supervised_epochs=1")
 
 
-@pytest.fixture
-def walk(make_config, tmp_path):
-    """Run directory of a blind policy."""
+@pytest.fixture(scope="module")
+def walk(make_config, tmp_path_factory):
+    """Run directory and runner of a blind policy."""
+    folder = tmp_path_factory.mktemp("walk")
     runner = build_runner(make_config(*BLIND, "seed=5"), None)
     with torch.no_grad():
         runner.alg.actor.obs_normalizer._mean.normal_()
         runner.alg.actor.mlp[0].weight.normal_()
-    runner.save(str(checkpoint_path(tmp_path / "walk", 3)))
-    return tmp_path / "walk", runner
+    runner.save(checkpoint_path(folder, 3))
+    return folder, runner
+
+
+@pytest.fixture(scope="module")
+def seeing(make_config, tmp_path_factory):
+    """Run directory and runner of a policy that perceives."""
+    folder = tmp_path_factory.mktemp("seeing")
+    runner = build_runner(make_config(*SEEING, "init=unread", "seed=9"), None)
+    runner.save(checkpoint_path(folder, 1))
+    return folder, runner
 
 
 def test_walks_alike_before_it_has_seen_anything(make_config, walk):
@@ -36,22 +46,19 @@ def test_walks_alike_before_it_has_seen_anything(make_config, walk):
     assert torch.equal(runner.alg.critic.mlp[0].weight, blind.alg.critic.mlp[0].weight)  # it observes the same
 
 
-def test_perception_comes_along_where_it_fits(make_config, tmp_path):
-    first = build_runner(make_config(*SEEING, "init=unread", "seed=9"), None)
-    first.save(str(checkpoint_path(tmp_path / "seeing", 1)))
+def test_perception_comes_along_where_it_fits(make_config, seeing):
+    run_dir, first = seeing
     second = build_runner(make_config(*SEEING, "init=unread", "seed=10"), None)
     before = [p.clone() for p in second.alg.actor.perception_parameters()]
-    second.start_from(tmp_path / "seeing")
+    second.start_from(run_dir)
     mine, theirs = second.alg.actor.state_dict(), first.alg.actor.state_dict()
     assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
     assert not all(torch.equal(a, b) for a, b in zip(before, second.alg.actor.perception_parameters(), strict=True))
 
 
-def test_a_gait_and_perception_are_joined(make_config, walk, tmp_path):
-    run_dir, blind = walk
-    seeing = build_runner(make_config(*SEEING, "init=unread", "seed=9"), None)
-    seeing.save(str(checkpoint_path(tmp_path / "seeing", 1)))
-    run = make_config(*SEEING, f"init=[{tmp_path / 'seeing'},{run_dir}]", "seed=10")
+def test_a_gait_and_perception_are_joined(make_config, walk, seeing):
+    (run_dir, blind), (seeing_dir, seeing) = walk, seeing
+    run = make_config(*SEEING, f"init=[{seeing_dir},{run_dir}]", "seed=10")
     joined = build_runner(run, None)
     for name in run.init:
         joined.start_from(config.find_run(name, "init"))
@@ -65,12 +72,11 @@ def test_a_gait_and_perception_are_joined(make_config, walk, tmp_path):
 def test_other_observations_are_refused(make_config, walk):
     run_dir, _ = walk
     runner = build_runner(make_config(*SEEING, "init=unread", "observations.groups.proprioception.history=2"), None)
-    with pytest.raises(
-        CheckpointError, match=r"init=.*walk does not fit: this run's .* give both the same observations"
-    ):
+    with pytest.raises(CheckpointError, match=r"init=.* does not fit: this run's .* give both the same observations"):
         runner.start_from(run_dir)
 
 
+@pytest.mark.slow
 def test_perception_learns_and_the_policy_stays_as_it_is(make_config, walk):
     run_dir, _ = walk
     terrain = ("terrain=mixed", "perception.height_weight=1.0")
@@ -107,22 +113,6 @@ def losses_on_the_rollout(runner):
     with torch.no_grad():
         actor.supervised_loss(actor.embed(frames), frames)
     return actor.pop_supervised_losses()
-
-
-def test_the_learning_rate_falls(make_config):
-    run = make_config(
-        *SEEING, "init=unread", "ppo.max_iterations=4", "perception.learning_rate=1e-3",
-        "perception.final_learning_rate=2e-4",
-    )  # fmt: skip
-    runner = build_runner(run, None)
-    rates, obs = [], runner.env.get_observations()
-    for _ in range(5):
-        with torch.inference_mode():
-            for _ in range(10):
-                obs = runner.step(obs)
-        runner.alg.update()
-        rates.append(runner.alg.perception_optimizer.param_groups[0]["lr"])
-    assert rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4, 2e-4])
 
 
 def test_nothing_that_learns_is_refused(make_config):
