@@ -18,7 +18,7 @@ from .shapes import Shape, ShapeKind
 class _Arrays:
     """What has been laid out so far; ``num_nodes`` and ``num_leaves`` include the copies of deformables.
 
-    ``windowed``: whether blocks of rays will walk over height fields.
+    ``windowed``: whether blocks of rays march through height fields.
     """
 
     windowed: bool
@@ -110,6 +110,8 @@ def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[
 
     geometry = Geometry()
     geometry.kind = upload([int(shape.kind) for shape in shapes], wp.int32)
+    geometry.body = upload([shape.body for shape in shapes], wp.int32)
+    geometry.pose = upload([wp_pose(shape.pos, shape.quat) for shape in shapes], wp.transformd)
     geometry.size = upload([shape.extents for shape in shapes], wp.vec3)
     geometry.exact_size = upload([shape.extents for shape in shapes], wp.vec3d)
     geometry.radius = upload([shape.bounding_radius for shape in shapes], wp.float32)
@@ -125,3 +127,9 @@ def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[
     geometry.field_extreme = concatenated(arrays.extremes, wp.vec2)
     geometry.field_window = concatenated(arrays.windows, wp.vec4)
     return geometry, deformables
+
+
+def wp_pose(pos: Sequence[float], quat: Sequence[float]) -> wp.transformd:
+    """A position and an orientation (w, x, y, z) of any norm as Warp's transform in float64."""
+    w, x, y, z = quat
+    return wp.transformd(wp.vec3d(*pos), wp.normalize(wp.quatd(x, y, z, w)))

@@ -1,11 +1,11 @@
-"""Height fields: a regular grid of heights, and the pyramid of extremes under which rays walk over it."""
+"""Height fields: a regular grid of heights, and the pyramid of extremes under which rays march over it."""
 
 from functools import cached_property
 
 import numpy as np
 
-from .kernels.field_block import REACHES
 from .kernels.heightfield import LEVEL_SHIFT
+from .kernels.march_block import REACHES
 
 
 class HeightField:
@@ -14,9 +14,9 @@ class HeightField:
     It is MuJoCo's height field. Point (row, col) of the grid lies at x = -half_x + 2 half_x col / (cols - 1),
     y = -half_y + 2 half_y row / (rows - 1). A cell is two triangles, divided by the diagonal from (row, col) to
     (row + 1, col + 1). The four sides are walls from the surface down to z = 0, and under the whole lies a box of
-    thickness ``base`` with walls, bottom and top. Rays meet all of these from both sides, so that a ray that starts
+    thickness ``base`` with walls, bottom and top. Rays hit all of these from both sides, so that a ray that starts
     inside ends at the exit, or at the top of the base. With ``base`` 0 there is no bottom: a ray from below comes in
-    and meets the surface from its underside.
+    and hits the surface from its underside.
 
     Attributes:
         heights: (rows, cols) float32, in units of ``scale``, >= 0.

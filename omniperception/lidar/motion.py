@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import torch
 import warp as wp
 
-from .kernels.motion import Track, Viewpoint, bound_swept_shapes, record_poses
+from .kernels.motion import Track, bound_swept_shapes, record_poses
 from .launch import SplitLaunch
-from .scene import RayScene, View, wp_pose
+from .scene import RayScene, View, empty_slots
 
 
 class PoseTrack:
@@ -93,55 +93,35 @@ class PoseTrack:
         track.pos, track.quat = wp.from_torch(self._pos, dtype=wp.vec3d), wp.from_torch(self._quat, dtype=wp.quatd)
         track.turn, track.oldest = wp.from_torch(self._turn, dtype=wp.vec4d), wp.from_torch(self._oldest)
         track.segments = self.segments
-        track.shape_body, track.shape_pose = self._scene.body, self._scene.pose
+        track.shape_body, track.shape_pose = self._scene.geometry.body, self._scene.geometry.pose
         return track
 
 
 class SweptShapes:
     """Bounds of a scene's shapes over a frame in a viewer's frame, nearest first, refreshed by ``refresh``.
 
-    ``bound``, ``near``, ``shape`` and ``count`` are those of ``PlacedShapes``; ``axes`` and ``pose`` are None: every
-    ray works them out for its own time.
+    Attributes:
+        slots: The shapes as the kernels read them, without poses: every ray computes them for its own time.
     """
 
-    axes: wp.array | None = None
-    pose: wp.array | None = None
-
     def __init__(self, scene: RayScene, exclude_shapes: Sequence[int], view: View, track: PoseTrack) -> None:
-        excluded = scene.check_shape_ids(exclude_shapes)
-        viewed = [k for k in range(len(scene.shapes)) if k not in excluded]
-        slots, device = (scene.num_envs, max(len(viewed), 1)), scene.wp_device
-        self.bound = wp.zeros(slots, dtype=wp.vec4, device=device)
-        self.near = wp.zeros(slots, dtype=wp.float32, device=device)
-        self.shape = wp.zeros(slots, dtype=wp.int32, device=device)
-        self.count = wp.zeros(scene.num_envs, dtype=wp.int32, device=device)
-        self._scene, self._view, self._track, self._num_viewed = scene, view, track, len(viewed)
-        self._viewed = wp.array(viewed or [0], dtype=wp.int32, device=device)
+        self._scene, self._view, self._track = scene, view, track
+        self.slots, viewed = empty_slots(scene, exclude_shapes, view)
+        self._num_viewed = len(viewed)
+        self._viewed = wp.array(viewed or [0], dtype=wp.int32, device=scene.wp_device)
         self._visible: torch.Tensor | None = None
         self._launch = self._record()
 
-    def refresh(self) -> bool:
-        """Bounds the shapes along the track; always True."""
+    def refresh(self) -> None:
+        """Bounds the shapes along the track."""
         if self._visible is not self._scene.visible_if_used:
             self._visible = self._scene.visible_if_used
             self._launch = self._record()
         self._launch()
-        return True
 
     def _record(self) -> SplitLaunch:
         scene, view, track = self._scene, self._view, self._track
-        if self._visible is None:
-            visible = wp.empty((0, 0), dtype=wp.bool, device=scene.wp_device)
-        else:
-            visible = wp.from_torch(self._visible)
-        args = [track.arrays, scene.geometry.radius, visible, self._viewed, self._num_viewed]
-        args += [viewpoint_of(view), view.max_range, self.bound, self.near, self.shape, self.count]
+        args = [track.arrays, scene.geometry.radius, scene.wp_visible, self._viewed, self._num_viewed]
+        args += [view.viewpoint, view.max_range + view.reach, self.slots]
         work = 160 * self._num_viewed * track.segments
         return scene.launch(bound_swept_shapes, (), args, work_per_env=work)
-
-
-def viewpoint_of(view: View) -> Viewpoint:
-    """Where a view is taken from, as the kernels read it."""
-    viewpoint = Viewpoint()
-    viewpoint.body, viewpoint.pose = view.body, wp_pose(view.pos, view.quat)
-    return viewpoint

@@ -1,4 +1,4 @@
-"""Noise of the LiDAR: figures of each model. A model that is not given is not in the compiled kernel.
+"""Noise of the LiDAR: parameters of each model.
 
 They act in this order, whatever the order in which they are given: angular jitter turns the ray before it is cast;
 mixed pixels, Gaussian and distance noise change the distance of a hit, which then ends at the maximum range and is no
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .kernels.noise import NoiseFigures
+    from .kernels.noise import NoiseParameters
 
 MAX_SIGMAS = 5.0
 """Jitter ends here, so that a ray stays within known bounds; exp(-12.5), or 4 in a million, would go beyond."""
@@ -164,28 +164,28 @@ def noise_by_name(noise: Sequence[Noise]) -> dict[str, Noise]:
     return named
 
 
-def noise_figures(named: dict[str, Noise], seed: int, min_range: float, max_range: float) -> NoiseFigures:
-    """The models' figures as the kernels read them, angles as their tangents."""
-    from .kernels.noise import NoiseFigures
+def noise_parameters(named: dict[str, Noise], seed: int, min_range: float, max_range: float) -> NoiseParameters:
+    """The models as the kernels read them, angles as their tangents."""
+    from .kernels.noise import NoiseParameters
 
-    figures = NoiseFigures()
-    figures.seed, figures.min_range, figures.max_range = seed & 0x7FFFFFFF, min_range, max_range
+    parameters = NoiseParameters()
+    parameters.seed, parameters.min_range, parameters.max_range = seed & 0x7FFFFFFF, min_range, max_range
     for name, model in named.items():
         if name == "jitter":
-            figures.jitter_sigma = math.tan(math.radians(model.sigma_deg))
+            parameters.jitter_sigma = math.tan(math.radians(model.sigma_deg))
         elif name == "mixed":
-            figures.mixed_radius = math.tan(math.radians(model.divergence_deg) / 2.0)
-            figures.mixed_min_gap, figures.mixed_max_gap = model.min_gap, model.max_gap
-            figures.mixed_weight = model.foreground
+            parameters.mixed_radius = math.tan(math.radians(model.divergence_deg) / 2.0)
+            parameters.mixed_min_gap, parameters.mixed_max_gap = model.min_gap, model.max_gap
+            parameters.mixed_weight = model.foreground
         elif name == "gaussian":
-            figures.gaussian_sigma, figures.gaussian_sigma_per_metre = model.sigma, model.sigma_per_metre
+            parameters.gaussian_sigma, parameters.gaussian_sigma_per_metre = model.sigma, model.sigma_per_metre
         elif name == "distance":
-            figures.distance_ratio = model.ratio
+            parameters.distance_ratio = model.ratio
         elif name == "dropout":
-            figures.dropout_ratio, figures.dropout_ratio_per_metre = model.ratio, model.ratio_per_metre
+            parameters.dropout_ratio, parameters.dropout_ratio_per_metre = model.ratio, model.ratio_per_metre
         else:
-            figures.mask_ratio, figures.mask_low, figures.mask_high = model.ratio, model.low, model.high
-    return figures
+            parameters.mask_ratio, parameters.mask_low, parameters.mask_high = model.ratio, model.low, model.high
+    return parameters
 
 
 def max_deviation(noise: Sequence[Noise]) -> float:

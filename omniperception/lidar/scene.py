@@ -2,19 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 import torch
 import warp as wp
 
-from .assets import lay_out
+from .assets import lay_out, wp_pose
 from .deformable import Deformable
-from .kernels.place import GROUP_SIZE, bound_groups, place_kernel
+from .kernels.place import GROUP_SIZE, Limits, bound_groups, place_shapes
 from .kernels.rays import rays_kernel
+from .kernels.slots import WORD, Slots, Viewpoint
 from .launch import SplitLaunch, default_num_threads, wp_device
-from .shapes import Shape
+from .shapes import Shape, ShapeKind
 
 Array = torch.Tensor | np.ndarray
 QuatOrder = Literal["wxyz", "xyzw"]
@@ -25,7 +25,7 @@ POSE_TYPES = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 @dataclass(frozen=True)
 class RayHits:
-    """What general rays met.
+    """What general rays hit.
 
     Attributes:
         ranges: Distance along each ray, metres, ``inf`` for a miss, (num_envs, R).
@@ -41,13 +41,29 @@ class RayHits:
 
 @dataclass(frozen=True)
 class View:
-    """From where, how far and in which elevations a sensor looks; what is outside need not be tested."""
+    """From where, how far and in which elevations a sensor looks; what is outside need not be tested.
+
+    Attributes:
+        body: That carries the sensor; -1: in the environment.
+        pos, quat: Of the sensor in the body's frame, metres and (w, x, y, z).
+        max_range: Of its rays, metres.
+        reach: How far from the sensor's origin rays start, metres.
+        elevation: Lowest and highest of its rays, rad; None: any.
+    """
 
     body: int = -1
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quat: tuple[float, float, float, float] = IDENTITY_QUAT
     max_range: float = float("inf")
+    reach: float = 0.0
     elevation: tuple[float, float] | None = None
+
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """Where the sensor is, as the kernels read it."""
+        viewpoint = Viewpoint()
+        viewpoint.body, viewpoint.pose = self.body, wp_pose(self.pos, self.quat)
+        return viewpoint
 
 
 class PlacedShapes:
@@ -56,100 +72,76 @@ class PlacedShapes:
     Without a view the frame is the environment's, nothing is left out, and neighbours stand together.
 
     Attributes:
-        bound: Centre and rejection threshold of each slot, (num_envs, S) vec4.
-        near: A lower bound of the distance to the shape, metres, ascending, (num_envs, S); none without a view.
-        shape: Index of the shape, (num_envs, S) int32.
-        axes: Its axes in rows, (num_envs, S) mat33.
-        pose: Its pose in float64, (num_envs, S) transformd.
-        count: How many of the S slots are in use, (num_envs,) int32.
+        slots: The shapes as the kernels read them.
         group: Centre and radius of a sphere around each GROUP_SIZE slots, (num_envs, G) vec4d; None with a view.
     """
 
     def __init__(self, scene: "RayScene", exclude_shapes: Sequence[int], view: View | None) -> None:
-        excluded = scene.check_shape_ids(exclude_shapes)
-        viewed = [k for k in range(len(scene.shapes)) if k not in excluded]
-        slots = (scene.num_envs, max(len(viewed), 1))
-        device = scene.wp_device
-        self.bound = wp.zeros(slots, dtype=wp.vec4, device=device)
-        self.near = wp.zeros(slots, dtype=wp.float32, device=device)
-        self.shape = wp.zeros(slots, dtype=wp.int32, device=device)
-        self.axes = wp.zeros(slots, dtype=wp.mat33, device=device)
-        self.pose = wp.zeros(slots, dtype=wp.transformd, device=device)
-        self.count = wp.zeros(scene.num_envs, dtype=wp.int32, device=device)
+        self._scene, self._view = scene, view or View()
+        self.slots, viewed = empty_slots(scene, exclude_shapes, self._view)
+        shape, device = self.slots.shape.shape, scene.wp_device
+        self.slots.axes = wp.zeros(shape, dtype=wp.mat33, device=device)
+        self.slots.pose = wp.zeros(shape, dtype=wp.transformd, device=device)
+        self.slots.view = wp.zeros(scene.num_envs, dtype=wp.transformd, device=device)
+        self._order = wp.zeros(shape, dtype=wp.int32, device=device)
+        self._spare = wp.zeros(shape, dtype=wp.float32, device=device)
+        self._limits = limits = Limits()
+        limits.viewed, limits.num_viewed = wp.array(viewed or [0], dtype=wp.int32, device=device), len(viewed)
+        limits.cull, limits.max_range = view is not None, self._view.max_range + self._view.reach
+        limits.elevation_min, limits.elevation_max = self._view.elevation or (-4.0, 4.0)
         self.group: wp.array | None = None
         if view is None:
-            groups = (scene.num_envs, -(-slots[1] // GROUP_SIZE))
+            groups = (scene.num_envs, -(-shape[1] // GROUP_SIZE))
             self.group = wp.zeros(groups, dtype=wp.vec4d, device=device)
-        self._order = wp.zeros(slots, dtype=wp.int32, device=device)
-        self._spare = wp.zeros(slots, dtype=wp.float32, device=device)
-        self._scene, self._view, self._num_viewed = scene, view, len(viewed)
-        self._viewed = wp.array(viewed or [0], dtype=wp.int32, device=device)
-        carriers = {scene.shapes[k].body for k in viewed} | {-1 if view is None else view.body}
+        carriers = {scene.shapes[k].body for k in viewed} | {self._view.body}
         self._moves = carriers != {-1}
         self._launches: list[SplitLaunch] = []
         self._visible: torch.Tensor | None = None
 
-    def refresh(self) -> bool:
-        """Places the shapes where their bodies are now; whether there was anything to do.
+    def refresh(self) -> None:
+        """Places the shapes where their bodies are now.
 
         What no body carries is placed once, unless ``visible`` is in use.
         """
         if not self._launches or self._visible is not self._scene.visible_if_used:
             self._visible = self._scene.visible_if_used
-            self._launches = [self._record_place()]
-            if self.group is not None:
-                self._launches.append(self._record_groups())
+            self._launches = self._record()
         elif not self._moves and self._visible is None:
-            return False
+            return
         for launch in self._launches:
             launch()
-        return True
 
-    def _record_groups(self) -> SplitLaunch:
-        args = [self._scene.geometry.radius, self.shape, self.pose, self.count, self.group]
-        return self._scene.launch(bound_groups, (), args, work_per_env=4 * self._num_viewed)
+    def _record(self) -> list[SplitLaunch]:
+        scene, slots, count = self._scene, self.slots, self._limits.num_viewed
+        place = [scene.wp_body_pos, scene.wp_body_quat, scene.geometry, scene.wp_visible, self._view.viewpoint]
+        place += [self._limits, self._order, self._spare, slots]
+        launches = [scene.launch(place_shapes, (), place, work_per_env=120 * count)]
+        if self.group is not None:
+            args = [scene.geometry.radius, slots, self.group]
+            launches.append(scene.launch(bound_groups, (), args, work_per_env=4 * count))
+        return launches
 
-    def _record_place(self) -> SplitLaunch:
-        scene, view = self._scene, self._view or View()
-        low, high = view.elevation or (-4.0, 4.0)
-        if self._visible is None:
-            visible = wp.empty((0, 0), dtype=wp.bool, device=scene.wp_device)
-        else:
-            visible = wp.from_torch(self._visible)
-        args = [
-            scene.wp_body_pos,
-            scene.wp_body_quat,
-            scene.geometry.kind,
-            scene.body,
-            scene.pose,
-            scene.geometry.size,
-            scene.geometry.radius,
-            visible,
-            self._viewed,
-            self._num_viewed,
-            view.body,
-            wp_pose(view.pos, view.quat),
-            int(self._view is not None),
-            view.max_range,
-            low,
-            high,
-            self._order,
-            self._spare,
-            self.bound,
-            self.near,
-            self.shape,
-            self.axes,
-            self.pose,
-            self.count,
-        ]
-        kernel = place_kernel(POSE_TYPES[scene.body_pos.dtype])
-        return scene.launch(kernel, (), args, work_per_env=120 * self._num_viewed)
+
+def empty_slots(scene: "RayScene", exclude_shapes: Sequence[int], view: View) -> tuple[Slots, list[int]]:
+    """Slots for the shapes of a scene that are not excluded, and the indices of these shapes."""
+    excluded = scene.check_shape_ids(exclude_shapes)
+    viewed = [k for k in range(len(scene.shapes)) if k not in excluded]
+    shape, device, slots = (scene.num_envs, max(len(viewed), 1)), scene.wp_device, Slots()
+    slots.bound = wp.zeros(shape, dtype=wp.vec4, device=device)
+    slots.near = wp.zeros(shape, dtype=wp.float32, device=device)
+    slots.shape = wp.zeros(shape, dtype=wp.int32, device=device)
+    slots.count = wp.zeros(scene.num_envs, dtype=wp.int32, device=device)
+    slots.reach = view.reach
+    if view.reach == 0.0:
+        words = (scene.num_envs, -(-shape[1] // int(WORD)), 4 * int(WORD))
+        slots.words = wp.zeros(words, dtype=wp.float32, device=device)
+    return slots, viewed
 
 
 class RayScene:
     """Shapes in ``num_envs`` environments, carried by bodies whose poses are each environment's own.
 
-    Every environment has its own origin, and a ray meets only the shapes of its own environment. Write ``body_pos`` and
+    Every environment has its own origin, and a ray hits only the shapes of its own environment. Write ``body_pos`` and
     ``body_quat`` in place before a cast, and ``visible`` to hide shapes or to have them in some environments only.
 
     Attributes:
@@ -157,7 +149,7 @@ class RayScene:
         device: Where the tensors live.
         num_threads: CPU threads per cast; unused on a GPU.
 
-    What rays meet is what they meet in ``mj_ray``:
+    What rays hit is what they hit in ``mj_ray``:
         - A plane is hit from the side of its normal only, and ends where its half extents do. Other surfaces are hit
           from both sides: a ray that starts inside a closed shape hits its exit surface.
         - Where two surfaces coincide, either is reported. A ray that starts on a surface, which is within 1e-7 of the
@@ -176,7 +168,7 @@ class RayScene:
     finite is not there. A ray whose origin or direction is not finite, or whose direction has length 0, misses.
 
     Args:
-        shapes: What there is to meet; may be empty.
+        shapes: The shapes; may be empty.
         num_envs: Number of environments.
         num_bodies: Bodies of an environment.
         device: Of the tensors.
@@ -214,9 +206,6 @@ class RayScene:
         self.wp_device = wp_device(self.device)
         self.num_threads = num_threads or default_num_threads()
         self._place_bodies(pose_dtype)
-        self.body = wp.array([shape.body for shape in shapes] or [0], dtype=wp.int32, device=self.wp_device)
-        poses = [wp_pose(shape.pos, shape.quat) for shape in shapes]
-        self.pose = wp.array(poses or [wp.transformd()], dtype=wp.transformd, device=self.wp_device)
         self.geometry, parts = lay_out(self.shapes, num_envs, self.wp_device)
         self._deformables = {
             k: Deformable(self.shapes[k].asset, part, self.geometry, num_envs, self.device, self.num_threads)
@@ -249,6 +238,11 @@ class RayScene:
     def visible_if_used(self) -> torch.Tensor | None:
         """``visible``, or None as long as nobody has asked for it."""
         return self._visible
+
+    @property
+    def wp_visible(self) -> wp.array | None:
+        """The same for the kernels."""
+        return None if self._visible is None else wp.from_torch(self._visible)
 
     def shapes_of(self, body: int) -> tuple[int, ...]:
         """Indices of the shapes that a body carries; -1 for those fixed in the environment."""
@@ -322,10 +316,15 @@ class RayScene:
         self.wp_body_pos = wp.from_torch(pos, dtype=wp.types.vector(3, real))
         self.wp_body_quat = wp.from_torch(quat, dtype=wp.types.vector(4, real))
 
-    @cached_property
-    def kinds(self) -> frozenset[int]:
-        """The kinds of shapes that this scene has."""
-        return frozenset(int(shape.kind) for shape in self.shapes)
+    @property
+    def has_mesh(self) -> bool:
+        """Whether any shape is a mesh or a deformable."""
+        return any(shape.kind in (ShapeKind.MESH, ShapeKind.DEFORMABLE) for shape in self.shapes)
+
+    @property
+    def has_heightfield(self) -> bool:
+        """Whether any shape is a height field."""
+        return any(shape.kind == ShapeKind.HEIGHTFIELD for shape in self.shapes)
 
     def launch(self, kernel: wp.Kernel, inner: Sequence[int], args: Sequence, work_per_env: int = 1) -> SplitLaunch:
         """A replayable launch of ``kernel`` over ``(num_envs, *inner)`` on this scene's device."""
@@ -370,40 +369,23 @@ class RayScene:
         num_rays = origins_w.shape[1]
         ranges = torch.empty(self.num_envs, num_rays, device=self.device)
         shape_id = torch.empty(self.num_envs, num_rays, device=self.device, dtype=torch.int32)
-        normals_w = torch.empty(self.num_envs, num_rays if normals else 1, 3, device=self.device)
+        normals_w = torch.empty(self.num_envs, num_rays, 3, device=self.device) if normals else None
         if num_rays:
             dtype = torch.promote_types(torch.promote_types(origins_w.dtype, directions_w.dtype), torch.float32)
             origins_w, directions_w = (x.to(self.device, dtype).contiguous() for x in (origins_w, directions_w))
             placed = self._placed_without(exclude_shapes)
             placed.refresh()
             vec3 = wp.types.vector(3, POSE_TYPES[dtype])
-            args = [
-                wp.from_torch(origins_w, dtype=vec3),
-                wp.from_torch(directions_w, dtype=vec3),
-                float(max_range),
-                int(normals),
-                self.geometry,
-                placed.group,
-                placed.shape,
-                placed.axes,
-                placed.pose,
-                placed.count,
-                wp.from_torch(ranges),
-                wp.from_torch(shape_id),
-                wp.from_torch(normals_w, dtype=wp.vec3),
-            ]
-            kernel = rays_kernel(self.kinds, POSE_TYPES[dtype])
+            rays = [wp.from_torch(origins_w, dtype=vec3), wp.from_torch(directions_w, dtype=vec3), float(max_range)]
+            out = [wp.from_torch(ranges), wp.from_torch(shape_id)]
+            out.append(None if normals_w is None else wp.from_torch(normals_w, dtype=wp.vec3))
+            args = [*rays, self.geometry, placed.group, placed.slots, *out]
+            kernel = rays_kernel(self.has_mesh, self.has_heightfield)
             self.launch(kernel, (num_rays,), args, work_per_env=num_rays * max(len(self.shapes), 1))()
-        return RayHits(ranges, shape_id, normals_w if normals else None)
+        return RayHits(ranges, shape_id, normals_w)
 
     def _placed_without(self, exclude_shapes: Sequence[int]) -> PlacedShapes:
         key = self.check_shape_ids(exclude_shapes)
         if key not in self._placed:
             self._placed[key] = PlacedShapes(self, exclude_shapes, view=None)
         return self._placed[key]
-
-
-def wp_pose(pos: Sequence[float], quat: Sequence[float]) -> wp.transformd:
-    """A position and an orientation (w, x, y, z) of any norm as Warp's transform in float64."""
-    w, x, y, z = quat
-    return wp.transformd(wp.vec3d(*pos), wp.normalize(wp.quatd(x, y, z, w)))

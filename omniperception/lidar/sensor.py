@@ -11,17 +11,16 @@ import numpy as np
 import torch
 import warp as wp
 
-from .kernels.field_block import BLOCK
+from .kernels.march_block import BLOCK
 from .kernels.motion import Track
-from .kernels.scan import Labels, Rays, ScanOutputs, ScanVariant, scan_kernel
-from .kernels.search import FEW_SLOTS, WORD, Slots, pack_slots
+from .kernels.scan import Labels, Rays, ScanOutputs, scan_kernel
 from .launch import SplitLaunch
-from .motion import PoseTrack, SweptShapes, viewpoint_of
-from .noise import Noise, max_deviation, noise_by_name, noise_figures
+from .motion import PoseTrack, SweptShapes
+from .noise import Noise, max_deviation, noise_by_name, noise_parameters
 from .patterns import ROW_SLACK, ScanPattern, make_selection
 from .patterns.selection import Strategy
 from .scan_table import ScanTable
-from .scene import POSE_TYPES, PlacedShapes, RayScene, View
+from .scene import PlacedShapes, RayScene, View
 from .shapes import ShapeKind, finite_tuple
 
 _COVERED = 0.8
@@ -185,8 +184,8 @@ class Lidar:
         env_slices: Runs of environments that are cast at the same time.
         slice_frames: Of each of them, as many rows of ``frame``.
         frame: The frame that ``cast`` fills and returns; with several ``env_slices``, that of the slice cast last.
+        features: What the scan's kernel was compiled for, see ``scan_kernel``.
         phase_rows: Rows by which each environment's device is ahead, (num_envs,) int64, from the seed.
-        variant: What the scan's kernel was compiled for.
         frame_count: Frames cast by each environment since its last ``reset``, (num_envs,) int32; the noise and a
             stratified selection are functions of it, of the seed and of the environment.
     """
@@ -241,9 +240,10 @@ class Lidar:
         self._track: PoseTrack | None = None
         self._rays = self._lay_out_rays()
         self._view, self._placed = self._place(mount_body, exclude_shapes)
+        self._is_marched = self._marches_blocks(exclude_shapes)
+        if self._is_marched:
+            self._allocate_marched()
         num_viewed = len(scene.shapes) - len(set(exclude_shapes))
-        self._walked = self._meets_field_first(exclude_shapes)
-        self._slots, self._pack = self._slots_of(num_viewed)
         self._casts = self._record_casts(seed, reflectivity or {}, num_viewed)
 
     def cast(self, time_s: torch.Tensor | np.ndarray | float) -> LidarFrame:
@@ -281,8 +281,7 @@ class Lidar:
         self._seek(time_s)
         if self._track is not None:
             self._track.record_end()
-        if self._placed.refresh() and self._pack is not None:
-            self._pack()
+        self._placed.refresh()
         for envs, cast, frame in zip(self.env_slices, self._casts, self.slice_frames, strict=True):
             cast()
             yield envs, frame
@@ -364,7 +363,7 @@ class Lidar:
             angles = torch.asin(self.pattern.directions_s[:, 2].double().clamp(-1.0, 1.0))
             margin = max_deviation(tuple(self._noise.values()))
             elevation = (float(angles.min()) - margin, float(angles.max()) + margin)
-        view = View(mount_body, config.mount_pos, config.quat, config.max_range + reach, elevation)
+        view = View(mount_body, config.mount_pos, config.quat, config.max_range, reach, elevation)
         if not config.motion_segments:
             return view, PlacedShapes(self.scene, exclude_shapes, view)
         self._track = PoseTrack(self.scene, config.motion_segments, config.motion_jump)
@@ -375,8 +374,8 @@ class Lidar:
         origins = self.pattern.origins_s
         return 0.0 if origins is None else float(torch.linalg.vector_norm(origins.double(), dim=1).max())
 
-    def _meets_field_first(self, exclude_shapes: Sequence[int]) -> bool:
-        """Whether a block's rays meet the height field all at once: on a CPU, from one place, along given rows."""
+    def _marches_blocks(self, exclude_shapes: Sequence[int]) -> bool:
+        """Whether a block's rays march through the height field all at once: on a CPU, from one place, along rows."""
         scene = self.scene
         viewed = (shape for k, shape in enumerate(scene.shapes) if k not in exclude_shapes)
         return (
@@ -388,22 +387,11 @@ class Lidar:
             and "jitter" not in self._noise
         )
 
-    def _slots_of(self, num_viewed: int) -> tuple[Slots, SplitLaunch | None]:
-        """The placed shapes as the kernels read them, and what packs them into words where there are many."""
-        placed, slots = self._placed, Slots()
-        slots.bound, slots.near, slots.shape = placed.bound, placed.near, placed.shape
-        slots.count, slots.reach = placed.count, self._reach()
-        if placed.axes is not None:
-            slots.axes, slots.pose = placed.axes, placed.pose
-        if self._walked:
-            shape, device = (self.scene.num_envs, self.config.num_rays), self.scene.wp_device
-            slots.walked_t, slots.walked_slope = (wp.zeros(shape, wp.float32, device=device) for _ in range(2))
-            slots.walked_face = wp.zeros(shape, wp.int32, device=device)
-        if num_viewed <= FEW_SLOTS or self.pattern.origins_s is not None:
-            return slots, None
-        num_words = -(-num_viewed // WORD)
-        slots.words = wp.zeros((self.scene.num_envs, num_words, 4 * WORD), wp.float32, device=self.scene.wp_device)
-        return slots, self.scene.launch(pack_slots, (), [slots], work_per_env=2 * num_viewed)
+    def _allocate_marched(self) -> None:
+        slots, shape = self._placed.slots, (self.scene.num_envs, self.config.num_rays)
+        slots.marched_t = wp.zeros(shape, wp.float32, device=self.scene.wp_device)
+        slots.marched_face = wp.zeros(shape, wp.int32, device=self.scene.wp_device)
+        slots.marched_uncertain = wp.zeros(shape, wp.bool, device=self.scene.wp_device)
 
     def _record_casts(self, seed: int, reflectivity: Mapping[int, float], num_viewed: int) -> list[SplitLaunch]:
         """A launch for each slice."""
@@ -411,32 +399,28 @@ class Lidar:
         written = self.outputs - ({"true_ranges"} if self.frame.true_ranges is self.frame.ranges else set())
         args = [
             rays,
-            viewpoint_of(self._view),
-            scene.wp_body_pos,
-            scene.wp_body_quat,
+            self._view.viewpoint,
+            noise_parameters(self._noise, seed, config.min_range, config.max_range),
             scene.geometry,
-            self._slots,
+            self._placed.slots,
             self._track.arrays if self._track is not None else Track(),
             self._labels(reflectivity),
-            noise_figures(self._noise, seed, config.min_range, config.max_range),
         ]
-        self.variant = variant = ScanVariant(
-            kinds=scene.kinds,
-            outputs=frozenset(written),
-            noise=frozenset(self._noise),
-            packed=self._pack is not None,
-            moving=self._track is not None,
-            displaced=self.pattern.origins_s is not None,
-            selected=self._variant is not None,
-            shots=self._lag is not None and self.pattern.rows_per_shot > 1,
-            walked=self._walked,
-            pose_type=POSE_TYPES[scene.body_pos.dtype],
-        )
+        special = {
+            "motion": self._track is not None,
+            "origins": self.pattern.origins_s is not None,
+            "offsets": self._variant is not None,
+            "mesh": scene.has_mesh,
+            "heightfield": scene.has_heightfield,
+            "marched": self._is_marched,
+        }
+        self.features = frozenset({name for name, is_there in special.items() if is_there} | written | set(self._noise))
+        kernel = scan_kernel(self.features)
         work = rays.block * (min(num_viewed, 64) + 4)
 
         def record(envs: slice) -> SplitLaunch:
-            given, tasks = [*args, self._output_arrays(written, envs.start)], (envs.stop - envs.start) * rays.num_blocks
-            kernel, first = scan_kernel(variant), envs.start * rays.num_blocks
+            first, tasks = envs.start * rays.num_blocks, (envs.stop - envs.start) * rays.num_blocks
+            given = [*args, self._output_arrays(written, envs.start)]
             return SplitLaunch(kernel, tasks, (), given, scene.device, scene.num_threads, work, first=first)
 
         return [record(envs) for envs in self.env_slices]
@@ -488,7 +472,7 @@ class Lidar:
 
     def _labels(self, reflectivity: Mapping[int, float]) -> Labels:
         labels, scene = Labels(), self.scene
-        labels.body, labels.frame = scene.body, wp.from_torch(self.frame_count)
+        labels.body, labels.frame = scene.geometry.body, wp.from_torch(self.frame_count)
         if "intensity" in self.outputs:
             table = _reflectivity_table(reflectivity, [shape.class_id for shape in scene.shapes])
             scaled = [value * self.config.reference_range**2 for value in table]

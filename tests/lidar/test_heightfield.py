@@ -16,7 +16,7 @@ from omniperception.lidar import (
     ShapeKind,
     TriangleMesh,
 )
-from omniperception.lidar.kernels.field_block import REACHES
+from omniperception.lidar.kernels.march_block import REACHES
 
 
 def field_shape(heights, half_x, half_y, base=0.0, scale=1.0, **options):

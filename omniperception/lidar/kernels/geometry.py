@@ -1,18 +1,15 @@
-"""Exact intersections of rays with shapes, compiled for the kinds of shapes that a scene has."""
+"""Intersections of rays with the shapes of a scene, of every kind."""
 
 # ruff: noqa: SIM102, SIM109  (in a kernel, a branch on wp.static stands alone, and there is no 'in')
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
-from .heightfield import FieldPart, heightfield_normal, meet_heightfield, refine_heightfield
+from .heightfield import FieldPart, heightfield_normal, intersect_heightfield, refine_heightfield
 from .intersections import intersections
 from .mesh import MeshPart, corner_of, descend, plane_through, slab_inverse
-from .variants import MAX_VARIANTS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,13 +33,16 @@ REFINE = wp.constant(wp.float32(50.0))
 class Geometry:
     """What the shapes of a scene are, indexed by shape; the data of meshes and height fields follow one another.
 
-    ``part`` is a shape's place in ``mesh_part`` or ``field_part``. The tree of a mesh has boxes ``mesh_bounds`` (node,
-    axis of lows then highs) of four children ``mesh_child``: a node if > 0, none if 0, leaf -1 - child if < 0. A leaf
-    is four triangles ``mesh_triangle`` (leaf, 3 * corner + axis). A height field's level is (first, columns) in
-    ``field_extreme``, which holds lowest and highest heights; ``field_window`` is read by ``walk_block``.
+    ``body`` carries the shape at ``pose``, -1 being the environment. ``part`` is a shape's place in ``mesh_part`` or
+    ``field_part``. The tree of a mesh has boxes ``mesh_bounds`` (node, axis of lows then highs) of four children
+    ``mesh_child``: a node if > 0, none if 0, leaf -1 - child if < 0. A leaf is four triangles ``mesh_triangle`` (leaf,
+    3 * corner + axis). A height field's level is (first, columns) in ``field_extreme``, which holds lowest and highest
+    heights; ``field_window`` is read by ``march_block``.
     """
 
     kind: wp.array(dtype=wp.int32)
+    body: wp.array(dtype=wp.int32)
+    pose: wp.array(dtype=wp.transformd)
     size: wp.array(dtype=wp.vec3)
     exact_size: wp.array(dtype=wp.vec3d)
     radius: wp.array(dtype=wp.float32)
@@ -61,7 +61,7 @@ class Geometry:
 
 @wp.struct
 class Hit:
-    """Where a ray meets a shape.
+    """Where a ray hits a shape.
 
     Distance, infinite for a miss; which face of a mesh or height field, -1 for other shapes; sine of the angle between
     ray and surface, 0 where it is not known.
@@ -69,7 +69,7 @@ class Hit:
 
     t: wp.float32
     face: wp.int32
-    slope: wp.float32
+    sin_incidence: wp.float32
 
 
 # --- frames -------------------------------------------------------------------------------------------------
@@ -133,76 +133,61 @@ def distance_to_shape(kind: int, c: wp.vec3, axes: wp.mat33, size: wp.vec3, radi
     return wp.max(wp.length(c) - radius, 0.0)
 
 
-# --- one function for all kinds of a scene --------------------------------------------------------------------
+# --- shapes of any kind ---------------------------------------------------------------------------------------
 
-
-@dataclass(frozen=True)
-class ShapeFunctions:
-    """Warp functions over the shapes of a scene.
-
-    Attributes:
-        meet: (geometry, shape, env, d, c, axes, best) -> Hit; the nearest hit before ``best`` along unit d from the
-            origin, for a shape centred at c whose axes are the rows of ``axes``.
-        normal: (geometry, shape, env, face, point) -> outward unit normal next to ``point``, in the shape's frame.
-        refine: (geometry, shape, env, face, d, pose, t) -> t in float64, for the nearest hit if it is ``uncertain``;
-            d is a wp.vec3d, pose the shape's wp.transformd in the frame of the ray.
-    """
-
-    meet: wp.Function
-    normal: wp.Function
-    refine: wp.Function
+hit_plane, hit_sphere, hit_box, hit_cylinder, hit_capsule, hit_ellipsoid = intersections(wp.float32)
+exact_plane, exact_sphere, exact_box, exact_cylinder, exact_capsule, exact_ellipsoid = intersections(wp.float64)
 
 
 @wp.func
 def uncertain(hit: Hit, c: wp.vec3):
     """Whether rounding may have moved a hit on a shape centred at c by more than 1e-5 of its range plus 1e-5 m."""
-    return hit.slope * (1.0 + hit.t) * REFINE < hit.t + wp.abs(c[0]) + wp.abs(c[1]) + wp.abs(c[2])
+    return hit.sin_incidence * (1.0 + hit.t) * REFINE < hit.t + wp.abs(c[0]) + wp.abs(c[1]) + wp.abs(c[2])
 
 
-def shape_functions(kinds: Iterable[int]) -> ShapeFunctions:
-    """The functions for scenes that hold these kinds only; what serves other kinds is not compiled."""
-    return _shape_functions(frozenset(int(kind) for kind in kinds))
+@cache
+def shape_functions(mesh: bool, heightfield: bool) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """Functions (intersect, refine, shape_normal) for scenes with or without meshes and height fields.
 
-
-@lru_cache(MAX_VARIANTS)
-def _shape_functions(kinds: frozenset[int]) -> ShapeFunctions:
-    has_plane, has_box, has_sphere = PLANE in kinds, BOX in kinds, SPHERE in kinds
-    has_cylinder, has_capsule, has_ellipsoid = CYLINDER in kinds, CAPSULE in kinds, ELLIPSOID in kinds
-    has_mesh, has_heightfield = bool(kinds & {MESH, DEFORMABLE}), HEIGHTFIELD in kinds
-    single, double = intersections(wp.float32), intersections(wp.float64)
-    meet_plane, meet_box, meet_sphere = single.plane, single.box, single.sphere
-    meet_cylinder, meet_capsule, meet_ellipsoid = single.cylinder, single.capsule, single.ellipsoid
-    exact_plane, exact_box, exact_sphere = double.plane, double.box, double.sphere
-    exact_cylinder, exact_capsule, exact_ellipsoid = double.cylinder, double.capsule, double.ellipsoid
+    Both are most of the code: with them in it, a scan of a scene that has none takes 15 % longer.
+    """
 
     @wp.func
-    def meet(geometry: Geometry, shape: int, env: int, d: wp.vec3, c: wp.vec3, axes: wp.mat33, best: float):
+    def intersect(geometry: Geometry, shape: int, env: int, d: wp.vec3, c: wp.vec3, axes: wp.mat33, best: float):
+        """The nearest hit before ``best`` along unit d from the origin on a shape centred at c with axes in rows."""
         kind = geometry.kind[shape]
-        met = wp.vec2(INF, 0.0)
+        found = wp.vec2(INF, 0.0)
         face = wp.int32(-1)
-        if wp.static(has_plane):
-            if kind == PLANE:
-                met = meet_plane(d, c, axes, geometry.size[shape])
-        if wp.static(has_capsule):
-            if kind == CAPSULE:
-                met = meet_capsule(d, c, axes, geometry.size[shape])
-        if wp.static(has_sphere):
-            if kind == SPHERE:
-                met = meet_sphere(d, c, geometry.size[shape])
-        if wp.static(has_box):
-            if kind == BOX:
-                met = meet_box(d, c, axes, geometry.size[shape])
-        if wp.static(has_cylinder):
-            if kind == CYLINDER:
-                met = meet_cylinder(d, c, axes, geometry.size[shape])
-        if wp.static(has_ellipsoid):
-            if kind == ELLIPSOID:
-                met = meet_ellipsoid(d, c, axes, geometry.size[shape])
-        if wp.static(has_mesh):
+        if kind == PLANE:
+            found = hit_plane(d, c, axes, geometry.size[shape])
+        elif kind == CAPSULE:
+            found = hit_capsule(d, c, axes, geometry.size[shape])
+        elif kind == SPHERE:
+            found = hit_sphere(d, c, geometry.size[shape])
+        elif kind == BOX:
+            found = hit_box(d, c, axes, geometry.size[shape])
+        elif kind == CYLINDER:
+            found = hit_cylinder(d, c, axes, geometry.size[shape])
+        elif kind == ELLIPSOID:
+            found = hit_ellipsoid(d, c, axes, geometry.size[shape])
+        if wp.static(heightfield):
+            if kind == HEIGHTFIELD:
+                on_field = intersect_heightfield(
+                    geometry.field_part[geometry.part[shape]],
+                    geometry.field_height,
+                    geometry.field_level,
+                    geometry.field_extreme,
+                    -(axes * c),
+                    axes * d,
+                    best,
+                )
+                found = wp.vec2(on_field.t, on_field.sin_incidence)
+                face = on_field.face
+        if wp.static(mesh):
             if kind == MESH or kind == DEFORMABLE:
                 part = geometry.mesh_part[geometry.part[shape]]
                 direction = axes * d
-                found = descend(
+                on_mesh = descend(
                     geometry.mesh_bounds,
                     geometry.mesh_child,
                     geometry.mesh_triangle,
@@ -214,48 +199,13 @@ def _shape_functions(kinds: frozenset[int]) -> ShapeFunctions:
                     wp.vec3(slab_inverse(direction[0]), slab_inverse(direction[1]), slab_inverse(direction[2])),
                     best,
                 )
-                met = wp.vec2(float(found[0]), float(found[2]))
-                face = int(found[1])
-        if wp.static(has_heightfield):
-            if kind == HEIGHTFIELD:
-                crossing = meet_heightfield(
-                    geometry.field_part[geometry.part[shape]],
-                    geometry.field_height,
-                    geometry.field_level,
-                    geometry.field_extreme,
-                    -(axes * c),
-                    axes * d,
-                    best,
-                )
-                met = wp.vec2(crossing.t, crossing.slope)
-                face = crossing.face
-        hit = Hit()
-        hit.t = met[0]
-        hit.slope = met[1]
-        hit.face = face
-        return hit
-
-    @wp.func
-    def normal(geometry: Geometry, shape: int, env: int, face: int, point: wp.vec3):
-        kind = geometry.kind[shape]
-        n = wp.vec3(0.0, 0.0, 1.0)
-        if wp.static(has_mesh):
-            if kind == MESH or kind == DEFORMABLE:
-                part = geometry.mesh_part[geometry.part[shape]]
-                leaves = part.first_leaf + env * part.leaf_stride
-                a = corner_of(geometry.mesh_triangle, leaves, face, 0)
-                b = corner_of(geometry.mesh_triangle, leaves, face, 1)
-                c = corner_of(geometry.mesh_triangle, leaves, face, 2)
-                n = wp.vec3(wp.normalize(wp.cross(b - a, c - a)))
-        if wp.static(has_heightfield):
-            if kind == HEIGHTFIELD:
-                n = heightfield_normal(geometry.field_part[geometry.part[shape]], geometry.field_height, face, point)
-        if kind < MESH:
-            n = outward_normal(kind, point, geometry.size[shape])
-        return n
+                found = wp.vec2(float(on_mesh[0]), float(on_mesh[2]))
+                face = int(on_mesh[1])
+        return Hit(found[0], face, found[1])
 
     @wp.func
     def refine(geometry: Geometry, shape: int, env: int, face: int, d: wp.vec3d, pose: wp.transformd, t: float):
+        """The distance t of a hit computed again in float64; ``pose`` is the shape's in the frame of the ray."""
         kind = geometry.kind[shape]
         q = wp.transform_get_rotation(pose)
         direction = wp.quat_rotate_inv(q, d)
@@ -263,25 +213,23 @@ def _shape_functions(kinds: frozenset[int]) -> ShapeFunctions:
         exact = wp.float64(t)
         own = wp.identity(n=3, dtype=wp.float64)
         size = geometry.exact_size[shape]
-        if wp.static(has_plane):
-            if kind == PLANE:
-                exact = exact_plane(direction, centre, own, size)[0]
-        if wp.static(has_capsule):
-            if kind == CAPSULE:
-                exact = exact_capsule(direction, centre, own, size)[0]
-        if wp.static(has_sphere):
-            if kind == SPHERE:
-                exact = exact_sphere(direction, centre, size)[0]
-        if wp.static(has_box):
-            if kind == BOX:
-                exact = exact_box(direction, centre, own, size)[0]
-        if wp.static(has_cylinder):
-            if kind == CYLINDER:
-                exact = exact_cylinder(direction, centre, own, size)[0]
-        if wp.static(has_ellipsoid):
-            if kind == ELLIPSOID:
-                exact = exact_ellipsoid(direction, centre, own, size)[0]
-        if wp.static(has_mesh):
+        if kind == PLANE:
+            exact = exact_plane(direction, centre, own, size)[0]
+        elif kind == CAPSULE:
+            exact = exact_capsule(direction, centre, own, size)[0]
+        elif kind == SPHERE:
+            exact = exact_sphere(direction, centre, size)[0]
+        elif kind == BOX:
+            exact = exact_box(direction, centre, own, size)[0]
+        elif kind == CYLINDER:
+            exact = exact_cylinder(direction, centre, own, size)[0]
+        elif kind == ELLIPSOID:
+            exact = exact_ellipsoid(direction, centre, own, size)[0]
+        if wp.static(heightfield):
+            if kind == HEIGHTFIELD:
+                field = geometry.field_part[geometry.part[shape]]
+                exact = refine_heightfield(field, geometry.field_height, face, -centre, direction, exact)
+        if wp.static(mesh):
             if kind == MESH or kind == DEFORMABLE:
                 part = geometry.mesh_part[geometry.part[shape]]
                 leaves = part.first_leaf + env * part.leaf_stride
@@ -293,18 +241,28 @@ def _shape_functions(kinds: frozenset[int]) -> ShapeFunctions:
                     direction,
                     exact,
                 )
-        if wp.static(has_heightfield):
-            if kind == HEIGHTFIELD:
-                exact = refine_heightfield(
-                    geometry.field_part[geometry.part[shape]],
-                    geometry.field_height,
-                    face,
-                    -centre,
-                    direction,
-                    exact,
-                )
         if wp.isfinite(exact):
             return float(exact)
         return t
 
-    return ShapeFunctions(meet, normal, refine)
+    @wp.func
+    def shape_normal(geometry: Geometry, shape: int, env: int, face: int, point: wp.vec3):
+        """Outward unit normal next to ``point``, both in the shape's frame."""
+        kind = geometry.kind[shape]
+        n = wp.vec3(0.0, 0.0, 1.0)
+        if kind < MESH:
+            n = outward_normal(kind, point, geometry.size[shape])
+        if wp.static(heightfield):
+            if kind == HEIGHTFIELD:
+                n = heightfield_normal(geometry.field_part[geometry.part[shape]], geometry.field_height, face, point)
+        if wp.static(mesh):
+            if kind == MESH or kind == DEFORMABLE:
+                part = geometry.mesh_part[geometry.part[shape]]
+                leaves = part.first_leaf + env * part.leaf_stride
+                a = corner_of(geometry.mesh_triangle, leaves, face, 0)
+                b = corner_of(geometry.mesh_triangle, leaves, face, 1)
+                c = corner_of(geometry.mesh_triangle, leaves, face, 2)
+                n = wp.vec3(wp.normalize(wp.cross(b - a, c - a)))
+        return n
+
+    return intersect, refine, shape_normal

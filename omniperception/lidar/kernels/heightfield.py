@@ -1,4 +1,4 @@
-"""Rays through height fields: a walk over cells under a pyramid of lowest and highest points."""
+"""Rays through height fields: a march over cells under a pyramid of lowest and highest points."""
 
 import math
 
@@ -43,7 +43,7 @@ class FieldPart:
 class FieldHit:
     t: wp.float32
     face: wp.int32
-    slope: wp.float32
+    sin_incidence: wp.float32
 
 
 @wp.func
@@ -54,15 +54,21 @@ def _inverse(x: float):
 
 
 @wp.func
-def _surface(h00: float, h10: float, h01: float, h11: float, u: float, v: float):
-    """Height at (u, v) in a cell; the diagonal of its two triangles goes from (0, 0) to (1, 1)."""
-    if u >= v:
-        return h00 + u * (h10 - h00) + v * (h11 - h10)
-    return h00 + u * (h11 - h01) + v * (h01 - h00)
+def _corners(heights: wp.array(dtype=wp.float32), first: int, cols: int):
+    """Heights h00, h10, h01, h11 at the corners of a cell, the first index counting along x."""
+    return wp.vec4(heights[first], heights[first + 1], heights[first + cols], heights[first + cols + 1])
 
 
 @wp.func
-def _meet_base(half: wp.vec3, o: wp.vec3, inv: wp.vec3):
+def _surface(h: wp.vec4, u: float, v: float):
+    """Height at (u, v) in a cell; the diagonal of its two triangles goes from (0, 0) to (1, 1)."""
+    if u >= v:
+        return h[0] + u * (h[1] - h[0]) + v * (h[3] - h[1])
+    return h[0] + u * (h[3] - h[2]) + v * (h[2] - h[0])
+
+
+@wp.func
+def _intersect_base(half: wp.vec3, o: wp.vec3, inv: wp.vec3):
     """The box under the floor, double-sided as every closed shape."""
     t_in = float(-INF)
     t_out = float(INF)
@@ -78,7 +84,38 @@ def _meet_base(half: wp.vec3, o: wp.vec3, inv: wp.vec3):
 
 
 @wp.func
-def meet_heightfield(
+def _crossing_in_cell(h: wp.vec4, z: float, z_next: float, uv: wp.vec4, t: float, t_next: float):
+    """(t, triangle) where a ray first is at or below the two triangles of a cell; infinite if it is nowhere.
+
+    It enters the cell at t, height z and uv[:2] in the cell and leaves it at t_next, z_next and uv[2:]; h holds the
+    corners h00, h10, h01, h11. Over each triangle both heights are linear in t.
+    """
+    above = z - _surface(h, uv[0], uv[1])
+    above_next = z_next - _surface(h, uv[2], uv[3])
+    triangle = wp.where(uv[2] >= uv[3], 0, 1)
+    across = uv[0] - uv[1]
+    across_next = uv[2] - uv[3]
+    if across * across_next < 0.0:  # the ray crosses the diagonal: the crossing is before or beyond that point
+        f = across / (across - across_next)
+        u_mid = uv[0] + f * (uv[2] - uv[0])
+        above_mid = z + f * (z_next - z) - h[0] - u_mid * (h[3] - h[0])
+        t_mid = t + f * (t_next - t)
+        if above <= 0.0 or above_mid <= 0.0:
+            t_next = t_mid
+            above_next = above_mid
+            triangle = wp.where(across >= 0.0, 0, 1)
+        else:
+            t = t_mid
+            above = above_mid
+    if above > 0.0 and above_next > 0.0:
+        return wp.vec2(INF, 0.0)
+    if above > 0.0:
+        t = t + (t_next - t) * above / (above - above_next)
+    return wp.vec2(t, float(triangle))
+
+
+@wp.func
+def intersect_heightfield(
     field: FieldPart,
     heights: wp.array(dtype=wp.float32),
     levels: wp.array(dtype=wp.vec2i),
@@ -89,75 +126,81 @@ def meet_heightfield(
 ):
     """The nearest crossing before ``limit`` of the field's surface, of its sides or of its base.
 
-    The walk knows on which side of the surface the ray is and looks for the first change, so that the borders of cells
-    have no gaps: a crossing that rounding hides from one cell is found at the entry of the next.
+    The march goes from node to node of the pyramid: down a level where the ray is not above the node's highest point,
+    up a level where it leaves the parent. It knows on which side of the surface the ray is and looks for the first
+    change, so that the borders of cells have no gaps: a crossing that rounding hides from one cell is found at the
+    entry of the next. Horizontal lengths are in cells, vertical ones in units of the heights.
     """
     hit = FieldHit()
     hit.t = INF
     hit.face = -1
     end = limit
-    inv = wp.vec3(_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
+
+    # base
     half_x = float(field.half_x)
     half_y = float(field.half_y)
     base = float(field.base)
     if base > 0.0:
-        t_base = _meet_base(wp.vec3(half_x, half_y, 0.5 * base), o, inv)
+        inv = wp.vec3(_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
+        t_base = _intersect_base(wp.vec3(half_x, half_y, 0.5 * base), o, inv)
         if t_base < end:
             hit.t = t_base
             hit.face = WALL
             end = t_base
+
+    # ray in the grid, from a grid point next to the origin, where float32 is finest
     scale_x = float(field.per_x)
     scale_y = float(field.per_y)
     grid_x = (wp.float64(o[0]) + field.half_x) * field.per_x
     grid_y = (wp.float64(o[1]) + field.half_y) * field.per_y
     near_x = int(wp.clamp(grid_x, wp.float64(0.0), wp.float64(field.cols - 1)))
     near_y = int(wp.clamp(grid_y, wp.float64(0.0), wp.float64(field.rows - 1)))
-    gx = float(grid_x - wp.float64(near_x))  # from a grid point next to the origin, where float32 is finest
+    unit = 1.0 / float(field.scale)
+    gx = float(grid_x - wp.float64(near_x))
     gy = float(grid_y - wp.float64(near_y))
+    oz = o[2] * unit
     dx = d[0] * scale_x
     dy = d[1] * scale_y
+    dz = d[2] * unit
     inv_x = _inverse(dx)
     inv_y = _inverse(dy)
+    inv_z = _inverse(dz)
+
+    # from t to end the ray is within the sides, above the floor and below the highest point
     west = (float(-near_x) - gx) * inv_x
     east = (float(field.cols - 1 - near_x) - gx) * inv_x
     south = (float(-near_y) - gy) * inv_y
     north = (float(field.rows - 1 - near_y) - gy) * inv_y
     enter = wp.max(wp.min(west, east), wp.min(south, north))
     leave = wp.min(wp.max(west, east), wp.max(south, north))
-    unit = 1.0 / float(field.scale)
-    oz = o[2] * unit
-    dz = d[2] * unit
-    inv_z = _inverse(dz)
-    margin = 1.0e-5 * (half_x + half_y) * unit  # a field as flat as its floor is still walked through
+    margin = 1.0e-5 * (half_x + half_y) * unit  # a field as flat as its floor is still marched through
     bottom = (-margin - oz) * inv_z
     ceiling = (field.top + margin - oz) * inv_z
     t = wp.max(wp.max(enter, wp.min(bottom, ceiling)), 0.0)
     end = wp.min(wp.min(leave, wp.max(bottom, ceiling)), end)
     if t > end:
         return hit
+
+    # side of the surface on which the ray begins; from below, the field is marched over upside down
     ix = wp.clamp(near_x + int(wp.floor(gx + t * dx)), 0, field.cols - 2)
     iy = wp.clamp(near_y + int(wp.floor(gy + t * dy)), 0, field.rows - 2)
-    k = field.first_height + iy * field.cols + ix
-    h = _surface(
-        heights[k],
-        heights[k + 1],
-        heights[k + field.cols],
-        heights[k + field.cols + 1],
-        gx + t * dx - float(ix - near_x),
-        gy + t * dy - float(iy - near_y),
-    )
+    corners = _corners(heights, field.first_height + iy * field.cols + ix, field.cols)
+    h = _surface(corners, gx + t * dx - float(ix - near_x), gy + t * dy - float(iy - near_y))
     side = wp.where(oz + t * dz < h, -1.0, 1.0)
     if side < 0.0 and t > 0.0 and t == enter:
         hit.t = t
         hit.face = WALL
         return hit
-    oz = side * oz  # from below, the field is walked over upside down
+    oz = side * oz
     dz = side * dz
+
+    # march
     forward_x = wp.where(inv_x > 0.0, 1, 0)
     forward_y = wp.where(inv_y > 0.0, 1, 0)
     level = wp.min(2, field.top_level)
-    walking = wp.int32(1)
-    while walking == 1:
+    marching = wp.int32(1)
+    while marching == 1:
+        # where the ray leaves the node
         shift = level * LEVEL_SHIFT
         node_x = ix >> shift
         node_y = iy >> shift
@@ -168,6 +211,8 @@ def meet_heightfield(
         t_next = wp.max(wp.min(wp.min(t_x, t_y), end), t)
         z = oz + t * dz
         z_next = oz + t_next * dz
+
+        # down a level, or into a cell
         if level > 0:
             row = levels[field.first_level + level]
             span = extremes[row[0] + node_y * row[1] + node_x]
@@ -176,44 +221,23 @@ def meet_heightfield(
                 continue
         else:
             k = field.first_height + iy * field.cols + ix
-            h00 = side * heights[k]
-            h10 = side * heights[k + 1]
-            h01 = side * heights[k + field.cols]
-            h11 = side * heights[k + field.cols + 1]
-            if wp.min(z, z_next) <= wp.max(wp.max(h00, h10), wp.max(h01, h11)):
-                u = gx + t * dx - float(ix - near_x)
-                v = gy + t * dy - float(iy - near_y)
-                u_next = gx + t_next * dx - float(ix - near_x)
-                v_next = gy + t_next * dy - float(iy - near_y)
-                above = z - _surface(h00, h10, h01, h11, u, v)
-                above_next = z_next - _surface(h00, h10, h01, h11, u_next, v_next)
-                from_t = float(t)
-                to_t = float(t_next)
-                triangle = wp.where(u_next >= v_next, 0, 1)
-                across = u - v
-                across_next = u_next - v_next
-                if across * across_next < 0.0:
-                    f = across / (across - across_next)
-                    u_mid = u + f * (u_next - u)
-                    above_mid = z + f * (z_next - z) - h00 - u_mid * (h11 - h00)
-                    t_mid = t + f * (t_next - t)
-                    if above <= 0.0 or above_mid <= 0.0:
-                        to_t = t_mid
-                        above_next = above_mid
-                        triangle = wp.where(across >= 0.0, 0, 1)
-                    else:
-                        from_t = t_mid
-                        above = above_mid
-                if above <= 0.0 or above_next <= 0.0:
-                    hit.t = from_t
-                    if above > 0.0:
-                        hit.t = from_t + (to_t - from_t) * above / (above - above_next)
+            cell = side * _corners(heights, k, field.cols)
+            if wp.min(z, z_next) <= wp.max(wp.max(cell[0], cell[1]), wp.max(cell[2], cell[3])):
+                x0 = float(ix - near_x)
+                y0 = float(iy - near_y)
+                uv = wp.vec4(gx + t * dx - x0, gy + t * dy - y0, gx + t_next * dx - x0, gy + t_next * dy - y0)
+                crossing = _crossing_in_cell(cell, z, z_next, uv, t, t_next)
+                if crossing[0] < INF:
+                    triangle = int(crossing[1])
+                    hit.t = crossing[0]
                     hit.face = 2 * (k - field.first_height) + triangle
-                    rise_x = wp.where(triangle == 0, h10 - h00, h11 - h01) * scale_x
-                    rise_y = wp.where(triangle == 0, h11 - h10, h01 - h00) * scale_y
+                    rise_x = wp.where(triangle == 0, cell[1] - cell[0], cell[3] - cell[2]) * scale_x
+                    rise_y = wp.where(triangle == 0, cell[3] - cell[1], cell[2] - cell[0]) * scale_y
                     square = unit * unit + rise_x * rise_x + rise_y * rise_y
-                    hit.slope = wp.abs(dz - rise_x * d[0] - rise_y * d[1]) / wp.sqrt(square)
+                    hit.sin_incidence = wp.abs(dz - rise_x * d[0] - rise_y * d[1]) / wp.sqrt(square)
                     return hit
+
+        # on to the next node, up a level where it has another parent
         old_x = ix
         old_y = iy
         if t_x < t_y:
@@ -236,7 +260,7 @@ def meet_heightfield(
                 level += 1
         t = t_next
         if t >= end or ix < 0 or iy < 0 or ix > field.cols - 2 or iy > field.rows - 2:
-            walking = wp.int32(0)
+            marching = wp.int32(0)
     if side < 0.0 and end == leave:
         hit.t = leave
         hit.face = WALL
@@ -293,11 +317,11 @@ def refine_heightfield(
         plane = wp.vec3d(field.half_x, field.half_y, wp.float64(0.0))
         if n[2] < 0.0:
             plane[2] = field.base
-        slope = wp.dot(wp.vec3d(n), d)
+        sine = wp.dot(wp.vec3d(n), d)
         offset = wp.dot(plane, wp.vec3d(wp.abs(n)))
-        if wp.abs(slope) < wp.float64(1.0e-9):
+        if wp.abs(sine) < wp.float64(1.0e-9):
             return t
-        return wp.max((offset - wp.dot(wp.vec3d(n), o)) / slope, wp.float64(0.0))
+        return wp.max((offset - wp.dot(wp.vec3d(n), o)) / sine, wp.float64(0.0))
     row = face / 2 / field.cols
     col = face / 2 % field.cols
     a = heightfield_corner(field, heights, row, col)

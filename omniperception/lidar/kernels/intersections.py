@@ -1,38 +1,22 @@
-"""Where a ray meets an analytic shape, in closed form, for any floating point type."""
+"""Intersections of rays with analytic shapes in closed form, for either floating point type."""
 
 import math
-from dataclasses import dataclass
 from functools import cache
 
 import warp as wp
 
 
-@dataclass(frozen=True)
-class Intersections:
-    """Warp functions that intersect a line from the frame's origin along unit ``d`` with a shape centred at ``c``.
-
-    ``axes`` holds the shape's x, y and z axis in its rows; ``size`` is that of ``Shape``. Each returns ``(t, slope)``:
-    the first crossing at t >= 0, infinite for a miss, and the sine of the angle between ray and surface there, by which
-    rounding errors are divided. A closed shape is convex, so a line is in it between two crossings; a ray that starts
-    inside hits the second one, as in mj_ray.
-
-    Attributes:
-        plane: (d, c, axes, size), from the side of the normal only, within the half extents where they are not 0.
-        sphere: (d, c, size).
-        box, cylinder, capsule, ellipsoid: (d, c, axes, size).
-    """
-
-    plane: wp.Function
-    sphere: wp.Function
-    box: wp.Function
-    cylinder: wp.Function
-    capsule: wp.Function
-    ellipsoid: wp.Function
-
-
 @cache
-def intersections(real: type) -> Intersections:
-    """The intersections in ``wp.float32``, for the search, or in ``wp.float64``, for the last digits."""
+def intersections(real: type) -> tuple[wp.Function, ...]:
+    """Functions (plane, sphere, box, cylinder, capsule, ellipsoid) in ``wp.float32`` or ``wp.float64``.
+
+    They intersect a line from the frame's origin along unit ``d`` with a shape centred at ``c``; ``axes`` holds the
+    shape's x, y and z axis in its rows, ``size`` is that of ``Shape``. Each returns ``(t, sin_incidence)``: the first
+    crossing at t >= 0, infinite for a miss, and the sine of the angle between ray and surface there, by which rounding
+    errors are divided. A closed shape is convex, so a line is in it between two crossings; a ray that starts inside
+    hits the second one, as in mj_ray. A plane is hit from the side of its normal only, and within its half extents
+    where they are not 0.
+    """
     vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
@@ -49,25 +33,25 @@ def intersections(real: type) -> Intersections:
         return x
 
     @wp.func
-    def first_crossing(t_in: real, t_out: real, slope_in: real, slope_out: real):
+    def first_crossing(t_in: real, t_out: real, sin_in: real, sin_out: real):
         if t_in > t_out or t_out < zero:
             return vec2(infinite, one)
-        return wp.where(t_in >= zero, vec2(t_in, slope_in), vec2(t_out, slope_out))
+        return wp.where(t_in >= zero, vec2(t_in, sin_in), vec2(t_out, sin_out))
 
     @wp.func
     def plane(d: vec3, c: vec3, axes: mat33, size: vec3):
-        slope = axes[2, 0] * d[0] + axes[2, 1] * d[1] + axes[2, 2] * d[2]
+        sine = axes[2, 0] * d[0] + axes[2, 1] * d[1] + axes[2, 2] * d[2]
         height = axes[2, 0] * c[0] + axes[2, 1] * c[1] + axes[2, 2] * c[2]
-        if slope > -parallel or height > zero:
+        if sine > -parallel or height > zero:
             return vec2(infinite, one)
-        t = height / slope
+        t = height / sine
         if size[0] > zero or size[1] > zero:
             p = t * d - c
             x = wp.abs(axes[0, 0] * p[0] + axes[0, 1] * p[1] + axes[0, 2] * p[2])
             y = wp.abs(axes[1, 0] * p[0] + axes[1, 1] * p[1] + axes[1, 2] * p[2])
             if (size[0] > zero and x > size[0]) or (size[1] > zero and y > size[1]):
                 return vec2(infinite, one)
-        return vec2(t, -slope)
+        return vec2(t, -sine)
 
     @wp.func
     def sphere(d: vec3, c: vec3, size: vec3):
@@ -77,14 +61,14 @@ def intersections(real: type) -> Intersections:
         if disc < zero:
             return vec2(infinite, one)
         half = wp.sqrt(disc)
-        slope = half / size[0]
-        return first_crossing(t_mid - half, t_mid + half, slope, slope)
+        sine = half / size[0]
+        return first_crossing(t_mid - half, t_mid + half, sine, sine)
 
     @wp.func
     def box(d: vec3, c: vec3, axes: mat33, size: vec3):
         direction = axes * d
         centre = axes * c
-        slope = wp.abs(direction)
+        sine = wp.abs(direction)
         inv = vec3(
             one / away_from_zero(direction[0]), one / away_from_zero(direction[1]), one / away_from_zero(direction[2])
         )
@@ -94,9 +78,9 @@ def intersections(real: type) -> Intersections:
         high = mid + half
         t_in = wp.max(wp.max(low[0], low[1]), low[2])
         t_out = wp.min(wp.min(high[0], high[1]), high[2])
-        slope_in = wp.where(low[0] == t_in, slope[0], wp.where(low[1] == t_in, slope[1], slope[2]))
-        slope_out = wp.where(high[0] == t_out, slope[0], wp.where(high[1] == t_out, slope[1], slope[2]))
-        return first_crossing(t_in, t_out, slope_in, slope_out)
+        sin_in = wp.where(low[0] == t_in, sine[0], wp.where(low[1] == t_in, sine[1], sine[2]))
+        sin_out = wp.where(high[0] == t_out, sine[0], wp.where(high[1] == t_out, sine[1], sine[2]))
+        return first_crossing(t_in, t_out, sin_in, sin_out)
 
     @wp.func
     def ellipsoid(d: vec3, c: vec3, axes: mat33, size: vec3):
@@ -109,12 +93,12 @@ def intersections(real: type) -> Intersections:
         if disc < zero:
             return vec2(infinite, one)
         half = wp.sqrt(disc / dd)
-        slope = half * dd * wp.min(size[0], wp.min(size[1], size[2]))  # a lower bound
-        return first_crossing(t_mid - half, t_mid + half, slope, slope)
+        sine = half * dd * wp.min(size[0], wp.min(size[1], size[2]))  # a lower bound
+        return first_crossing(t_mid - half, t_mid + half, sine, sine)
 
     @wp.func
     def tube(d: vec3, c: vec3, axis: vec3, radius: real):
-        """(t_in, t_out, slope) of the infinite cylinder around ``axis``; t_in > t_out if the line misses it."""
+        """(t_in, t_out, sin_incidence) of the infinite cylinder around ``axis``; t_in > t_out if the line misses it."""
         across = wp.cross(d, axis)
         moment = wp.cross(axis, c)
         a = wp.dot(across, across)
@@ -136,13 +120,13 @@ def intersections(real: type) -> Intersections:
         side = tube(d, c, axis, size[0])
         if side[0] > side[1]:
             return vec2(infinite, one)
-        slope = wp.dot(d, axis)
-        inv = one / away_from_zero(slope)
+        sine = wp.dot(d, axis)
+        inv = one / away_from_zero(sine)
         mid = wp.dot(c, axis) * inv
         half = size[1] * wp.abs(inv)
-        slope_in = wp.where(mid - half > side[0], wp.abs(slope), side[2])
-        slope_out = wp.where(mid + half < side[1], wp.abs(slope), side[2])
-        return first_crossing(wp.max(side[0], mid - half), wp.min(side[1], mid + half), slope_in, slope_out)
+        sin_in = wp.where(mid - half > side[0], wp.abs(sine), side[2])
+        sin_out = wp.where(mid + half < side[1], wp.abs(sine), side[2])
+        return first_crossing(wp.max(side[0], mid - half), wp.min(side[1], mid + half), sin_in, sin_out)
 
     @wp.func
     def half_chord(d: vec3, c: vec3, radius: real):
@@ -159,28 +143,28 @@ def intersections(real: type) -> Intersections:
         side = tube(d, c, axis, size[0])
         if side[0] > side[1]:
             return vec2(infinite, one)
-        slope = wp.dot(d, axis)
+        sine = wp.dot(d, axis)
         height = wp.dot(c, axis)
         t_in = side[0]
         t_out = side[1]
-        slope_in = side[2]
-        slope_out = side[2]
-        z_in = t_in * slope - height
-        z_out = t_out * slope - height
+        sin_in = side[2]
+        sin_out = side[2]
+        z_in = t_in * sine - height
+        z_out = t_out * sine - height
         if wp.abs(z_in) > size[1]:
             cap = c + wp.clamp(z_in, -size[1], size[1]) * axis
             half = half_chord(d, cap, size[0])
             if half < zero:
                 return vec2(infinite, one)
             t_in = wp.dot(d, cap) - half
-            slope_in = half / size[0]
+            sin_in = half / size[0]
         if wp.abs(z_out) > size[1]:
             cap_out = c + wp.clamp(z_out, -size[1], size[1]) * axis
             half_out = half_chord(d, cap_out, size[0])
             if half_out < zero:
                 return vec2(infinite, one)
             t_out = wp.dot(d, cap_out) + half_out
-            slope_out = half_out / size[0]
-        return first_crossing(t_in, t_out, slope_in, slope_out)
+            sin_out = half_out / size[0]
+        return first_crossing(t_in, t_out, sin_in, sin_out)
 
-    return Intersections(plane, sphere, box, cylinder, capsule, ellipsoid)
+    return plane, sphere, box, cylinder, capsule, ellipsoid

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from .geometry import INF, PI
+from .slots import Slots, Viewpoint, pack_words
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,14 +45,6 @@ class Moment:
     view: wp.transformd
     to_view: wp.transformd
     origin: wp.vec3
-
-
-@wp.struct
-class Viewpoint:
-    """Where the sensor sits on which body; -1: in the environment."""
-
-    body: wp.int32
-    pose: wp.transformd
 
 
 @wp.func
@@ -177,7 +170,7 @@ def is_there(track: Track, env: int, body: int):
 
 
 @wp.func
-def bow(track: Track, env: int, body: int, pose: wp.transformd):
+def chord_error(track: Track, env: int, body: int, pose: wp.transformd):
     """How far a point fixed at ``pose`` on a turning body strays from even motion along a line.
 
     A function whose second derivative is at most arm * angle^2 differs by an eighth of that from its chord.
@@ -207,16 +200,13 @@ def bound_swept_shapes(
     viewpoint: Viewpoint,
     max_range: float,
     # out
-    slot_bound_out: wp.array2d(dtype=wp.vec4),
-    slot_near_out: wp.array2d(dtype=wp.float32),
-    slot_shape_out: wp.array2d(dtype=wp.int32),
-    num_slots_out: wp.array(dtype=wp.int32),
+    slots: Slots,
 ):
     """Bounds of one environment's shapes over the whole frame, in the sensor's frame at its middle, nearest first.
 
     The positions relative to the sensor lie in a ball around their values at the moments, and the sensor's orientation
     within ``turned`` of the middle one (a geodesic between two points of a ball below a right angle stays in it): a ray
-    can meet the shape only within the ball's cone widened by that angle.
+    can hit the shape only within the ball's cone widened by that angle.
     """
     env = wp.tid() + env_offset
     middle = moment_at(track, env, viewpoint, 0.5)
@@ -225,13 +215,13 @@ def bound_swept_shapes(
         turned = wp.max(turned, angle_between(middle.view, view_at(track, env, viewpoint, end // 2, float(end % 2))))
     if turned >= HALF_PI:
         turned = PI
-    view_bow = bow(track, env, viewpoint.body, viewpoint.pose)
-    seeing = is_there(track, env, viewpoint.body)
+    view_error = chord_error(track, env, viewpoint.body, viewpoint.pose)
+    has_view = is_there(track, env, viewpoint.body)
     count = wp.int32(0)
     for i in range(num_viewed):
         shape = viewed[i]
-        there = bool(seeing) and is_there(track, env, track.shape_body[shape])
-        if visible.shape[0] > 0:
+        there = bool(has_view) and is_there(track, env, track.shape_body[shape])
+        if visible:
             there = there and visible[env, shape]
         bound = wp.vec4(0.0, 0.0, 0.0, -INF)
         near = float(0.0)
@@ -245,8 +235,8 @@ def bound_swept_shapes(
                 low = wp.min(low, offset)
                 high = wp.max(high, offset)
             centre = 0.5 * (low + high)
-            bows = view_bow + bow(track, env, track.shape_body[shape], track.shape_pose[shape])
-            radius = (shape_radius[shape] + 0.5 * wp.length(high - low) + bows) * (1.0 + ANGLE_SLACK)
+            chord_errors = view_error + chord_error(track, env, track.shape_body[shape], track.shape_pose[shape])
+            radius = (shape_radius[shape] + 0.5 * wp.length(high - low) + chord_errors) * (1.0 + ANGLE_SLACK)
             distance = wp.length(centre)
             near = wp.max(distance - radius, 0.0)
             if distance > radius:
@@ -255,13 +245,15 @@ def bound_swept_shapes(
                 bound = wp.vec4(c[0], c[1], c[2], cosine * wp.abs(cosine) * distance * distance)
         if there and near < max_range:
             slot = count
-            while slot > 0 and slot_near_out[env, wp.max(slot - 1, 0)] > near:
-                slot_bound_out[env, slot] = slot_bound_out[env, slot - 1]
-                slot_near_out[env, slot] = slot_near_out[env, slot - 1]
-                slot_shape_out[env, slot] = slot_shape_out[env, slot - 1]
+            while slot > 0 and slots.near[env, wp.max(slot - 1, 0)] > near:
+                slots.bound[env, slot] = slots.bound[env, slot - 1]
+                slots.near[env, slot] = slots.near[env, slot - 1]
+                slots.shape[env, slot] = slots.shape[env, slot - 1]
                 slot -= 1
-            slot_bound_out[env, slot] = bound
-            slot_near_out[env, slot] = near
-            slot_shape_out[env, slot] = shape
+            slots.bound[env, slot] = bound
+            slots.near[env, slot] = near
+            slots.shape[env, slot] = shape
             count += 1
-    num_slots_out[env] = count
+    slots.count[env] = count
+    if slots.words:
+        pack_words(slots, env, count)

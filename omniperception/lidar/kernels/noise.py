@@ -1,26 +1,25 @@
-"""Noise of a LiDAR, compiled for the models that are configured.
+"""Noise of a LiDAR, compiled for the models that a sensor has.
 
 The random numbers are a function of seed, environment, frame, ray and model: none depends on what else is configured.
 """
 
-from collections.abc import Iterable
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
 from ..noise import MAX_SIGMAS
 from .geometry import INF, PI
-from .variants import MAX_VARIANTS
 
 wp.set_module_options({"enable_backward": False})
 
 JITTER, GAUSSIAN, DISTANCE, DROPOUT, MASK = (wp.constant(k) for k in range(5))
+MODELS = frozenset(("jitter", "mixed", "gaussian", "distance", "dropout", "mask"))
 GOLDEN_ANGLE = wp.constant(wp.float32(2.399963229728653))
 
 
 @wp.struct
-class NoiseFigures:
-    """The figures of all models; those of models that are not configured are not read."""
+class NoiseParameters:
+    """The parameters of all models; those of models that a sensor does not have are not read."""
 
     seed: wp.int32
     min_range: wp.float32
@@ -47,7 +46,7 @@ def child_key(key: wp.uint32, index: int):
 
 
 @wp.func
-def leaning(d: wp.vec3, sideways: wp.vec2):
+def deflected(d: wp.vec3, sideways: wp.vec2):
     """Unit d moved by ``sideways`` across itself, in units of its length.
 
     The axes across d are those of Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6(1), 2017.
@@ -66,52 +65,52 @@ def jittered(d: wp.vec3, sigma: float, key: wp.uint32):
     state = child_key(key, JITTER)
     radius = sigma * wp.min(wp.sqrt(-2.0 * wp.log(1.0 - wp.randf(state))), MAX_SIGMAS)  # by Box and Muller
     bearing = 2.0 * PI * wp.randf(state)
-    return leaning(d, radius * wp.vec2(wp.cos(bearing), wp.sin(bearing)))
+    return deflected(d, radius * wp.vec2(wp.cos(bearing), wp.sin(bearing)))
 
 
 @wp.func
 def beside(d: wp.vec3, radius: float, row: int):
     """A direction across d by ``radius``, on a side that changes evenly from row to row."""
     bearing = GOLDEN_ANGLE * float(row % 4096)
-    return leaning(d, radius * wp.vec2(wp.cos(bearing), wp.sin(bearing)))
+    return deflected(d, radius * wp.vec2(wp.cos(bearing), wp.sin(bearing)))
 
 
 @wp.func
-def mixed(figures: NoiseFigures, first: float, second: float):
+def mixed(noise: NoiseParameters, first: float, second: float):
     """The distance measured by a beam that meets two surfaces."""
     gap = wp.abs(second - first)
-    if gap <= figures.mixed_min_gap or gap > figures.mixed_max_gap:  # an infinite second distance, too
+    if gap <= noise.mixed_min_gap or gap > noise.mixed_max_gap:  # an infinite second distance, too
         return first
     near = wp.min(first, second)
-    return near + (1.0 - figures.mixed_weight) * gap
+    return near + (1.0 - noise.mixed_weight) * gap
 
 
-@lru_cache(MAX_VARIANTS)
-def disturb_function(models: Iterable[str]) -> wp.Function:
-    """(figures, distance, true distance, key) -> what is measured of a hit; for the models named here."""
+@cache
+def disturb_function(models: frozenset[str]) -> wp.Function:
+    """(noise, distance, true distance, key) -> what is measured of a hit; mixed pixels are in ``distance`` already."""
     has_gaussian, has_distance = "gaussian" in models, "distance" in models
     has_dropout, has_mask = "dropout" in models, "mask" in models
 
     @wp.func
-    def disturb(figures: NoiseFigures, distance: float, true_distance: float, key: wp.uint32):
+    def disturb(noise: NoiseParameters, distance: float, true_distance: float, key: wp.uint32):
         measured = distance
         if wp.static(has_gaussian):
             gaussian = child_key(key, GAUSSIAN)
-            sigma = figures.gaussian_sigma + figures.gaussian_sigma_per_metre * true_distance
+            sigma = noise.gaussian_sigma + noise.gaussian_sigma_per_metre * true_distance
             measured += sigma * wp.sqrt(-2.0 * wp.log(1.0 - wp.randf(gaussian))) * wp.cos(2.0 * PI * wp.randf(gaussian))
         if wp.static(has_distance):
             uniform = child_key(key, DISTANCE)
-            measured *= 1.0 + figures.distance_ratio * (2.0 * wp.randf(uniform) - 1.0)
-        measured = wp.min(measured, figures.max_range)
-        if measured < figures.min_range:
+            measured *= 1.0 + noise.distance_ratio * (2.0 * wp.randf(uniform) - 1.0)
+        measured = wp.min(measured, noise.max_range)
+        if measured < noise.min_range:
             measured = INF
         if wp.static(has_mask):
             mask = child_key(key, MASK)
-            if wp.randf(mask) < figures.mask_ratio:
-                measured = figures.mask_low + (figures.mask_high - figures.mask_low) * wp.randf(mask)
+            if wp.randf(mask) < noise.mask_ratio:
+                measured = noise.mask_low + (noise.mask_high - noise.mask_low) * wp.randf(mask)
         if wp.static(has_dropout):
             dropout = child_key(key, DROPOUT)
-            if wp.randf(dropout) < figures.dropout_ratio + figures.dropout_ratio_per_metre * true_distance:
+            if wp.randf(dropout) < noise.dropout_ratio + noise.dropout_ratio_per_metre * true_distance:
                 measured = INF
         return measured
 

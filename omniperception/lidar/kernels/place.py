@@ -3,11 +3,12 @@
 # ruff: noqa: UP018  (in a kernel, wp.int32(0) declares a variable that may change)
 
 import math
+from typing import Any
 
 import warp as wp
 
-from .geometry import INF, PLANE, SLACK, distance_to_shape
-from .variants import variants
+from .geometry import INF, PLANE, SLACK, Geometry, distance_to_shape
+from .slots import Slots, Viewpoint, pack_words
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,13 +25,36 @@ MARGIN = wp.constant(wp.float32(1.0e-3))
 HALF_PI = wp.constant(wp.float32(0.5 * math.pi))
 
 
+@wp.struct
+class Limits:
+    """Which shapes a viewer may see at all."""
+
+    viewed: wp.array(dtype=wp.int32)  # indices of shapes
+    num_viewed: wp.int32
+    cull: wp.bool  # whether shapes out of reach are left out; without it, neighbours stand together
+    max_range: wp.float32
+    elevation_min: wp.float32  # of rays, rad
+    elevation_max: wp.float32
+
+
 @wp.func
-def settled(v: wp.vec3):
+def flush_denormals(v: wp.vec3):
     """``v`` without parts so small that products of two would be denormal, on which a CPU is a hundred times slower."""
     return wp.vec3(
         wp.where(wp.abs(v[0]) < NOTHING, 0.0, v[0]),
         wp.where(wp.abs(v[1]) < NOTHING, 0.0, v[1]),
         wp.where(wp.abs(v[2]) < NOTHING, 0.0, v[2]),
+    )
+
+
+@wp.func
+def axes_of(pose: wp.transformd):
+    """The axes of a pose in rows."""
+    turn = wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
+    return wp.matrix_from_rows(
+        flush_denormals(wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0])),
+        flush_denormals(wp.vec3(turn[0, 1], turn[1, 1], turn[2, 1])),
+        flush_denormals(wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])),
     )
 
 
@@ -143,28 +167,26 @@ def _order_along_curve(
 def bound_groups(
     env_offset: int,
     radius: wp.array(dtype=wp.float32),
-    slot_shape: wp.array2d(dtype=wp.int32),
-    slot_pose: wp.array2d(dtype=wp.transformd),
-    num_slots: wp.array(dtype=wp.int32),
+    slots: Slots,
     # out
     group_out: wp.array2d(dtype=wp.vec4d),
 ):
     """Centre and radius of a sphere around every GROUP consecutive slots of one environment."""
     env = wp.tid() + env_offset
-    count = num_slots[env]
+    count = slots.count[env]
     for group in range((count + GROUP - 1) // GROUP):
         first = group * GROUP
         last = wp.min(first + GROUP, count)
-        low = wp.transform_get_translation(slot_pose[env, first])
+        low = wp.transform_get_translation(slots.pose[env, first])
         high = low
         for slot in range(first + 1, last):
-            low = wp.min(low, wp.transform_get_translation(slot_pose[env, slot]))
-            high = wp.max(high, wp.transform_get_translation(slot_pose[env, slot]))
+            low = wp.min(low, wp.transform_get_translation(slots.pose[env, slot]))
+            high = wp.max(high, wp.transform_get_translation(slots.pose[env, slot]))
         centre = wp.float64(0.5) * (low + high)
         reach = wp.float64(0.0)
         for slot in range(first, last):
-            away = wp.length(wp.transform_get_translation(slot_pose[env, slot]) - centre)
-            reach = wp.max(reach, away + wp.float64(radius[slot_shape[env, slot]]))
+            away = wp.length(wp.transform_get_translation(slots.pose[env, slot]) - centre)
+            reach = wp.max(reach, away + wp.float64(radius[slots.shape[env, slot]]))
         group_out[env, group] = wp.vec4d(centre[0], centre[1], centre[2], reach)
 
 
@@ -183,145 +205,136 @@ def _is_between(c: wp.vec3, distance: float, radius: float, sin_low: float, sin_
     return above and below
 
 
-@variants
-def place_kernel(pose_type: type) -> wp.Kernel:
-    """The kernel for poses of bodies in ``wp.float32`` or ``wp.float64``. Poses are composed in float64."""
-    vec3 = wp.types.vector(3, pose_type)
-    vec4 = wp.types.vector(4, pose_type)
+@wp.func
+def is_pose(p: wp.vec3d, q: wp.vec4d):
+    """Whether a position and an orientation are finite and the orientation is one."""
+    norm = wp.dot(q, q)
+    away = wp.dot(p, p)
+    return norm > wp.float64(1.0e-12) and norm < wp.float64(1.0e12) and away < wp.float64(1.0e30)
 
-    @wp.func
-    def is_pose(p: wp.vec3d, q: wp.vec4d):
-        """Whether a position and an orientation are finite and the orientation is one."""
-        norm = wp.dot(q, q)
-        away = wp.dot(p, p)
-        return norm > wp.float64(1.0e-12) and norm < wp.float64(1.0e12) and away < wp.float64(1.0e30)
 
-    @wp.func
-    def to_pose(p: wp.vec3d, q: wp.vec4d):
-        """The pose with its orientation normalised; a norm that is 1 but for rounding needs no square root."""
-        square = wp.dot(q, q)
-        scale = wp.float64(1.5) - wp.float64(0.5) * square
-        if wp.abs(square - wp.float64(1.0)) > wp.float64(1.0e-6):
-            scale = wp.float64(1.0) / wp.sqrt(square)
-        return wp.transformation(p, wp.quatd(scale * q[1], scale * q[2], scale * q[3], scale * q[0]))
+@wp.func
+def to_pose(p: wp.vec3d, q: wp.vec4d):
+    """The pose with its orientation (w, x, y, z) normalised; a norm that is 1 but for rounding needs no square root."""
+    square = wp.dot(q, q)
+    scale = wp.float64(1.5) - wp.float64(0.5) * square
+    if wp.abs(square - wp.float64(1.0)) > wp.float64(1.0e-6):
+        scale = wp.float64(1.0) / wp.sqrt(square)
+    return wp.transformation(p, wp.quatd(scale * q[1], scale * q[2], scale * q[3], scale * q[0]))
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def place_shapes(
-        env_offset: int,
-        # scene
-        body_pos: wp.array2d(dtype=vec3),
-        body_quat: wp.array2d(dtype=vec4),
-        shape_kind: wp.array(dtype=wp.int32),
-        shape_body: wp.array(dtype=wp.int32),
-        shape_pose: wp.array(dtype=wp.transformd),
-        shape_size: wp.array(dtype=wp.vec3),
-        shape_radius: wp.array(dtype=wp.float32),
-        visible: wp.array2d(dtype=wp.bool),
-        # view
-        viewed: wp.array(dtype=wp.int32),
-        num_viewed: int,
-        view_body: int,
-        view_pose: wp.transformd,
-        cull: int,
-        max_range: float,
-        elevation_min: float,
-        elevation_max: float,
-        # scratch
-        order: wp.array2d(dtype=wp.int32),
-        spare: wp.array2d(dtype=wp.float32),
-        # out
-        slot_bound_out: wp.array2d(dtype=wp.vec4),
-        slot_near_out: wp.array2d(dtype=wp.float32),
-        slot_shape_out: wp.array2d(dtype=wp.int32),
-        slot_axes_out: wp.array2d(dtype=wp.mat33),
-        slot_pose_out: wp.array2d(dtype=wp.transformd),
-        num_slots_out: wp.array(dtype=wp.int32),
-    ):
-        """Expresses one environment's shapes in the viewer's frame, nearest first, without those out of reach.
 
-        With ``cull`` 0 none is left out and neighbours stand together; ``slot_near_out`` then holds no distances.
-        """
-        env = wp.tid() + env_offset
-        count = wp.int32(0)
-        view = view_pose
-        seeing = bool(True)
-        if view_body >= 0:
-            p_carrier = wp.vec3d(body_pos[env, view_body])
-            q_carrier = wp.vec4d(body_quat[env, view_body])
-            seeing = is_pose(p_carrier, q_carrier)
-            view = to_pose(p_carrier, q_carrier) * view
-        to_view = wp.transform_inverse(view)
-        sin_low = wp.sin(wp.max(elevation_min - MARGIN, -HALF_PI)) - ROUNDING
-        sin_high = wp.sin(wp.min(elevation_max + MARGIN, HALF_PI)) + ROUNDING
-        for i in range(num_viewed):
-            shape = viewed[i]
-            body = shape_body[shape]
-            pose = shape_pose[shape]
-            there = bool(seeing)
-            if visible.shape[0] > 0:
-                there = there and visible[env, shape]
-            if body >= 0:
-                p_body = wp.vec3d(body_pos[env, body])
-                q_body = wp.vec4d(body_quat[env, body])
-                there = there and is_pose(p_body, q_body)
-                pose = to_pose(p_body, q_body) * pose
-            pose = to_view * pose
-            if there:
-                kind = shape_kind[shape]
-                c = settled(wp.vec3(wp.transform_get_translation(pose)))
-                turn = wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
-                x_axis = settled(wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0]))
-                y_axis = settled(wp.vec3(turn[0, 1], turn[1, 1], turn[2, 1]))
-                up = settled(wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]))
-                axes = wp.matrix_from_rows(x_axis, y_axis, up)
-                radius = shape_radius[shape]
-                distance = wp.length(c)
-                near = distance_to_shape(kind, c, axes, shape_size[shape], radius)
-                near = wp.max(near - ROUNDING * distance, 0.0)
-                threshold = -INF
-                if distance > radius * (1.0 + SLACK):
-                    threshold = (distance - radius) * (distance + radius) * (1.0 - SLACK) - radius * radius * SLACK
-                bound = wp.vec4(c[0], c[1], c[2], threshold)
-                if cull != 0:
-                    there = near < max_range
-                    if kind == PLANE:
-                        height = -wp.dot(c, up)
-                        there = there and height >= 0.0
-                        if shape_size[shape][0] <= 0.0 and shape_size[shape][1] <= 0.0:
-                            bound = wp.vec4(-height * up[0], -height * up[1], -height * up[2], 0.0)
-                    elif distance > radius * (1.0 + SLACK):
-                        there = there and _is_between(c, distance, radius, sin_low, sin_high)
-                if there:
-                    slot_bound_out[env, count] = bound
-                    slot_near_out[env, count] = near
-                    slot_shape_out[env, count] = shape
-                    slot_axes_out[env, count] = axes
-                    slot_pose_out[env, count] = pose
-                    order[env, count] = count
-                    count += 1
-        num_slots_out[env] = count
-        if cull == 0:
-            _order_along_curve(env, count, shape_radius, slot_shape_out, slot_bound_out, slot_near_out)
-        _sort_by_distance(env, count, slot_near_out, order, spare)
-        for start in range(count):
-            if order[env, start] != start:
-                bound = slot_bound_out[env, start]
-                shape = slot_shape_out[env, start]
-                axes = slot_axes_out[env, start]
-                pose = slot_pose_out[env, start]
-                slot = int(start)
-                while order[env, slot] != start:
-                    other = order[env, slot]
-                    slot_bound_out[env, slot] = slot_bound_out[env, other]
-                    slot_shape_out[env, slot] = slot_shape_out[env, other]
-                    slot_axes_out[env, slot] = slot_axes_out[env, other]
-                    slot_pose_out[env, slot] = slot_pose_out[env, other]
-                    order[env, slot] = slot
-                    slot = other
-                slot_bound_out[env, slot] = bound
-                slot_shape_out[env, slot] = shape
-                slot_axes_out[env, slot] = axes
-                slot_pose_out[env, slot] = pose
+@wp.func
+def _apply_order(env: int, count: int, order: wp.array2d(dtype=wp.int32), slots: Slots):
+    """Brings one environment's slots into an order, cycle by cycle; ``order`` ends as 0, 1, 2, ..."""
+    for start in range(count):
+        if order[env, start] != start:
+            bound = slots.bound[env, start]
+            shape = slots.shape[env, start]
+            axes = slots.axes[env, start]
+            pose = slots.pose[env, start]
+            slot = int(start)
+            while order[env, slot] != start:
+                other = order[env, slot]
+                slots.bound[env, slot] = slots.bound[env, other]
+                slots.shape[env, slot] = slots.shape[env, other]
+                slots.axes[env, slot] = slots.axes[env, other]
+                slots.pose[env, slot] = slots.pose[env, other]
                 order[env, slot] = slot
+                slot = other
+            slots.bound[env, slot] = bound
+            slots.shape[env, slot] = shape
+            slots.axes[env, slot] = axes
+            slots.pose[env, slot] = pose
+            order[env, slot] = slot
+    return 0
 
-    return place_shapes
+
+@wp.kernel(module="unique", enable_backward=False)
+def place_shapes(
+    env_offset: int,
+    # scene
+    body_pos: wp.array2d(dtype=Any),
+    body_quat: wp.array2d(dtype=Any),
+    geometry: Geometry,
+    visible: wp.array2d(dtype=wp.bool),
+    # viewer
+    viewpoint: Viewpoint,
+    limits: Limits,
+    # scratch
+    order: wp.array2d(dtype=wp.int32),
+    spare: wp.array2d(dtype=wp.float32),
+    # out
+    slots: Slots,
+):
+    """Expresses one environment's shapes in the viewer's frame, nearest first, without those out of reach.
+
+    Poses are composed in float64. Without ``limits.cull``, none is left out, neighbours stand together, and
+    ``slots.near`` then holds no distances.
+    """
+    env = wp.tid() + env_offset
+    count = wp.int32(0)
+    view = viewpoint.pose
+    has_view = bool(True)
+    if viewpoint.body >= 0:
+        p_carrier = wp.vec3d(body_pos[env, viewpoint.body])
+        q_carrier = wp.vec4d(body_quat[env, viewpoint.body])
+        has_view = is_pose(p_carrier, q_carrier)
+        if has_view:
+            view = to_pose(p_carrier, q_carrier) * view
+    to_view = wp.transform_inverse(view)
+    slots.view[env] = view
+    sin_low = wp.sin(wp.max(limits.elevation_min - MARGIN, -HALF_PI)) - ROUNDING
+    sin_high = wp.sin(wp.min(limits.elevation_max + MARGIN, HALF_PI)) + ROUNDING
+    for i in range(limits.num_viewed):
+        # pose in the viewer's frame
+        shape = limits.viewed[i]
+        body = geometry.body[shape]
+        pose = geometry.pose[shape]
+        there = bool(has_view)
+        if visible:
+            there = there and visible[env, shape]
+        if body >= 0:
+            p_body = wp.vec3d(body_pos[env, body])
+            q_body = wp.vec4d(body_quat[env, body])
+            there = there and is_pose(p_body, q_body)
+            pose = to_pose(p_body, q_body) * pose
+        pose = to_view * pose
+        if there:
+            kind = geometry.kind[shape]
+            size = geometry.size[shape]
+            radius = geometry.radius[shape]
+            c = flush_denormals(wp.vec3(wp.transform_get_translation(pose)))
+            axes = axes_of(pose)
+            z_axis = wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2])
+            # bounds: nearest distance, and the cone in which rays can hit it
+            distance = wp.length(c)
+            near = distance_to_shape(kind, c, axes, size, radius)
+            near = wp.max(near - ROUNDING * distance, 0.0)
+            threshold = -INF
+            if distance > radius * (1.0 + SLACK):
+                threshold = (distance - radius) * (distance + radius) * (1.0 - SLACK) - radius * radius * SLACK
+            bound = wp.vec4(c[0], c[1], c[2], threshold)
+            if limits.cull:
+                there = near < limits.max_range
+                if kind == PLANE:
+                    height = -wp.dot(c, z_axis)
+                    there = there and height >= 0.0
+                    if size[0] <= 0.0 and size[1] <= 0.0:
+                        bound = wp.vec4(-height * z_axis[0], -height * z_axis[1], -height * z_axis[2], 0.0)
+                elif distance > radius * (1.0 + SLACK):
+                    there = there and _is_between(c, distance, radius, sin_low, sin_high)
+            if there:
+                slots.bound[env, count] = bound
+                slots.near[env, count] = near
+                slots.shape[env, count] = shape
+                slots.axes[env, count] = axes
+                slots.pose[env, count] = pose
+                order[env, count] = count
+                count += 1
+    slots.count[env] = count
+    if not limits.cull:
+        _order_along_curve(env, count, geometry.radius, slots.shape, slots.bound, slots.near)
+    _sort_by_distance(env, count, slots.near, order, spare)
+    _apply_order(env, count, order, slots)
+    if slots.words:
+        pack_words(slots, env, count)

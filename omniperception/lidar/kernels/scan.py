@@ -1,50 +1,21 @@
-"""One frame of a LiDAR, compiled for the shapes, the outputs and the noise that a sensor has."""
+"""One frame of a LiDAR."""
 
-# ruff: noqa: UP018, SIM102  (in a kernel, wp.int32(0) and float(0) declare a variable that may change, and a branch on
-# wp.static stands alone)
+# ruff: noqa: SIM102, UP018  (in a kernel, a branch on wp.static stands alone, and float(0) declares a variable that changes)
 
-from dataclasses import dataclass
+from functools import cache
 
 import warp as wp
 
-from .field_block import walk_block
-from .geometry import HEIGHTFIELD, INF, Geometry, shape_functions
-from .motion import Moment, Track, Viewpoint, moment_at, to_quatd
-from .noise import NoiseFigures, beside, child_key, disturb_function, jittered, mixed
-from .search import Slots, locate_functions, search_function
-from .variants import variants
+from .geometry import HEIGHTFIELD, INF, REFINE, Geometry, shape_functions
+from .march_block import REACHES, march_block
+from .motion import Moment, Track, Viewpoint, moment_at
+from .noise import MODELS, NoiseParameters, beside, child_key, disturb_function, jittered, mixed
+from .search import search_functions
+from .slots import Slots
 
 NAN = wp.constant(wp.float32(float("nan")))
 NO_BODY = wp.constant(-2)
-
-
-@dataclass(frozen=True)
-class ScanVariant:
-    """What one compiled scan serves.
-
-    Attributes:
-        kinds: Kinds of shapes in the scene.
-        outputs: Names of the fields of ``ScanOutputs`` that are written.
-        noise: Names of the noise models.
-        packed: Whether slots are searched by words.
-        moving: Whether every ray is cast at its own time.
-        displaced: Whether rays start beside the sensor's origin.
-        selected: Whether the rays of a frame are listed, rather than every k-th row.
-        shots: Whether several rows fire at one instant.
-        walked: Whether a block's rays meet the scene's one height field all at once.
-        pose_type: Of the bodies' poses, ``wp.float32`` or ``wp.float64``.
-    """
-
-    kinds: frozenset[int]
-    outputs: frozenset[str]
-    noise: frozenset[str]
-    packed: bool
-    moving: bool
-    displaced: bool
-    selected: bool
-    shots: bool
-    walked: bool
-    pose_type: type
+WINDOW_REACHES = wp.constant(wp.vec4(*map(float, REACHES)))
 
 
 @wp.struct
@@ -83,7 +54,7 @@ class Labels:
 
 @wp.struct
 class ScanOutputs:
-    """(E, N) each, of E environments from the first one on; only those that the variant writes exist."""
+    """(E, N) each, of E environments from the first one on; only those that are asked for exist."""
 
     first_env: wp.int32
     ranges: wp.array2d(dtype=wp.float32)
@@ -106,50 +77,88 @@ class ScanOutputs:
 
 
 @wp.func
+def start_of_shot(row: int, first_row: int, rows_per_shot: int):
+    """First row of a row's shot; both count from the frame's first row, which is ``first_row`` of the pattern."""
+    start = row
+    if rows_per_shot > 1:
+        into_shot = first_row % rows_per_shot
+        start = (row + into_shot) // rows_per_shot * rows_per_shot - into_shot
+    return start
+
+
+@wp.func
 def turn_of(pose: wp.transformd):
     return wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
 
 
-@variants
-def scan_kernel(variant: ScanVariant) -> wp.Kernel:
-    """The kernel of one variant; a task casts ``Rays.block`` rays of one environment, one after the other."""
-    outputs, noise = variant.outputs, variant.noise
-    moving, displaced, selected, shots = variant.moving, variant.displaced, variant.selected, variant.shots
-    walked = variant.walked
-    search = search_function(variant.kinds, variant.packed, moving, displaced, walked)
-    locate, _ = locate_functions(moving, displaced)
-    normal_of = shape_functions(variant.kinds).normal
-    disturb = disturb_function(noise)
-    noisy, has_jitter, has_mixed = bool(noise), "jitter" in noise, "mixed" in noise
-    in_base, in_world = "points_b" in outputs, "points_w" in outputs
-    faces = bool(outputs & {"normals_w", "incidence", "intensity"})
-    placed_at_end = not moving and bool(outputs & {"points_w", "normals_w"})
-    timed = moving or "time_s" in outputs
-    writes_ranges, writes_truth = "ranges" in outputs, "true_ranges" in outputs
-    writes_valid, writes_points = "valid" in outputs, "points_s" in outputs
-    writes_normals, writes_incidence = "normals_w" in outputs, "incidence" in outputs
-    writes_intensity, writes_body = "intensity" in outputs, "body_id" in outputs
-    writes_shape, writes_class = "shape_id" in outputs, "class_id" in outputs
-    writes_time, writes_direction = "time_s" in outputs, "directions_s" in outputs
-    writes_elevation, writes_azimuth, writes_row = "elevation" in outputs, "azimuth" in outputs, "row" in outputs
-    vec3 = wp.types.vector(3, variant.pose_type)
-    vec4 = wp.types.vector(4, variant.pose_type)
+@wp.func
+def march_height_field(rays: Rays, geometry: Geometry, slots: Slots, env: int, first: int, last: int):
+    """Notes in ``slots`` what a block of rays hits of the scene's one height field."""
+    for s in range(slots.count[env]):
+        shape = slots.shape[env, s]
+        if geometry.kind[shape] == HEIGHTFIELD:
+            pose = slots.pose[env, s]
+            march_block(
+                geometry.field_part[geometry.part[shape]],
+                geometry.field_height,
+                geometry.field_window,
+                WINDOW_REACHES,
+                rays.directions,
+                rays.start[env, 0],
+                rays.cycle,
+                rays.start[env, 1],
+                first,
+                last,
+                wp.quat_rotate_inv(wp.transform_get_rotation(pose), -wp.transform_get_translation(pose)),
+                slots.axes[env, s],
+                rays.max_range,
+                REFINE,
+                env,
+                slots.marched_t,
+                slots.marched_face,
+                slots.marched_uncertain,
+            )
+    return 0
+
+
+@cache
+def scan_kernel(has: frozenset[str]) -> wp.Kernel:
+    """The kernel for what a sensor has; everything else is not in its code and costs no time.
+
+    Args:
+        has: Names of outputs (fields of ``ScanOutputs``), of noise models, and out of "motion" (each ray is cast at its
+            own time), "origins" (rays start beside the sensor's origin), "offsets" (rays are listed), "mesh" and
+            "heightfield" (the scene has such shapes) and "marched" (blocks of rays march through its one height field).
+    """
+    search, locate = search_functions(has & {"motion", "origins", "mesh", "heightfield", "marched"})
+    _, _, shape_normal = shape_functions("mesh" in has, "heightfield" in has)
+    disturb, noisy = disturb_function(has & MODELS), bool(has & MODELS)
+    has_point = bool(has & {"points_s", "points_b", "points_w"})
+    has_label = bool(has & {"body_id", "shape_id", "class_id"})
+    has_normal = bool(has & {"normals_w", "incidence", "intensity"})
+    has_view = "motion" not in has and bool(has & {"points_w", "normals_w"})
+    is_timed = bool(has & {"motion", "time_s"})
 
     @wp.kernel(module="unique", enable_backward=False)
     def cast_scan(
         task_offset: int,
+        # sensor
         rays: Rays,
         viewpoint: Viewpoint,
-        body_pos: wp.array2d(dtype=vec3),
-        body_quat: wp.array2d(dtype=vec4),
+        noise: NoiseParameters,
+        # scene
         geometry: Geometry,
         slots: Slots,
         track: Track,
         labels: Labels,
-        figures: NoiseFigures,
+        # out
         out: ScanOutputs,
     ):
-        """Casts a block of one environment's rays in the sensor's frame."""
+        """Casts a block of one environment's rays, one after the other, in the sensor's frame.
+
+        A ray is found in the scan table, turned by jitter, cast at its own time where things move, disturbed by noise,
+        and written to the outputs.
+        """
         task = wp.tid() + task_offset
         env = task // rays.num_blocks
         out_env = env - out.first_env
@@ -158,145 +167,128 @@ def scan_kernel(variant: ScanVariant) -> wp.Kernel:
         cycle = rays.start[env, 0]
         steps = rays.start[env, 1]
         moment = Moment()
-        if wp.static(placed_at_end):
-            moment.view = viewpoint.pose
-            if viewpoint.body >= 0:
-                p_carrier = wp.vec3d(body_pos[env, viewpoint.body])
-                q_carrier = to_quatd(wp.vec4d(body_quat[env, viewpoint.body]))
-                moment.view = wp.transformation(p_carrier, q_carrier) * viewpoint.pose
+        if wp.static(has_view):
+            moment.view = slots.view[env]
         turn_view = turn_of(moment.view)
-        if wp.static(in_base):
+        if wp.static("points_b" in has):
             p_mount = wp.vec3(wp.transform_get_translation(viewpoint.pose))
             turn_mount = turn_of(viewpoint.pose)
-        if wp.static(selected):
-            listed = int(rays.variant[env])
-        if wp.static(shots):
-            into_shot = int(rays.first_row[env]) % rays.rows_per_shot
         if wp.static(noisy):
-            env_key = child_key(child_key(wp.rand_init(figures.seed), env), labels.frame[env])
-        if wp.static(walked):
-            for s in range(slots.count[env]):
-                field = slots.shape[env, s]
-                if geometry.kind[field] == HEIGHTFIELD:
-                    pose = slots.pose[env, s]
-                    q = wp.transform_get_rotation(pose)
-                    walk_block(
-                        geometry.field_part[geometry.part[field]],
-                        geometry.field_height,
-                        geometry.field_window,
-                        rays.directions,
-                        cycle,
-                        rays.cycle,
-                        steps,
-                        first,
-                        last,
-                        wp.quat_rotate_inv(q, -wp.transform_get_translation(pose)),
-                        slots.axes[env, s],
-                        rays.max_range,
-                        env,
-                        slots.walked_t,
-                        slots.walked_slope,
-                        slots.walked_face,
-                    )
+            env_key = child_key(child_key(wp.rand_init(noise.seed), env), labels.frame[env])
+        if wp.static("marched" in has):
+            march_height_field(rays, geometry, slots, env, first, last)
+
         for ray in range(first, last):
+            # place in the scan table, and rows of the pattern since the frame's first
+            row = ray * rays.stride
             at = steps + ray
-            if wp.static(selected):
-                at = steps + rays.offsets[listed, ray]
+            if wp.static("offsets" in has):
+                row = rays.offsets[int(rays.variant[env]), ray]
+                at = steps + row
             if at >= rays.cycle:
                 at = at % rays.cycle
             at += cycle
+
+            # the ray, at its own time
             d = rays.directions[at]
             cast_d = d
-            if wp.static(timed):
-                row_in_frame = ray * rays.stride
-                if wp.static(selected):
-                    row_in_frame = rays.offsets[listed, ray]
-                if wp.static(shots):
-                    row_in_frame = (row_in_frame + into_shot) // rays.rows_per_shot * rays.rows_per_shot - into_shot
-                time = rays.lag[env] + float(row_in_frame) * rays.seconds_per_row
-            if wp.static(moving):
-                moment = moment_at(track, env, viewpoint, time / rays.period)
-                turn_view = turn_of(moment.view)
-            if wp.static(displaced):
+            if wp.static("origins" in has):
                 moment.origin = rays.origins[at]
+            if wp.static(is_timed):
+                shot_row = start_of_shot(row, int(rays.first_row[env]), rays.rows_per_shot)
+                time = rays.lag[env] + float(shot_row) * rays.seconds_per_row
+            if wp.static("motion" in has):
+                now = moment_at(track, env, viewpoint, time / rays.period)
+                now.origin = moment.origin
+                moment = now
+                turn_view = turn_of(moment.view)
             if wp.static(noisy):
                 key = child_key(env_key, ray)
-            if wp.static(has_jitter):
-                cast_d = jittered(d, figures.jitter_sigma, key)
-            met = search(geometry, slots, track, moment, env, ray, cast_d, rays.max_range)
-            is_hit = met.slot >= 0 and met.t >= rays.min_range
-            true_range = wp.where(is_hit, met.t, INF)
+            if wp.static("jitter" in has):
+                cast_d = jittered(d, noise.jitter_sigma, key)
+
+            # distance
+            hit = search(geometry, slots, track, moment, env, ray, cast_d, rays.max_range)
+            is_hit = hit.slot >= 0 and hit.t >= rays.min_range
+            true_range = wp.where(is_hit, hit.t, INF)
             measured = true_range
             if wp.static(noisy):
                 if is_hit:
-                    if wp.static(has_mixed):
-                        second_d = beside(cast_d, figures.mixed_radius, at)
+                    if wp.static("mixed" in has):
+                        second_d = beside(cast_d, noise.mixed_radius, at)
                         second = search(geometry, slots, track, moment, env, -1, second_d, rays.max_range)
                         if second.slot >= 0 and second.t >= rays.min_range:
-                            measured = mixed(figures, measured, second.t)
-                    measured = disturb(figures, measured, true_range, key)
-            if wp.static(writes_ranges):
+                            measured = mixed(noise, measured, second.t)
+                    measured = disturb(noise, measured, true_range, key)
+            if wp.static("ranges" in has):
                 out.ranges[out_env, ray] = measured
-            if wp.static(writes_truth):
+            if wp.static("true_ranges" in has):
                 out.true_ranges[out_env, ray] = true_range
-            if wp.static(writes_valid):
+            if wp.static("valid" in has):
                 out.valid[out_env, ray] = measured < INF
-            point = wp.vec3(NAN, NAN, NAN)
-            if measured < INF:
-                point = measured * d
-                if wp.static(displaced):
-                    point = point + moment.origin
-            if wp.static(writes_points):
-                out.points_s[out_env, ray] = point
-            if wp.static(in_base):
-                out.points_b[out_env, ray] = p_mount + turn_mount * point
-            if wp.static(in_world):
-                away = wp.vec3d(turn_view * point)
-                out.points_w[out_env, ray] = wp.vec3(wp.transform_get_translation(moment.view) + away)
-            shape = wp.int32(-1)
-            if is_hit:
-                shape = slots.shape[env, met.slot]
-            if wp.static(writes_shape):
+
+            # measured point
+            if wp.static(has_point):
+                point = wp.vec3(NAN, NAN, NAN)
+                if measured < INF:
+                    point = measured * d
+                    if wp.static("origins" in has):
+                        point = point + moment.origin
+                if wp.static("points_s" in has):
+                    out.points_s[out_env, ray] = point
+                if wp.static("points_b" in has):
+                    out.points_b[out_env, ray] = p_mount + turn_mount * point
+                if wp.static("points_w" in has):
+                    away = wp.vec3d(turn_view * point)
+                    out.points_w[out_env, ray] = wp.vec3(wp.transform_get_translation(moment.view) + away)
+
+            # what was hit
+            if wp.static(has_label or has_normal):
+                shape = wp.int32(-1)
+                if is_hit:
+                    shape = slots.shape[env, hit.slot]
+            if wp.static("shape_id" in has):
                 out.shape_id[out_env, ray] = shape
-            if wp.static(writes_class):
+            if wp.static("class_id" in has):
                 class_id = wp.int32(-1)
                 if is_hit:
                     class_id = geometry.class_id[shape]
                 out.class_id[out_env, ray] = class_id
-            if wp.static(writes_body):
+            if wp.static("body_id" in has):
                 body_id = wp.int32(NO_BODY)
                 if is_hit:
                     body_id = labels.body[shape]
                 out.body_id[out_env, ray] = body_id
-            if wp.static(faces):
+
+            # surface
+            if wp.static(has_normal):
                 normal = wp.vec3(0.0, 0.0, 0.0)
                 cosine = float(0.0)
                 if is_hit:
-                    met_at = locate(slots, track, moment, env, met.slot)
-                    at_shape = met_at.axes * (true_range * cast_d - met_at.c)
-                    normal = wp.transpose(met_at.axes) * normal_of(geometry, shape, env, met.face, at_shape)
+                    on = locate(slots, track, moment, env, hit.slot)
+                    point_of_shape = on.axes * (true_range * cast_d - on.c)
+                    normal = wp.transpose(on.axes) * shape_normal(geometry, shape, env, hit.face, point_of_shape)
                     cosine = wp.min(wp.abs(wp.dot(normal, cast_d)), 1.0)
-                if wp.static(writes_normals):
+                if wp.static("normals_w" in has):
                     out.normals_w[out_env, ray] = turn_view * normal
-                if wp.static(writes_incidence):
+                if wp.static("incidence" in has):
                     out.incidence[out_env, ray] = wp.where(is_hit, wp.acos(cosine), NAN)
-                if wp.static(writes_intensity):
+                if wp.static("intensity" in has):
                     intensity = float(0.0)
                     if is_hit:
                         intensity = labels.reflectivity[geometry.class_id[shape]] * cosine / (true_range * true_range)
                     out.intensity[out_env, ray] = intensity
-            if wp.static(writes_time):
+
+            # the ray itself
+            if wp.static("time_s" in has):
                 out.time_s[out_env, ray] = time
-            if wp.static(writes_direction):
+            if wp.static("directions_s" in has):
                 out.directions_s[out_env, ray] = d
-            if wp.static(writes_elevation):
+            if wp.static("elevation" in has):
                 out.elevation[out_env, ray] = rays.angles[at][0]
-            if wp.static(writes_azimuth):
+            if wp.static("azimuth" in has):
                 out.azimuth[out_env, ray] = rays.angles[at][1]
-            if wp.static(writes_row):
-                row = int(rays.first_row[env]) + ray * rays.stride
-                if wp.static(selected):
-                    row = int(rays.first_row[env]) + rays.offsets[listed, ray]
-                out.row[out_env, ray] = row % rays.num_rows
+            if wp.static("row" in has):
+                out.row[out_env, ray] = (int(rays.first_row[env]) + row) % rays.num_rows
 
     return cast_scan

@@ -1,38 +1,61 @@
-"""Many rays of one sensor through a height field in waves, for CPUs, where one ray alone waits for every step."""
+// Many rays of one sensor through a height field in waves, for CPUs.
+//
+// A step of a march waits for the one before it, and most of its branches are mispredicted: a ray alone leaves most of a
+// core idle. Here all rays of a block take a step each, and lists of those that go on are kept without branches, so that
+// steps of different rays overlap. A ray first jumps over windows: in a window, and above its highest point, it hits
+// nothing, and the window that lets it go farthest counts. Where none allows half a cell, it visits its cell, as
+// intersect_heightfield does. Rays that do not start above the surface, and the rare one that rounding takes through it,
+// are left to that function.
 
-import warp as wp
+#pragma once
+#include "warp/native/builtin.h"
 
-from .geometry import REFINE
-from .heightfield import LEVEL_SHIFT, FieldPart
+// One height field of a scene, as Warp generates it from FieldPart in heightfield.py.
+struct FieldPart {
+    int rows, cols;
+    double half_x, half_y, base, scale, per_x, per_y;
+    float top;
+    int first_height, first_level, top_level, first_window, window_cols;
+};
 
-wp.set_module_options({"enable_backward": False})
-
-BLOCK = 256
-"""The most rays that are walked at once."""
-REACHES = (2, 8, 32, 128)
-"""Cells by which the windows of highest points reach beyond their block of 4 x 4 cells."""
-UNKNOWN = wp.constant(-3)
-"""The face of a ray that these waves leave to ``meet_heightfield``."""
-
-# A step of a walk waits for the one before it, and hardly a branch of it can be foretold: a ray alone leaves most of a
-# core idle. Here all rays of a block take a step each, and lists of those that go on are kept without branches, so that
-# steps of different rays overlap. A ray first jumps over windows: in a window, and above its highest point, it
-# meets nothing, and the window that lets it go farthest counts. Where none allows half a cell, it visits its cell, as
-# ``meet_heightfield`` does. Rays that do not start above the surface, and the rare one that rounding takes through it,
-# are left to that function.
-_WALK_BLOCK = """
-    constexpr int most = BLOCK;
+// What intersect_heightfield finds for rays `first` to `last` of an environment, all from `o` in the field's frame. Their
+// directions, turned by `axes`, are rows `start + (steps + ray) % cycle`. A hit is uncertain, to be refined in float64,
+// as geometry.uncertain says; as `o` has float64, the field's centre may be far away without making it so.
+inline void march_block(
+    FieldPart field,
+    wp::array_t<float> heights,
+    wp::array_t<wp::vec4> windows,
+    wp::vec4 reaches,  // cells by which the windows reach beyond their block
+    wp::array_t<wp::vec3> directions,
+    int start,
+    int cycle,
+    int steps,
+    int first,
+    int last,
+    wp::vec3d o,
+    wp::mat33 axes,
+    float limit,
+    float refine,
+    int env,
+    wp::array_t<float> t_out,
+    wp::array_t<int> face_out,
+    wp::array_t<bool> uncertain_out)
+{
+    constexpr int block = 256;       // the most rays at once
+    constexpr int not_marched = -3;  // the face of a ray that is left to intersect_heightfield
+    constexpr int block_shift = 2;   // windows are there for blocks of 4 x 4 cells
+    constexpr float slack = 0.05f;   // cells by which rounding may misplace a ray
     const float tiny = 1.0e-12f;
     const int n = last - first;
     float* const t_row = t_out.data + size_t(env) * (t_out.strides[0] / sizeof(float)) + first;
-    float* const slope_row = slope_out.data + size_t(env) * (slope_out.strides[0] / sizeof(float)) + first;
+    bool* const uncertain_row = uncertain_out.data + size_t(env) * uncertain_out.strides[0] + first;
     int* const face_row = face_out.data + size_t(env) * (face_out.strides[0] / sizeof(int)) + first;
     const int cols = field.cols, last_x = field.cols - 2, last_y = field.rows - 2;
     const double grid_x = (o[0] + field.half_x) * field.per_x;
     const double grid_y = (o[1] + field.half_y) * field.per_y;
     if (!(grid_x >= 0.0 && grid_y >= 0.0 && grid_x <= last_x + 1 && grid_y <= last_y + 1 && o[2] > 0.0)) {
         for (int i = 0; i < n; ++i)
-            face_row[i] = UNKNOWN;
+            face_row[i] = not_marched;
         return;
     }
     const int near_x = (int)grid_x, near_y = (int)grid_y;
@@ -46,9 +69,11 @@ _WALK_BLOCK = """
     const float* const h = heights.data + field.first_height;
     const float* const window = (const float*)(windows.data + field.first_window);
     const int window_cols = field.window_cols;
-    float ax[most], ay[most], az[most], dx[most], dy[most], dz[most], inv_x[most], inv_y[most], fall[most], cell[most];
-    float t[most], end[most];
-    int ix[most], iy[most], seen[most], todo[most], cells[most], close[most];
+    const float reach[4] = {reaches[0] - slack, reaches[1] - slack, reaches[2] - slack, reaches[3] - slack};
+    float ax[block], ay[block], az[block], dx[block], dy[block], dz[block], inv_x[block], inv_y[block];
+    float fall[block], cell[block], t[block], end[block];
+    int ix[block], iy[block], seen[block], todo[block], cells[block], close[block];
+    // The rays' directions, from the table.
     for (int i = 0; i < n; ++i) {
         int at = steps + first + i;
         if (at >= cycle)
@@ -61,6 +86,7 @@ _WALK_BLOCK = """
     const float m00 = axes.data[0][0], m01 = axes.data[0][1], m02 = axes.data[0][2];
     const float m10 = axes.data[1][0], m11 = axes.data[1][1], m12 = axes.data[1][2];
     const float m20 = axes.data[2][0], m21 = axes.data[2][1], m22 = axes.data[2][2];
+    // Each ray in grid units, and from where to where it is above the floor, below the highest point and in the grid.
     for (int i = 0; i < n; ++i) {
         const float x = (m00 * ax[i] + m01 * ay[i] + m02 * az[i]) * per_x;
         const float y = (m10 * ax[i] + m11 * ay[i] + m12 * az[i]) * per_y;
@@ -91,19 +117,20 @@ _WALK_BLOCK = """
         iy[i] = cy < last_y ? cy : last_y;
         seen[i] = 0;
         t_row[i] = INFINITY;
-        slope_row[i] = 0.0f;
+        uncertain_row[i] = false;
         face_row[i] = -1;
     }
-    int count = 0;
+    int count = 0;  // rays under way, listed in todo
     for (int i = 0; i < n; ++i) {
         todo[count] = i;
         count += t[i] <= end[i];
     }
     while (count > 0) {
-        int kept = 0, stuck = 0, met = 0;
+        int kept = 0, num_cells = 0, num_close = 0;
+        // A jump as far as a window or the height above it allows; where that is half a cell, the cell is visited.
         for (int k = 0; k < count; ++k) {
             const int i = todo[k];
-            const float* const high = window + 4 * ((iy[i] >> SHIFT) * window_cols + (ix[i] >> SHIFT));
+            const float* const high = window + 4 * ((iy[i] >> block_shift) * window_cols + (ix[i] >> block_shift));
             const float z = oz + t[i] * dz[i];
             float jump = 0.0f;
 #pragma unroll
@@ -127,10 +154,11 @@ _WALK_BLOCK = """
             seen[i] |= jumps;
             todo[kept] = i;
             kept += jumps & goes_on;
-            cells[stuck] = i;
-            stuck += !jumps;
+            cells[num_cells] = i;
+            num_cells += !jumps;
         }
-        for (int k = 0; k < stuck; ++k) {
+        // A step through a cell, unless the ray dips below the highest of its corners.
+        for (int k = 0; k < num_cells; ++k) {
             const int i = cells[k];
             const int forward_x = dx[i] >= 0.0f, forward_y = dy[i] >= 0.0f;
             const float t_x = ((float)(ix[i] + forward_x - near_x) - gx) * inv_x[i];
@@ -143,19 +171,20 @@ _WALK_BLOCK = """
             const float* const c = h + (iy[i] * cols + ix[i]);
             const float low_z = z < z_next ? z : z_next;
             const float high_s = c[0] > c[1] ? c[0] : c[1], high_n = c[cols] > c[cols + 1] ? c[cols] : c[cols + 1];
-            const int meets = low_z <= (high_s > high_n ? high_s : high_n);
-            const int passes = !meets;
+            const int dips = low_z <= (high_s > high_n ? high_s : high_n);
+            const int passes = !dips;
             const int cx = ix[i] + (along_x ? 2 * forward_x - 1 : 0), cy = iy[i] + (along_x ? 0 : 2 * forward_y - 1);
             t[i] = passes ? next : t[i];
             ix[i] = passes ? cx : ix[i];
             iy[i] = passes ? cy : iy[i];
             seen[i] |= passes;
-            close[met] = i;
-            met += meets;
+            close[num_close] = i;
+            num_close += dips;
             todo[kept] = i;
             kept += passes & (next < end[i]) & (cx >= 0) & (cy >= 0) & (cx <= last_x) & (cy <= last_y);
         }
-        for (int k = 0; k < met; ++k) {
+        // The two triangles of such a cell: a crossing, or a step through the cell.
+        for (int k = 0; k < num_close; ++k) {
             const int i = close[k];
             const int forward_x = dx[i] >= 0.0f, forward_y = dy[i] >= 0.0f;
             const float x0 = (float)(ix[i] - near_x) - gx, y0 = (float)(iy[i] - near_y) - gy;
@@ -189,16 +218,16 @@ _WALK_BLOCK = """
                 }
             }
             if (over <= 0.0f && !seen[i]) {
-                face_row[i] = UNKNOWN;
+                face_row[i] = not_marched;
             } else if (over <= 0.0f || over_next <= 0.0f) {
                 const float rise_x = (triangle == 0 ? h10 - h00 : h11 - h01) * per_x;
                 const float rise_y = (triangle == 0 ? h11 - h10 : h01 - h00) * per_y;
                 const float into = dz[i] - (triangle == 0 ? h10 - h00 : h11 - h01) * dx[i]
                     - (triangle == 0 ? h11 - h10 : h01 - h00) * dy[i];
                 const float at = over > 0.0f ? from + (to - from) * over / (over - over_next) : from;
-                const float slope = fabsf(into) / sqrtf(unit * unit + rise_x * rise_x + rise_y * rise_y);
+                const float sine = fabsf(into) / sqrtf(unit * unit + rise_x * rise_x + rise_y * rise_y);
                 t_row[i] = at;
-                slope_row[i] = slope * (1.0f + at) * REFINE < at + height ? -1.0f : slope;
+                uncertain_row[i] = sine * (1.0f + at) * refine < at + height;
                 face_row[i] = 2 * (iy[i] * cols + ix[i]) + triangle;
             } else {
                 t[i] = next;
@@ -211,40 +240,9 @@ _WALK_BLOCK = """
                 if (next < end[i] && ix[i] >= 0 && iy[i] >= 0 && ix[i] <= last_x && iy[i] <= last_y)
                     ++kept;
                 else if (z_next <= 0.0f)
-                    face_row[i] = UNKNOWN;
+                    face_row[i] = not_marched;
             }
         }
         count = kept;
     }
-"""
-_SLACK = 0.05  # cells by which rounding may misplace a ray
-_WALK_BLOCK = "    const float reach[4] = {" + ", ".join(f"{r - _SLACK}f" for r in REACHES) + "};" + _WALK_BLOCK
-_WALK_BLOCK = _WALK_BLOCK.replace("BLOCK", str(BLOCK)).replace("UNKNOWN", str(int(UNKNOWN)))
-_WALK_BLOCK = _WALK_BLOCK.replace("REFINE", f"{float(REFINE)}f").replace("SHIFT", str(int(LEVEL_SHIFT)))
-
-
-@wp.func_native(_WALK_BLOCK)
-def walk_block(
-    field: FieldPart,
-    heights: wp.array(dtype=wp.float32),
-    windows: wp.array(dtype=wp.vec4),
-    directions: wp.array(dtype=wp.vec3),
-    start: int,
-    cycle: int,
-    steps: int,
-    first: int,
-    last: int,
-    o: wp.vec3d,
-    axes: wp.mat33,
-    limit: float,
-    env: int,
-    t_out: wp.array2d(dtype=wp.float32),
-    slope_out: wp.array2d(dtype=wp.float32),
-    face_out: wp.array2d(dtype=wp.int32),
-):
-    """What ``meet_heightfield`` finds for rays ``first`` to ``last`` of an environment, all from ``o``.
-
-    Their directions, turned by ``axes``, are rows ``start + (steps + ray) % cycle``. The slope is negative where the
-    distance is ``uncertain``; as ``o`` has float64, the field's centre may be far away without making it so.
-    """
-    ...
+}
