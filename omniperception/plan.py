@@ -22,7 +22,7 @@ from omniperception.learning import Runner
 from omniperception.learning.read_out import MotionReadOut
 
 if TYPE_CHECKING:
-    from omniperception.env.sensing import LidarSensing
+    pass
 
 PLAN_FILE = "plan.yaml"
 OPTIONAL_PACKAGES = {
@@ -223,7 +223,7 @@ def _kernels(run: RunConfig, runner: Runner, things: dict[str, object]) -> Secti
     section, env = Section("kernels"), runner.env
     sensing = env.sensing
     for name in dict.fromkeys(thing.name for thing in things.values() if is_launch(thing)):
-        section.add(name, _variant(sensing) if name == "cast_scan" else "")
+        section.add(name, " ".join(sorted(sensing.lidar.features)) if name == "cast_scan" else "")
     for name in _sensing(env, "sampler").kernels if _sensing(env, "frames") is not None else ():
         section.add(name, "", type(sensing.sampler).__name__)
     for name, why in dict((*_kernels_of_policy(runner), *_kernels_beside(run, env))).items():
@@ -257,21 +257,6 @@ def _kernels_of_policy(runner: Runner) -> Iterator[tuple[str, str]]:
         yield "write_rings", "perception.network.rings"
     if isinstance(getattr(actor, "read_out", None), MotionReadOut):
         yield "worst_sectors", "perception.motion_weight: risks follow from what is perceived"
-
-
-def _variant(sensing: LidarSensing) -> str:
-    """What the scan's kernel is compiled for."""
-    from omniperception.lidar import ShapeKind
-
-    variant = sensing.lidar.variant
-    options = [name for name in ("packed", "moving", "displaced", "selected", "shots") if getattr(variant, name)]
-    parts = {
-        "shapes": [ShapeKind(kind).name.lower() for kind in sorted(variant.kinds)],
-        "outputs": sorted(variant.outputs),
-        "noise": sorted(variant.noise),
-        "options": options,
-    }
-    return ", ".join(f"{name}: {' '.join(values) or 'none'}" for name, values in parts.items())
 
 
 def _rays(run: RunConfig, env: OmniEnv) -> Section:
@@ -395,17 +380,7 @@ def _packages() -> Section:
     for name, what in OPTIONAL_PACKAGES.items():
         section.either(name in sys.modules, name, what, "imported", f"{what}: not imported")
     section.either(torch.cuda.is_initialized(), "CUDA", "", "initialised", "the run is on the CPU")
-    if "warp" in sys.modules:
-        section.add("Warp's compiled variants", _variants_kept(), "warp.clear_kernel_cache() empties the disk")
     return section
-
-
-def _variants_kept() -> str:
-    from omniperception.lidar.kernels.variants import MAX_VARIANTS, kept_variants, num_built
-
-    folder = Path(sys.modules["warp"].config.kernel_cache_dir)
-    kept = f"{len(kept_variants())} of at most {MAX_VARIANTS} kept in this process, {num_built()} built"
-    return f"{kept}; compiled code of {sum(1 for _ in folder.glob('wp_*'))} modules in {folder}"
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------

@@ -20,7 +20,6 @@ from omniperception.build import build_runner
 from omniperception.env import sensing as sensing_module
 from omniperception.inventory import walk
 from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid, ray_bytes
-from omniperception.lidar.kernels import variants
 from omniperception.lidar.launch import SplitLaunch
 from omniperception.plan import PLAN_FILE, contact_pairs, describe
 from omniperception.scene import build_world, ray_shapes
@@ -312,7 +311,7 @@ def test_only_noise_that_is_configured_is_compiled(make_env):
     rays = ("perception=none", "lidar.num_rays=50")
     assert "rand" not in code_of_scan(make_env(*rays)).replace("operand", "")
     noisy = make_env(*rays, "randomization=lidar")
-    assert noisy.sensing.lidar.variant.noise == {"mask", "distance"} and "randf" in code_of_scan(noisy)
+    assert {"mask", "distance"} <= noisy.sensing.lidar.features and "randf" in code_of_scan(noisy)
 
 
 def test_a_group_without_history_keeps_none(make_env):
@@ -327,22 +326,6 @@ def test_frames_are_kept_as_far_back_as_the_network_looks(quick_run):
     assert runner.env.sensing.frames.shape[1] == run.perception.history
     windows = 1 + -(-(run.ppo.num_steps_per_env - 1) // runner.env.sensing.period_steps)
     assert runner.alg.storage.frames.shape[1] == run.perception.history - 1 + windows
-
-
-# --- kernels that are kept --------------------------------------------------------------------------------------------
-
-
-def test_the_cache_of_variants_is_bounded_and_a_forgotten_variant_still_casts(monkeypatch):
-    monkeypatch.setattr(variants, "MAX_VARIANTS", 3)
-    scene = RayScene([Shape(ShapeKind.SPHERE, (0.5,), pos=(2.0, 0.0, 0.0))], 1, 0, num_threads=1)
-    pattern = grid(4, 4, 10.0, 10.0)
-    lidars = [
-        Lidar(LidarConfig(num_rays=16), pattern, scene, -1, outputs=outputs)
-        for outputs in (("ranges",), ("ranges", "valid"), ("ranges", "shape_id"), ("ranges", "row"))
-    ]
-    assert len(variants.kept_variants()) == 3 and variants.num_built() > 3
-    for lidar in lidars:
-        assert lidar.cast(0.1).ranges.isfinite().any()
 
 
 # --- the plan ---------------------------------------------------------------------------------------------------------

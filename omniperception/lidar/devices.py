@@ -1,6 +1,6 @@
 """Figures of the devices that the patterns simulate, as their makers give them.
 
-``source`` names the document and what in it is a choice of ours. "Not re-checked" marks figures that were taken from
+``source`` names the document and what in it is a choice of ours. "Not re-checked" marks numbers that were taken from
 commonly quoted datasheet values without the document at hand.
 """
 
@@ -47,7 +47,7 @@ class DeviceSpec:
         max_range: Range at 10 % reflectivity, or the one range that the maker gives, metres.
         range_sigma: Standard deviation of a range, metres.
         angle_sigma_deg: Standard deviation of a direction, degrees; None where none is given.
-        source: Where the figures are from.
+        source: Where the numbers are from.
     """
 
     name: str
@@ -74,7 +74,7 @@ class DeviceSpec:
         return 1.0 / self.frame_hz
 
     def noise(self) -> tuple[Noise, ...]:
-        """The maker's figures as noise models: normal ranges, and normal directions where a figure is given."""
+        """The maker's errors as noise models: normal ranges, and normal directions where the maker gives them."""
         models: list[Noise] = [GaussianNoise(self.range_sigma)]
         if self.angle_sigma_deg is not None:
             models.append(AngularJitter(self.angle_sigma_deg))
@@ -109,8 +109,8 @@ def _ouster(model: str, channels: int) -> DeviceSpec:
     )
 
 
-def _livox(name: str, pattern: Callable, *figures, source: str) -> DeviceSpec:
-    width, elevation, lasers, rate, near, far, sigma, angle_sigma = figures
+def _livox(name: str, pattern: Callable, *specs, source: str) -> DeviceSpec:
+    width, elevation, lasers, rate, near, far, sigma, angle_sigma = specs
     return DeviceSpec(
         f"Livox {name}", pattern, width, elevation, lasers, rate, 10.0, near, far, sigma, angle_sigma, source
     )

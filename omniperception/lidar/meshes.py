@@ -32,9 +32,9 @@ class Tree:
 
 
 class TriangleMesh:
-    """A triangle mesh in a frame of its own. Rays meet both sides of a triangle.
+    """A triangle mesh in a frame of its own. Rays hit both sides of a triangle.
 
-    Coordinates are kept in float32. Triangles without area are left out (a ray cannot meet them), duplicates are kept
+    Coordinates are kept in float32. Triangles without area are left out (a ray cannot hit them), duplicates are kept
     (the nearer hit is reported, of equal ones either). The mesh may be open, and its triangles may turn either way; the
     normal is that about which the corners go counter-clockwise.
 

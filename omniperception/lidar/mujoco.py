@@ -40,7 +40,7 @@ def geom_shapes(
     class_of: Callable[[int], int] | None = None,
     geoms: Sequence[int] | None = None,
 ) -> GeomShapes:
-    """Every geom of a model as the exact shape that ``mj_ray`` meets.
+    """Every geom of a model as the exact shape that ``mj_ray`` intersects.
 
     A body moves if it has a joint above it or is a mocap body; geoms of the others are placed where the model's
     reference configuration has them.
@@ -48,7 +48,7 @@ def geom_shapes(
     Args:
         model: The compiled model.
         class_of: Class id (>= 0) of a geom by its id; 0 for all if None.
-        geoms: Ids of the geoms to take; all that ``mj_ray`` meets if None, which leaves out the fully transparent.
+        geoms: Ids of the geoms to take; all that ``mj_ray`` hits if None, which leaves out the fully transparent.
 
     Raises:
         ValueError: A geom is a signed distance field, which has no surface that rays could be cast at.
@@ -82,7 +82,7 @@ def geom_shapes(
 
 
 class MujocoScene(RayScene):
-    """A ray scene of a compiled model's geoms; rays meet what they meet in ``mj_ray``.
+    """A ray scene of a compiled model's geoms; rays hit what they hit in ``mj_ray``.
 
     Attributes:
         geom_ids: The geom of each shape.
@@ -93,7 +93,7 @@ class MujocoScene(RayScene):
         model: The compiled model.
         num_envs: Environments, each with poses of its own.
         class_of: Class id (>= 0) of a geom by its id; 0 for all if None.
-        geoms: Ids of the geoms to take; all that ``mj_ray`` meets if None.
+        geoms: Ids of the geoms to take; all that ``mj_ray`` hits if None.
         device, num_threads, pose_dtype: As for ``RayScene``; poses are MuJoCo's float64 unless told otherwise.
     """
 
@@ -144,7 +144,7 @@ def _kind(model: mujoco.MjModel, geom: int) -> ShapeKind:
     kind = "HEIGHTFIELD" if name == "HFIELD" else name
     if kind not in ShapeKind.__members__:
         raise ValueError(
-            f"geom {geom} ({model.geom(geom).name!r}) is of type {name.lower()}, which rays cannot meet: "
+            f"geom {geom} ({model.geom(geom).name!r}) is of type {name.lower()}, which rays cannot hit: "
             "make it a mesh, or leave it out with geoms=[...]"
         )
     return ShapeKind[kind]

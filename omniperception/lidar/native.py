@@ -1,5 +1,6 @@
 """C++ functions of kernels, each in a header file of its own that editors and formatters understand."""
 
+import re
 from pathlib import Path
 
 
@@ -14,3 +15,8 @@ def function_body(header: str | Path) -> str:
     if text.count("\n{\n") != 1 or text.count("\n}\n") != 1:
         raise ValueError(f"{header}: one function was expected, its braces on lines of their own")
     return text.partition("\n{\n")[2].rpartition("}\n")[0]
+
+
+def constant(header: str | Path, name: str) -> int:
+    """The value of ``constexpr int name`` in a header, for Python code that needs it as well."""
+    return int(re.search(rf"constexpr int {name} = (-?\d+);", Path(header).read_text(encoding="utf-8"))[1])

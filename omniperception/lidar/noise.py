@@ -3,7 +3,7 @@
 They act in this order, whatever the order in which they are given: angular jitter turns the ray before it is cast;
 mixed pixels, Gaussian and distance noise change the distance of a hit, which then ends at the maximum range and is no
 point below the minimum range; the mask replaces it; dropout loses it. No model turns a miss into a hit; a ray that
-jitter turns may meet what the nominal one would have missed.
+jitter turns may hit what the nominal one would have missed.
 """
 
 from __future__ import annotations
@@ -109,12 +109,12 @@ class Dropout:
 
 @dataclass(frozen=True)
 class MixedPixels:
-    """A beam that meets two surfaces at a depth edge measures a distance between them.
+    """A beam that hits two surfaces at a depth edge measures a distance between them.
 
     A second ray is cast on the beam's rim, on a side that turns by the golden angle from row to row of the scan table:
     which rays are mixed is a function of the scene alone. Where both rays hit and their distances differ by more than
     ``min_gap`` and at most ``max_gap``, the distance is foreground * near + (1 - foreground) * far. Where the second
-    ray meets nothing, so does that part of the beam, and the first ray's distance stands.
+    ray hits nothing, so does that part of the beam, and the first ray's distance stands.
 
     Attributes:
         divergence_deg: Full opening angle of the beam, degrees.

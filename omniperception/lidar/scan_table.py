@@ -1,4 +1,4 @@
-"""A scan pattern's rows on the device, in the order in which one sensor reads them."""
+"""A scan pattern's table on the device, its rows in the order in which one sensor reads them."""
 
 import math
 
@@ -10,8 +10,8 @@ from .patterns import ScanPattern
 class ScanTable:
     """A repeating table laid out so that a frame of every ``stride``-th row reads neighbours in memory.
 
-    Steps of ``stride`` through a table of M rows walk along gcd(stride, M) cycles of equal length. The cycles are
-    stored one after the other, each in the order of the walk: a frame is a run within one cycle, and a ray fetches
+    Steps of ``stride`` through a table of M rows run along gcd(stride, M) cycles of equal length. The cycles are
+    stored one after the other, each in the order of the steps: a frame is a run within one cycle, and a ray fetches
     its direction from the cache line of the ray before it.
 
     Attributes:

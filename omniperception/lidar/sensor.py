@@ -113,7 +113,7 @@ class LidarFrame:
     """One scan of every environment. The tensors are the sensor's own and are overwritten by the next cast.
 
     A field that was not asked for is None: it is neither computed nor stored. Noise disturbs ``ranges``, and with it
-    ``valid`` and the points; everything else describes the surface that the ray really met.
+    ``valid`` and the points; everything else describes the surface that the ray really hit.
 
     Attributes:
         ranges: Measured distance along each ray with noise, metres, ``inf`` for a miss, (num_envs, N).
@@ -288,7 +288,7 @@ class Lidar:
         self.frame_count.add_(1)
 
     def reset(self, env_ids: torch.Tensor | None = None) -> None:
-        """Starts the random numbers of some environments, or of all, anew: they repeat from the first frame's."""
+        """Starts the random numbers of some environments, or of all, again from the first frame's."""
         if env_ids is None:
             self.frame_count.zero_()
         else:

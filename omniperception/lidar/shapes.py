@@ -1,4 +1,4 @@
-"""Shapes that rays can meet, described with MuJoCo's size conventions."""
+"""Shapes that rays can hit, described with MuJoCo's size conventions."""
 
 import math
 from collections.abc import Sequence

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from lidar_helpers import CUBE, CUBE_FACES
 
 from omniperception.lidar import (
     DEVICES,
@@ -20,9 +21,6 @@ from omniperception.lidar import (
 )
 from omniperception.lidar import ShapeKind as K
 
-CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-CORNERS_OF_FACES = ("013", "032", "467", "475", "045", "051", "237", "276", "026", "064", "157", "173")
-FACES = np.array([[*map(int, corners)] for corners in CORNERS_OF_FACES])
 AXES = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 LOWER, UPPER, CARRIED = range(3)
 """Bodies: one with a sensor at the origin, one with a sensor 3 m above it, one that carries a mesh."""
@@ -30,7 +28,7 @@ LOWER, UPPER, CARRIED = range(3)
 
 def everything():
     """Two environments: a deformable twice as wide in the second, where a ball is missing; metres."""
-    cube = TriangleMesh(CUBE, FACES)
+    cube = TriangleMesh(CUBE, CUBE_FACES)
     shapes = [
         Shape(K.SPHERE, (0.2,), body=LOWER),
         Shape(K.SPHERE, (0.2,), body=UPPER),
@@ -43,7 +41,7 @@ def everything():
     ]
     scene = RayScene(shapes, num_envs=2, num_bodies=3)
     scene.set_poses(np.array([[0, 0, 0], [0, 0, 3.0], [4.0, 0, 0]]), np.tile([1.0, 0, 0, 0], (3, 1)))
-    scene.update_vertices(3, torch.from_numpy(CUBE) * torch.tensor([1.0, 2.0]).reshape(2, 1, 1))
+    scene.update_vertices(3, torch.from_numpy(CUBE.astype(np.float32)) * torch.tensor([1.0, 2.0]).reshape(2, 1, 1))
     scene.visible[1, 4] = False
     return scene
 

@@ -5,15 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from lidar_helpers import CUBE, CUBE_FACES, cast, one
 
 from omniperception.lidar import HeightField, Lidar, LidarConfig, RayScene, Shape, ShapeKind, TriangleMesh, grid
 
 K = ShapeKind
-CUBE = TriangleMesh(
-    [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)],
-    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)],
-)  # fmt: skip
+CUBE_MESH = TriangleMesh(CUBE, CUBE_FACES)
 BLOCK = HeightField(2.0 * np.ones((4, 4)), 1.0, 1.0, base=0.5)
 BODIES = [
     Shape(K.BOX, (1, 1, 1)),
@@ -21,8 +18,8 @@ BODIES = [
     Shape(K.CYLINDER, (1, 1)),
     Shape(K.CAPSULE, (1, 0.5)),
     Shape(K.ELLIPSOID, (1, 1, 1)),
-    Shape(K.MESH, asset=CUBE),
-    Shape(K.DEFORMABLE, asset=CUBE),
+    Shape(K.MESH, asset=CUBE_MESH),
+    Shape(K.DEFORMABLE, asset=CUBE_MESH),
     Shape(K.HEIGHTFIELD, asset=BLOCK, pos=(0, 0, -1)),
 ]
 EVERYTHING = [Shape(K.PLANE, pos=(0, 0, -4)), *BODIES]
@@ -30,15 +27,6 @@ EVERYTHING = [Shape(K.PLANE, pos=(0, 0, -4)), *BODIES]
 
 def carried(shape, body=0):
     return Shape(shape.kind, shape.size, body, shape.pos, shape.quat, shape.class_id, shape.asset)
-
-
-def cast(scene, origins, directions, **options):
-    rays = [torch.from_numpy(np.array(v, np.float64)).reshape(scene.num_envs, -1, 3) for v in (origins, directions)]
-    return scene.cast(*rays, **options)
-
-
-def one(shapes, origin, direction, **options):
-    return float(cast(RayScene(shapes, 1, 0), origin, direction, **options).ranges)
 
 
 each_body = pytest.mark.parametrize("shape", BODIES, ids=lambda shape: shape.kind.name.lower())
@@ -70,10 +58,10 @@ def test_far_from_the_origin_float32_costs_its_own_rounding():
 @pytest.mark.parametrize("size", [1e-4, 1e4])
 @pytest.mark.parametrize("kind", [K.BOX, K.SPHERE, K.CYLINDER, K.CAPSULE, K.ELLIPSOID, K.MESH, K.HEIGHTFIELD])
 def test_tiny_and_huge_bodies(kind, size):
-    """Met from outside, from 2 sizes away and from 1 m, and from inside."""
+    """Hit from outside, from 2 sizes away and from 1 m, and from inside."""
     sizes = {K.BOX: (size,) * 3, K.SPHERE: (size,), K.CYLINDER: (size,) * 2, K.CAPSULE: (size,) * 2}
     if kind == K.MESH:
-        shape = Shape(kind, asset=TriangleMesh(CUBE.vertices * size, CUBE.triangles))
+        shape = Shape(kind, asset=TriangleMesh(CUBE_MESH.vertices * size, CUBE_MESH.triangles))
     elif kind == K.HEIGHTFIELD:
         shape = Shape(kind, asset=HeightField(np.ones((3, 3)), size, size, scale=2 * size), pos=(0, 0, -size))
     else:
@@ -94,7 +82,7 @@ def test_a_sensor_inside_a_body_sees_its_far_side(shape):
 
 
 @each_body
-def test_a_ray_that_starts_on_a_surface_meets_it_or_the_next_one(shape):
+def test_a_ray_that_starts_on_a_surface_hits_it_or_the_next_one(shape):
     scene = RayScene([shape], 1, 0)
     rng = np.random.default_rng(2)
     outward = rng.normal(size=(500, 3))
@@ -170,7 +158,7 @@ def test_grazing_rays():
     assert one(ground, (0, 0, 1), away) == math.inf
     slab = [Shape(K.BOX, (50, 50, 1), pos=(0, 0, -1)), Shape(K.CYLINDER, (50, 1), pos=(0, 0, -1))]
     slab += [Shape(K.HEIGHTFIELD, asset=HeightField(np.ones((6, 6)), 50, 50), pos=(0, 0, -1))]
-    slab += [Shape(K.MESH, asset=TriangleMesh(CUBE.vertices * (50, 50, 1), CUBE.triangles), pos=(0, 0, -1))]
+    slab += [Shape(K.MESH, asset=TriangleMesh(CUBE_MESH.vertices * (50, 50, 1), CUBE_MESH.triangles), pos=(0, 0, -1))]
     for shape in slab:
         assert one([shape], (-10, 0, 1e-5), towards) == pytest.approx(10, abs=0.1)
         assert one([shape], (-10, 0, 1e-4), towards) == math.inf  # past the far end

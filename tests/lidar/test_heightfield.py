@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from lidar_helpers import cast
 
 from omniperception.lidar import (
     HeightField,
@@ -32,11 +33,6 @@ def surface_mesh(field):
     a = (np.arange(rows - 1)[:, None] * cols + np.arange(cols - 1)).ravel()
     lower, upper = np.stack([a, a + 1, a + cols + 1], 1), np.stack([a, a + cols + 1, a + cols], 1)
     return TriangleMesh(vertices, np.concatenate([lower, upper]))
-
-
-def cast(scene, origins, directions, **options):
-    rays = [torch.from_numpy(np.array(v, np.float64)).reshape(scene.num_envs, -1, 3) for v in (origins, directions)]
-    return scene.cast(*rays, **options)
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(2, 2), (2, 9), (33, 7), (66, 130)])
@@ -125,7 +121,7 @@ def test_walls_and_base(origin, direction, base, expected):
     scene = RayScene([field_shape(np.ones((4, 6)), 2.0, 1.0, base)], 1, 0)
     hits = cast(scene, origin, direction, normals=True)
     assert float(hits.ranges) == pytest.approx(expected)
-    if math.isfinite(expected) and min(abs(origin[2] - 0.25), 1) > 0:  # met from outside, or from inside at a wall
+    if math.isfinite(expected) and min(abs(origin[2] - 0.25), 1) > 0:  # hit from outside, or from inside at a wall
         facing = np.dot(hits.normals_w[0, 0].numpy(), direction)
         assert abs(facing) == pytest.approx(1.0)
 
@@ -168,7 +164,7 @@ def test_windows_hold_the_highest_points_around_each_block(rows, cols):
 
 
 @pytest.mark.parametrize(("base", "scale"), [(0.0, 1.0), (0.5, 1.0), (0.5, 1e-3), (0.0, 100.0)])
-def test_a_scan_meets_what_single_rays_meet(base, scale):
+def test_a_scan_hits_what_single_rays_hit(base, scale):
     """From above, near the rim, in the ground, below it, far over it and beside it, upright and tilted."""
     rng = np.random.default_rng(3)
     steps = 0.15 * np.floor(np.arange(240) / 3 % 20)

@@ -6,30 +6,16 @@ import sys
 import numpy as np
 import pytest
 import torch
+from lidar_helpers import CUBE, CUBE_FACES, cast, one
 
 from benchmarks.lidar_accuracy import random_mesh
 from omniperception.lidar import RayScene, Shape, ShapeKind, TriangleMesh
 from omniperception.lidar.kernels.mesh import STACK_SIZE
 from omniperception.lidar.meshes import _build_tree
 
-CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-CUBE_FACES = np.array(
-    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-)  # fmt: skip
-
 
 def mesh_shape(vertices, triangles, **options):
     return Shape(ShapeKind.MESH, asset=TriangleMesh(vertices, triangles), **options)
-
-
-def cast(scene, origins, directions, **options):
-    rays = [torch.from_numpy(np.array(v, np.float64)).reshape(scene.num_envs, -1, 3) for v in (origins, directions)]
-    return scene.cast(*rays, **options)
-
-
-def one(shapes, origin, direction, **options):
-    return float(cast(RayScene(shapes, 1, 0), origin, direction, **options).ranges)
 
 
 def brute_force(corners, origins, directions):
@@ -157,7 +143,7 @@ def test_triangles_without_area_and_duplicates():
     assert one([Shape(ShapeKind.MESH, asset=mesh)], (-3, 0.2, 0.1), (1, 0, 0)) == 2.0
 
 
-def test_a_mesh_without_triangles_is_not_met():
+def test_a_mesh_without_triangles_is_not_hit():
     empty = TriangleMesh(CUBE, np.zeros((0, 3), int))
     line = TriangleMesh(CUBE, [(0, 0, 1)])
     for asset in (empty, line):
@@ -175,7 +161,7 @@ def test_slivers_and_coplanar_faces():
     assert one([in_plane], (-1, -0.5, 0), (1, 0, 0)) in (1.0, math.inf)  # along the face: a point on it, or none
 
 
-def test_both_sides_are_met_and_the_normal_follows_the_corners():
+def test_both_sides_are_hit_and_the_normal_follows_the_corners():
     shape = mesh_shape([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     scene = RayScene([shape], 1, 0)
     hits = cast(scene, [[(0.2, 0.2, 1), (0.2, 0.2, -1)]], [[(0, 0, -1), (0, 0, 1)]], normals=True)

@@ -1,10 +1,12 @@
 """Motion within a frame: closed forms in float64, and each ray against a scene that stands still at its time."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from lidar_helpers import closed_shapes, multiply, random_quats, rotate
 
 from omniperception.lidar import GaussianNoise, Lidar, LidarConfig, RayScene, ScanPattern, Shape, ShapeKind, mid360
 
@@ -107,19 +109,14 @@ def test_a_sphere_on_a_turning_arm_moves_on_a_circle():
 
 
 def crowd(num_envs, num_bodies, seed=0):
-    closed = [K.BOX, K.SPHERE, K.CYLINDER, K.CAPSULE, K.ELLIPSOID]
-    sizes = {K.BOX: (0.3, 0.2, 0.5), K.SPHERE: (0.4,), K.CYLINDER: (0.2, 0.6), K.CAPSULE: (0.1, 0.5)}
-    shapes = [
-        Shape(closed[i % 5], sizes.get(closed[i % 5], (0.2, 0.4, 0.6)), body=1 + i, pos=(0.3 * (i % 3), 0.0, 0.2))
-        for i in range(num_bodies)
-    ]
+    shapes = [replace(shape, pos=(0.3 * (i % 3), 0.0, 0.2)) for i, shape in enumerate(closed_shapes(num_bodies, 1))]
     shapes += [Shape(K.PLANE, pos=(0.0, 0.0, -1.0)), Shape(K.BOX, (1.0, 1.0, 1.0), pos=(4.0, 1.0, 0.0))]
     return RayScene(shapes, num_envs, num_bodies + 1, num_threads=2)
 
 
 def random_poses(scene, generator, spread=3.0):
     pos = spread * torch.randn(scene.body_pos.shape, generator=generator)
-    return pos, torch.nn.functional.normalize(torch.randn(scene.body_quat.shape, generator=generator), dim=-1)
+    return pos, random_quats(generator, *scene.body_quat.shape[:2])
 
 
 @pytest.mark.parametrize("num_bodies", [5, 40])
@@ -160,12 +157,7 @@ def test_each_ray_sees_the_scene_of_its_own_time(segments, turn, num_bodies):
     """Poses at every ray's time by textbook formulas; each ray alone in a scene that stands still there."""
     generator = torch.Generator().manual_seed(segments)
     scene = crowd(1, num_bodies)
-    keys = [random_poses(scene, generator, 2.0)]
-    keys[0][0][:, 0] = 0.0
-    for _ in range(segments):
-        pos, quat = random_poses(scene, generator, 0.3)
-        nudge = torch.nn.functional.normalize(torch.cat([torch.ones(1, num_bodies + 1, 1), turn * quat[..., 1:]], -1))
-        keys.append((keys[-1][0] + pos, torch.nn.functional.normalize(multiply(keys[-1][1], nudge), dim=-1)))
+    keys = moves(scene, generator, segments + 1, turn)
     end = keys[1] if segments == 1 else keys[1:]
     frame = sweep(scene, keys[0], end, segments, fan(175.0, 80.0), mount_pos=(0.3, 0.0, 0.1))
     at = (frame.time_s[0].double() / PERIOD * segments).clamp(max=segments)
@@ -221,12 +213,13 @@ def test_a_reset_forgets_the_motion_of_its_environment_only():
         assert bent == [True, which is None]
 
 
-def moves(scene, generator, count):
+def moves(scene, generator, count, turn=0.3):
     """Poses at ``count`` moments, each a little farther than the last one."""
     keys = [random_poses(scene, generator, 2.0)]
+    keys[0][0][:, 0] = 0.0
     for _ in range(count - 1):
         pos, quat = random_poses(scene, generator, 0.3)
-        nudge = torch.nn.functional.normalize(torch.cat([torch.ones_like(quat[..., :1]), 0.3 * quat[..., 1:]], -1))
+        nudge = torch.nn.functional.normalize(torch.cat([torch.ones_like(quat[..., :1]), turn * quat[..., 1:]], -1))
         keys.append((keys[-1][0] + pos, torch.nn.functional.normalize(multiply(keys[-1][1], nudge), dim=-1)))
     return keys
 
@@ -309,15 +302,3 @@ def test_wrong_settings_are_refused(options, message):
 def angles(frame):
     d = frame.directions_s.double()
     return torch.asin(d[..., 2]), torch.atan2(d[..., 1], d[..., 0])
-
-
-def multiply(a, b):
-    w, v = a[..., :1], a[..., 1:]
-    s, u = b[..., :1], b[..., 1:]
-    return torch.cat([w * s - (v * u).sum(-1, keepdim=True), w * u + s * v + torch.linalg.cross(v, u)], -1)
-
-
-def rotate(quat, vectors):
-    w, xyz = quat[..., :1], quat[..., 1:].expand(vectors.shape)
-    across = 2.0 * torch.linalg.cross(xyz, vectors)
-    return vectors + w * across + torch.linalg.cross(xyz, across)

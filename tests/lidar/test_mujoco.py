@@ -109,5 +109,5 @@ def test_poses_of_environments_come_from_arrays(model):
 def test_a_signed_distance_field_is_refused(model):
     copy = mujoco.MjModel.from_xml_string(XML)
     copy.geom_type[copy.geom("ball").id] = mujoco.mjtGeom.mjGEOM_SDF
-    with pytest.raises(ValueError, match=r"\('ball'\) is of type sdf, which rays cannot meet: make it a mesh"):
+    with pytest.raises(ValueError, match=r"\('ball'\) is of type sdf, which rays cannot hit: make it a mesh"):
         MujocoScene(copy)

@@ -18,17 +18,11 @@ from omniperception.lidar import (
     Shape,
     ShapeKind,
     grid,
-    mid360,
     sensor,
 )
 
 SPHERE = Shape(ShapeKind.SPHERE, (2.0,), body=0)
 NOW = torch.full((4,), 0.1, dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
-def pattern():
-    return mid360()
 
 
 def make(pattern, *noise, seed=1, radius=2.0, threads=2, **options):
@@ -62,7 +56,7 @@ def test_same_seed_same_noise_whatever_the_threads(pattern):
     frames = [lidar.cast(NOW).ranges.clone() for lidar in (first, same, other)]
     assert torch.equal(frames[0], frames[1])
     assert not torch.equal(frames[0], frames[2])
-    assert not torch.equal(frames[0], first.cast(NOW).ranges)  # the next frame draws anew
+    assert not torch.equal(frames[0], first.cast(NOW).ranges)  # the next frame draws again
     assert torch.equal(first.frame.ranges, same.cast(NOW).ranges)
 
 
@@ -223,18 +217,18 @@ def test_a_reset_repeats_an_environments_noise_and_no_others(pattern):
 
 @pytest.mark.parametrize("model", ALL, ids=lambda model: type(model).__name__)
 def test_a_kernel_holds_only_the_models_that_are_configured(pattern, model, monkeypatch):
-    """Figures of models that are not configured may be anything: they are not read."""
+    """Parameters of models that are not configured may be anything: they are not read."""
     expected = make(pattern, model).cast(NOW).ranges
-    plain = sensor.noise_figures
+    plain = sensor.noise_parameters
 
     def poisoned(named, *args):
-        figures, used = plain(named, *args), f"{next(iter(named))}_"
+        parameters, used = plain(named, *args), f"{next(iter(named))}_"
         for name in ("jitter_sigma", "mixed_radius", "gaussian_sigma", "distance_ratio", "dropout_ratio", "mask_ratio"):
             if not name.startswith(used):
-                setattr(figures, name, math.nan)
-        return figures
+                setattr(parameters, name, math.nan)
+        return parameters
 
-    monkeypatch.setattr(sensor, "noise_figures", poisoned)
+    monkeypatch.setattr(sensor, "noise_parameters", poisoned)
     assert torch.equal(make(pattern, model).cast(NOW).ranges, expected)
 
 

@@ -8,14 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.lidar import ScanPattern, grid, mid360, select_rows, vlp16, xt32
+from omniperception.lidar import ScanPattern, grid, select_rows, vlp16, xt32
 
 RATE = 200_000
-
-
-@pytest.fixture(scope="module")
-def model():
-    return mid360()
 
 
 def seconds(*values):
@@ -31,11 +26,11 @@ def tiny(points_per_second=10.0, **fields):
     return ScanPattern.from_angles(np.zeros(6), np.arange(6.0), points_per_second, **fields)
 
 
-def test_directions_agree_with_the_angles(model):
-    for pattern in (model, grid(7, 5, 90.0), xt32()):
-        x, y, z = pattern.directions_s.double().T
-        assert torch.allclose(torch.asin(z), pattern.elevation.double(), atol=1e-6)
-        turn = torch.atan2(y, x) - pattern.azimuth.double()
+def test_directions_agree_with_the_angles(pattern):
+    for each in (pattern, grid(7, 5, 90.0), xt32()):
+        x, y, z = each.directions_s.double().T
+        assert torch.allclose(torch.asin(z), each.elevation.double(), atol=1e-6)
+        turn = torch.atan2(y, x) - each.azimuth.double()
         assert torch.allclose(torch.cos(turn), torch.ones(len(turn), dtype=torch.float64), atol=1e-6)
 
 
@@ -53,34 +48,34 @@ def test_azimuths_stay_below_a_turn_also_after_rounding():
     assert azimuth.tolist() == pytest.approx([0.0, 0.0, 7.0 - 2.0 * math.pi], abs=1e-6)
 
 
-def test_a_frame_holds_every_kth_point_of_its_period_of_all_lasers(model):
-    rows = select_rows(model, seconds(0.1, 0.2), 0.1, 1000)
+def test_a_frame_holds_every_kth_point_of_its_period_of_all_lasers(pattern):
+    rows = select_rows(pattern, seconds(0.1, 0.2), 0.1, 1000)
     assert rows.shape == (2, 1000) and rows.dtype == torch.int64
     assert rows[0].tolist() == list(range(0, 19_000, 19))  # 20 would keep one laser of the four
     assert rows[1].tolist() == list(range(20_000, 39_000, 19))
-    assert select_rows(model, seconds(0.1), 0.1, 3000)[0].tolist() == list(range(0, 15_000, 5))
+    assert select_rows(pattern, seconds(0.1), 0.1, 3000)[0].tolist() == list(range(0, 15_000, 5))
     assert torch.bincount(rows[0] % 4).tolist() == [250, 250, 250, 250]
 
 
-def test_the_scan_repeats_after_four_seconds_and_not_before(model):
-    rows = select_rows(model, seconds(1.0, 1.1, 5.0, 4.0, 0.0), 0.1, 500)
+def test_the_scan_repeats_after_four_seconds_and_not_before(pattern):
+    rows = select_rows(pattern, seconds(1.0, 1.1, 5.0, 4.0, 0.0), 0.1, 500)
     assert not torch.equal(rows[0], rows[1])
     assert torch.equal(rows[0], rows[2])
     assert torch.equal(rows[3], rows[4]) and rows[4][0] == 780_000  # a frame at time 0 began before it
 
 
 @pytest.mark.parametrize("late", [0, 1_000, 1_000_000])
-def test_rows_are_exact_also_late(model, late):
+def test_rows_are_exact_also_late(pattern, late):
     frames = range(1, 200)
     times = seconds(*(late + frame * 0.1 for frame in frames))
     expected = [(late * RATE + (frame - 1) * RATE // 10) % 800_000 for frame in frames]
-    assert select_rows(model, times, 0.1, 100)[:, 0].tolist() == expected
+    assert select_rows(pattern, times, 0.1, 100)[:, 0].tolist() == expected
 
 
-def test_rows_between_ticks_are_those_of_exact_arithmetic(model):
+def test_rows_between_ticks_are_those_of_exact_arithmetic(pattern):
     times = [0.123456, 17.00000251, 3.14159265]
     expected = [expected_first(t, Fraction(1, 10), Fraction(RATE), 800_000) for t in times]
-    assert model.first_rows(seconds(*times), 0.1).tolist() == expected
+    assert pattern.first_rows(seconds(*times), 0.1).tolist() == expected
 
 
 @pytest.mark.parametrize("make", [vlp16, xt32], ids=["vlp16", "xt32"])
@@ -97,30 +92,30 @@ def test_a_rate_that_is_no_multiple_of_the_step_loses_and_repeats_no_point(make,
     assert {b - a for a, b in itertools.pairwise(exact)} <= {points, points + 1}
 
 
-def test_a_pause_a_reset_and_a_replay_see_what_belongs_to_their_time(model):
+def test_a_pause_a_reset_and_a_replay_see_what_belongs_to_their_time(pattern):
     phase = torch.tensor([0, 123_457])
-    straight = {t: select_rows(model, seconds(t, t), 0.1, 50, phase) for t in (0.1, 0.2, 0.3, 0.4)}
+    straight = {t: select_rows(pattern, seconds(t, t), 0.1, 50, phase) for t in (0.1, 0.2, 0.3, 0.4)}
     for t in (0.4, 0.1, 0.1, 0.3):  # backwards, twice, after a gap: nothing is remembered
-        assert torch.equal(select_rows(model, seconds(t, t), 0.1, 50, phase), straight[t])
-    mixed = select_rows(model, seconds(0.1, 0.3), 0.1, 50, phase)  # environment 0 was reset
+        assert torch.equal(select_rows(pattern, seconds(t, t), 0.1, 50, phase), straight[t])
+    mixed = select_rows(pattern, seconds(0.1, 0.3), 0.1, 50, phase)  # environment 0 was reset
     assert torch.equal(mixed[0], straight[0.1][0]) and torch.equal(mixed[1], straight[0.3][1])
 
 
-def test_phase_shifts_each_environment(model):
-    rows = select_rows(model, seconds(0.1, 0.1), 0.1, 10, phase_rows=torch.tensor([0, 799_999]))
+def test_phase_shifts_each_environment(pattern):
+    rows = select_rows(pattern, seconds(0.1, 0.1), 0.1, 10, phase_rows=torch.tensor([0, 799_999]))
     assert rows[:, 0].tolist() == [0, 799_999] and rows[1, 1] == 1998
 
 
-def test_first_rows_write_where_they_are_told(model):
+def test_first_rows_write_where_they_are_told(pattern):
     out, scratch = torch.zeros(3, dtype=torch.int64), torch.zeros(3, dtype=torch.float64)
     times = seconds(0.1, 0.7, 9.3)
-    assert model.first_rows(times, 0.1, 5, out, scratch) is out
-    assert torch.equal(out, model.first_rows(times, 0.1, 5)) and times.tolist() == [0.1, 0.7, 9.3]
+    assert pattern.first_rows(times, 0.1, 5, out, scratch) is out
+    assert torch.equal(out, pattern.first_rows(times, 0.1, 5)) and times.tolist() == [0.1, 0.7, 9.3]
 
 
-def test_more_rays_than_points_are_refused(model):
+def test_more_rays_than_points_are_refused(pattern):
     with pytest.raises(ValueError, match=r"lidar.num_rays=20001 must be in 1..20000"):
-        select_rows(model, seconds(0.1), 0.1, 20_001)
+        select_rows(pattern, seconds(0.1), 0.1, 20_001)
 
 
 @pytest.mark.parametrize(

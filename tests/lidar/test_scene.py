@@ -159,15 +159,15 @@ def test_a_view_has_everything_in_reach_nearest_first(num_shapes):
     placed.refresh()
     origin = torch.tensor([0.3, 0.2, 0.1])
     for env in range(scene.num_envs):
-        count = int(placed.count.numpy()[env])
-        near, shape = placed.near.numpy()[env, :count], placed.shape.numpy()[env, :count]
+        count = int(placed.slots.count.numpy()[env])
+        near, shape = placed.slots.near.numpy()[env, :count], placed.slots.shape.numpy()[env, :count]
         assert (near[1:] >= near[:-1]).all() and len(set(shape)) == count
         away = (scene.body_pos[env] - origin).norm(dim=-1)
         radius = torch.tensor([s.bounding_radius for s in scene.shapes])
         assert set((away < 4.0).nonzero().flatten().tolist()) <= set(shape.tolist())
         assert (torch.from_numpy(near) <= away[shape] + 1e-6).all()
         assert (torch.from_numpy(near) >= (away - radius)[shape] - 1e-4).all()
-        centre = torch.from_numpy(placed.bound.numpy()[env, :count, :3])
+        centre = torch.from_numpy(placed.slots.bound.numpy()[env, :count, :3])
         torch.testing.assert_close(centre.norm(dim=-1), away[shape], rtol=1e-5, atol=1e-5)
 
 
@@ -177,7 +177,7 @@ def test_what_is_left_out_is_outside_the_elevations(window):
     scene = random_crowd(200, seed=7, num_envs=1)
     placed = PlacedShapes(scene, (), View(elevation=window))
     placed.refresh()
-    viewed = set(placed.shape.numpy()[0, : int(placed.count.numpy()[0])].tolist())
+    viewed = set(placed.slots.shape.numpy()[0, : int(placed.slots.count.numpy()[0])].tolist())
     generator = torch.Generator().manual_seed(1)
     low, high = (math.sin(angle) for angle in window)
     z = low + (high - low) * torch.rand(50000, generator=generator)

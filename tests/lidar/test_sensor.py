@@ -6,6 +6,7 @@ import warnings
 
 import pytest
 import torch
+from lidar_helpers import clock, closed_shapes, random_quats, rotate
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -19,7 +20,6 @@ from omniperception.lidar import (
     Shape,
     ShapeKind,
     grid,
-    mid360,
     quat_from_rpy,
 )
 from omniperception.lidar.patterns import make_selection, select_rows
@@ -27,42 +27,18 @@ from omniperception.lidar.patterns import make_selection, select_rows
 K = ShapeKind
 
 
-@pytest.fixture(scope="module")
-def pattern():
-    return mid360()
-
-
-def clock(num_envs, time):
-    return torch.full((num_envs,), time, dtype=torch.float64)
-
-
-def rotate(quat, vectors):
-    w, xyz = quat[..., :1], quat[..., 1:].expand(vectors.shape)
-    across = 2.0 * torch.linalg.cross(xyz, vectors)
-    return vectors + w * across + torch.linalg.cross(xyz, across)
-
-
 def crowd(num_envs, seed=0, num_threads=2):
     """A plane, a carrier and one body of each closed kind per environment, in random poses."""
-    closed = [K.BOX, K.SPHERE, K.CYLINDER, K.CAPSULE, K.ELLIPSOID] * 3
-    sizes = {
-        K.BOX: (0.3, 0.2, 0.5),
-        K.SPHERE: (0.4,),
-        K.CYLINDER: (0.2, 0.6),
-        K.CAPSULE: (0.1, 0.5),
-        K.ELLIPSOID: (0.2, 0.4, 0.6),
-    }
-    shapes = [Shape(K.PLANE)] + [Shape(k, sizes[k], body=1 + i, class_id=1 + i % 3) for i, k in enumerate(closed)]
-    scene = RayScene(shapes, num_envs, 1 + len(closed), num_threads=num_threads)
+    closed = [dataclasses.replace(shape, class_id=1 + i % 3) for i, shape in enumerate(closed_shapes(15, 1))]
+    scene = RayScene([Shape(K.PLANE), *closed], num_envs, 16, num_threads=num_threads)
     generator = torch.Generator().manual_seed(seed)
     scene.body_pos[:] = 6.0 * torch.rand(scene.body_pos.shape, generator=generator) - 3.0
     scene.body_pos[..., 2].abs_()
-    quat = torch.randn(scene.body_quat.shape, generator=generator)
-    scene.body_quat[:] = quat / quat.norm(dim=-1, keepdim=True)
+    scene.body_quat[:] = random_quats(generator, num_envs, 16)
     return scene
 
 
-def test_scan_meets_what_general_rays_meet(pattern):
+def test_scan_hits_what_general_rays_hit(pattern):
     config = LidarConfig(2000, 0.1, 0.05, 5.0, mount_pos=(0.3, 0.0, -0.05), mount_rpy=(0.0, -2.8782, 3.14))
     scene = crowd(6)
     lidar = Lidar(config, pattern, scene, 0, (2,), outputs=("ranges", "shape_id", "class_id", "directions_s"))
@@ -286,14 +262,15 @@ def sphere_grid():
 def test_searching_many_shapes_at_once_finds_what_one_by_one_finds(num_bodies):
     """Shapes of all kinds: around the sensor, beside it, above and below it, behind one another."""
     generator = torch.Generator().manual_seed(num_bodies)
-    closed = [K.BOX, K.SPHERE, K.CYLINDER, K.CAPSULE, K.ELLIPSOID]
-    sizes = {K.BOX: (0.3, 0.2, 0.5), K.SPHERE: (0.4,), K.CYLINDER: (0.2, 0.6), K.CAPSULE: (0.1, 0.5)}
-    shapes = [Shape(closed[i % 5], sizes.get(closed[i % 5], (0.2, 0.4, 0.6)), body=i) for i in range(num_bodies)]
-    shapes += [Shape(K.PLANE, pos=(0.0, 0.0, -2.0)), Shape(K.BOX, (5.0, 6.0, 7.0), quat=quat_from_rpy(0.1, 0.2, 0.3))]
+    shapes = [
+        *closed_shapes(num_bodies),
+        Shape(K.PLANE, pos=(0.0, 0.0, -2.0)),
+        Shape(K.BOX, (5.0, 6.0, 7.0), quat=quat_from_rpy(0.1, 0.2, 0.3)),
+    ]
     scene = RayScene(shapes, 8, num_bodies, num_threads=2)
     scene.body_pos[:] = 2.5 * torch.randn(scene.body_pos.shape, generator=generator)
     scene.body_pos[:, :3] = torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, -1.5], [1.5, 0.0, 0.0]])
-    scene.body_quat[:] = torch.nn.functional.normalize(torch.randn(scene.body_quat.shape, generator=generator), dim=-1)
+    scene.body_quat[:] = random_quats(generator, 8, num_bodies)
     pattern = sphere_grid()
     config = LidarConfig(pattern.num_rows, 0.1, 0.0, 20.0)
     frame = Lidar(config, pattern, scene, -1, outputs=("ranges", "shape_id", "directions_s")).cast(clock(8, 0.1))
@@ -356,15 +333,15 @@ class TestEnvSlices:
         whole = Lidar(config, pattern, scene, 0, **given)
         sliced = Lidar(config, pattern, scene, 0, envs_at_once=at_once, **given)
         for time in (0.1, 0.2):
-            expected, met = whole.cast(clock(5, time)), []
+            expected, seen = whole.cast(clock(5, time)), []
             for envs, frame in sliced.cast_slices(clock(5, time)):
-                met += range(envs.start, envs.stop)
+                seen += range(envs.start, envs.stop)
                 assert len(frame.ranges) == envs.stop - envs.start <= at_once
                 for name in OUTPUTS:
                     torch.testing.assert_close(
                         getattr(frame, name), getattr(expected, name)[envs], rtol=0, atol=0, equal_nan=True
                     )
-            assert met == [0, 1, 2, 3, 4]
+            assert seen == [0, 1, 2, 3, 4]
         assert sliced.frame_count.tolist() == whole.frame_count.tolist() == [2] * 5
 
     def test_one_frame_of_all_is_refused(self, pattern):

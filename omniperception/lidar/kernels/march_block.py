@@ -1,21 +1,24 @@
 """All rays of a block through a height field at once, for CPUs, where one ray alone waits for every step."""
 
+from pathlib import Path
+
 import warp as wp
 
+from ..native import constant, function_body
 from .heightfield import FieldPart
-from .native import body, constant
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = constant("march_block.h", "block")
+HEADER = Path(__file__).with_name("march_block.h")
+BLOCK = constant(HEADER, "block")
 """The most rays that are marched at once."""
-NOT_MARCHED = wp.constant(constant("march_block.h", "not_marched"))
+NOT_MARCHED = wp.constant(constant(HEADER, "not_marched"))
 """The face of a ray that is left to ``intersect_heightfield``."""
 REACHES = (2, 8, 32, 128)
 """Cells by which the windows of highest points reach beyond their block of 4 x 4 cells."""
 
 
-@wp.func_native(body("march_block.h"))
+@wp.func_native(function_body(HEADER))
 def march_block(
     field: FieldPart,
     heights: wp.array(dtype=wp.float32),

@@ -1,12 +1,15 @@
 """Rays through triangle meshes: a descent of a tree of boxes, four at a time."""
 
+from pathlib import Path
+
 import warp as wp
 
-from .native import body, constant
+from ..native import constant, function_body
 
 wp.set_module_options({"enable_backward": False})
 
-STACK_SIZE = constant("mesh_descend.h", "stack_size")
+HEADER = Path(__file__).with_name("mesh_descend.h")
+STACK_SIZE = constant(HEADER, "stack_size")
 """Nodes that a descent can put off; ``meshes`` builds no tree that needs more."""
 
 
@@ -21,7 +24,7 @@ class MeshPart:
     leaf_stride: wp.int32
 
 
-@wp.func_native(body("mesh_descend.h"))
+@wp.func_native(function_body(HEADER))
 def descend(
     bounds: wp.array2d(dtype=wp.vec4),
     child: wp.array(dtype=wp.vec4i),

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from .geometry import INF, PI
+from .place import is_pose
 from .slots import Slots, Viewpoint, pack_words
 
 wp.set_module_options({"enable_backward": False})
@@ -79,10 +80,8 @@ def record_poses(
         p = wp.vec3d(body_pos[env, body])
         wxyz = wp.vec4d(body_quat[env, body])
         q = to_quatd(wxyz)
-        norm = wp.dot(wxyz, wxyz)
-        is_pose = norm > wp.float64(1.0e-12) and norm < wp.float64(1.0e12) and wp.dot(p, p) < wp.float64(1.0e30)
         if forget[env]:
-            turn = wp.vec4d(ZERO, ZERO, ONE, wp.where(is_pose, ZERO, BROKEN))
+            turn = wp.vec4d(ZERO, ZERO, ONE, wp.where(is_pose(p, wxyz), ZERO, BROKEN))
             for row in range(rows):
                 pos_out[row, env, body] = p
                 quat_out[row, env, body] = q
@@ -90,7 +89,7 @@ def record_poses(
         else:
             turn = wp.vec4d(ZERO, ZERO, ONE, HELD)
             was_there = turn_out[before, env, body][3] > BROKEN
-            if not is_pose:
+            if not is_pose(p, wxyz):
                 turn[3] = BROKEN
             elif was_there and wp.length(p - pos_out[last, env, body]) <= wp.float64(jump):
                 step = wp.quat_inverse(quat_out[last, env, body]) * q

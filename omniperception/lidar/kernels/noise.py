@@ -77,7 +77,7 @@ def beside(d: wp.vec3, radius: float, row: int):
 
 @wp.func
 def mixed(noise: NoiseParameters, first: float, second: float):
-    """The distance measured by a beam that meets two surfaces."""
+    """The distance measured by a beam that hits two surfaces."""
     gap = wp.abs(second - first)
     if gap <= noise.mixed_min_gap or gap > noise.mixed_max_gap:  # an infinite second distance, too
         return first

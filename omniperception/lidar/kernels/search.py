@@ -7,15 +7,16 @@ a call would copy kilobytes for each ray.
 # ruff: noqa: SIM102, UP018  (in a kernel, a branch on wp.static stands alone, and bool(False) declares a variable)
 
 from functools import cache
+from pathlib import Path
 
 import warp as wp
 
+from ..native import function_body
 from .geometry import HEIGHTFIELD, INF, SLACK, Geometry, shape_functions, uncertain
 from .march_block import NOT_MARCHED
 from .motion import Moment, Track, shape_at
-from .native import body
 from .place import axes_of, flush_denormals
-from .slots import WORD, Slots
+from .slots import SLOTS_AHEAD, WORD, Slots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,7 +51,7 @@ class NearestHit:
     face: wp.int32
 
 
-@wp.func_native(body("slots_ahead.h"))
+@wp.func_native(function_body(SLOTS_AHEAD))
 def slots_ahead(
     words: wp.array3d(dtype=wp.float32), env: int, word: int, count: int, dx: float, dy: float, dz: float
 ) -> int:
@@ -66,7 +67,7 @@ def first_slots(count: int):
     return (1 << count) - 1
 
 
-@wp.func_native(body("lowest_bit.h"))
+@wp.func_native(function_body(Path(__file__).with_name("lowest_bit.h")))
 def lowest_bit(bits: int) -> int:
     """Index of the lowest bit that is set; one must be."""
     ...

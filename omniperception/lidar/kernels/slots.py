@@ -1,12 +1,15 @@
 """The shapes around a viewer as its rays look for them: slots, nearest first, and words of 32 of them."""
 
+from pathlib import Path
+
 import warp as wp
 
-from .native import constant
+from ..native import constant
 
 wp.set_module_options({"enable_backward": False})
 
-WORD = wp.constant(constant("slots_ahead.h", "word_size"))
+SLOTS_AHEAD = Path(__file__).with_name("slots_ahead.h")
+WORD = wp.constant(constant(SLOTS_AHEAD, "word_size"))
 """Slots that are compared with a ray at once."""
 
 

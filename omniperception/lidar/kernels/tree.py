@@ -227,7 +227,7 @@ def gather_leaves(
 ):
     """Writes the corners of one leaf's triangles: nine rows (corner, axis) of four triangles.
 
-    A triangle with a corner that is not finite becomes all NaN, which no ray meets.
+    A triangle with a corner that is not finite becomes all NaN, which no ray hits.
     """
     i, leaf = wp.tid()
     env = i + env_offset
