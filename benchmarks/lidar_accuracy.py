@@ -85,7 +85,7 @@ class Tally:
 
     Attributes:
         rays: How many were cast.
-        hits: How many of them meet something in mj_ray.
+        hits: How many of them hit something in mj_ray.
         within: How many have mj_ray's geom (or miss) and its range within the tolerance.
         explained: How many of the others graze a silhouette or start on a surface.
         unexplained: The rest.

@@ -30,7 +30,7 @@ DURATIONS_S = (0.1, 0.5, 1.0)
 SLACK_ROWS = {"hap": 1000}
 """Sensors whose model fires in an order that drifts from the table's, and by how many rows at most."""
 WINDOWS = 4
-"""Windows of the table over which figures are averaged, evenly placed."""
+"""Windows of the table over which shares are averaged, evenly placed."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,8 @@ def selection_coverage(
     for seconds in durations_s:
         frames = max(1, round(seconds / period_s))
         starts = np.linspace(0.0, pattern.duration_s, WINDOWS, endpoint=False)
-        figures = [_seen(pattern, _frames(pattern, selection, period_s, s, frames), cells, field) for s in starts]
-        rows.append(Coverage(seconds, *(float(np.mean(column)) for column in zip(*figures, strict=True))))
+        found = [_seen(pattern, _frames(pattern, selection, period_s, s, frames), cells, field) for s in starts]
+        rows.append(Coverage(seconds, *(float(np.mean(column)) for column in zip(*found, strict=True))))
     return rows
 
 

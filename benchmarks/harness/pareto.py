@@ -90,8 +90,8 @@ class Study:
 
     def cheapest_as_good(self, choice: Choice) -> Choice:
         """The cheapest choice whose error is no larger, but for ``AS_GOOD``."""
-        bar = AS_GOOD * self.error_of(choice)
-        return min((other for other in self.choices if self.error_of(other) <= bar), key=lambda other: other.cost)
+        limit = AS_GOOD * self.error_of(choice)
+        return min((other for other in self.choices if self.error_of(other) <= limit), key=lambda other: other.cost)
 
     def excess(self, choice: Choice) -> float:
         """How many times more a choice costs than the cheapest one that is as good; 1 if it is that one."""
@@ -105,9 +105,9 @@ class Study:
         table = Table(self.name, self.title, ["choice", "default", "front", "excess", self.cost, *errors, *facts])
         for choice in sorted(self.choices, key=lambda c: c.cost):
             marks = ("default" if choice.default else "", "*" if choice.name in front else "")
-            figures = [choice.errors.get(key, math.nan) for key in errors]
+            values = [choice.errors.get(key, math.nan) for key in errors]
             table.rows.append(
-                [choice.name, *marks, self.excess(choice), choice.cost, *figures]
+                [choice.name, *marks, self.excess(choice), choice.cost, *values]
                 + [choice.facts.get(key, math.nan) for key in facts]
             )
         table.notes += [*self.notes, self.words()]

@@ -68,7 +68,7 @@ def far_away(distance: float, count: int, rng: np.random.Generator) -> list[Row]
 
 
 def sizes(size: float, count: int, rng: np.random.Generator) -> list[Row]:
-    """Bodies of `size` m, met from up to four sizes away."""
+    """Bodies of `size` m, seen from up to four sizes away."""
     rows = []
     for name, shape, truth in _bodies(size):
         origins, directions = _around(count, size, rng)
@@ -105,7 +105,7 @@ def bad_triangles(count: int, rng: np.random.Generator) -> list[Row]:
 
 
 def grazing(angle: float = 1e-6) -> list[Row]:
-    """Rays that meet the ground at `angle` rad, from 0.01 to 10 m above it, and as many that rise as steeply."""
+    """Rays that hit the ground at `angle` rad, from 0.01 to 10 m above it, and as many that rise as steeply."""
     heights = np.geomspace(0.01, 10.0, 50).repeat(2)
     sign = np.tile([-1.0, 1.0], 50)
     origins = np.stack([np.zeros(100), np.zeros(100), heights], -1)
@@ -134,7 +134,7 @@ def edges(count: int, rng: np.random.Generator) -> list[Row]:
 
 
 def inside(count: int, rng: np.random.Generator) -> list[Row]:
-    """A sensor inside a body meets its far side."""
+    """A sensor inside a body sees its far side."""
     rows = []
     for name, shape, truth in _bodies(1.0):
         origins, directions = 0.3 * rng.uniform(-1, 1, (count, 3)), random_unit(rng, count, 3)
@@ -144,7 +144,7 @@ def inside(count: int, rng: np.random.Generator) -> list[Row]:
 
 
 def sensor_limits() -> list[Row]:
-    """A scan that meets nothing, one whose every hit lies at the minimum range, one with the body a hair nearer."""
+    """A scan that hits nothing, one whose every hit lies at the minimum range, one with the body a hair nearer."""
     rows = []
     for name, minimum, height, expected in (
         ("all misses", 0.5, 100.0, math.inf),
@@ -254,7 +254,7 @@ def _cast(scene: RayScene, origins: np.ndarray, directions: np.ndarray) -> np.nd
 
 
 def _near_silhouette(truth: Truth, origins: np.ndarray, directions: np.ndarray, allowed: float) -> np.ndarray:
-    """(R,) bool: rays that, moved by what a range may be wrong, meet something else: they may go either way."""
+    """(R,) bool: rays that, moved by what a range may be wrong, hit something else: they may go either way."""
     true, loose = truth(origins, directions), np.zeros(len(origins), bool)
     for step in 2 * allowed * np.concatenate([np.eye(3), -np.eye(3)]):
         other = truth(origins + step, directions)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -100,23 +100,10 @@ class TrainedRun:
 
 
 def trained_runs(names: Sequence[str]) -> list[TrainedRun]:
-    """Run directories by path, named by what tells them apart."""
+    """Run directories by path, named by their paths below the folder that they share."""
     paths = [config.find_run(name) for name in names]
-    labels = _told_apart([path.resolve().parts for path in paths])
-    return [TrainedRun(path, label) for path, label in zip(paths, labels, strict=True)]
-
-
-def _told_apart(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """Paths without the parts that all of them begin and end with, but for one part of each."""
-    shortest = min((len(path) for path in paths), default=0)
-    first = min(_shared(paths), shortest - 1)
-    ends = min(_shared([path[::-1] for path in paths]), shortest - 1 - first)
-    return ["/".join(path[first : len(path) - ends]) for path in paths]
-
-
-def _shared(paths: Sequence[tuple[str, ...]]) -> int:
-    """How many parts all of them begin with."""
-    return len(list(itertools.takewhile(lambda parts: len(set(parts)) == 1, zip(*paths, strict=False))))
+    shared = os.path.commonpath([path.resolve().parent for path in paths]) if paths else ""
+    return [TrainedRun(path, str(path.resolve().relative_to(shared))) for path in paths]
 
 
 def evaluated_runs() -> list[str]:

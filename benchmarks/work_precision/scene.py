@@ -120,7 +120,7 @@ class Truth:
         return np.array([self.scan(t, env, d[None])[0][0] for t, d in zip(times, directions_s, strict=True)])
 
     def sectors(self, time_s: float, directions_s: Sequence[np.ndarray], num_sectors: int, cap: float) -> np.ndarray:
-        """Horizontal distance from the base to the nearest obstacle that the rays meet, by sector, (E, num_sectors).
+        """Horizontal distance from the base to the nearest obstacle that the rays hit, by sector, (E, num_sectors).
 
         ``directions_s`` are (N, 3) for each environment, in the sensor's frame; ``cap`` is the largest distance, m, and
         that of a sector without a hit. Sectors begin at -pi of the yaw-aligned frame.
