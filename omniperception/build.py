@@ -16,17 +16,12 @@ from omegaconf.errors import OmegaConfBaseException
 from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.env.mdp.randomization import RandomizationConfig
-from omniperception.env.mdp.terminations import TerminationsConfig
-from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
 from omniperception.env.mirror import Mirror
 from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.learning.memory import check_fits
-from omniperception.scene import Mount, ObstaclesConfig, RobotConfig, TerrainConfig, TiledTerrainConfig
-from omniperception.schema import ANYTHING, make
-from omniperception.sim import SimConfig
+from omniperception.scene import Mount, RobotConfig
+from omniperception.schema import ANYTHING, make, types_of
 
 if TYPE_CHECKING:
     from omniperception.env.sensing import SensorConfig
@@ -60,17 +55,9 @@ class RunConfig:
             )
 
 
-_PARTS = {
-    "terrain": TerrainConfig | TiledTerrainConfig,
-    "obstacles": ObstaclesConfig,
-    "commands": VelocityCommandConfig | GoalCommandConfig,
-    "observations": ObservationsConfig,
-    "rewards": RewardsConfig,
-    "terminations": TerminationsConfig,
-    "randomization": RandomizationConfig,
-    "sim": SimConfig,
-}
-"""The parts of the task that stand for themselves."""
+_TASK = ("num_envs", "seed", "robot", "terrain", "obstacles", "commands", "observations", "rewards", "terminations")
+_TASK += ("randomization", "sim")
+"""Keys of a configuration that are fields of EnvConfig as they stand."""
 
 
 def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
@@ -86,33 +73,32 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     trust = ANYTHING if is_composed(config) else trust
     if config.get("perception") and not config.get("lidar"):
         raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
-    try:
-        composed = OmegaConf.to_container(config, resolve=True)
-    except OmegaConfBaseException as error:
-        message = one_line(error).partition(" full_key:")[0]
-        raise ConfigError(message.partition("raised while resolving interpolation: ")[2] or message) from None
-    needed = {"num_envs", "seed", "lidar", "perception", "ppo", "robot", *_PARTS}
-    for key in needed - composed.keys():
+    composed = _resolved(config)
+    for key in {*_TASK, "lidar", "perception", "ppo"} - composed.keys():
         raise ConfigError(f"the configuration has no {key}")
-    perception = make(PerceptionConfig, composed["perception"], "perception", trust) if composed["perception"] else None
+    hints = types_of(EnvConfig)
+    task = {key: make(hints[key], composed[key], key, trust) for key in _TASK}
     ppo = make(PPOConfig, composed["ppo"], "ppo", trust)
-    robot = make(RobotConfig, composed["robot"], "robot", trust)
+    perception = make(PerceptionConfig, composed["perception"], "perception", trust) if composed["perception"] else None
+    seen = {}
+    if perception is not None:
+        seen = {"sampler": perception.sampler, "frame_history": perception.history}
+        seen |= {"base_motion": perception.base_motion, "targets": tuple(perception.supervision)}
     try:
-        env = EnvConfig(
-            num_envs=make(int, composed["num_envs"], "num_envs"),
-            seed=make(int, composed["seed"], "seed"),
-            robot=robot,
-            lidar=_sensor(composed["lidar"], robot, trust) if composed["lidar"] else None,
-            sampler=perception.sampler if perception else None,
-            frame_history=perception.history if perception else 0,
-            base_motion=perception.base_motion if perception else False,
-            targets=tuple(perception.supervision) if perception else (),
-            log_interval=ppo.num_steps_per_env,
-            **{key: make(part, composed[key], key, trust) for key, part in _PARTS.items()},
-        )
+        lidar = _sensor(composed["lidar"], task["robot"], trust) if composed["lidar"] else None
+        env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, **seen)
         return RunConfig(env, perception, ppo, _names(composed.get("init")), composed)
     except ValueError as error:
         raise ConfigError(one_line(error)) from None
+
+
+def _resolved(config: DictConfig) -> dict:
+    """A configuration as plain data."""
+    try:
+        return OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:
+        message = one_line(error).partition(" full_key:")[0]
+        raise ConfigError(message.partition("raised while resolving interpolation: ")[2] or message) from None
 
 
 def _sensor(preset: dict, robot: RobotConfig, trust: Sequence[str] | None) -> SensorConfig:

@@ -283,7 +283,12 @@ def presets(group: str, folders: Sequence[Path] = ()) -> tuple[str, ...]:
 def save(composed: dict, run_dir: Path) -> None:
     """Writes the resolved configuration into the run directory."""
     run_dir.mkdir(parents=True, exist_ok=True)
-    (run_dir / CONFIG_FILE).write_text(yaml.safe_dump(composed, sort_keys=False))
+    (run_dir / CONFIG_FILE).write_text(as_yaml(composed))
+
+
+def as_yaml(composed: dict) -> str:
+    """A resolved configuration as it is saved."""
+    return yaml.safe_dump(composed, sort_keys=False)
 
 
 def read(run_dir: Path) -> DictConfig:

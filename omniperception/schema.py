@@ -100,7 +100,7 @@ def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -
                 given = {name: item for name, item in value.items() if item is not None}
                 items = {name: make(item_hint, item, f"{key}.{name}", trust) for name, item in given.items()}
                 return {name: item for name, item in items.items() if item is not None}
-            if inspect.isclass(option) and option is not Any and option not in _WORDS:
+            if dataclasses.is_dataclass(option):
                 return call(option, arguments(option, value, key, trust), key)
     if not _fits(value, hint):
         raise ConfigError(f"{key}={_shown(value)} must be {_expected(hint)}")
@@ -134,7 +134,7 @@ def arguments(
     missing = [p.name for p in parameters if p.default is p.empty and p.name in named and p.name not in values]
     if missing and given is not None:
         raise ConfigError(f"{key} lacks {', '.join(missing)}: give {key}.{missing[0]}=...")
-    hints = _hints(target)
+    hints = types_of(target)
     return {name: make(hints.get(name, Any), item, f"{key}.{name}", trust) for name, item in values.items()}
 
 
@@ -227,7 +227,7 @@ def _imported(path: str, key: str) -> Callable:
     module, _, name = path.rpartition(".")
     try:
         found = getattr(importlib.import_module(module), name, None)
-    except ImportError as error:
+    except (ImportError, TypeError, ValueError) as error:
         raise ConfigError(f"{key}={path} cannot be imported: {error}") from None
     if not callable(found):
         raise ConfigError(f"{key}={path}: {module} has no function or class {name}")
@@ -235,8 +235,8 @@ def _imported(path: str, key: str) -> Callable:
 
 
 @cache
-def _hints(target: Callable) -> dict[str, Any]:
-    """Types of the parameters, but for those that name what only type checkers import."""
+def types_of(target: Callable) -> dict[str, Any]:
+    """Types of the parameters of a function, or fields of a class, but for those that only type checkers import."""
     sources: list[Any] = [target]
     if inspect.isclass(target):
         sources = target.__mro__[::-1] if dataclasses.is_dataclass(target) else [target.__init__]

@@ -34,6 +34,12 @@ def test_no_preset_is_missed():
     assert set(COMPANIONS) <= set(PRESETS)
 
 
+def test_every_preset_says_what_it_is():
+    for path in config.CONFIG_DIR.glob("**/*.yaml"):
+        said = path.read_text().removeprefix("# @package _global_\n")
+        assert said.startswith("# "), path
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_composes_builds_and_steps(preset):
     group, name = preset.split("/")

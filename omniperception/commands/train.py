@@ -22,7 +22,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from omniperception import build, config
 from omniperception.cli import Command, argument, fail, trust
@@ -58,7 +58,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         run_dir = config.find_run(arguments.run)
         learn(build.assemble(config.load(run_dir, values), arguments.trust), run_dir, resume=True)
     elif flags & SHOW:
-        print(OmegaConf.to_yaml(config.compose(values)), end="")
+        print(config.as_yaml(build.assemble(config.compose(values)).composed), end="")
     elif flags:
         sweep(values, arguments.trust)
     else:

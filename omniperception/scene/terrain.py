@@ -17,20 +17,14 @@ class TerrainConfig:
     """A flat ground plane at height 0 of every environment.
 
     Attributes:
-        kind: 'flat'.
         friction: sliding friction coefficient of the ground; it holds for every contact with the ground.
         restitution: coefficient of restitution e in [0, 1].
     """
 
-    kind: str = "flat"
     friction: float = 0.8
     restitution: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind != "flat":
-            raise ValueError(
-                f"terrain.kind={self.kind} is unknown; known: flat, or another preset such as terrain=mixed"
-            )
         check_contact(self.friction, self.restitution)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
