@@ -10,9 +10,9 @@ from omniperception.perception.networks.windows import WindowedGru, WindowedLine
 H, W, B = 5, 4, 3
 
 
-def sequence(points=6, dtype=torch.float32, seed=0):
-    torch.manual_seed(seed)
-    return torch.randn(B, H - 1 + W, points, 3, dtype=dtype)
+def sequence(points=6):
+    torch.manual_seed(0)
+    return torch.randn(B, H - 1 + W, points, 3)
 
 
 def counts():
@@ -61,9 +61,9 @@ def test_invalid_frames_have_no_influence():
     network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3)
     frames, count = sequence(), counts()
     poisoned = frames.clone()
-    poisoned[0, :H] = 1e3  # windows 0 and 1 of environment 0 have 0 and 1 valid frames
+    poisoned[0, :H] = 1e3  # window w of environment 0 has w valid frames, from frame H on
     a, b = network(frames, count), network(poisoned, count)
-    assert torch.equal(a[0, 0], b[0, 0]) and (a[0, 0] == 0).all()
+    assert torch.equal(a, b) and (a[0, 0] == 0).all() and (a[0, 1:] != 0).all()
 
 
 def test_pd_risknet_splits_the_points():
@@ -112,12 +112,6 @@ def test_ablations_share_the_interface(network):
         assert torch.allclose(alone[:, 0], full[:, w], atol=1e-6)
     full.sum().backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.parameters())
-
-
-def test_gradient_in_float64():
-    frames, count = sequence(2, torch.float64).requires_grad_(), counts()
-    gru = WindowedGru(6, 3, H).double()
-    assert torch.autograd.gradcheck(lambda f: gru(f.flatten(2), count), frames)
 
 
 def test_wrong_counts_are_refused():
