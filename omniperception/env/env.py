@@ -38,6 +38,7 @@ class OmniEnv(VecEnv):
         state: what terms read.
         ground, terrain_levels, obstacles, avoidance, sensing: None where the task has none.
         step_hooks: called at the end of each step, before finished environments are reset.
+        healthy: (num_envs,) bool: whose physics was sound in the last step.
         done: (num_envs,) bool: which environments ended in the last step.
         outcomes: (num_envs,) bool each: why, by `OUTCOMES`; an environment ends for one reason.
         contacts: (num_envs,) bool: which touched an obstacle in the last step.
@@ -108,11 +109,12 @@ class OmniEnv(VecEnv):
         self._advance_physics(self._clipped(actions))
         with self.timer.stage("state"):
             self.state.end_step()
+            self.healthy = ~self.sim.failed
         self._follow_sensors()
         self._follow_terrain()
         with self.timer.stage("rewards"):
             self._terminate()
-            rewards = self.rewards.compute(self.state, ~self.sim.failed)
+            rewards = self.rewards.compute(self.state, self.healthy)
             self._record()
         for hook in self.step_hooks:
             hook()
@@ -187,18 +189,18 @@ class OmniEnv(VecEnv):
     def _follow_terrain(self) -> None:
         if self.terrain_levels is not None:
             with self.timer.stage("terrain"):
-                self.terrain_levels.record(self.state.kinematics, self.command.value, ~self.sim.failed)
+                self.terrain_levels.record(self.state.kinematics, self.command.value, self.healthy)
 
     def _terminate(self) -> None:
         """Whether environments end, and why, each for the first reason that applies."""
         state, config = self.state, self.config.terminations
-        never = torch.zeros_like(self.sim.failed)
+        never = torch.zeros_like(self.healthy)
         reached = self.command.reached(state.kinematics)
         timed_out = self.episode_length_buf >= self.max_episode_length
         if self.ground is not None:
             timed_out |= self.ground.outside(state.kinematics.base_pos_w[:, :2])
         causes = {
-            "diverged": self.sim.failed,
+            "diverged": ~self.healthy,
             "fall": config.fallen(state.kinematics, state.base_height),
             "collision_end": state.obstacle_contact if config.on_collision else never,
             "goal": never if reached is None else reached,
@@ -210,7 +212,7 @@ class OmniEnv(VecEnv):
             self.done = self.done | happened
 
     def _record(self) -> None:
-        healthy, kinematics, command = ~self.sim.failed, self.state.kinematics, self.command.value
+        healthy, kinematics, command = self.healthy, self.state.kinematics, self.command.value
         lin_error = (kinematics.base_lin_vel_yaw - command[:, :2]).norm(dim=1)
         yaw_error = (kinematics.base_ang_vel_b[:, 2] - command[:, 2]).abs()
         self.velocity_error = torch.where(healthy, lin_error, 0.0)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import torch
 
+from omniperception.common.lazy import lazy
 from omniperception.common.rotations import rotate_inverse, rotate_yaw, yaw_of
 
 
@@ -26,12 +25,12 @@ class Kinematics:
         self.base_pos_w, self.base_quat_w, self.joint_pos = qpos[:, :3], qpos[:, 3:7], qpos[:, 7:]
         self.base_ang_vel_b, self.joint_vel = self._qvel[:, 3:6], self._qvel[:, 6:]
 
-    @cached_property
+    @lazy
     def yaw(self) -> torch.Tensor:
         """(n,) rad: heading of the base."""
         return yaw_of(self.base_quat_w)
 
-    @cached_property
+    @lazy
     def base_lin_vel_yaw(self) -> torch.Tensor:
         """(n, 2) m/s: horizontal velocity in the yaw-aligned frame."""
         return rotate_yaw(-self.yaw, self._qvel[:, :2])
@@ -46,7 +45,7 @@ class Kinematics:
         """(n, 3) unit vector of gravity in the base frame."""
         return self._in_base_frame[1]
 
-    @cached_property
+    @lazy
     def _in_base_frame(self) -> torch.Tensor:
         """(2, n, 3) linear velocity and gravity, in one rotation."""
         down = torch.zeros_like(self._qvel[:, :3])

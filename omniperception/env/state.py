@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
 
+from omniperception.common.lazy import lazy
 from omniperception.common.rotations import rotate_yaw
 from omniperception.env.heights import flat_heights
 from omniperception.env.kinematics import Kinematics
@@ -176,12 +177,12 @@ class EnvState:
 
     # ---- the robot ---------------------------------------------------------------------------------------------------
 
-    @cached_property
+    @lazy
     def kinematics(self) -> Kinematics:
         """Base and joints."""
         return Kinematics(*self._sim.robot_state())
 
-    @cached_property
+    @lazy
     def measured(self) -> Kinematics:
         """Base and joints as the robot's sensors give them, with latency where it is randomized."""
         return self.kinematics if self._history is None else self._history.delayed()
@@ -191,29 +192,29 @@ class EnvState:
         """(num_envs, 3) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame."""
         return self._command.value
 
-    @cached_property
+    @lazy
     def base_lin_acc_b(self) -> torch.Tensor:
         """(num_envs, 3) m/s^2: change of the linear velocity in the base frame over the control step."""
         return (self.kinematics.base_lin_vel_b - self.before.base_lin_vel_b) / self.control_dt
 
-    @cached_property
+    @lazy
     def joint_acc(self) -> torch.Tensor:
         """(num_envs, num_joints) rad/s^2: change of the joint velocity over the control step."""
         return (self.kinematics.joint_vel - self.before.joint_vel) / self.control_dt
 
-    @cached_property
+    @lazy
     def joint_torque(self) -> torch.Tensor:
         """(num_envs, num_joints) N m."""
         return self._sim.joint_torque()
 
-    @cached_property
+    @lazy
     def base_height(self) -> torch.Tensor:
         """(num_envs,) m: the base's origin above the ground, the mean of what lies below it and below the hips."""
         if self._height_lookup is None:
             return self.kinematics.base_pos_w[:, 2]
         return self._height_lookup.base_height(self.kinematics)
 
-    @cached_property
+    @lazy
     def heights(self) -> torch.Tensor:
         """(num_envs, 187) m: the base's origin above the ground at `height_grid`, clipped to +-1 m."""
         if self._height_lookup is None:
@@ -222,18 +223,18 @@ class EnvState:
 
     # ---- contacts ----------------------------------------------------------------------------------------------------
 
-    @cached_property
+    @lazy
     def foot_force(self) -> torch.Tensor:
         """(num_envs, F, 3) N, environment frame: of each foot on what it touches, so that a foot that stands pushes
         down. Requires "foot_force"."""
         return self._contact_force(FOOT_FORCE)
 
-    @cached_property
+    @lazy
     def link_force(self) -> torch.Tensor:
         """(num_envs, L, 3) N, environment frame: likewise of the robot's penalised links. Requires "link_force"."""
         return self._contact_force(LINK_FORCE)
 
-    @cached_property
+    @lazy
     def obstacle_contact(self) -> torch.Tensor:
         """(num_envs,) bool: whether a link touched an obstacle in any physics step of the control step. Requires
         "obstacle_contact"; False for all without obstacles."""
@@ -247,17 +248,17 @@ class EnvState:
 
     # ---- feet, in the order of robot.foot_geoms ----------------------------------------------------------------------
 
-    @cached_property
+    @lazy
     def foot_pos_w(self) -> torch.Tensor:
         """(num_envs, F, 3) m, environment frame: centres of the foot geoms."""
         return self._sim.geom_poses(self._foot_geoms)[0]
 
-    @cached_property
+    @lazy
     def foot_vel_w(self) -> torch.Tensor:
         """(num_envs, F, 3) m/s, environment frame: of the same points."""
         return self._sim.geom_velocities(self._foot_geoms)
 
-    @cached_property
+    @lazy
     def foot_contact(self) -> torch.Tensor:
         """(num_envs, F) bool: which feet push down with more than CONTACT_FORCE. Requires "foot_force"."""
         return self.foot_force[..., 2].abs() > CONTACT_FORCE
@@ -271,7 +272,7 @@ class EnvState:
 
     # ---- around the robot --------------------------------------------------------------------------------------------
 
-    @cached_property
+    @lazy
     def obstacles(self) -> Obstacles:
         """Where the obstacles are and how they move."""
         n, field, yaw = self.num_envs, self._obstacles, self.kinematics.yaw
@@ -301,7 +302,7 @@ class EnvState:
         return self._sensing.mean_distal_range(max_distance)
 
 
-_CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance(value, cached_property))
+_CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance(value, lazy))
 
 
 def _check(there: bool, name: str) -> None:
