@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from omniperception import config
+from omniperception.commands import main
 from omniperception.learning import load_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,27 +37,34 @@ def checkpoint(folder, run, iteration):
     return load_checkpoint(folder / run / "checkpoints" / f"model_{iteration}.pt")
 
 
-def test_the_configuration_is_saved_before_anything_uses_it(tmp_path):
+def test_the_configuration_is_saved_before_anything_uses_it(tmp_path, monkeypatch, capsys):
     """This run ends while its world is compiled: what it was is on the disk."""
-    arguments = ["num_envs=5", "lidar.exclude_geoms=[nose]", "hydra.run.dir=here"]
-    command = [sys.executable, str(ROOT / "train.py"), *arguments]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert result.returncode == 2 and "lidar.exclude_geoms names ['nose']" in result.stderr
-    assert "Traceback" not in result.stderr
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", "num_envs=5", "robot.mounts.head.exclude_geoms=[nose]", "hydra.run.dir=here"])
+    assert "nose" in capsys.readouterr().err
     saved = config.load(tmp_path / "here")
-    assert saved.num_envs == 5 and list(saved.lidar.exclude_geoms) == ["nose"]
+    assert saved.num_envs == 5 and list(saved.robot.mounts.head.exclude_geoms) == ["nose"]
+
+
+def test_a_sweep_gives_every_run_a_directory(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    sweep = ("experiment=walk", "seed=1,2", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=${seed}")
+    main(["train", "-m", *sweep, "num_envs=2", "ppo.num_steps_per_env=2", "ppo.max_iterations=1", *SMALL[3:]])
+    assert capsys.readouterr().out.count("completed: 1 iterations") == 2
+    for seed in (1, 2):
+        assert config.read(tmp_path / "sweep" / str(seed)).seed == seed
+        assert (tmp_path / "sweep" / str(seed) / "checkpoints" / "model_1.pt").is_file()
+
+
+def test_the_composed_configuration_is_printed(capsys):
+    main(["train", "--cfg", "job", "num_envs=7"])
+    assert yaml.safe_load(capsys.readouterr().out)["num_envs"] == 7
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "recipe",
-    [
-        ["experiment=walk"],
-        ["experiment=quickstart", "randomization=paper", *SMALL_CLOUD],
-    ],
-    ids=["walk", "quickstart"],
-)
-def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, recipe):
+def test_a_resumed_run_is_the_uninterrupted_one(tmp_path):
+    recipe = ("experiment=quickstart", "randomization=paper", *SMALL_CLOUD)
     train(tmp_path, *recipe, *SMALL, "ppo.max_iterations=4", "hydra.run.dir=whole")
     train(tmp_path, *recipe, *SMALL, "ppo.max_iterations=2", "hydra.run.dir=parts")
     halfway = checkpoint(tmp_path, "parts", 2)

@@ -6,6 +6,8 @@ import json
 import shutil
 from pathlib import Path
 
+from omegaconf import OmegaConf
+
 from omniperception import config
 from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
@@ -43,10 +45,11 @@ def publish(run_dir: Path, folder: Path) -> dict:
             f"{newest} has {size / 1e6:.1f} MB of weights, at most {LIMIT / 1e6:.0f} MB are published; train a smaller"
             " network"
         )
-    composed = config.load(run_dir)
+    composed = config.read(run_dir)
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copy(run_dir / config.CONFIG_FILE, folder / config.CONFIG_FILE)
+    composed.pop(config.SEARCH_PATH, None)  # a folder of this machine
+    config.save(OmegaConf.to_container(composed), folder)
     save_checkpoint(checkpoint_path(folder, state["iteration"]), {**weights, "iteration": state["iteration"]})
     steps = state["iteration"] * composed.num_envs * composed.ppo.num_steps_per_env
     record = {
