@@ -121,6 +121,8 @@ LINES = [
     ("train robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),
     ("train robot.mounts.head.exclude_geoms=[nose]", "nose"),
     ("train init=nowhere", "init=nowhere"),
+    ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape,weight:1.0}", "rewards.terms.mine"),
+    ("train +rewards.terms.mine={func:wrong_input_terms.not_a_tensor,weight:1.0}", "rewards.terms.mine"),
     ("train +rewards.terms.mine={func:wrong_input_terms.missing,weight:1.0}", "rewards.terms.mine"),
     ("train +rewards.terms.mine={func:nowhere.at_all,weight:1.0}", "nowhere"),
     ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape}", "rewards.terms.mine"),

@@ -100,6 +100,8 @@ class ObservationManager:
 
 
 def _check_shape(name: str, value: torch.Tensor, shape: tuple[int, ...], expected: str) -> None:
+    if not isinstance(value, torch.Tensor):
+        raise ValueError(f"{name} is of type {type(value).__name__}, expected a tensor of shape {expected}")
     if tuple(value.shape) != shape:
         raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {expected}")
 
