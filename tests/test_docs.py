@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from omniperception.build import assemble, build_runner
+from omniperception.config import compose
 from omniperception.lidar import Lidar, vlp16
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -87,6 +89,40 @@ def test_what_a_page_links_to_and_runs_exists(page):
 def test_the_readme_names_every_page():
     text = (ROOT / "README.md").read_text()
     assert [page.name for page in PAGES if page.parent.parent == ROOT / "docs" and page.name not in text] == []
+
+
+@pytest.fixture(scope="module")
+def own_project(tmp_path_factory):
+    """A folder that holds the files which the guide's blocks name in their first line."""
+    folder = tmp_path_factory.mktemp("guide")
+    for page in (ROOT / "docs" / "guide").glob("new_*.md"):
+        for code in re.findall(r"```(?:yaml|python)\n(.*?)```", page.read_text(), flags=re.DOTALL):
+            named = re.match(r"(?:# @package _global_\n)?# ((?:conf|own_project)/\S+)\n", code)
+            if named and not (ROOT / named[1]).exists():
+                path = folder / named[1]
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(code)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("rewards=mine",),
+        ("lidar=os0_32", "lidar.mount=back"),
+        ("terrain=mine",),
+        ("obstacles=mine",),
+        ("scenario=mine",),
+        ("perception=mine",),
+    ],
+    ids=lambda overrides: overrides[0],
+)
+def test_what_the_guide_adds_trains(own_project, overrides, monkeypatch):
+    monkeypatch.syspath_prepend(own_project)
+    added = (f"hydra.searchpath=['file://{own_project / 'conf'}']",)
+    small = ("num_envs=4", "obstacles.curriculum=null", "ppo.num_mini_batches=1", "lidar.num_rays=200")
+    runner = build_runner(assemble(compose((*added, *overrides, *small))), None)
+    runner.learn(1)
 
 
 def test_numpy(run):
