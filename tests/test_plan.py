@@ -358,7 +358,7 @@ def test_readers_and_reasons_are_named(quick_run, walk_run):
     stages = {entry.name: entry.reason for entry in quick["stages of a step"].has}
     assert stages["sectors"].startswith("read by rewards.velocity_tracking_with_avoidance, obs")
     assert left_out(blind, "stages of a step")["rays"] == "lidar=none"
-    assert left_out(quick, "ray geometry")["head_upper"] == "named in lidar.exclude_geoms"
+    assert left_out(quick, "ray geometry")["head_upper"] == "named in its mount's exclude_geoms"
     others = left_out(quick, "optional packages")  # of other tests in this process some may be imported
     assert "mujoco_warp" in sys.modules or others["mujoco_warp"].startswith("physics on a GPU")
     assert not set(others) & set(sys.modules)

@@ -75,4 +75,4 @@ def hidden_geoms(world: World, exclude: Collection[str], view: FieldOfView) -> d
         raise ValueError(f"robot.mounts: exclude_geoms names {unknown}; known: {', '.join(known)}")
     beyond = unreachable_geoms(model, world.base_body, view)
     hidden = {known[k]: "out of the reach of every ray, however the joints stand" for k in sorted(beyond)}
-    return hidden | dict.fromkeys(exclude, "named in lidar.exclude_geoms")
+    return hidden | dict.fromkeys(exclude, "named in its mount's exclude_geoms")

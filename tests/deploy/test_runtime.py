@@ -303,5 +303,5 @@ def test_what_cannot_be_exported_is_named(exported_run, tmp_path):
         export(tmp_path)
     privileged = ("experiment=walk", "observations.actor=[privileged,command]", "num_envs=1")
     run = build.assemble(config.compose(privileged))
-    with pytest.raises(config.ConfigError, match=r"privileged\.terms\.proprioception cannot be exported"):
+    with pytest.raises(config.ConfigError, match=r"privileged\.terms\.true_proprioception cannot be exported"):
         describe(run, OmniEnv(run.env))

@@ -82,5 +82,5 @@ def test_fixed_obstacles_carry_no_pose(make_config):
 
 def test_unknown_excluded_geoms_are_named(world):
     view = FieldOfView.of(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.eye(3))
-    with pytest.raises(ValueError, match=r"lidar\.exclude_geoms names \['nose'\]"):
+    with pytest.raises(ValueError, match=r"robot\.mounts: exclude_geoms names \['nose'\]"):
         hidden_geoms(world, ("nose",), view)

@@ -81,7 +81,7 @@ def take_scan(
     config = replace(sensor, period_s=seconds, num_rays=num_rays or pattern.points_per_frame(seconds))
     unknown = sorted(set(sensor.exclude_geoms) - set(demo.robot_geoms))
     if unknown:
-        raise ValueError(f"lidar.exclude_geoms names {unknown}; known: {', '.join(demo.robot_geoms)}")
+        raise ValueError(f"robot.mounts: exclude_geoms names {unknown}; known: {', '.join(demo.robot_geoms)}")
     lidar = Lidar(
         config,
         pattern,
