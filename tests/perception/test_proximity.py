@@ -94,6 +94,14 @@ def test_proximal_half_is_pd_risknets():
     assert torch.equal(sample(sampler(), rays, attitude(angles(3, 1)))[:, :8], expected)
 
 
+def test_inside_and_outside_of_inference_mode():
+    rays, level = random_rays(3, 200, seed=4), attitude(angles(3, 2))
+    proximities = sampler()
+    with torch.inference_mode():
+        inside = sample(proximities, rays, level)
+    assert torch.equal(sample(proximities, rays, level), inside)
+
+
 def test_a_mismatch_is_named():
     with pytest.raises(ValueError, match="needs the attitude of the base"):
         sample(sampler(), random_rays(2, 20))

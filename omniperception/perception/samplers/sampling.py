@@ -33,10 +33,9 @@ class RawSampler(Sampler):
         return ("write_raw",)
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
-        cloud, lanes = (view(ranges, wp.float32), view(directions_s, wp.vec3)), kernels.LANES[ranges.device.type]
-        _launcher(ranges, self.num_threads)(
-            kernels.write_raw, lanes, *cloud, 1.0 / self.max_range, lanes, view(out, wp.vec3)
-        )
+        launch, lanes = _launcher(ranges, self.num_threads), kernels.LANES[ranges.device.type]
+        cloud, points = (view(ranges, wp.float32), view(directions_s, wp.vec3)), view(out, wp.vec3)
+        launch(kernels.write_raw, lanes, *cloud, 1.0 / self.max_range, lanes, points)
 
 
 class PdSampler(Sampler):
@@ -210,7 +209,8 @@ class ProximitySampler(PdSampler):
             self._write_halves(ranges, directions_s, elevation, azimuth, out, num_bins=0)
         n, device = len(ranges), ranges.device
         if self._nearest is None or n > len(self._nearest) or self._nearest.device != device:
-            self._nearest = torch.empty(n, self.num_distal, dtype=torch.int64, device=device)
+            with torch.inference_mode(False):  # a tensor of inference mode could not be zeroed outside of it
+                self._nearest = torch.empty(n, self.num_distal, dtype=torch.int64, device=device)
             self.edges = self.edges.to(device)
         nearest = view(self._nearest[:n].zero_(), wp.int64)
         cloud, lanes = (view(ranges, wp.float32), view(directions_s, wp.vec3)), kernels.LANES[device.type]
