@@ -89,7 +89,7 @@ def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
-            given = [*(str(o.input_line) for o in chosen), *_as_override(folders)]
+            given = [*(str(o.input_line) for o in chosen), *as_override(folders)]
             config = hydra_compose("config", given, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(one_line(error)) from None
@@ -125,7 +125,7 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
     parsed = parse(overrides)
     folders = search_path(parsed, config)
     chosen, values = _split(parsed, folders)
-    fresh = compose([*(str(o.input_line) for o in chosen), *_as_override(folders)]) if chosen else {}
+    fresh = compose([*(str(o.input_line) for o in chosen), *as_override(folders)]) if chosen else {}
     for override in chosen:
         group = override.key_or_group
         if group == "experiment" or override.is_hydra_override():
@@ -262,7 +262,7 @@ def _folder(entry: str) -> Path:
     return folder
 
 
-def _as_override(folders: Sequence[Path]) -> list[str]:
+def as_override(folders: Sequence[Path]) -> list[str]:
     """The override that puts folders on Hydra's search path."""
     return [f"hydra.searchpath=[{','.join(repr(f'file://{folder}') for folder in folders)}]"] if folders else []
 

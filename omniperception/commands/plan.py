@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from omniperception import build, config
-from omniperception.cli import Command, trust
+from omniperception.cli import Command
 from omniperception.plan import Plan, describe
 
 BUILT_ENVS = 13
@@ -19,19 +19,17 @@ BUILT_ENVS = 13
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """The command's own arguments."""
-
-    trust: tuple[str, ...] = trust()
+    """The command has overrides only."""
 
 
-def main(arguments: Arguments, overrides: list[str]) -> None:
+def main(_: Arguments, overrides: list[str]) -> None:
     """Prints the plan of a configuration."""
-    print(plan_of(overrides, arguments.trust).text())
+    print(plan_of(overrides).text())
 
 
-def plan_of(overrides: list[str], trust: tuple[str, ...] = ()) -> Plan:
+def plan_of(overrides: list[str]) -> Plan:
     """The plan of a configuration."""
-    run = build.assemble(config.compose(overrides), trust)
+    run = build.assemble(config.compose(overrides))
     built = replace(run, env=replace(run.env, num_envs=min(run.env.num_envs, BUILT_ENVS)))
     return describe(run, build.build_runner(built, None))
 

@@ -60,17 +60,17 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     elif flags & SHOW:
         print(config.as_yaml(build.assemble(config.compose(values)).composed), end="")
     elif flags:
-        sweep(values, arguments.trust)
+        sweep(values)
     else:
         composed = config.compose(values, with_hydra=True)
         HydraConfig.instance().set_config(composed)  # for ${hydra:...} in hydra.run.dir
         run_dir = Path(os.path.relpath(composed.hydra.run.dir))
-        train(config.without_hydra(composed), run_dir, arguments.trust)
+        train(config.without_hydra(composed), run_dir)
 
 
-def train(composed: DictConfig, run_dir: Path, trust: Sequence[str]) -> None:
+def train(composed: DictConfig, run_dir: Path) -> None:
     """Trains one composed configuration in its directory."""
-    run = build.assemble(composed, trust)
+    run = build.assemble(composed)
     distributed.connect(run.env.sim.torch_device)
     run_dir = distributed.of_first(run_dir)
     begun = distributed.of_first(config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir)))
@@ -104,16 +104,16 @@ def report(text: str) -> None:
         print(text)
 
 
-def sweep(overrides: Sequence[str], trust: Sequence[str]) -> None:
+def sweep(overrides: Sequence[str]) -> None:
     """Runs every combination of overrides with several values, by Hydra and the launcher that is chosen."""
-    check_jobs(overrides, trust)
+    check_jobs(overrides)
 
     def job(_: DictConfig) -> None:
         settings = HydraConfig.get()
         folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
         try:
             composed = config.compose([*settings.overrides.task, *folders])
-            train(composed, Path(os.path.relpath(settings.runtime.output_dir)), trust)
+            train(composed, Path(os.path.relpath(settings.runtime.output_dir)))
         except (config.ConfigError, *ERRORS) as error:
             fail(error)
 
@@ -124,7 +124,7 @@ def sweep(overrides: Sequence[str], trust: Sequence[str]) -> None:
         sys.argv = given
 
 
-def check_jobs(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
+def check_jobs(overrides: Sequence[str]) -> None:
     """Composes and validates every job of a sweep before the first is started."""
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
@@ -132,7 +132,7 @@ def check_jobs(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
         raise config.ConfigError(config.one_line(error)) from None
     for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None):
         for job in batch:
-            build.assemble(config.compose(job), trust)
+            build.assemble(config.compose(job))
 
 
 command = Command(main, Arguments, __doc__, "of the configuration", ERRORS, flags=(*sorted(SWEEP), *sorted(SHOW)))

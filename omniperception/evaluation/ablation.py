@@ -34,6 +34,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 """Overrides of the variants that are no presets of `perception` themselves. `_small` has as many frames and points as
 pd_risknet_small; what the perception is supervised with is the experiment's."""
 
+RATES = ("success", "success_untouched", "collision", "fall", "time_out")
 PAPER = {
     "direct_mlp": "out of memory (24 GB)",
     "fps_mlp": "33.3 | 93.3",
@@ -95,7 +96,6 @@ def train(study: Ablation) -> None:
             f"seed={','.join(map(str, study.seeds))}",
             f"hydra.sweep.dir={study.out}",
             f"hydra.sweep.subdir={variant}/seed${{seed}}",
-            *([f"trust={','.join(study.trust)}"] if study.trust else []),
             *study.overrides,
         ]
         running.append(subprocess.Popen(command))
@@ -152,16 +152,14 @@ def _row(study: Ablation, variant: str) -> dict:
     for scenario in study.scenarios:
         summaries = [_report(study.run_dir(variant, seed), scenario)["policies"]["run"] for seed in study.seeds]
         row[scenario] = {
-            name: pooled([(s["rates"][name]["count"], s["episodes"]) for s in summaries])
-            for name in ("success", "success_untouched", "collision", "fall", "time_out")
+            name: pooled([(s["rates"][name]["count"], s["episodes"]) for s in summaries]) for name in RATES
         }
     return row
 
 
 def _table(scenario: str, rows: dict, study: Ablation) -> str:
-    names = ("success", "success_untouched", "collision", "fall", "time_out")
-    columns = ["variant", *(name.replace("_", " ") + ", %" for name in names)]
-    cells = [[variant, *(_cell(row[scenario][name]) for name in names)] for variant, row in rows.items()]
+    columns = ["variant", *(name.replace("_", " ") + ", %" for name in RATES)]
+    cells = [[variant, *(_cell(row[scenario][name]) for name in RATES)] for variant, row in rows.items()]
     if scenario == "corridor":
         columns.append("paper: success | collision, %")
         for variant, row in zip(rows, cells, strict=True):

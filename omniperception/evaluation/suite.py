@@ -146,7 +146,7 @@ def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolic
     run_dir = evaluation.walker if walks and evaluation.walker is not None else evaluation.run_dir
     run = _assemble(evaluation, scenario, run_dir)
     trained = load_policy(run, run_dir)
-    policy = trained.policy
+    policy, checkpoint = trained.policy, trained.checkpoint
     try:
         if name == "blind":
             policy = covered(trained.env, policy)
@@ -155,17 +155,18 @@ def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolic
             own = run_dir == evaluation.run_dir and avoidance.risk is not None  # the run's commands follow from it
             policy = steered(trained.env, policy, avoidance, None if own else _learned_commands(run_dir))
         if name == "exported":
-            exported = ExportedPolicies(trained.env, ExportedPolicy.load(run_dir / EXPORTED))
-            return TrainedPolicy(trained.env, exported, run_dir / EXPORTED)
+            checkpoint = run_dir / EXPORTED
+            policy = ExportedPolicies(trained.env, ExportedPolicy.load(checkpoint))
     except ValueError as error:
         raise ConfigError(f"policy={name}: {error}") from None
-    return TrainedPolicy(trained.env, policy, trained.checkpoint)
+    return TrainedPolicy(trained.env, policy, checkpoint)
 
 
 def _assemble(evaluation: Evaluation, scenario: str, run_dir: Path) -> RunConfig:
-    """The run with the scenario's scene; a walker takes the overrides that change the scene."""
+    """The run with the scenario's scene; a walker takes the overrides that change the scene, and finds the presets."""
     overrides = list(evaluation.overrides)
     if run_dir != evaluation.run_dir:
+        overrides += config.as_override(config.search_path((), config.read(evaluation.run_dir)))
         scene = (*config.FIXED_BY_SCENARIO, "sim", "hydra")
         overrides = [o for o in overrides if o.lstrip("+~").split("=", 1)[0].split(".", 1)[0] in scene]
     composed = config.load(run_dir, [f"scenario={scenario}", *overrides, f"num_envs={evaluation.envs}"])

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import build, config
-from omniperception.cli import Command, argument, trust
+from omniperception.cli import Command, argument
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
 from omniperception.commands.scan.room import demo_scene
 from omniperception.common.figures import PlotsUnavailable
@@ -33,7 +33,6 @@ class Arguments:
     rays: int | None = argument(None, "how many of the points are kept; null: all", least=1)
     seconds: float | None = argument(None, "how long the sensor measures; null: one frame of the preset", positive=True)
     colour: str = argument("class", "of the points in scan.ply", choices=("class", "height"))
-    trust: tuple[str, ...] = trust()
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
@@ -43,7 +42,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     out, scans = arguments.out or Path("outputs/view_scan"), []
     for name in arguments.lidar:
         composed = config.compose([*NO_TASK, f"lidar={name}", *overrides])
-        env = build.assemble(composed, arguments.trust).env
+        env = build.assemble(composed).env
         demo = demo_scene(env.robot)
         scans.append(take_scan(name, env.lidar, demo, arguments.seconds, arguments.rays, arguments.seed))
         folder = out if arguments.out and len(arguments.lidar) == 1 else out / name
