@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -83,7 +84,7 @@ class TrainedRun:
         weights = (v for k, v in state["actor_state_dict"].items() if "normalizer" not in k)
         return {
             "parameters": float(sum(tensor.numel() for tensor in weights)),
-            "training (min)": state["total_time"] / 60.0,
+            "training (min)": state.get("total_time", math.nan) / 60.0,  # a published run does not tell
         }
 
     def stepper(self) -> Callable[[int], None]:

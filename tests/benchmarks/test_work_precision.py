@@ -2,7 +2,9 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +13,12 @@ import torch
 from benchmarks.work_precision import lidar, perception, physics, policy
 from benchmarks.work_precision.__main__ import command
 from benchmarks.work_precision.scene import MovingScene, Truth, dense_directions, moving_scene
+from omniperception.commands.export import command as export
 from omniperception.config import ConfigError
 from omniperception.lidar import LidarConfig
 from omniperception.perception import ProximitySampler
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def one_cylinder(distance: float, azimuth: float) -> MovingScene:
@@ -183,6 +188,23 @@ def test_policies_are_judged_by_what_evaluation_wrote(tmp_path):
     assert errors["low (%)"] == pytest.approx(20.0) and errors["high (%)"] == pytest.approx(40.0)
     with pytest.raises(ConfigError, match=r"has not been exported; python scripts/export.py run="):
         _ = run.exported
+
+
+@pytest.mark.slow
+def test_trained_policies_are_timed_as_they_were_exported(tmp_path, capsys):
+    run = tmp_path / "gait"
+    shutil.copytree(ROOT / "pretrained" / "gait", run)
+    export([f"run={run}", "formats=onnx"])
+    rates = {
+        name: {"rate": 0.5, "low": 0.1, "high": 0.9} for name in ("success", "success_untouched", "collision", "fall")
+    }
+    report = {"scenario": "static", "policies": {"run": {"rates": rates, "episodes": 4}}}
+    (run / "evaluation").mkdir()
+    (run / "evaluation" / "static.json").write_text(json.dumps(report))
+    command(["subject=policy", f"runs={run}", f"default={run}", "size=small", f"out={tmp_path / 'out'}"])
+    assert "The default, gait, is on it, alone." in capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "out" / "policy" / "policy_static.json").read_text())["rows"]
+    assert row[policy.FAILED] == 50.0 and row["parameters"] > 0 and 0.0 < row[policy.COST] < 1e5
 
 
 def test_the_command_writes_tables_and_plot(tmp_path, capsys):
