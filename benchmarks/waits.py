@@ -7,15 +7,14 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from unittest.mock import patch
 
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from omniperception.common import rows
+import omniperception
 
-_PACKAGE = Path(rows.__file__).resolve().parents[1]
+_PACKAGE = Path(omniperception.__file__).resolve().parent
 _READS = {"item", "tolist", "cpu", "numpy", "__array__", "__bool__", "__int__", "__float__", "__index__"}
 """Methods that need a tensor's numbers on the host."""
 _SENDS = {"tensor", "as_tensor", "new_tensor", "from_numpy"}
@@ -84,13 +83,9 @@ class Waits(Counter):
 
 @contextmanager
 def find_waits() -> Iterator[Waits]:
-    """Runs the block on a CPU as it would run on a GPU, environments chosen by masks (see `rows`), and notes every
-    operation of PyTorch for which the host would wait there.
-
-    Simulators that only a CPU has take indices alone and do not work in the block.
-    """
+    """Runs the block and notes every operation of PyTorch for which the host would wait on a GPU."""
     found = Waits()
-    with patch.object(rows, "COUNTED_FREE_ON", ()), _Calls(found), _Operators(found):
+    with _Calls(found), _Operators(found):
         yield found
 
 

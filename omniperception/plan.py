@@ -277,8 +277,6 @@ def _rays(run: RunConfig, env: OmniEnv) -> Section:
     section.either(scene.num_bodies > 0, "moving bodies", moving, "poses copied each frame", "nothing moves")
     section.either(triangles > 0, "trees of triangles", f"{triangles} triangles", "meshes", "every shape is exact")
     section.either(heights > 0, "height field", f"{heights} heights", "tiled terrain", "the ground is a plane")
-    for geom, why in env.sensing.hidden.items():
-        section.leave_out(geom, why)
     return section
 
 

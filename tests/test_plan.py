@@ -14,6 +14,7 @@ import pytest
 import torch
 import warp as wp
 import yaml
+from omniperception.scene.reach import FieldOfView, unreachable_geoms
 
 from omniperception import build, config
 from omniperception.build import build_runner
@@ -24,7 +25,6 @@ from omniperception.lidar.launch import SplitLaunch
 from omniperception.plan import PLAN_FILE, contact_pairs, describe
 from omniperception.scene import build_world, ray_shapes
 from omniperception.scene.rays import hidden_geoms
-from omniperception.scene.reach import FieldOfView, unreachable_geoms
 
 ROOT = Path(__file__).resolve().parents[1]
 WALK = ("experiment=walk", "num_envs=13")

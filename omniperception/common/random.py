@@ -7,8 +7,6 @@ from collections.abc import Sequence
 
 import torch
 
-from omniperception.common.rows import put, take
-
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64
 _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
@@ -26,24 +24,24 @@ class EnvRandom:
         self._key = _mix(torch.arange(num_envs, device=device) + (seed + 1) * 1_000_003)
         self.counter = torch.zeros(num_envs, dtype=torch.int64, device=device)
 
-    def start_episode(self, envs: torch.Tensor) -> None:
-        """Goes on to the stretch of the stream that the next episode of `envs` (see `rows`) draws from.
+    def start_episode(self, env_ids: torch.Tensor) -> None:
+        """Moves on to the part of the stream that the next episode of environments `env_ids` (n,) draws from.
 
         What an environment draws in its k-th episode then depends on k, not on how much it drew before.
         """
-        put(self.counter, envs, (take(self.counter, envs) // _DRAWS_PER_EPISODE + 1) * _DRAWS_PER_EPISODE)
+        self.counter[env_ids] = (self.counter[env_ids] // _DRAWS_PER_EPISODE + 1) * _DRAWS_PER_EPISODE
 
-    def uniform(self, envs: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
-        """Draws from [0, 1) for some environments, see `rows`; the others' streams stay where they are.
+    def uniform(self, env_ids: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
+        """Draws from [0, 1) for environments `env_ids` (n,); the others' streams stay where they are.
 
         Returns:
-            (len(envs), *shape) float32.
+            (n, *shape) float32.
         """
         size = math.prod(shape)
         draw = torch.arange(1, size + 1, device=self.counter.device)
-        drawn = take(self.counter, envs)[:, None]
-        state = take(self._key, envs)[:, None] + (drawn + draw) * _GOLDEN
-        put(self.counter, envs, drawn[:, 0] + size)
+        drawn = self.counter[env_ids][:, None]
+        state = self._key[env_ids][:, None] + (drawn + draw) * _GOLDEN
+        self.counter[env_ids] = drawn[:, 0] + size
         bits = _shift(_mix(state), 40)
         return (bits.float() * 2.0**-24).reshape(-1, *shape)
 

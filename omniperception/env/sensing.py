@@ -20,12 +20,10 @@ from omniperception.lidar import (
     ScanPattern,
     SectorDistances,
     env_slices,
-    max_deviation,
     ray_bytes,
 )
 from omniperception.perception import Attitude
-from omniperception.scene.rays import HitClass, hidden_geoms, ray_shapes
-from omniperception.scene.reach import FieldOfView
+from omniperception.scene.rays import HitClass, ray_shapes
 from omniperception.sim import Simulator
 
 NEVER = 2**31
@@ -72,7 +70,6 @@ class LidarSensing:
     environment's history; its next frame comes with the sensor's next tick.
 
     Attributes:
-        hidden: geoms that are not in the ray scene, and why.
         base: index of the robot's base among the bodies of the ray scene.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
             newest last, with `base_motion` one row more: how the base moved since the frame before; None without a
@@ -128,8 +125,7 @@ class LidarSensing:
         self._steps_per_segment = self.period_steps // segments
         self._sim, self.sampler, self.whole = sim, sampler, whole
         self.config, pattern = config, config.pattern()
-        self.hidden = hidden_geoms(sim.world, config.exclude_geoms, field_of_view(config, pattern, noise))
-        shapes = ray_shapes(sim.world, self.hidden)
+        shapes = ray_shapes(sim.world, config.exclude_geoms)
         self._bodies, self.base = shapes.bodies, shapes.base
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
@@ -332,13 +328,6 @@ class LidarSensing:
             )
             for part, frame in zip(self.lidar.env_slices, self.lidar.slice_frames, strict=True)
         ]
-
-
-def field_of_view(sensor: LidarConfig, pattern: ScanPattern, noise: Sequence[Noise]) -> FieldOfView:
-    """Where the rays of a sensor go."""
-    directions, origins = pattern.directions_s.numpy(), pattern.origins_s
-    reach = 0.0 if origins is None else float(origins.double().norm(dim=1).max())
-    return FieldOfView.of(sensor.mount_pos, sensor.quat, directions, max_deviation(noise), reach)
 
 
 def _outputs(sampled: bool, sectors: bool, sightings: bool, distal: bool, whole: bool) -> tuple[str, ...]:

@@ -9,7 +9,6 @@ import torch
 import warp as wp
 
 from omniperception.common.launch import launch_over_envs, view
-from omniperception.common.rows import put, take
 from omniperception.scene import ground_kernels as kernels
 from omniperception.scene.terrain import GROUND
 from omniperception.scene.tiled_terrain import TiledTerrainConfig
@@ -26,7 +25,7 @@ class Ground:
     """Which tile each environment starts on, and how high the ground is in that environment's frame.
 
     The origin of an environment's frame is the middle of its tile, at the height of the ground there. The surface is
-    the one that MuJoCo collides and rays meet: two triangles to a cell, divided from (row, col) to (row + 1, col + 1).
+    the one that MuJoCo collides and rays hit: two triangles to a cell, divided from (row, col) to (row + 1, col + 1).
 
     Attributes:
         level: (num_envs,) int64 row of each environment's tile, 0 the easiest.
@@ -64,20 +63,20 @@ class Ground:
         self._surface = self._as_struct()
         self.move(self._all_envs, self.level.clone())
 
-    def move(self, envs: torch.Tensor, level: torch.Tensor) -> None:
-        """Puts some environments, see `rows`, on the tiles of levels (n,) in their columns."""
-        put(self.level, envs, level)
+    def move(self, env_ids: torch.Tensor, level: torch.Tensor) -> None:
+        """Puts environments `env_ids` (n,) on the tiles of levels (n,) in their columns."""
+        self.level[env_ids] = level
         grid, border = self.config.grid, self.config.border_cells
-        tile = torch.stack((level, take(self.column, envs)), -1)
+        tile = torch.stack((level, self.column[env_ids]), -1)
         middle = border + (2 * tile + 1) * grid.half
         height = self._heights[middle[:, 1] * self._cols + middle[:, 0]]
-        put(self._middle, envs, middle)
-        put(self._middle_height, envs, height)
-        put(self._pos_w[:, :2], envs, self._half - middle * self.config.cell)
-        put(self._pos_w[:, 2], envs, -height)
+        self._middle[env_ids] = middle
+        self._middle_height[env_ids] = height
+        self._pos_w[env_ids, :2] = self._half - middle * self.config.cell
+        self._pos_w[env_ids, 2] = -height.to(self._pos_w.dtype)
 
-    def height(self, xy_w: torch.Tensor, envs: torch.Tensor | None = None) -> torch.Tensor:
-        """Heights (n, ...) in m of the ground below points (n, ..., 2) in the frames of `envs` (see `rows`), or of all.
+    def height(self, xy_w: torch.Tensor, env_ids: torch.Tensor | None = None) -> torch.Tensor:
+        """Heights (n, ...) in m of the ground below points (n, ..., 2) in the frames of `env_ids` (n,), or of all.
 
         Beyond its edge the terrain goes on as high as at the edge.
         """
@@ -86,7 +85,7 @@ class Ground:
         points = xy_w.reshape(len(xy_w), -1, 2)
         heights = points.new_empty(points.shape[:2])
         real, vec2 = _REAL[xy_w.dtype]
-        ids = self._all_envs if envs is None else take(self._all_envs, envs).contiguous()
+        ids = self._all_envs if env_ids is None else env_ids.contiguous()
         arrays = [view(ids, wp.int64), view(points, vec2), view(heights, real)]
         self.launch(kernels.heights_kernel(real), arrays, *points.shape[:2])
         return heights.reshape(xy_w.shape[:-1])
@@ -109,7 +108,7 @@ class Ground:
         threads = self._num_threads if num_envs * lookups > _LOOKUPS_PER_THREAD else 1
         launch_over_envs(kernel, num_envs, [self._surface, *inputs], self._heights.device, num_threads=threads)
 
-    def highest(self, xy_w: torch.Tensor, radius: float, envs: torch.Tensor) -> torch.Tensor:
+    def highest(self, xy_w: torch.Tensor, radius: float, env_ids: torch.Tensor) -> torch.Tensor:
         """Heights (n,) in m of the highest grid point within a square of 2 `radius` (m) and the cells around it.
 
         Nothing of the surface within `radius` of the points (n, 2) is higher.
@@ -117,10 +116,10 @@ class Ground:
         reach = math.ceil(radius / self.config.cell) + 1
         step = torch.arange(-reach, reach + 1, device=xy_w.device)
         window = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1).flatten(0, 1)
-        index = (xy_w / self.config.cell).round().long() + take(self._middle, envs)
+        index = (xy_w / self.config.cell).round().long() + self._middle[env_ids]
         index = (index[:, None] + window).clamp(min=0).minimum(self._last + 1)
         highest = self._heights[index[..., 1] * self._cols + index[..., 0]].amax(1)
-        return highest - take(self._middle_height, envs)
+        return highest - self._middle_height[env_ids]
 
     def outside(self, xy_w: torch.Tensor) -> torch.Tensor:
         """(num_envs,) bool: which points (num_envs, 2) lie within EDGE of the terrain's outer edge, or beyond."""

@@ -55,7 +55,7 @@ def height_beside(surface: Surface, env: int, base_pos: wp.array2d(dtype=wp.floa
 
 @cache
 def heights_kernel(real: type) -> wp.Kernel:
-    """The kernel for points in ``wp.float32`` or ``wp.float64``; it reckons in float64."""
+    """The kernel for points in ``wp.float32`` or ``wp.float64``; it computes in float64."""
     vec2 = wp.types.vector(2, real)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -118,7 +118,7 @@ def heights_around(
 
 @cache
 def lift_kernel(real: type) -> wp.Kernel:
-    """The kernel for obstacles in ``wp.float32`` or ``wp.float64``; it reckons in float64."""
+    """The kernel for obstacles in ``wp.float32`` or ``wp.float64``; it computes in float64."""
     vec3 = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False)

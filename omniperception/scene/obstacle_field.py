@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import torch
 
 from omniperception.common.random import EnvRandom
-from omniperception.common.rows import chosen, put, take
 from omniperception.scene.obstacles import Obstacle, ObstaclesConfig
 
 if TYPE_CHECKING:
@@ -36,8 +35,6 @@ class ObstacleField:
         radius: (num_placed,) m, of the circle around the footprint.
         approaches: (num_placed,) bool: which obstacles come at the robot.
         any_approaches: whether some do, and `start_anew` has to be called.
-        searches: whether places are searched for, which takes long and is best not done for more environments than
-            need it.
         level: share of obstacles and of their speed that the curriculum lets in, 0 to 1.
     """
 
@@ -72,7 +69,7 @@ class ObstacleField:
         self._within = column(*(group.approach.within if group.approach else 0.0 for group in groups))
         self._start = column(*(group.approach.distance if group.approach else (0.0, 0.0) for group in groups))
         self.any_approaches = bool(self.approaches.any())
-        self.searches = config.spacing > 0.0 or config.free_path is not None
+        self._searches = config.spacing > 0.0 or config.free_path is not None
         self._any_moves = any(_moves(slot) for slot in slots)
         self._stands = torch.tensor([not _moves(slot) for slot in slots], device=device)
         self.velocity_w = torch.zeros(pos_w.shape[0], len(slots), 2, dtype=self._dtype, device=device)
@@ -84,44 +81,44 @@ class ObstacleField:
 
     def reset(
         self,
-        envs: torch.Tensor,
+        env_ids: torch.Tensor,
         robot_xy_w: torch.Tensor,
         command_w: torch.Tensor | None = None,
         goal_w: torch.Tensor | None = None,
     ) -> None:
-        """Places the obstacles of some environments anew.
+        """Places the obstacles of some environments again.
 
         Args:
-            envs: which, see `rows`.
+            env_ids: (n,) which environments.
             robot_xy_w: (n, 2) where the robot stands, m.
             command_w: (n, 2) the velocity (m/s) that it is commanded; None for none.
             goal_w: (n, 2) where it is to go, m; only a free path needs it.
         """
         robot = robot_xy_w.to(self._dtype)
-        u = self._random.uniform(envs, (7, self.pos_w.shape[1])).to(self._dtype)
+        u = self._random.uniform(env_ids, (7, self.pos_w.shape[1])).to(self._dtype)
         bottom, yaw, heading = (
             _within(bounds, u[:, row]) for row, bounds in ((6, self._bottom), (2, self._yaw), (4, self._heading))
         )
         speed = _within(self._speed, u[:, 3]) * self.level
         active = u[:, 5] < self.level
-        if self.searches:
-            xy, found = self._keep_clear(envs, robot, goal_w, bottom)
+        if self._searches:
+            xy, found = self._keep_clear(env_ids, robot, goal_w, bottom)
             active = active & found
         else:
             xy = self._push_off(self._in_area(u[:, :2], robot), robot)
-        put(self.active, envs, active)
-        put(self.velocity_w, envs, _unit(heading) * (speed * active)[..., None])
+        self.active[env_ids] = active
+        self.velocity_w[env_ids] = _unit(heading) * (speed * active)[..., None]
         z = torch.where(active, bottom + self._half_height, PARKED_HEIGHT)
-        put(self.pos_w, envs, torch.cat((xy, z[..., None]), -1))
+        self.pos_w[env_ids] = torch.cat((xy, z[..., None]), -1)
         if self._ground is not None:
-            put(self._above_ground, envs, bottom + self._half_height)
+            self._above_ground[env_ids] = bottom + self._half_height
         zero = torch.zeros_like(yaw)
-        put(self.quat_w, envs, torch.stack(((yaw / 2).cos(), zero, zero, (yaw / 2).sin()), -1))
+        self.quat_w[env_ids] = torch.stack(((yaw / 2).cos(), zero, zero, (yaw / 2).sin()), -1)
         if self.any_approaches:
             command = torch.zeros_like(robot) if command_w is None else command_w.to(self._dtype)
-            self._start_approach(envs, self.approaches & active, robot, command)
+            self._start_approach(env_ids, self.approaches & active, robot, command)
         if self._ground is not None:
-            put(self.pos_w[..., 2], envs, self._over_ground(take(self.pos_w, envs)[..., :2], envs))
+            self.pos_w[env_ids, :, 2] = self._over_ground(self.pos_w[env_ids, :, :2], env_ids)
 
     def advance(self, dt: float, robot_xy_w: torch.Tensor) -> None:
         """Moves every obstacle level by `dt` (s); `robot_xy_w` (num_envs, 2) is the centre of a wrapping area."""
@@ -165,10 +162,10 @@ class ObstacleField:
         """Lets approaching obstacles that have left the robot behind come again; see `reset` for the arguments."""
         distance = (self.pos_w[..., :2] - robot_xy_w.to(self._dtype)[:, None]).norm(dim=-1)
         gone = self.approaches & self.active & (distance > self._start[:, 1] + LOSE_SIGHT)
-        envs = chosen(gone.any(1))
-        if len(envs):
-            robot, command = (take(xy, envs).to(self._dtype) for xy in (robot_xy_w, command_w))
-            self._start_approach(envs, take(gone, envs), robot, command)
+        env_ids = gone.any(1).nonzero().flatten()
+        if len(env_ids):
+            robot, command = (xy[env_ids].to(self._dtype) for xy in (robot_xy_w, command_w))
+            self._start_approach(env_ids, gone[env_ids], robot, command)
 
     def raise_level(self, velocity_error: float, seconds: float) -> None:
         """Raises the curriculum's level while the robot walks well (`velocity_error` in m/s)."""
@@ -214,19 +211,19 @@ class ObstacleField:
         return places.gather(0, first[None, ..., None].expand(1, -1, -1, 2))[0]
 
     def _keep_clear(
-        self, envs: torch.Tensor, robot: torch.Tensor, goal: torch.Tensor | None, bottom: torch.Tensor
+        self, env_ids: torch.Tensor, robot: torch.Tensor, goal: torch.Tensor | None, bottom: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Places (n, num_placed, 2) with the spacing and off the free path, and (n, num_placed) whether found.
 
         Obstacles choose in turn. Every environment draws equally many random numbers, whatever fits.
         """
         config, count = self.config, self.pos_w.shape[1]
-        u = self._random.uniform(envs, (_CANDIDATES * 2, count)).to(self._dtype)
+        u = self._random.uniform(env_ids, (_CANDIDATES * 2, count)).to(self._dtype)
         places = torch.stack([self._in_area(pair, robot) for pair in u.split(2, 1)], 2)  # (n, num_placed, C, 2)
         in_the_way = self._stands & (bottom < config.headroom)
         fits = (places - robot[:, None, None]).norm(dim=-1) - self.radius[:, None] >= config.clearance
         if config.free_path is not None:
-            bends = config.free_path.bend * (2 * self._random.uniform(envs, (2,)).to(self._dtype) - 1)
+            bends = config.free_path.bend * (2 * self._random.uniform(env_ids, (2,)).to(self._dtype) - 1)
             off_path = distance_to_path(places, bent_path(robot, goal.to(self._dtype), bends)) - self.radius[:, None]
             fits &= (off_path >= config.free_path.width / 2) | ~in_the_way[..., None]
         xy, found = places[:, :, 0].clone(), self.approaches.repeat(len(robot), 1)
@@ -241,26 +238,26 @@ class ObstacleField:
         return xy, found
 
     def _start_approach(
-        self, envs: torch.Tensor, which: torch.Tensor, robot: torch.Tensor, command: torch.Tensor
+        self, env_ids: torch.Tensor, which: torch.Tensor, robot: torch.Tensor, command: torch.Tensor
     ) -> None:
         """Puts obstacles `which` (n, num_placed) around the robots (n, 2) on courses that lead past them."""
-        u = self._random.uniform(envs, (3, self.pos_w.shape[1])).to(self._dtype)
+        u = self._random.uniform(env_ids, (3, self.pos_w.shape[1])).to(self._dtype)
         bearing = _unit(2 * math.pi * u[:, 0])
         distance = _within(self._start, u[:, 1])
         miss = (2 * u[:, 2] - 1) * self._within
-        before = take(self.velocity_w, envs)
+        before = self.velocity_w[env_ids]
         speed = before.norm(dim=-1)  # which an obstacle keeps through the episode
         velocity = passing_velocity(bearing, distance, miss, speed, command[:, None])
         xy = robot[:, None] + bearing * distance[..., None]
-        put(self.pos_w[..., :2], envs, torch.where(which[..., None], xy, take(self.pos_w, envs)[..., :2]))
-        put(self.velocity_w, envs, torch.where(which[..., None], velocity, before))
+        self.pos_w[env_ids, :, :2] = torch.where(which[..., None], xy, self.pos_w[env_ids, :, :2])
+        self.velocity_w[env_ids] = torch.where(which[..., None], velocity, before)
 
     # ---- moving ------------------------------------------------------------------------------------------------------
 
-    def _over_ground(self, xy: torch.Tensor, envs: torch.Tensor) -> torch.Tensor:
+    def _over_ground(self, xy: torch.Tensor, env_ids: torch.Tensor) -> torch.Tensor:
         """Heights (n, num_placed) of the obstacles' centres where they are at (n, num_placed, 2)."""
-        above = take(self._above_ground, envs) + self._ground.height(xy, envs)
-        return torch.where(take(self.active, envs), above, PARKED_HEIGHT)
+        above = self._above_ground[env_ids] + self._ground.height(xy, env_ids)
+        return torch.where(self.active[env_ids], above, PARKED_HEIGHT)
 
     def _bounce(self) -> None:
         xy, free = self.pos_w[..., :2], self.approaches[:, None]

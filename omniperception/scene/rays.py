@@ -1,4 +1,4 @@
-"""Turns a compiled environment into the shapes that LiDAR rays can meet."""
+"""Turns a compiled environment into the shapes that LiDAR rays can hit."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from enum import IntEnum
 from omniperception.lidar import Shape
 from omniperception.lidar.mujoco import geom_shapes
 from omniperception.scene.build import World
-from omniperception.scene.reach import FieldOfView, unreachable_geoms
 from omniperception.scene.terrain import GROUND
 
 
 class HitClass(IntEnum):
-    """What a ray has met."""
+    """What a ray has hit."""
 
     TERRAIN = 0
     OBSTACLE = 1
@@ -42,12 +41,19 @@ class RayShapes:
         return tuple(self.geom_names.index(name) for name in geom_names)
 
 
-def ray_shapes(world: World, leave_out: Collection[str] = ()) -> RayShapes:
-    """The geoms of the environment but those named in `leave_out`, as exact shapes; what cannot move has no pose."""
+def ray_shapes(world: World, exclude_geoms: Collection[str] = ()) -> RayShapes:
+    """Exact shapes of all geoms of the environment but `exclude_geoms`; what cannot move has no pose.
+
+    Raises:
+        ValueError: `exclude_geoms` names a geom that does not exist.
+    """
     model = world.model
+    known = [model.geom(k).name for k in range(model.ngeom)]
+    unknown = sorted(set(exclude_geoms) - set(known))
+    if unknown:
+        raise ValueError(f"robot.mounts: exclude_geoms names {', '.join(unknown)}; known: {', '.join(known)}")
+    kept = [k for k, name in enumerate(known) if name not in exclude_geoms]
     obstacles = set(world.obstacles.geom_names())
-    kept = [k for k in range(model.ngeom) if model.geom(k).name not in leave_out]
-    names = tuple(model.geom(k).name for k in kept)
     found = geom_shapes(model, geoms=kept)
     bodies = tuple(dict.fromkeys((*found.body_ids, world.base_body)))
 
@@ -56,23 +62,7 @@ def ray_shapes(world: World, leave_out: Collection[str] = ()) -> RayShapes:
             return HitClass.OBSTACLE
         return HitClass.ROBOT if shape.body >= 0 and name != GROUND else HitClass.TERRAIN
 
-    shapes = (
-        replace(shape, class_id=int(hit_class(name, shape))) for name, shape in zip(names, found.shapes, strict=True)
-    )
-    return RayShapes(tuple(shapes), names, bodies, bodies.index(world.base_body))
-
-
-def hidden_geoms(world: World, exclude: Collection[str], view: FieldOfView) -> dict[str, str]:
-    """Geoms of the robot that no ray of a sensor on its base meets, and why: excluded, or out of its reach.
-
-    Raises:
-        ValueError: `exclude` names a geom that the robot does not have.
-    """
-    model = world.model
-    known = [model.geom(k).name for k in range(model.ngeom)]
-    unknown = sorted(set(exclude) - set(known))
-    if unknown:
-        raise ValueError(f"robot.mounts: exclude_geoms names {unknown}; known: {', '.join(known)}")
-    beyond = unreachable_geoms(model, world.base_body, view)
-    hidden = {known[k]: "out of the reach of every ray, however the joints stand" for k in sorted(beyond)}
-    return hidden | dict.fromkeys(exclude, "named in its mount's exclude_geoms")
+    names = tuple(known[k] for k in kept)
+    named = zip(names, found.shapes, strict=True)
+    shapes = tuple(replace(shape, class_id=int(hit_class(name, shape))) for name, shape in named)
+    return RayShapes(shapes, names, bodies, bodies.index(world.base_body))

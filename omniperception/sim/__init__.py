@@ -1,6 +1,6 @@
 """Physics back ends behind one protocol."""
 
-from omniperception.sim.base import Failure, SimConfig, Simulator
-from omniperception.sim.mujoco import MujocoSimulator
+from omniperception.sim.base import Failure, Simulator
+from omniperception.sim.mujoco import MujocoSimulator, SimConfig
 
 __all__ = ["Failure", "MujocoSimulator", "SimConfig", "Simulator"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
@@ -10,8 +9,6 @@ import torch
 
 from omniperception.scene import World
 
-_INTEGRATORS = ("euler", "implicitfast", "implicit", "rk4")
-_CONES = ("pyramidal", "elliptic")
 MAX_SPEED = 1e3
 """A generalised velocity (m/s or rad/s) beyond this is a diverged simulation."""
 MAX_DISTANCE = 1e4
@@ -32,58 +29,6 @@ class Failure(IntEnum):
     """It is so far away that single precision no longer resolves a millimetre."""
     ENGINE = 5
     """The engine warned or gave up: a singular inertia, full contact buffers, an acceleration out of bounds."""
-
-
-@dataclass(frozen=True)
-class SimConfig:
-    """Physics settings.
-
-    Attributes:
-        timestep: physics step (s).
-        decimation: physics steps per control step.
-        integrator: 'euler', 'implicitfast', 'implicit' or 'rk4'.
-        iterations: iterations of the constraint solver.
-        ls_iterations: line-search iterations of the solver.
-        cone: friction cone, 'pyramidal' or 'elliptic'.
-        num_threads: CPU threads; 0 uses every core.
-    """
-
-    timestep: float = 0.005
-    decimation: int = 4
-    integrator: str = "implicitfast"
-    iterations: int = 10
-    ls_iterations: int = 20
-    cone: str = "pyramidal"
-    num_threads: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.timestep < float("inf"):
-            raise ValueError(f"sim.timestep={self.timestep} must be positive")
-        for name in ("decimation", "iterations", "ls_iterations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"sim.{name}={getattr(self, name)} must be at least 1")
-        if self.num_threads < 0:
-            raise ValueError(f"sim.num_threads={self.num_threads} must be 0 (every core) or a positive number")
-        if self.integrator not in _INTEGRATORS:
-            raise ValueError(f"sim.integrator={self.integrator} is unknown; known: {', '.join(_INTEGRATORS)}")
-        if self.cone not in _CONES:
-            raise ValueError(f"sim.cone={self.cone} is unknown; known: {', '.join(_CONES)}")
-
-    @property
-    def control_dt(self) -> float:
-        """Control step (s)."""
-        return self.timestep * self.decimation
-
-    @property
-    def torch_device(self) -> torch.device:
-        """Where the simulations and everything that they feed live."""
-        return torch.device("cpu")
-
-    def build(self, world: World, num_envs: int, record_states: bool = False) -> Simulator:
-        """`num_envs` simulations of a world; with `record_states` their states after each physics step are kept."""
-        from omniperception.sim.mujoco import MujocoSimulator
-
-        return MujocoSimulator(world, self, num_envs, record_states)
 
 
 class Simulator(Protocol):

@@ -15,8 +15,8 @@ import warp as wp
 
 from omniperception.lidar.launch import wp_device
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, SimConfig
-from omniperception.sim.mujoco import apply_options
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder
+from omniperception.sim.mujoco import SimConfig, apply_options
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 """Model fields that the engine derives from masses and inertias."""

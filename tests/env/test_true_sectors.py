@@ -158,7 +158,7 @@ def test_risk_is_of_what_a_ray_has_hit_alone(risky_env):
     held = avoidance.motion
     assert torch.equal(held, measured(known)) and not torch.equal(held, measured(None))
     hit = env.sensing.frame.shape_id
-    names = ray_shapes(env.world, env.sensing.hidden).geom_names
+    names = ray_shapes(env.world, env.sensing.config.exclude_geoms).geom_names
     for env_id in range(5):
         seen = {names[k] for k in hit[env_id].unique().tolist() if k >= 0}
         for o, name in enumerate(avoidance.true_sectors.names):

@@ -1,0 +1,55 @@
+"""A control step synchronises the host with the device only to count environments; shown on a CPU by operators."""
+
+import traceback
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import omniperception
+
+PACKAGE = Path(omniperception.__file__).parent
+NEEDS_HOST = {"nonzero", "_local_scalar_dense", "is_nonzero", "equal", "bincount", "masked_select", "_unique2"}
+"""Operators whose result has a size, or is a number, that the host has to know."""
+BY_MASK = {"index", "index_put", "index_put_", "_index_put_impl_"}
+ON_WARP = ("sim=mujoco_warp", "sim.device=cpu", "randomization=paper")
+
+
+class Synchronisations(TorchDispatchMode):
+    """Counts, by file of the package, the operators for which the host waits for a GPU."""
+
+    def __init__(self):
+        super().__init__()
+        self.files = Counter()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        if name in NEEDS_HOST or (name in BY_MASK and any(i is not None and i.dtype == torch.bool for i in args[1])):
+            frames = [Path(frame.filename) for frame in traceback.extract_stack()]
+            inside = [path for path in frames if path.is_relative_to(PACKAGE)]
+            self.files[str(inside[-1].relative_to(PACKAGE))] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "times"),
+    [
+        (("experiment=walk",), 2),
+        (("experiment=avoid", "terrain=mixed", "lidar.num_rays=100"), 2),
+        (("experiment=avoid", "obstacles=crowd", "lidar.num_rays=100"), 3),
+    ],
+)
+def test_a_step_counts_environments_and_nothing_else(make_env, overrides, times):
+    """Those that end, those whose command is drawn again, and those with an approaching obstacle that has passed."""
+    env = make_env(*overrides, *ON_WARP)
+    if env.obstacles is not None:
+        env.obstacles.level = 1.0
+    env.step(torch.zeros(4, 12))
+    ends = 0
+    with Synchronisations() as found:
+        for step in range(10):
+            env.episode_length_buf[step % 4] = env.max_episode_length - 1
+            ends += int(env.step(torch.randn(4, 12))[2].numpy().sum())
+    assert ends >= 10 and sum(found.files.values()) == 10 * times, found.files
