@@ -61,7 +61,9 @@ NAMES: dict[str, Kind] = {
         _members("scene.terrain", flat="TerrainConfig") | _members("scene.tiled_terrain", tiled="TiledTerrainConfig")
     ),
     "terrain.tiles.*": Kind(_members("scene.tiles", rough="Rough", slope="Slope", stairs="Stairs", stones="Stones")),
-    "sim": Kind(_members("sim.base", mujoco="SimConfig") | _members("sim.mujoco_warp", mujoco_warp="MujocoWarpConfig")),
+    "sim": Kind(
+        _members("sim.mujoco", mujoco="SimConfig") | _members("sim.mujoco_warp", mujoco_warp="MujocoWarpConfig")
+    ),
     "lidar.pattern": Kind(_members("lidar", **{name: name for name in _PATTERNS.split()}), built=False),
     "perception.sampler": Kind(
         _members("perception", raw="RawSampler", fps="FpsSampler", pd="PdSampler", proximity="ProximitySampler"),

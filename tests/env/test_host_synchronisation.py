@@ -37,8 +37,7 @@ class Synchronisations(TorchDispatchMode):
     ("overrides", "times"),
     [
         (("experiment=walk",), 2),
-        (("experiment=avoid", "terrain=mixed", "lidar.num_rays=100"), 2),
-        (("experiment=avoid", "obstacles=crowd", "lidar.num_rays=100"), 3),
+        (("experiment=avoid", "terrain=mixed", "lidar.num_rays=100"), 3),
     ],
 )
 def test_a_step_counts_environments_and_nothing_else(make_env, overrides, times):

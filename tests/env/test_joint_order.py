@@ -13,7 +13,7 @@ from omniperception.env.mirror import mirrored_joints
 ORDER = [7, 2, 11, 0, 9, 4, 1, 10, 3, 8, 5, 6]
 JOINTS = tuple(f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf"))
 PERMUTED = f"robot.joints=[{','.join(JOINTS[k] for k in ORDER)}]"
-PER_JOINT = {"joint_pos": 1, "joint_vel": 1, "previous_action": 1, "proprioception": 2}
+PER_JOINT = {"joint_pos_offset": 1, "joint_vel": 1, "previous_action": 1, "true_proprioception": 2}
 """How many numbers for each joint a term begins with."""
 TASK = (
     "obstacles=moving",
