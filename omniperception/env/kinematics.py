@@ -21,7 +21,7 @@ class Kinematics:
 
     def __init__(self, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         """From `Simulator.robot_state`: (n, 7 + joints) and (n, 6 + joints)."""
-        qpos, self._qvel = (values.to(torch.float32, copy=True) for values in (qpos, qvel))
+        qpos, self._qvel = qpos.float(), qvel.float()
         self.base_pos_w, self.base_quat_w, self.joint_pos = qpos[:, :3], qpos[:, 3:7], qpos[:, 7:]
         self.base_ang_vel_b, self.joint_vel = self._qvel[:, 3:6], self._qvel[:, 6:]
 
