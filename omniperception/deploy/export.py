@@ -21,7 +21,9 @@ from omniperception.deploy.description import Description, Group, Joints, Lidar,
 from omniperception.env.env import MAX_ACTION, OmniEnv
 from omniperception.env.mdp import observations
 from omniperception.env.mdp.commands import VelocityCommandConfig
+from omniperception.env.sensing import SensorConfig
 from omniperception.learning.checkpoint import load_checkpoint
+from omniperception.learning.config import PerceptionConfig
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.read_out import MotionReadOut
 from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler
@@ -100,8 +102,8 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         joints=joints,
         observations=tuple(_group(name, env) for name in run.env.observations.actor),
         command=_command_ranges(run),
-        lidar=_lidar(run) if run.perception is not None else None,
-        perception=_perception(run) if run.perception is not None else None,
+        lidar=_lidar(run.env.lidar) if run.perception is not None and run.env.lidar is not None else None,
+        perception=_perception(run.perception) if run.perception is not None else None,
     )
 
 
@@ -133,8 +135,8 @@ def _command_ranges(run: RunConfig) -> dict[str, list[float]]:
     return {"lin_vel_x": [-speed, speed], "lin_vel_y": [-speed, speed], "ang_vel_z": [-turn, turn]}
 
 
-def _lidar(run: RunConfig) -> Lidar:
-    sensor, pattern = run.env.lidar, run.env.lidar.pattern()
+def _lidar(sensor: SensorConfig) -> Lidar:
+    pattern = sensor.pattern()
     every_kth = sensor.selection == "every_kth"
     return Lidar(
         period_s=sensor.period_s,
@@ -148,10 +150,9 @@ def _lidar(run: RunConfig) -> Lidar:
     )
 
 
-def _perception(run: RunConfig) -> Perception:
-    sampler = run.perception.sampler()
-    moves = run.perception.base_motion
-    return Perception(run.perception.history, sampler.num_points + moves, sampler_parameters(sampler), moves)
+def _perception(config: PerceptionConfig) -> Perception:
+    sampler, moves = config.sampler(), config.base_motion
+    return Perception(config.history, sampler.num_points + moves, sampler_parameters(sampler), moves)
 
 
 def sampler_parameters(sampler: Sampler) -> dict:
@@ -182,7 +183,7 @@ def sampler_parameters(sampler: Sampler) -> dict:
 class BlindNetwork(nn.Module):
     """Flat observations -> actions; the observations' normalisation is part of it."""
 
-    input_names = ("observations",)
+    input_names: Sequence[str] = ("observations",)
 
     def __init__(self, actor: MLPModel) -> None:
         """Args: actor: copied, on the CPU."""
@@ -210,7 +211,9 @@ class PerceptiveNetwork(BlindNetwork):
         super().__init__(actor)
         self.command_start = command_start
 
-    def forward(self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor) -> torch.Tensor:
+    def forward(  # type: ignore[override]
+        self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor
+    ) -> torch.Tensor:
         """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> (B, num_actions)."""
         features = self.actor.perception(frames, frame_count)[:, 0]
         if self.actor.read_out is not None:

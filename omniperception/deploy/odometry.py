@@ -32,6 +32,7 @@ class Odometry:
         """(3,) x, y (m) and yaw (rad) since the call before, in the levelled base of then."""
         cos, sin = np.cos(self._yaw_before), np.sin(self._yaw_before)
         dx, dy = self._travelled_w
-        turned = np.remainder(self._yaw - self._yaw_before + np.pi, 2 * np.pi) - np.pi
-        self._travelled_w, self._yaw_before = np.zeros(2), self._yaw
+        yaw = self._yaw_before if self._yaw is None else self._yaw
+        turned = np.remainder(yaw - self._yaw_before + np.pi, 2 * np.pi) - np.pi
+        self._travelled_w, self._yaw_before = np.zeros(2), yaw
         return np.array([cos * dx + sin * dy, -sin * dx + cos * dy, turned], np.float32)

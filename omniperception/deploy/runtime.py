@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from omniperception.deploy.description import DeployError, Description, Group
+from omniperception.deploy.description import DeployError, Description, Group, Lidar
 from omniperception.deploy.odometry import Odometry
-from omniperception.deploy.sampling import Attitude, make_sampler
+from omniperception.deploy.sampling import Attitude, CloudSampler, make_sampler
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -31,11 +32,11 @@ class RobotState:
             observes it nor follows the base's motion.
     """
 
-    joint_pos: Sequence[float]
-    joint_vel: Sequence[float]
-    base_quat: Sequence[float]
-    base_ang_vel: Sequence[float]
-    base_lin_vel: Sequence[float] | None = None
+    joint_pos: ArrayLike
+    joint_vel: ArrayLike
+    base_quat: ArrayLike
+    base_ang_vel: ArrayLike
+    base_lin_vel: ArrayLike | None = None
 
 
 class ExportedPolicy:
@@ -59,7 +60,9 @@ class ExportedPolicy:
         joints, perception = description.joints, description.perception
         self._default_pos = np.asarray(joints.default_pos, np.float32)
         self._sampler = make_sampler(perception.sampler) if perception is not None else None
-        self._histories = {group.name: deque(maxlen=group.history) for group in description.observations}
+        self._histories: dict[str, deque[np.ndarray]] = {
+            group.name: deque(maxlen=group.history) for group in description.observations
+        }
         self.frames: np.ndarray | None = None
         if perception is not None:
             self.frames = np.zeros((perception.history, perception.num_points, 3), np.float32)
@@ -114,31 +117,31 @@ class ExportedPolicy:
 
     def thin(self, points: np.ndarray) -> np.ndarray:
         """Of a device's whole frame (n, 3), misses as zeros or left out, the points that training would have kept."""
-        lidar = self._lidar()
+        lidar = self._perception()[0]
         if lidar.keep_every is not None:
             return points[:: lidar.keep_every][: lidar.num_rays]
         count = min(len(points), -(-len(points) * lidar.num_rays // lidar.points_per_frame))
         return points[np.arange(count) * len(points) // max(count, 1)]
 
-    def see(self, points: np.ndarray, base_quat: Sequence[float]) -> None:
+    def see(self, points: np.ndarray, base_quat: ArrayLike) -> None:
         """Appends a LiDAR frame to the history; :meth:`step` does it for points that it is given.
 
         Args:
             points: (n, 3) m in the sensor frame, in the order of measurement.
             base_quat: (4,) orientation of the base at the end of the frame, (w, x, y, z).
         """
-        lidar = self._lidar()
+        lidar, sampler, frames = self._perception()
         points = np.asarray(points, np.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
         attitude = Attitude(_quaternion(base_quat), lidar.mount_pos, lidar.mount_quat)
-        self.frames[:-1] = self.frames[1:]
-        self.frames[-1, : self._sampler.num_points] = self._sampler(points, attitude)
+        frames[:-1] = frames[1:]
+        frames[-1, : sampler.num_points] = sampler(points, attitude)
         if self._odometry is not None:
-            self.frames[-1, -1] = self._odometry.since_last_frame()
-        self.frame_count = min(self.frame_count + 1, len(self.frames))
+            frames[-1, -1] = self._odometry.since_last_frame()
+        self.frame_count = min(self.frame_count + 1, len(frames))
 
-    def step(self, state: RobotState, command: Sequence[float], points: np.ndarray | None = None) -> np.ndarray:
+    def step(self, state: RobotState, command: ArrayLike, points: np.ndarray | None = None) -> np.ndarray:
         """One control step.
 
         Args:
@@ -162,8 +165,8 @@ class ExportedPolicy:
         self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
         return self._default_pos + np.float32(joints.action_scale) * self.action
 
-    def _observe(self, state: RobotState, command: Sequence[float]) -> np.ndarray:
-        parts = []
+    def _observe(self, state: RobotState, command: ArrayLike) -> np.ndarray:
+        parts: list[np.ndarray] = []
         for group in self.description.observations:
             history = self._histories[group.name]
             value = self._measure(group, state, command)
@@ -171,7 +174,7 @@ class ExportedPolicy:
             parts += history
         return np.concatenate(parts)
 
-    def _measure(self, group: Group, state: RobotState, command: Sequence[float]) -> np.ndarray:
+    def _measure(self, group: Group, state: RobotState, command: ArrayLike) -> np.ndarray:
         """(width,) the group's terms at this step."""
         values = []
         for term in group.terms:
@@ -183,10 +186,11 @@ class ExportedPolicy:
             values.append(value * np.float32(term.scale))
         return np.concatenate(values)
 
-    def _lidar(self):
-        if self.frames is None:
+    def _perception(self) -> tuple[Lidar, CloudSampler, np.ndarray]:
+        """The sensor, the sampler and the history of frames of a policy that sees."""
+        if self.description.lidar is None or self._sampler is None or self.frames is None:
             raise DeployError("this policy is blind: it was trained without a LiDAR and takes no points")
-        return self.description.lidar
+        return self.description.lidar, self._sampler, self.frames
 
     def _check_network(self) -> None:
         """The network and its description belong together."""
@@ -200,7 +204,7 @@ class ExportedPolicy:
             )
         if self.frames is None:
             return
-        rows = self._sampler.num_points + (self._odometry is not None)
+        rows = self._perception()[1].num_points + (self._odometry is not None)
         if rows != self.frames.shape[1]:
             raise DeployError(
                 f"the sampler and the base's motion give {rows} rows, the network reads {self.frames.shape[1]}; export"
@@ -208,10 +212,14 @@ class ExportedPolicy:
             )
 
 
-def _vector(name: str) -> Callable[[ExportedPolicy, RobotState, Sequence[float]], np.ndarray]:
+Quantity = Callable[[ExportedPolicy, RobotState, ArrayLike], np.ndarray]
+"""What a policy observes, from the robot's state and the command."""
+
+
+def _vector(name: str) -> Quantity:
     """Reads a field of the state as float32."""
 
-    def read(policy: ExportedPolicy, state: RobotState, command: Sequence[float]) -> np.ndarray:
+    def read(policy: ExportedPolicy, state: RobotState, command: ArrayLike) -> np.ndarray:
         value = getattr(state, name)
         if value is None:
             raise DeployError(f"{name}: this policy observes it, None was given")
@@ -220,28 +228,28 @@ def _vector(name: str) -> Callable[[ExportedPolicy, RobotState, Sequence[float]]
     return read
 
 
-def _joint_pos_offset(policy: ExportedPolicy, state: RobotState, command: Sequence[float]) -> np.ndarray:
+def _joint_pos_offset(policy: ExportedPolicy, state: RobotState, command: ArrayLike) -> np.ndarray:
     """Joint position relative to the default pose, rad."""
     joint_pos = np.asarray(state.joint_pos, np.float32)
     return joint_pos - policy._default_pos if joint_pos.shape == policy._default_pos.shape else joint_pos
 
 
-def _projected_gravity(policy: ExportedPolicy, state: RobotState, command: Sequence[float]) -> np.ndarray:
+def _projected_gravity(policy: ExportedPolicy, state: RobotState, command: ArrayLike) -> np.ndarray:
     """Unit vector of gravity in the base frame."""
     w, x, y, z = _quaternion(state.base_quat)
     return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], np.float32)
 
 
-def _quaternion(quat: Sequence[float]) -> np.ndarray:
+def _quaternion(given: ArrayLike) -> np.ndarray:
     """(4,) float64 of unit length."""
-    quat = np.asarray(quat, np.float64)
-    length = np.linalg.norm(quat) if quat.shape == (4,) else np.nan
+    quat = np.asarray(given, np.float64)
+    length = float(np.linalg.norm(quat)) if quat.shape == (4,) else float("nan")
     if not abs(length - 1.0) < 1e-2:
         raise DeployError(f"base_quat: a unit quaternion (w, x, y, z) was expected, {quat.tolist()} given")
     return quat / length
 
 
-QUANTITIES: dict[str, Callable[[ExportedPolicy, RobotState, Sequence[float]], np.ndarray]] = {
+QUANTITIES: dict[str, Quantity] = {
     "joint_pos_offset": _joint_pos_offset,
     "joint_vel": _vector("joint_vel"),
     "base_lin_vel": _vector("base_lin_vel"),

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from omniperception.deploy.description import DeployError
 
@@ -232,7 +233,7 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
         np.add(total, squares[1], out=total)
         np.add(total, squares[2], out=total)
         np.minimum(nearest, total, out=nearest)
-        current = nearest.argmax()
+        current = int(nearest.argmax())
     return picked
 
 
@@ -255,7 +256,7 @@ def sort_keys(theta: np.ndarray, phi: np.ndarray, ring: np.float32) -> np.ndarra
     return (row << _PHI_BITS) | column
 
 
-def rotation_matrix(quat: Sequence[float]) -> np.ndarray:
+def rotation_matrix(quat: ArrayLike) -> np.ndarray:
     """(3, 3) float64 of a quaternion (w, x, y, z), which is normalised."""
     w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)
     return np.array(

@@ -7,6 +7,7 @@ import statistics
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -37,7 +38,7 @@ class Logger:
         self._infos: list[Mapping] = []
         self._ended: list[torch.Tensor] = []  # by step: whether episodes ended, their returns and lengths
         self._recent: deque[float] = deque(maxlen=20)  # s, of iterations
-        self._writer = None
+        self._writer: Any = None  # a SummaryWriter; evaluation needs no tensorboard
 
     def open(self, first_iteration: int) -> None:
         """Open the TensorBoard file; scalars of iterations that will be repeated after a resume are dropped."""

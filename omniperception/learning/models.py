@@ -81,6 +81,8 @@ class PerceptionActor(MLPModel):
         if AVOIDANCE_TARGET in self.supervision:
             self.read_out_target, self.read_out = AVOIDANCE_TARGET, VelocityReadOut(self._feature_dim)
         elif MOTION_TARGET in self.supervision:
+            if velocity_risk is None:
+                raise ValueError("perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk")
             part, num_values = perception.supervised.get(MOTION_TARGET), obs[MOTION_TARGET].shape[-1]
             self.read_out_target = MOTION_TARGET
             self.read_out = MotionReadOut(self._feature_dim, num_values, part, velocity_risk)
@@ -157,7 +159,7 @@ class PerceptionActor(MLPModel):
         has_frame = obs.step_count > 0
         total = torch.zeros((), device=features.device)
         for target, weight in self.supervision.items():
-            if target == self.read_out_target:
+            if self.read_out is not None and target == self.read_out_target:
                 error = self.read_out.error(features, obs[target])
             else:
                 error = (features[:, self.perception.supervised[target]] - obs[target]).square().mean(dim=-1)

@@ -45,8 +45,8 @@ class PerceptivePpo(PPO):
         super().__init__(*args, **kwargs)
         self.num_updates = 0
         self.learns_policy = self.num_learning_epochs > 0
-        parameters = self.optimizer.param_groups[0]["params"]  # as rsl_rl's Adam, in one pass over the parameters
-        self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)  # rsl_rl's is not fused
         self.guard = DivergenceGuard(self)
 
     @classmethod
@@ -164,8 +164,11 @@ class PerceptivePpo(PPO):
 
         Each frame is compared with the targets of the first control step that sees it, when they were measured.
         """
+        optimizer = self.perception_optimizer
+        if optimizer is None:  # PPO trains it, or there is none
+            return
         epochs, (first, last), num_updates = self._supervision
-        for group in self.perception_optimizer.param_groups:
+        for group in optimizer.param_groups:
             group["lr"] = first + (last - first) * min(self.num_updates / num_updates, 1.0)
         device_type = torch.device(self.device).type
         for _ in range(epochs):
@@ -175,12 +178,12 @@ class PerceptivePpo(PPO):
                     continue
                 with torch.autocast(device_type, dtype=torch.bfloat16, enabled=self.use_mixed_precision):
                     loss = self.actor.supervised_loss(self.actor.embed(obs), obs)
-                self.perception_optimizer.zero_grad()
+                optimizer.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(self._perception_parameters, self.max_grad_norm)
                 average_gradients(self._perception_parameters)
                 self.guard.check_gradients("perception network", self._perception_parameters)
-                self.perception_optimizer.step()
+                optimizer.step()
 
     def save(self) -> dict:
         """States of the networks and of the optimisers."""

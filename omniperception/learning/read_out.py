@@ -36,6 +36,8 @@ class MotionReadOut(nn.Module):
     The risks of the candidate velocities are computed once per embedding, the choice among them at every control step.
     """
 
+    candidates: torch.Tensor
+
     def __init__(self, feature_dim: int, num_values: int, part: slice | None, velocity_risk: VelocityRisk) -> None:
         """Configure the read-out.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from torch import nn
+from rsl_rl.models import MLPModel
 
 from omniperception.learning.checkpoint import CheckpointError
 
@@ -13,7 +13,7 @@ _FIRST_LAYER = "mlp.0.weight"
 _OPTIONAL = ("perception.", "read_out.")
 
 
-def start_from(model: nn.Module, weights: Mapping[str, torch.Tensor], source: str) -> None:
+def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> None:
     """Copies the actor's weights of another run into a model with the same one-dimensional observations.
 
     The first layer reads these observations before an embedding, so a policy that walked blind starts to walk with
