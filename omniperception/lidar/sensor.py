@@ -472,7 +472,7 @@ class Lidar:
 
     def _labels(self, reflectivity: Mapping[int, float]) -> Labels:
         labels, scene = Labels(), self.scene
-        labels.body, labels.frame = scene.geometry.body, wp.from_torch(self.frame_count)
+        labels.frame = wp.from_torch(self.frame_count)
         if "intensity" in self.outputs:
             table = _reflectivity_table(reflectivity, [shape.class_id for shape in scene.shapes])
             scaled = [value * self.config.reference_range**2 for value in table]

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from .geometry import INF, PI
-from .place import is_pose
+from .rotations import is_pose, to_quatd
 from .slots import Slots, Viewpoint, pack_words
 
 wp.set_module_options({"enable_backward": False})
@@ -46,11 +46,6 @@ class Moment:
     view: wp.transformd
     to_view: wp.transformd
     origin: wp.vec3
-
-
-@wp.func
-def to_quatd(wxyz: wp.vec4d):
-    return wp.normalize(wp.quatd(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from .geometry import INF, PLANE, SLACK, Geometry, distance_to_shape
+from .rotations import NOTHING, axes_of, flush_denormals, is_pose, to_pose
 from .slots import Slots, Viewpoint, pack_words
 
 wp.set_module_options({"enable_backward": False})
@@ -20,7 +21,6 @@ ROUNDING = wp.constant(wp.float32(1.0e-6))
 FEW = wp.constant(24)
 NUM_BUCKETS = wp.constant(64)
 Buckets = wp.types.vector(length=64, dtype=wp.int32)
-NOTHING = wp.constant(wp.float32(1.0e-9))
 MARGIN = wp.constant(wp.float32(1.0e-3))
 HALF_PI = wp.constant(wp.float32(0.5 * math.pi))
 
@@ -35,27 +35,6 @@ class Limits:
     max_range: wp.float32
     elevation_min: wp.float32  # of rays, rad
     elevation_max: wp.float32
-
-
-@wp.func
-def flush_denormals(v: wp.vec3):
-    """``v`` without parts so small that products of two would be denormal, on which a CPU is a hundred times slower."""
-    return wp.vec3(
-        wp.where(wp.abs(v[0]) < NOTHING, 0.0, v[0]),
-        wp.where(wp.abs(v[1]) < NOTHING, 0.0, v[1]),
-        wp.where(wp.abs(v[2]) < NOTHING, 0.0, v[2]),
-    )
-
-
-@wp.func
-def axes_of(pose: wp.transformd):
-    """The axes of a pose in rows."""
-    turn = wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
-    return wp.matrix_from_rows(
-        flush_denormals(wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0])),
-        flush_denormals(wp.vec3(turn[0, 1], turn[1, 1], turn[2, 1])),
-        flush_denormals(wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])),
-    )
 
 
 @wp.func
@@ -203,24 +182,6 @@ def _is_between(c: wp.vec3, distance: float, radius: float, sin_low: float, sin_
     above = level * tangent < c[2] * radius or c[2] * tangent + level * radius >= sin_low * square
     below = level * tangent < -c[2] * radius or c[2] * tangent - level * radius <= sin_high * square
     return above and below
-
-
-@wp.func
-def is_pose(p: wp.vec3d, q: wp.vec4d):
-    """Whether a position and an orientation are finite and the orientation is one."""
-    norm = wp.dot(q, q)
-    away = wp.dot(p, p)
-    return norm > wp.float64(1.0e-12) and norm < wp.float64(1.0e12) and away < wp.float64(1.0e30)
-
-
-@wp.func
-def to_pose(p: wp.vec3d, q: wp.vec4d):
-    """The pose with its orientation (w, x, y, z) normalised; a norm that is 1 but for rounding needs no square root."""
-    square = wp.dot(q, q)
-    scale = wp.float64(1.5) - wp.float64(0.5) * square
-    if wp.abs(square - wp.float64(1.0)) > wp.float64(1.0e-6):
-        scale = wp.float64(1.0) / wp.sqrt(square)
-    return wp.transformation(p, wp.quatd(scale * q[1], scale * q[2], scale * q[3], scale * q[0]))
 
 
 @wp.func

@@ -10,6 +10,7 @@ from .geometry import HEIGHTFIELD, INF, REFINE, Geometry, shape_functions
 from .march_block import REACHES, march_block
 from .motion import Moment, Track, Viewpoint, moment_at
 from .noise import MODELS, NoiseParameters, beside, child_key, disturb_function, jittered, mixed
+from .rotations import turn_of
 from .search import search_functions
 from .slots import Slots
 
@@ -45,9 +46,8 @@ class Rays:
 
 @wp.struct
 class Labels:
-    """What is known of the shapes and of the sensor beside where they are."""
+    """What is known of classes and environments."""
 
-    body: wp.array(dtype=wp.int32)  # by shape
     reflectivity: wp.array(dtype=wp.float32)  # by class, times the square of the reference range, m^2
     frame: wp.array(dtype=wp.int32)  # (num_envs,) frames cast, for the noise
 
@@ -84,11 +84,6 @@ def start_of_shot(row: int, first_row: int, rows_per_shot: int):
         into_shot = first_row % rows_per_shot
         start = (row + into_shot) // rows_per_shot * rows_per_shot - into_shot
     return start
-
-
-@wp.func
-def turn_of(pose: wp.transformd):
-    return wp.mat33(wp.quat_to_matrix(wp.transform_get_rotation(pose)))
 
 
 @wp.func
@@ -257,7 +252,7 @@ def scan_kernel(has: frozenset[str]) -> wp.Kernel:
             if wp.static("body_id" in has):
                 body_id = wp.int32(NO_BODY)
                 if is_hit:
-                    body_id = labels.body[shape]
+                    body_id = geometry.body[shape]
                 out.body_id[out_env, ray] = body_id
 
             # surface

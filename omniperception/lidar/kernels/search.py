@@ -4,7 +4,7 @@ Warp passes structures by value. Functions that take them are called from one pl
 a call would copy kilobytes for each ray.
 """
 
-# ruff: noqa: SIM102, UP018  (in a kernel, a branch on wp.static stands alone, and bool(False) declares a variable)
+# ruff: noqa: SIM102, SIM108, UP018  (in a kernel, a branch on wp.static stands alone, and bool(False) declares a variable)
 
 from functools import cache
 from pathlib import Path
@@ -15,7 +15,7 @@ from ..native import function_body
 from .geometry import HEIGHTFIELD, INF, SLACK, Geometry, shape_functions, uncertain
 from .march_block import NOT_MARCHED
 from .motion import Moment, Track, shape_at
-from .place import axes_of, flush_denormals
+from .rotations import axes_of, flush_denormals
 from .slots import SLOTS_AHEAD, WORD, Slots
 
 wp.set_module_options({"enable_backward": False})
@@ -118,6 +118,14 @@ def search_functions(has: frozenset[str]) -> tuple[wp.Function, wp.Function]:
         return located
 
     @wp.func
+    def nearest(near: float, reach: float):
+        """A lower bound of a slot's distance from where the ray starts."""
+        if wp.static(displaced):
+            return near - reach
+        else:
+            return near
+
+    @wp.func
     def hit_slot(
         geometry: Geometry,
         slots: Slots,
@@ -160,16 +168,20 @@ def search_functions(has: frozenset[str]) -> tuple[wp.Function, wp.Function]:
         word = wp.int32(0)
         left = slots.count[env]
         while left > 0:
-            if slots.near[env, word * WORD] - slots.reach >= best:
+            if nearest(slots.near[env, word * WORD], slots.reach) >= best:
                 break
-            bits = first_slots(left)
-            if wp.static(not displaced):
+            bits = wp.int32(0)
+            if wp.static(displaced):
+                bits = first_slots(left)
+            else:
                 if left > FEW:
                     bits = slots_ahead(slots.words, env, word, left, d[0], d[1], d[2])
+                else:
+                    bits = first_slots(left)
             while bits != 0:
                 slot = word * WORD + lowest_bit(bits)
                 bits = bits & (bits - 1)
-                if slots.near[env, slot] - slots.reach >= best:
+                if nearest(slots.near[env, slot], slots.reach) >= best:
                     bits = wp.int32(0)
                     left = wp.int32(0)
                 else:

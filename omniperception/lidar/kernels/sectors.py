@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from .geometry import PI, to_quat
+from .geometry import PI
+from .rotations import to_quat
 
 
 @wp.func

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import warp as wp
 
-from omniperception.lidar.kernels.geometry import to_quat
+from omniperception.lidar.kernels.rotations import to_quat
 from omniperception.lidar.kernels.sectors import levelled
 from omniperception.lidar.native import function_body
 
