@@ -6,7 +6,7 @@ import random
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -55,8 +55,10 @@ class RunConfig:
             )
 
 
-_TASK = ("num_envs", "seed", "robot", "terrain", "obstacles", "commands", "observations", "rewards", "terminations")
-_TASK += ("randomization", "sim")
+_TASK = (
+    *("num_envs", "seed", "robot", "terrain", "obstacles", "commands", "observations", "rewards", "terminations"),
+    *("randomization", "sim"),
+)
 """Keys of a configuration that are fields of EnvConfig as they stand."""
 
 
@@ -70,22 +72,22 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     Raises:
         ConfigError: one line that says what to change.
     """
-    trust = ANYTHING if is_composed(config) else trust
+    trusted = ANYTHING if is_composed(config) else trust
     if config.get("perception") and not config.get("lidar"):
         raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
     composed = _resolved(config)
     for key in {*_TASK, "lidar", "perception", "ppo"} - composed.keys():
         raise ConfigError(f"the configuration has no {key}")
     hints = types_of(EnvConfig)
-    task = {key: make(hints[key], composed[key], key, trust) for key in _TASK}
-    ppo = make(PPOConfig, composed["ppo"], "ppo", trust)
-    perception = make(PerceptionConfig, composed["perception"], "perception", trust) if composed["perception"] else None
+    task = {key: make(hints[key], composed[key], key, trusted) for key in _TASK}
+    ppo = make(PPOConfig, composed["ppo"], "ppo", trusted)
+    perception = make(PerceptionConfig | None, composed["perception"] or None, "perception", trusted)
     seen = {}
     if perception is not None:
         seen = {"sampler": perception.sampler, "frame_history": perception.history}
         seen |= {"base_motion": perception.base_motion, "targets": tuple(perception.supervision)}
     try:
-        lidar = _sensor(composed["lidar"], task["robot"], trust) if composed["lidar"] else None
+        lidar = _sensor(composed["lidar"], task["robot"], trusted) if composed["lidar"] else None
         env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, **seen)
         return RunConfig(env, perception, ppo, _names(composed.get("init")), composed)
     except ValueError as error:
@@ -95,16 +97,18 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
 def _resolved(config: DictConfig) -> dict:
     """A configuration as plain data."""
     try:
-        return OmegaConf.to_container(config, resolve=True)
+        return cast("dict", OmegaConf.to_container(config, resolve=True))
     except OmegaConfBaseException as error:
         message = one_line(error).partition(" full_key:")[0]
         raise ConfigError(message.partition("raised while resolving interpolation: ")[2] or message) from None
 
 
-def _sensor(preset: dict, robot: RobotConfig, trust: Sequence[str] | None) -> SensorConfig:
+def _sensor(preset: object, robot: RobotConfig, trust: Sequence[str] | None) -> SensorConfig:
     """A sensor on one of the robot's mounts."""
     from omniperception.env.sensing import SensorConfig
 
+    if not isinstance(preset, dict):
+        raise ConfigError(f"lidar={preset} must be a group of settings")
     settings = dict(preset)
     mount = settings.pop("mount", None)
     if isinstance(mount, str) and mount not in robot.mounts:

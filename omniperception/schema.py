@@ -92,7 +92,7 @@ def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -
         ConfigError: one line with the key, what was given and what was expected.
     """
     kind = _kind(key)
-    if isinstance(value, Mapping) and (kind is not None or hint is RewardTerm):
+    if isinstance(value, Mapping) and kind is not None:
         return _named(kind, hint, dict(value), key, trust)
     options = [option for option in _options(hint) if option is not types.NoneType]
     if isinstance(value, Mapping):
@@ -102,7 +102,7 @@ def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -
                 given = {name: item for name, item in value.items() if item is not None}
                 items = {name: make(item_hint, item, f"{key}.{name}", trust) for name, item in given.items()}
                 return {name: item for name, item in items.items() if item is not None}
-            if dataclasses.is_dataclass(option):
+            if isinstance(option, type) and dataclasses.is_dataclass(option):
                 return call(option, arguments(option, value, key, trust), key)
     if not _fits(value, hint):
         raise ConfigError(f"{key}={_shown(value)} must be {_expected(hint)}")
@@ -276,8 +276,8 @@ def _fits(value: object, hint: Any) -> bool:
     if origin in (tuple, list, Sequence):
         if not isinstance(value, (list, tuple)):
             return False
-        items = args if origin is tuple and args[-1] is not Ellipsis else args[:1] * len(value)
-        return len(value) == len(items) and all(map(_fits, value, items))
+        hints = list(args) if origin is tuple and args[-1] is not Ellipsis else [args[0]] * len(value)
+        return len(value) == len(hints) and all(map(_fits, value, hints))
     return inspect.isclass(hint) and isinstance(value, hint)
 
 

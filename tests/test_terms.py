@@ -1,5 +1,6 @@
 """Terms and other names in configurations: found, checked, and not taken from strangers."""
 
+import importlib.util
 import json
 import os
 import sys
@@ -11,6 +12,7 @@ import yaml
 from omniperception import build, config
 from omniperception.config import ConfigError
 from omniperception.env.mdp import observations, rewards
+from omniperception.schema import NAMES, look_up
 
 OWN = '''
 """A module of the user's own."""
@@ -53,6 +55,12 @@ def terms(*overrides):
 
 
 class TestNames:
+    def test_every_name_is_there(self):
+        for place, kind in NAMES.items():
+            for name in () if isinstance(kind.names, str) else kind.names:
+                if name != "mujoco_warp" or importlib.util.find_spec("mujoco_warp"):
+                    assert callable(look_up(kind, name, place))
+
     def test_a_key_is_the_name_of_its_function(self):
         found = terms("rewards=default")
         term = found["velocity_tracking_with_avoidance"]
