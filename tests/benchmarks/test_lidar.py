@@ -1,8 +1,9 @@
 """The LiDAR benchmark: its scenes, every adapter against exact ranges, and each of its studies at tiny size."""
 
-import importlib.util
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -26,15 +27,20 @@ TINY = Options(num_envs=2, num_rays=50, num_bodies=8, num_frames=2, rounds=2, nu
 NUM_ENVS, NUM_RAYS = 3, 200
 TRIANGLES = (EMBREE, OPEN3D, ONE_MESH)
 ENTRIES = {entry.name: entry for entry in (OURS, *PEERS)}
-INSTALLED_BY_REQUIREMENTS = ("ours", BATCH_RAY, ONE_MESH)
+ROOT = Path(__file__).resolve().parents[2]
+REQUIRED = {
+    re.match(r"[\w.-]+", line).group()
+    for file in ROOT.glob("requirements*.txt")
+    for line in file.read_text().splitlines()
+    if line and not line.startswith("#")
+}
+"""What `make setup` installs."""
 
 
 def needs_its_package(entry):
-    """A parameter that is skipped, with what to install, where an optional peer is missing; others must run."""
-    absent = any(importlib.util.find_spec(module.split(".")[0]) is None for module in entry.modules)
-    skip = pytest.mark.skipif(
-        absent and not entry.name.startswith(INSTALLED_BY_REQUIREMENTS), reason=f"pip install {entry.package}"
-    )
+    """A parameter that is skipped, with what to install, where a peer is missing that `make setup` does not bring."""
+    optional = not set(entry.package.split()) <= REQUIRED
+    skip = pytest.mark.skipif(optional and bool(entry.missing()), reason=f"pip install {entry.package}")
     return pytest.param(entry, marks=skip, id=entry.name)
 
 
