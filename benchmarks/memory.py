@@ -122,7 +122,7 @@ def measure(run: RunConfig) -> tuple[int, int, str]:
 
 def _clouds_at_once(env: OmniEnv, num_envs: int) -> int:
     """Environments of a run of `num_envs` whose clouds exist at the same time."""
-    parts = [slice(0, num_envs)] if env.sensing is None else env.sensing.parts_of(num_envs)
+    parts = [slice(0, num_envs)] if env.sensing is None else env.sensing.slices_of(num_envs)
     return max(part.stop - part.start for part in parts)
 
 

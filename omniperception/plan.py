@@ -237,9 +237,9 @@ def _kernels_beside(run: RunConfig, env: OmniEnv) -> Iterator[tuple[str, str]]:
     """Kernels that are launched on tensors which come with each call, and why."""
     avoidance = env.avoidance
     if avoidance is not None and avoidance.true_sectors is not None:
-        yield "nearest_by_sector", "rewards.avoidance.risk is a law"
+        yield "nearest_by_sector", "rewards.avoidance.risk is set"
     if avoidance is not None and avoidance.risk is not None:
-        yield "worst_sectors", "rewards.avoidance.risk is a law"
+        yield "worst_sectors", "rewards.avoidance.risk is set"
     if env.ground is not None:
         yield "heights_at", "robots and obstacles start on the ground"
         yield "base_heights", "height above ground that is not flat"
@@ -269,8 +269,8 @@ def _rays(run: RunConfig, env: OmniEnv) -> Section:
     triangles = sum(len(shape.asset.faces) for shape in scene.shapes if hasattr(shape.asset, "faces"))
     heights = scene.geometry.field_height.size
     section.add("rays", f"{lidar.num_rays} a frame, every {lidar.period_s:g} s", _readers_of_rays(run))
-    parts, limit = len(env.sensing.parts_of(run.env.num_envs)), f"lidar.cloud_mb={env.sensing.config.cloud_mb:g}"
-    never = f"{limit}: the clouds of all environments never exist at once; scripts/memory.py reckons with that"
+    parts, limit = len(env.sensing.slices_of(run.env.num_envs)), f"lidar.cloud_mb={env.sensing.config.cloud_mb:g}"
+    never = f"{limit}: the clouds of all environments never exist at once; scripts/memory.py counts on that"
     section.either(parts > 1, "parts of a frame", f"{parts}", never, f"{limit} is enough, or whole clouds are read")
     section.add("shapes", f"{len(scene.shapes)}: " + ", ".join(f"{n} {kind}" for kind, n in sorted(kinds.items())))
     moving = f"{scene.num_bodies}"

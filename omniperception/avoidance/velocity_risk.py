@@ -57,7 +57,7 @@ class VelocityRisk:
         weight: of a risk of 1 against a squared deviation from the command ((m/s)^2).
         temperature: ((m/s)^2) of the choice; small ones take the best candidate alone.
         sideways: what a squared deviation beside the command counts; at 1 it is better to stand before something wide
-            than to go round it, as in runs saved before there was a choice.
+            than to go round it.
     """
 
     max_speed: float

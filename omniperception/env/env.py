@@ -32,7 +32,7 @@ class OmniEnv(VecEnv):
 
     One control step: `decimation` physics steps, before each of which the obstacles move -> at the LiDAR's rate a frame
     is cast, given noise and sampled -> terminations and rewards -> finished environments are reset -> observations.
-    How old each quantity is, `EnvState` tells.
+    `EnvState` says how old each quantity is.
 
     Attributes:
         state: what terms read.
@@ -130,7 +130,7 @@ class OmniEnv(VecEnv):
             extras["log"] = self._report()
         return self.observations, rewards, self.done.long(), extras
 
-    # ---- the parts of a step, in their order -------------------------------------------------------------------------
+    # ---- a step, in its order ----------------------------------------------------------------------------------------
 
     def _clipped(self, actions: torch.Tensor) -> torch.Tensor:
         """Actions within MAX_ACTION; infinite ones become NaN, which the simulator counts as a failure."""
@@ -318,7 +318,7 @@ class OmniEnv(VecEnv):
     def state_dict(self) -> dict:
         """Everything that a resumed run needs to go on exactly."""
         return {
-            **{name: part.state_dict() for name, part in self._parts().items()},
+            **{name: part.state_dict() for name, part in self._with_state().items()},
             "random": self.random.counter,
             "step_count": self.step_count,
             "episode_length": self.episode_length_buf,
@@ -328,7 +328,7 @@ class OmniEnv(VecEnv):
 
     def load_state_dict(self, state: dict) -> None:
         """Goes on from the `state_dict` of an environment with the same configuration."""
-        for name, part in self._parts().items():
+        for name, part in self._with_state().items():
             part.load_state_dict(state[name])
         self.random.counter.copy_(state["random"])
         self.step_count = state["step_count"]
@@ -340,7 +340,7 @@ class OmniEnv(VecEnv):
         """Those that evaluate terms."""
         return {"rewards": self.rewards, **{f"observations.{name}": group for name, group in self._groups.items()}}
 
-    def _parts(self) -> dict:
+    def _with_state(self) -> dict:
         """Whatever has a state to be saved, by name."""
         names = ("sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing")
         parts = {name: getattr(self, name) for name in (*names, "state", "metrics")} | self._managers()

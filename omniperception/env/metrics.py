@@ -13,7 +13,7 @@ OUTCOMES = ("time_out", "fall", "goal", "collision_end", "diverged")
 
 
 class EpisodeMetrics:
-    """Sums on the device, read out every `period` steps so that the step itself never waits.
+    """Sums on the device, read out at the end of a log interval: a step itself never waits for the device.
 
     Attributes:
         collided: (num_envs,) bool: whether the current episode has had a contact with an obstacle.
@@ -67,20 +67,16 @@ class EpisodeMetrics:
         return float(self._errors[2] / self._errors[3]) if self._errors[3] > 0 else float("inf")
 
     def state_dict(self) -> dict:
-        sums = {"rewards": self._rewards, "errors": self._errors, "outcomes": self._outcomes}
-        health = {"failures": self._failures, "clipped": self._clipped, "healthy_steps": self._healthy_steps}
-        return {**sums, "health": health, "steps": self._steps, "collided": self.collided}
+        return {"sums": list(self._sums()), "steps": self._steps, "collided": self.collided}
 
     def load_state_dict(self, state: dict) -> None:
-        self._rewards.copy_(state["rewards"])
-        self._errors.copy_(state["errors"])
-        self._outcomes.copy_(state["outcomes"])
-        if "health" in state:  # checkpoints of earlier versions lack it
-            self._failures.copy_(state["health"]["failures"])
-            self._clipped.copy_(state["health"]["clipped"])
-            self._healthy_steps.copy_(state["health"]["healthy_steps"])
+        for total, saved in zip(self._sums(), state["sums"], strict=True):
+            total.copy_(saved)
         self.collided.copy_(state["collided"])
         self._steps = state["steps"]
+
+    def _sums(self) -> tuple[torch.Tensor, ...]:
+        return self._rewards, self._errors, self._outcomes, self._failures, self._clipped, self._healthy_steps
 
     def drain(self) -> dict[str, float]:
         """Means since the last call, and clears them."""
@@ -103,8 +99,7 @@ class EpisodeMetrics:
             if cause != Failure.NONE:
                 log[f"Anomalies/{cause.name.lower()}"] = count
         log["Anomalies/clipped_actions"] = int(self._clipped)
-        sums = (self._rewards, self._errors, self._outcomes, self._failures, self._clipped, self._healthy_steps)
-        for tensor in sums:
-            tensor.zero_()
+        for total in self._sums():
+            total.zero_()
         self._steps = 0
         return log

@@ -41,7 +41,7 @@ class SensorConfig(LidarConfig):
             on, or None.
         distal_below_deg: rays whose elevation in the sensor frame is below this count for `capped_ray_distance`.
         cloud_mb: most memory (MB) for clouds that exist at the same time; where those of all environments take more,
-            environments are cast and sampled in parts.
+            they are cast and sampled in slices of environments.
     """
 
     pattern: Callable[[], ScanPattern] | None = None
@@ -167,7 +167,7 @@ class LidarSensing:
         """The newest clouds of all environments; None before the first.
 
         Raises:
-            ValueError: they are cast in parts.
+            ValueError: they are cast in slices.
         """
         if len(self.lidar.env_slices) > 1:
             raise ValueError(
@@ -176,8 +176,8 @@ class LidarSensing:
             )
         return self.lidar.frame if self._is_cast else None
 
-    def parts_of(self, num_envs: int) -> tuple[slice, ...]:
-        """The parts in which the clouds of a run with so many environments are cast."""
+    def slices_of(self, num_envs: int) -> tuple[slice, ...]:
+        """The slices in which the clouds of a run with so many environments are cast."""
         most = num_envs if self.whole else envs_at_once(self.config, self.lidar.outputs)
         return env_slices(num_envs, most)
 
@@ -210,21 +210,21 @@ class LidarSensing:
         """
         with timer.stage("rays"):
             self._place_bodies()
-        parts = self.lidar.cast_slices(self._time.fill_(time_s))
+        slices = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
             with timer.stage("rays"):
-                part, frame = next(parts)
+                envs, frame = next(slices)
                 if self.unseen is not None:
-                    self._note_sightings(part, frame)
+                    self._note_sightings(envs, frame)
                 for cap, mean in self._distal_range.items():
-                    mean[part] = self._mean_distal_range(frame, cap)
+                    mean[envs] = self._mean_distal_range(frame, cap)
             if self.frames is not None:
                 with timer.stage("sampling"):
-                    self._sample(part, frame, base_quat)
+                    self._sample(envs, frame, base_quat)
             if self._sectors:
                 with timer.stage("sectors"):
                     self._sectors[index]()
-        next(parts, None)  # the frame has been cast
+        next(slices, None)  # the frame has been cast
         self.tick, self._is_cast = self.tick + 1, True
         self.frame_tick.fill_(self.tick)
         if self.frames is not None:
@@ -235,15 +235,15 @@ class LidarSensing:
         self.scene.body_pos.copy_(pos)
         self.scene.body_quat.copy_(quat)
 
-    def _note_sightings(self, part: slice, frame: LidarFrame) -> None:
+    def _note_sightings(self, envs: slice, frame: LidarFrame) -> None:
         hit = self._obstacle_of[frame.shape_id.long() + 1]
         seen = torch.zeros(len(hit), self.unseen.shape[1] + 1, dtype=torch.bool, device=hit.device)
         seen.scatter_(1, hit, True)
-        self.unseen[part] = torch.where(seen[:, :-1], 0, self.unseen[part] + 1)
+        self.unseen[envs] = torch.where(seen[:, :-1], 0, self.unseen[envs] + 1)
 
-    def _sample(self, part: slice, frame: LidarFrame, base_quat: torch.Tensor) -> None:
-        sensor, points = self.config, self._newest[part, : self.sampler.num_points]
-        attitude = Attitude(base_quat[part].contiguous(), sensor.mount_pos, sensor.quat)
+    def _sample(self, envs: slice, frame: LidarFrame, base_quat: torch.Tensor) -> None:
+        sensor, points = self.config, self._newest[envs, : self.sampler.num_points]
+        attitude = Attitude(base_quat[envs].contiguous(), sensor.mount_pos, sensor.quat)
         self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
 
     def _append_newest(self) -> None:
@@ -316,7 +316,7 @@ class LidarSensing:
                 frame.true_ranges,
                 frame.directions_s,
                 frame.class_id,
-                self.scene.body_quat[part],
+                self.scene.body_quat[envs],
                 self.base,
                 sensor.mount_pos,
                 sensor.quat,
@@ -324,9 +324,9 @@ class LidarSensing:
                 max_distance=sensor.max_range,
                 num_sectors=out.shape[1],
                 num_threads=num_threads,
-                out=out[part],
+                out=out[envs],
             )
-            for part, frame in zip(self.lidar.env_slices, self.lidar.slice_frames, strict=True)
+            for envs, frame in zip(self.lidar.env_slices, self.lidar.slice_frames, strict=True)
         ]
 
 

@@ -37,7 +37,7 @@ class FollowCamera:
         self._pos: torch.Tensor | None = None
 
     def cut(self) -> None:
-        """Starts anew at the robot's next pose."""
+        """Starts again at the robot's next pose."""
         self._pos = None
 
     def follow(self, foot_w: torch.Tensor, yaw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

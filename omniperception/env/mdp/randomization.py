@@ -1,4 +1,4 @@
-"""Domain randomization: the thirteen rows of the paper's table and the LiDAR's own noise, each absent when null."""
+"""Domain randomization: the thirteen ranges of the paper's table and the LiDAR's own noise, each absent when null."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _DRAWN = (
 
 @dataclass(frozen=True)
 class RandomizationConfig:
-    """Ranges (low, high) drawn uniformly per environment at every reset; null leaves a row out altogether.
+    """Ranges (low, high) drawn uniformly per environment at every reset; null leaves a parameter as it is.
 
     Attributes:
         lidar_device: whether ranges and directions have the noise that the maker of the LiDAR in use states.
