@@ -63,8 +63,8 @@ class SplitLaunch:
     """A kernel launch over ``(num_envs, *inner)`` recorded once and replayed by calling it.
 
     The launch begins with environment ``first``. The kernel's first argument must be its first environment
-    (``env_offset``); ``args`` are the others. The
-    arrays are those given here: what they hold may change, where they lie may not.
+    (``env_offset``); ``args`` are the others. The arrays are those given here: what they hold may change, where they
+    lie may not.
     """
 
     def __init__(
