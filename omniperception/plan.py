@@ -1,410 +1,243 @@
-"""What a composed scene consists of and what was left out, each with its reason: read off the objects that exist."""
+"""What a run consists of, read off the objects that exist after a few control steps."""
 
 from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mujoco
+import numpy as np
 import torch
 import yaml
+from tensordict import TensorDictBase
 
-from omniperception.build import RunConfig
-from omniperception.env.config import HEIGHT_TARGET
 from omniperception.env.env import OmniEnv
-from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, requirements
-from omniperception.inventory import Buffer, buffers_of, is_launch, walk
 from omniperception.learning import Runner
-from omniperception.learning.read_out import MotionReadOut
-
-if TYPE_CHECKING:
-    pass
 
 PLAN_FILE = "plan.yaml"
-OPTIONAL_PACKAGES = {
-    "warp": "casts and samples LiDAR rays",
-    "mujoco_warp": "physics on a GPU",
-    "matplotlib": "plots",
-    "imageio_ffmpeg": "videos",
-    "trimesh": "mesh files",
-    "mujoco_lidar": "recorded scan tables",
-    "viser": "views in a browser",
-    "onnx": "export",
-    "onnxruntime": "runs exported policies",
-}
-"""Packages that no run needs altogether, and what for."""
-
-_LISTED_FROM = 0.01
-"""Share of the memory from which on a buffer has a line of its own in the text."""
-
-
-@dataclass(frozen=True)
-class Entry:
-    """Something that exists or was left out.
-
-    Attributes:
-        name: what it is.
-        reason: why it is there, or why not.
-        detail: how much of it there is; empty for what is not there.
-    """
-
-    name: str
-    reason: str
-    detail: str = ""
-
-
-class Section:
-    """Things of one kind: those that exist and those that were left out."""
-
-    def __init__(self, title: str) -> None:
-        self.title = title
-        self.has: list[Entry] = []
-        self.left_out: list[Entry] = []
-
-    def add(self, name: str, detail: str = "", why: str = "") -> None:
-        self.has.append(Entry(name, why, detail))
-
-    def leave_out(self, name: str, why: str) -> None:
-        self.left_out.append(Entry(name, why))
-
-    def either(self, there: bool, name: str, detail: str, why: str, why_not: str) -> None:
-        """Adds something where it is there, and the reason why not where it is not."""
-        if there:
-            self.add(name, detail, why)
-        else:
-            self.leave_out(name, why_not)
+STEPS = 12
+"""Control steps after which every part of a step has run, LiDAR frames included."""
+_OPTIONAL = ("warp", "mujoco_warp", "matplotlib", "imageio_ffmpeg", "trimesh", "mujoco_lidar", "onnx", "onnxruntime")
+_ENTERED = ("omniperception.", "mujoco.batch", "mujoco_warp.", "rsl_rl.storage")
+"""Objects of these modules are looked into, and so are dicts and sequences; networks are not."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run consists of.
+    """What exists, by section and name, with a size or an empty text.
 
     Attributes:
-        sections: everything but memory.
-        buffers: memory, the largest first.
-        built_envs: environments that were built to find out.
-        num_envs: environments of the run.
+        num_envs: environments of which this was seen.
+        sections: physics, rays, terms, state, stages, kernels, modules.
+        buffers: bytes of every array by where it hangs, the largest first.
     """
 
-    sections: tuple[Section, ...]
-    buffers: tuple[Buffer, ...]
-    built_envs: int
     num_envs: int
+    sections: dict[str, dict[str, str]]
+    buffers: dict[str, int]
 
-    def __getitem__(self, title: str) -> Section:
-        return next(section for section in self.sections if section.title == title)
-
-    @property
-    def bytes_per_env(self) -> float:
-        return sum(b.num_bytes for b in self.buffers if b.per_env) / self.built_envs
-
-    @property
-    def shared_bytes(self) -> int:
-        return sum(b.num_bytes for b in self.buffers if not b.per_env)
+    def absent(self, fuller: Plan) -> dict[str, list[str]]:
+        """By section what `fuller` has and this has not, buffers included."""
+        pairs = {title: (names, self.sections[title]) for title, names in fuller.sections.items()}
+        pairs["buffers"] = (fuller.buffers, self.buffers)
+        return {title: [name for name in theirs if name not in ours] for title, (theirs, ours) in pairs.items()}
 
     def summary(self) -> str:
         """One line."""
-        counts = {title: len(self[title].has) for title in ("stages of a step", "kernels", "optional packages")}
-        left_out = sum(len(section.left_out) for section in self.sections)
-        return (
-            f"plan: {', '.join(f'{count} {title}' for title, count in counts.items())},"
-            f" {self.bytes_per_env / 1e3:.1f} kB an environment and {self.shared_bytes / 1e6:.1f} MB shared;"
-            f" {left_out} things left out, {PLAN_FILE} says why"
-        )
-
-    def as_dict(self) -> dict:
-        """Plain dicts and lists, as saved."""
-        sections = {
-            section.title: {
-                "has": {e.name: "; ".join(filter(None, (e.detail, e.reason))) for e in section.has},
-                "left_out": {e.name: e.reason for e in section.left_out},
-            }
-            for section in self.sections
-        }
-        memory = {
-            "bytes_per_env": round(self.bytes_per_env),
-            "shared_bytes": self.shared_bytes,
-            "per_env": {b.name: round(b.num_bytes / self.built_envs) for b in self.buffers if b.per_env},
-            "shared": {b.name: b.num_bytes for b in self.buffers if not b.per_env},
-        }
-        return {"num_envs": self.num_envs, **sections, "memory": memory}
+        counts = ", ".join(f"{len(self.sections[title])} {title}" for title in ("terms", "stages", "kernels"))
+        return f"plan: {counts}, {sum(self.buffers.values()) / 1e6:.1f} MB for {self.num_envs} environments"
 
     def save(self, run_dir: Path) -> None:
         """Writes the plan beside the run's configuration."""
-        (run_dir / PLAN_FILE).write_text(yaml.safe_dump(self.as_dict(), sort_keys=False, width=120))
+        (run_dir / PLAN_FILE).write_text(yaml.safe_dump(asdict(self), sort_keys=False, width=120))
 
-    def text(self) -> str:
-        """For a terminal: + what exists, - what was left out."""
+    def text(self, fuller: Plan | None = None, most: int = 12) -> str:
+        """For a terminal: + what exists, - what only `fuller` has; at most so many buffers and modules each."""
+        absent = {} if fuller is None else self.absent(fuller)
+        shown = {**self.sections, "buffers": {name: f"{size:,} bytes" for name, size in self.buffers.items()}}
         lines = []
-        for section in self.sections:
-            lines.append(section.title)
-            width = max((len(e.name) for e in (*section.has, *section.left_out)), default=0)
-            for mark, entries in (("+", section.has), ("-", section.left_out)):
-                for e in entries:
-                    what = f"{e.detail}  ({e.reason})" if e.detail and e.reason else e.detail or e.reason
-                    lines.append(f"  {mark} {e.name:<{width}}  {what}".rstrip())
-        return "\n".join((*lines, *self._memory_lines(), self.summary()))
-
-    def _memory_lines(self) -> Iterator[str]:
-        yield "memory: bytes per environment"
-        total = max(self.bytes_per_env, 1.0)
-        shares = {b.name: b.num_bytes / self.built_envs for b in self.buffers if b.per_env}
-        listed = {name: share for name, share in shares.items() if share >= _LISTED_FROM * total}
-        width = max(map(len, listed), default=0)
-        for name, share in listed.items():
-            yield f"  + {name:<{width}}  {share:>12,.0f}"
-        yield f"    {'smaller ones':<{width}}  {total - sum(listed.values()):>12,.0f}"
-        yield f"    {'altogether':<{width}}  {total:>12,.0f}, {total * self.num_envs / 1e6:,.1f} MB for {self.num_envs}"
-        yield f"    {'shared by all':<{width}}  {self.shared_bytes:>12,.0f}"
+        for title, names in shown.items():
+            lines.append(f"{title}: {len(names)}")
+            limit = most if title in ("buffers", "modules") else len(names) + len(absent.get(title, ()))
+            lines += [f"  + {name}  {detail}".rstrip() for name, detail in list(names.items())[:limit]]
+            lines += [f"  - {name}" for name in absent.get(title, [])[:limit]]
+            hidden = [max(n - limit, 0) for n in (len(names), len(absent.get(title, ())))]
+            lines += [f"  ... {hidden[0]} more here, {hidden[1]} more absent"] if any(hidden) else []
+        return "\n".join((*lines, self.summary()))
 
 
-def describe(run: RunConfig, runner: Runner) -> Plan:
-    """The plan of a run that has been built.
+class Watch:
+    """Notes what is computed in the first control steps of a run, and then describes it."""
+
+    def __init__(self, runner: Runner, then: Callable[[Plan], None]) -> None:
+        """
+        Args:
+            runner: of the run, before its first step.
+            then: called with the plan within control step number `STEPS`.
+        """
+        self._runner, self._then, self._left = runner, then, STEPS
+        self._computed, self._stages = set(vars(runner.env.state)), set()
+        runner.env.step_hooks.append(self._look)
+
+    def _look(self) -> None:
+        env = self._runner.env
+        self._computed |= vars(env.state).keys()
+        self._stages |= env.timer.seconds.keys()
+        self._left -= 1
+        if not self._left:
+            env.step_hooks.remove(self._look)
+            self._then(describe(self._runner, self._computed, self._stages))
+
+
+def look(runner: Runner) -> Plan:
+    """The plan of a run, for which its environment takes a few steps with random actions and all obstacles."""
+    env, found = runner.env, []
+    if env.obstacles is not None:
+        env.obstacles.level = 1.0
+    Watch(runner, found.append)
+    with torch.inference_mode():
+        runner.alg.actor(env.get_observations())
+        while not found:
+            env.step(0.1 * torch.randn(env.num_envs, env.num_actions, device=env.device))
+    return found[0]
+
+
+def describe(runner: Runner, computed: Iterable[str] = (), stages: Iterable[str] = ()) -> Plan:
+    """The plan of a run.
 
     Args:
-        run: its configuration; tells the reasons and, by `num_envs`, how many environments it is to have.
-        runner: what was built of it, of any number of environments; tells what exists.
+        runner: of the run.
+        computed: names in the environment's state that were computed.
+        stages: stages of a step that ran.
     """
     env = runner.env
-    things = dict(walk({"env": env, "storage": runner.alg.storage}))
-    sections = (
-        _stages(run, env),
-        _kernels(run, runner, things),
-        _rays(run, env),
-        _physics(run, env),
-        _rewards(run),
-        _observations(run, env),
-        _randomization(run),
-        _learning(run, runner),
-        _packages(),
-    )
-    buffers = [*buffers_of(things, env.num_envs), *_networks(runner)]
-    return Plan(sections, tuple(sorted(buffers, key=lambda b: -b.num_bytes)), env.num_envs, run.env.num_envs)
-
-
-def _networks(runner: Runner) -> Iterator[Buffer]:
-    for name, network in (("actor", runner.alg.actor), ("critic", runner.alg.critic)):
-        weights = sum(p.numel() * p.element_size() for p in network.parameters())
-        yield Buffer(f"{name}: weights, gradients, Adam's moments", (), 4 * weights, False)
-
-
-# --- sections ---------------------------------------------------------------------------------------------------------
-
-
-def _stages(run: RunConfig, env: OmniEnv) -> Section:
-    section, sensing, sim = Section("stages of a step"), env.sensing, run.env.sim
-    blind = _why_blind(run)
-    obstacles = "all obstacles stand where they are" if run.env.obstacles.num_obstacles else "obstacles=none"
-    section.either(env.obstacles is not None, "obstacles", "", "they move before each physics step", obstacles)
-    section.add("physics", f"{sim.decimation} steps of {1e3 * sim.timestep:g} ms")
-    section.add("state")
-    every = f"every {sensing.period_steps} steps" if sensing else ""
-    section.either(sensing is not None, "rays", every, _readers_of_rays(run), blind)
-    sampled = _sensing(env, "frames") is not None
-    measured = env.avoidance is not None and env.avoidance.sector_distance is not None
-    section.either(sampled, "sampling", every, "the network reads points", blind or "no network reads points")
-    section.either(measured, "sectors", every, _readers(run, AVOIDANCE), blind or "nothing reads sectors")
-    avoided = env.avoidance is not None
-    section.either(avoided, "avoidance", every, _readers(run, AVOIDANCE), blind or "nothing reads V_avoid")
-    late = run.env.targets and HEIGHT_TARGET in run.env.targets and not env.heights_each_step
-    section.either(bool(late), "heights", every, "supervision", "no network is supervised with them alone")
-    section.either(env.ground is not None, "terrain", "", "levels follow how far robots walk", "flat ground")
-    section.add("rewards", f"{len(run.env.rewards.terms)} terms, and terminations")
-    section.add("resets")
-    section.add("observations", f"{len(run.env.observations.groups)} groups")
-    return section
-
-
-def _kernels(run: RunConfig, runner: Runner, things: dict[str, object]) -> Section:
-    section, env = Section("kernels"), runner.env
-    sensing = env.sensing
-    for name in dict.fromkeys(thing.name for thing in things.values() if is_launch(thing)):
-        section.add(name, " ".join(sorted(sensing.lidar.features)) if name == "cast_scan" else "")
-    for name in _sensing(env, "sampler").kernels if _sensing(env, "frames") is not None else ():
-        section.add(name, "", type(sensing.sampler).__name__)
-    for name, why in dict((*_kernels_of_policy(runner), *_kernels_beside(run, env))).items():
-        section.add(name, "", why)
-    if sensing is None:
-        section.leave_out("those of the LiDAR", _why_blind(run))
-    return section
-
-
-def _kernels_beside(run: RunConfig, env: OmniEnv) -> Iterator[tuple[str, str]]:
-    """Kernels that are launched on tensors which come with each call, and why."""
-    avoidance = env.avoidance
-    if avoidance is not None and avoidance.true_sectors is not None:
-        yield "nearest_by_sector", "rewards.avoidance.risk is set"
-    if avoidance is not None and avoidance.risk is not None:
-        yield "worst_sectors", "rewards.avoidance.risk is set"
-    if env.ground is not None:
-        yield "heights_at", "robots and obstacles start on the ground"
-        yield "base_heights", "height above ground that is not flat"
-    if env.ground is not None and (env.heights_each_step or HEIGHT_TARGET in run.env.targets):
-        yield "heights_around", "the heights are read"
-    if env.ground is not None and env.obstacles is not None:
-        yield "lift", "obstacles move over ground that is not flat"
-
-
-def _kernels_of_policy(runner: Runner) -> Iterator[tuple[str, str]]:
-    """Kernels inside the actor."""
-    actor = runner.alg.actor
-    rings = getattr(getattr(actor, "perception", None), "rings", None)
-    if rings is not None:
-        yield "write_rings", "perception.network.rings"
-    if isinstance(getattr(actor, "read_out", None), MotionReadOut):
-        yield "worst_sectors", "perception.motion_weight: risks follow from what is perceived"
-
-
-def _rays(run: RunConfig, env: OmniEnv) -> Section:
-    section = Section("ray geometry")
-    if env.sensing is None:
-        section.leave_out("ray scene", _why_blind(run))
-        return section
-    scene, lidar = env.sensing.scene, env.sensing.lidar.config
-    kinds = Counter(shape.kind.name.lower() for shape in scene.shapes)
-    triangles = sum(len(shape.asset.faces) for shape in scene.shapes if hasattr(shape.asset, "faces"))
-    heights = scene.geometry.field_height.size
-    section.add("rays", f"{lidar.num_rays} a frame, every {lidar.period_s:g} s", _readers_of_rays(run))
-    parts, limit = len(env.sensing.slices_of(run.env.num_envs)), f"lidar.cloud_mb={env.sensing.config.cloud_mb:g}"
-    never = f"{limit}: the clouds of all environments never exist at once; scripts/memory.py counts on that"
-    section.either(parts > 1, "parts of a frame", f"{parts}", never, f"{limit} is enough, or whole clouds are read")
-    section.add("shapes", f"{len(scene.shapes)}: " + ", ".join(f"{n} {kind}" for kind, n in sorted(kinds.items())))
-    moving = f"{scene.num_bodies}"
-    section.either(scene.num_bodies > 0, "moving bodies", moving, "poses copied each frame", "nothing moves")
-    section.either(triangles > 0, "trees of triangles", f"{triangles} triangles", "meshes", "every shape is exact")
-    section.either(heights > 0, "height field", f"{heights} heights", "tiled terrain", "the ground is a plane")
-    return section
-
-
-def _physics(run: RunConfig, env: OmniEnv) -> Section:
-    section, model = Section("physics"), env.world.model
-    obstacles = len(run.env.obstacles.geom_names())
-    section.add("geoms", f"{model.ngeom}: ground, {model.ngeom - 1 - obstacles} of the robot, {obstacles} obstacles")
-    section.add("contact pairs", f"{len(contact_pairs(model))}", "the robot with ground and obstacles, no others")
-    section.add("degrees of freedom", f"{model.nv}, {model.nu} actuators")
-    section.either(model.nmocap > 0, "kinematic bodies", f"{model.nmocap}", "they are moved", "nothing is moved")
-    kinds = f"{model.nsensor}: {', '.join(sorted(env.world.sensors))}"
-    section.either(model.nsensor > 0, "contact sensors", kinds, "terms read them", "no term reads contacts")
-    batch = getattr(env.sim, "batch", None)  # of the native engine
-    bound, expanded = (sorted(getattr(batch, name, ())) for name in ("_bound", "_expanded"))
-    section.either(bool(bound), "bound fields", ", ".join(bound), "copied out after calls", "the state is enough")
-    own = "model fields per environment"
-    section.either(bool(expanded), own, ", ".join(expanded), "randomized", "no parameter of physics is randomized")
-    return section
+    things = walk({"env": env, "storage": runner.alg.storage})
+    launches = [thing for thing in things.values() if _is_launch(thing)]
+    cache = sys.modules.get("omniperception.common.launch")
+    launches += [] if cache is None else [launch for launch, _ in cache._launches.values()]
+    quantities = {name for name in computed if hasattr(type(env.state), name)}
+    modules = sorted(name for name in sys.modules if name.startswith("omniperception.") or name in _OPTIONAL)
+    sections = {
+        "physics": _physics(env),
+        "rays": _rays(env),
+        "terms": _terms(env),
+        "state": dict.fromkeys(sorted(quantities), ""),
+        "stages": dict.fromkeys(sorted(stages), ""),
+        "kernels": dict.fromkeys(sorted({launch.name for launch in launches}), ""),
+        "modules": dict.fromkeys(modules, ""),
+    }
+    return Plan(env.num_envs, sections, _buffers(things))
 
 
 def contact_pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """Pairs of geoms that the engine may test for contacts."""
-    pairs = []
-    for a in range(model.ngeom):
-        for b in range(a + 1, model.ngeom):
-            bodies = model.body_weldid[model.geom_bodyid[[a, b]]]
-            parents = model.body_weldid[model.body_parentid[bodies]]
-            related = any(bodies[k] == parents[1 - k] and bodies[k] != 0 for k in (0, 1))
-            types, affinities = model.geom_contype[[a, b]], model.geom_conaffinity[[a, b]]
-            meet = (types[0] & affinities[1]) or (types[1] & affinities[0])
-            if meet and bodies[0] != bodies[1] and not related:
-                pairs.append((a, b))
-    return pairs
+    bodies, parents = model.body_weldid[model.geom_bodyid], model.body_weldid[model.body_parentid]
+
+    def may_touch(a: int, b: int) -> bool:
+        types, affinities = model.geom_contype[[a, b]], model.geom_conaffinity[[a, b]]
+        child = any(bodies[x] != 0 and bodies[x] == parents[bodies[y]] for x, y in ((a, b), (b, a)))
+        return bool((types & affinities[::-1]).any()) and bodies[a] != bodies[b] and not child
+
+    return [pair for pair in combinations(range(model.ngeom), 2) if may_touch(*pair)]
 
 
-def _rewards(run: RunConfig) -> Section:
-    section, kept = Section("reward terms"), run.env.rewards.terms
-    given = run.composed["rewards"]["terms"]
-    for name in dict.fromkeys((*given, *kept)):
-        if name in kept:
-            needed = ", ".join(sorted(requirements(kept[name].func)))
-            section.add(name, f"weight {kept[name].weight:g}", needed and f"requires {needed}")
-        else:
-            section.leave_out(name, "null" if given[name] is None else "weight 0")
-    return section
+def _physics(env: OmniEnv) -> dict[str, str]:
+    model, world = env.world.model, env.world
+    counts = {
+        "bodies": model.nbody,
+        "geoms": model.ngeom,
+        "contact pairs": len(contact_pairs(model)),
+        "actuators": model.nu,
+        "kinematic bodies": model.nmocap,
+        "heights of the ground": model.nhfielddata,
+    }
+    widths = {kind: world.sensor_slice(kind) for kind in sorted(world.sensors)}
+    sensors = {f"contact sensor {kind}": f"{part.stop - part.start} numbers" for kind, part in widths.items()}
+    fields = {f"model field {name}": "of each environment" for name in sorted(env.sim.state_dict()["fields"])}
+    return {**{name: str(count) for name, count in counts.items() if count}, **sensors, **fields}
 
 
-def _observations(run: RunConfig, env: OmniEnv) -> Section:
-    section, config = Section("observations"), run.env.observations
-    for name, group in run.composed["observations"]["groups"].items():
-        if name not in config.groups:
-            section.leave_out(name, "neither actor nor critic sees it")
+def _rays(env: OmniEnv) -> dict[str, str]:
+    if env.sensing is None:
+        return {}
+    scene, lidar = env.sensing.scene, env.sensing.lidar
+    kinds = Counter(shape.kind.name.lower() for shape in scene.shapes)
+    shapes = {f"shapes {kind}": str(count) for kind, count in sorted(kinds.items())}
+    outputs = {f"output {name}": "" for name in lidar.outputs}
+    features = {f"kernel feature {name}": "" for name in sorted(lidar.features)}
+    frame = f"{lidar.config.num_rays} a frame, every {env.sensing.period_steps} steps"
+    return {"rays": frame, "moving bodies": str(scene.num_bodies), **shapes, **outputs, **features}
+
+
+def _terms(env: OmniEnv) -> dict[str, str]:
+    rewards = {f"rewards.{name}": f"weight {term.weight:g}" for name, term in env.config.rewards.terms.items()}
+    groups = env.config.observations.groups
+    widths = {f"{group}.{name}": width for group in groups for name, width in env.observation_widths(group).items()}
+    return {**rewards, **{f"observations.{name}": f"{width} numbers" for name, width in widths.items()}}
+
+
+# --- objects ----------------------------------------------------------------------------------------------------------
+
+
+def walk(roots: Mapping[str, object]) -> dict[str, object]:
+    """Arrays of torch, NumPy and Warp and recorded launches below the roots, each once, by where they hang."""
+    found, seen = {}, set()
+    left = list(reversed(roots.items()))
+    while left:
+        path, thing = left.pop()
+        if id(thing) in seen or isinstance(thing, torch.nn.Module | type):
             continue
-        sees = [who for who in ("actor", "critic") if name in getattr(config, who)]
-        values = f"{env.observations[name].shape[1]} values, history {config.groups[name].history}"
-        section.add(name, values, " and ".join(sees))
-        for term in (term for term, given in group["terms"].items() if given is None):
-            section.leave_out(f"{name}.{term}", "null")
-    for name in (*run.env.targets, "frames"):
-        there = name in env.observations.keys()  # noqa: SIM118  (a TensorDict is no dict)
-        shape = "x".join(str(n) for n in env.observations[name].shape[1:]) if there else ""
-        why = "the network reads points" if name == "frames" else "perception is supervised with it"
-        section.either(there, name, f"{shape} values", why, "no network reads points")
-    return section
-
-
-def _randomization(run: RunConfig) -> Section:
-    section, config = Section("randomization"), run.env.randomization
-    for name in (item.name for item in fields(config) if item.name != "payload_position"):
-        value = getattr(config, name)
-        if isinstance(value, tuple):
-            section.add(name, f"{value[0]:g} to {value[1]:g}", "drawn at every reset")
-        elif value:
-            section.add(name, "" if value is True else str(value), "in the scan's kernel")
+        seen.add(id(thing))
+        if _is_launch(thing) or _extent(thing) is not None:
+            found[path] = thing
         else:
-            section.leave_out(name, "null" if value is None else "false")
-    return section
+            left += reversed([(f"{path}.{name}", child) for name, child in _children(thing)])
+    return found
 
 
-def _learning(run: RunConfig, runner: Runner) -> Section:
-    section, network = Section("learning"), getattr(runner.alg.actor, "perception", None)
-
-    def count(module: torch.nn.Module) -> str:
-        return f"{sum(p.numel() for p in module.parameters()):,} parameters"
-
-    section.add("actor", count(runner.alg.actor))
-    section.add("critic", count(runner.alg.critic))
-    detail = f"{count(network)} of the actor's, history {network.history}" if network is not None else ""
-    section.either(network is not None, "perception network", detail, "", "perception=none")
-    weights = [item.name for item in fields(run.perception) if item.name.endswith("_weight")] if run.perception else []
-    for name in weights:
-        weight = getattr(run.perception, name)
-        section.either(weight != 0, f"perception.{name}", f"{weight:g}", "supervises the embedding", "weight 0")
-    return section
+def _children(thing: object) -> Iterable[tuple[object, object]]:
+    if isinstance(thing, dict | TensorDictBase):
+        return list(thing.items())
+    if isinstance(thing, list | tuple):
+        return list(enumerate(thing))
+    if type(thing).__name__ == "StructInstance":  # of Warp
+        return [(name, getattr(thing, name)) for name in type(thing)._cls.vars]
+    if type(thing).__module__.startswith(_ENTERED) and hasattr(thing, "__dict__"):
+        return list(vars(thing).items())
+    return []
 
 
-def _packages() -> Section:
-    section = Section("optional packages")
-    for name, what in OPTIONAL_PACKAGES.items():
-        section.either(name in sys.modules, name, what, "imported", f"{what}: not imported")
-    section.either(torch.cuda.is_initialized(), "CUDA", "", "initialised", "the run is on the CPU")
-    return section
+def _buffers(things: Mapping[str, object]) -> dict[str, int]:
+    """Bytes of the arrays, the largest first; one that lies within another's memory is not counted again."""
+    extents = {name: extent for name, thing in things.items() if (extent := _extent(thing)) is not None}
+    buffers: dict[str, int] = {}
+    spans: list[tuple[int, int]] = []
+    for name, (start, size) in sorted(extents.items(), key=lambda item: -item[1][1]):
+        if size and not any(low <= start and start + size <= high for low, high in spans):
+            spans.append((start, start + size))
+            buffers[name] = size
+    return buffers
 
 
-# --- reasons ----------------------------------------------------------------------------------------------------------
+def _extent(thing: object) -> tuple[int, int] | None:
+    """(address, bytes) of the memory that an array keeps alive; None for what is no array."""
+    if isinstance(thing, torch.Tensor):
+        storage = thing.untyped_storage()
+        return storage.data_ptr(), storage.nbytes()
+    if isinstance(thing, np.ndarray):
+        while isinstance(thing.base, np.ndarray):
+            thing = thing.base
+        return thing.__array_interface__["data"][0], thing.nbytes
+    warp = sys.modules.get("warp")
+    if warp is not None and isinstance(thing, warp.array):
+        return thing.ptr or 0, thing.capacity
+    return None
 
 
-def _sensing(env: OmniEnv, name: str) -> object | None:
-    """An attribute of the LiDAR's part of an environment; None without one."""
-    return getattr(env.sensing, name, None)
-
-
-def _readers(run: RunConfig, *names: str) -> str:
-    """The terms that require one of the names, and the network."""
-    rewards = {f"rewards.{name}": term.func for name, term in run.env.rewards.terms.items()}
-    groups = run.env.observations.groups.items()
-    seen = {f"observations.{group}.{name}": term for group, its in groups for name, term in its.terms.items()}
-    readers = [name for name, term in (rewards | seen).items() if requirements(term) & set(names)]
-    readers += [f"supervision.{target}" for target in run.env.targets if target != HEIGHT_TARGET]
-    return "read by " + (", ".join(readers) or "nothing")
-
-
-def _readers_of_rays(run: RunConfig) -> str:
-    network = ", the perception network" if run.env.sampler is not None else ""
-    return _readers(run, AVOIDANCE, DISTAL_RANGE, CLOUD) + network
-
-
-def _why_blind(run: RunConfig) -> str:
-    if run.env.uses_lidar:
-        return ""
-    return "lidar=none" if run.env.lidar is None else "nothing reads the LiDAR"
+def _is_launch(thing: object) -> bool:
+    module = sys.modules.get("omniperception.lidar.launch")
+    return module is not None and isinstance(thing, module.SplitLaunch)

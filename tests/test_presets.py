@@ -43,8 +43,6 @@ def test_every_preset_says_what_it_is():
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_composes_builds_and_steps(preset):
     group, name = preset.split("/")
-    if preset == "sim/mujoco_warp":
-        pytest.importorskip("mujoco_warp")
     beside = [*COMPANIONS.get(preset, []), *(QUICK if group == "lidar" and name != "none" else [])]
     run = build.assemble(config.compose([*beside, f"{group}={name}", "num_envs=2"]))
     if preset.startswith(LEARNING):

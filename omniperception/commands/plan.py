@@ -1,8 +1,11 @@
-"""Lists what a composed scene consists of and what was left out, each with the reason, without training.
+"""Lists what a run consists of, and what it does without.
 
     plan experiment=walk
+    plan experiment=walk beside=quickstart
 
-A few environments are built, and what exists is listed. Every training run saves the same as plan.yaml.
+A few environments are built and take a few steps; what then exists is listed with a +: physics, shapes of the rays,
+terms, the state that was computed, stages of a step, kernels, imported modules, and memory. A - marks what exists in
+the recipe `beside` and not here. Every training run saves its own as plan.yaml.
 """
 
 from __future__ import annotations
@@ -10,28 +13,32 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from omniperception import build, config
-from omniperception.cli import Command
-from omniperception.plan import Plan, describe
+from omniperception.cli import Command, argument
+from omniperception.plan import Plan, look
 
-BUILT_ENVS = 13
-"""Environments that are built: few, and a number that no other dimension has."""
+NUM_ENVS = 13
+"""Environments that are built."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """The command has overrides only."""
+    """The command's own arguments."""
+
+    beside: str = argument("paper", "experiment that it is compared with; empty for none")
 
 
-def main(_: Arguments, overrides: list[str]) -> None:
+def main(arguments: Arguments, overrides: list[str]) -> None:
     """Prints the plan of a configuration."""
-    print(plan_of(overrides).text())
+    plan = plan_of(overrides)  # first, because modules that were imported stay
+    fuller = plan_of([f"experiment={arguments.beside}", "randomization=paper"]) if arguments.beside else None
+    print(plan.text(fuller))
 
 
 def plan_of(overrides: list[str]) -> Plan:
-    """The plan of a configuration."""
+    """The plan of a configuration, built with few environments."""
     run = build.assemble(config.compose(overrides))
-    built = replace(run, env=replace(run.env, num_envs=min(run.env.num_envs, BUILT_ENVS)))
-    return describe(run, build.build_runner(built, None))
+    few = replace(run, env=replace(run.env, num_envs=min(run.env.num_envs, NUM_ENVS)))
+    return look(build.build_runner(few, None))
 
 
 command = Command(main, Arguments, __doc__, "of the configuration")

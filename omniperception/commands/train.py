@@ -34,7 +34,7 @@ from omniperception.learning import (
     latest_checkpoint,
     list_checkpoints,
 )
-from omniperception.plan import describe
+from omniperception.plan import Plan, Watch
 
 ERRORS = (CheckpointError, RolloutTooSmall, TrainingDiverged)
 SWEEP, SHOW = {"-m", "--multirun"}, {"--cfg", "job"}
@@ -89,10 +89,13 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
         for name in run.init:
             runner.start_from(config.find_run(name, "init"))
         report(f"run directory: {run_dir}")
-    plan = describe(run, runner)
-    if distributed.rank() == 0:
+
+    def save(plan: Plan) -> None:
         plan.save(run_dir)
-    report(plan.summary())
+        report(plan.summary())
+
+    if distributed.rank() == 0:
+        Watch(runner, save)
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
     report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; play run={run_dir} replays it")
     distributed.disconnect()

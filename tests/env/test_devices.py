@@ -11,8 +11,6 @@ from omniperception import build, config
 from omniperception.build import build_runner
 from omniperception.env.env import OmniEnv
 
-pytest.importorskip("mujoco_warp")
-
 TASKS = {
     "paper": ("experiment=paper",),
     "avoid": ("experiment=avoid", "terrain=mixed", "randomization=paper", "lidar.cloud_mb=0.02"),

@@ -24,8 +24,6 @@ def make(request, make_env):
 
 
 def make_with(sim, make_env):
-    if sim == "mujoco_warp":
-        pytest.importorskip("mujoco_warp")
     device = ("sim.device=cpu",) if sim == "mujoco_warp" else ()
     return lambda *overrides: make_env(f"sim={sim}", *device, *FULL, *overrides)
 

@@ -105,8 +105,6 @@ def test_without_obstacles_there_are_none(make_env):
 @pytest.mark.parametrize("sim", ["sim=mujoco", "sim=mujoco_warp"])
 def test_feet_move_as_mujoco_says(make_env, sim):
     """Positions and velocities against mj_objectVelocity in float64."""
-    if sim.endswith("warp"):
-        pytest.importorskip("mujoco_warp")
     env = make_env(sim, *(["sim.device=cpu"] if sim.endswith("warp") else []), "obstacles=none", blind=True)
     for step in range(3):
         env.step(torch.randn(4, 12, generator=torch.Generator().manual_seed(step)))

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("mujoco_warp")
-
 from benchmarks.step_errors import step_errors
 from omniperception.scene import build_world
 from omniperception.sim.mujoco_warp import Capacity, MujocoWarpConfig

@@ -19,7 +19,6 @@ SENSORS = ("foot_force", "obstacle_contact")
 def engine(request):
     if request.param == "mujoco":
         return SimConfig()
-    pytest.importorskip("mujoco_warp")
     return MujocoWarpConfig(device="cpu")
 
 
