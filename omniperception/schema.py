@@ -278,7 +278,7 @@ def _fits(value: object, hint: Any) -> bool:
             return False
         hints = list(args) if origin is tuple and args[-1] is not Ellipsis else [args[0]] * len(value)
         return len(value) == len(hints) and all(map(_fits, value, hints))
-    return inspect.isclass(hint) and isinstance(value, hint)
+    return hint in _WORDS and isinstance(value, hint)
 
 
 def _expected(hint: Any) -> str:

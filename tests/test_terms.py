@@ -113,6 +113,7 @@ class TestNames:
             ("commands.type=gaol", "commands.type=gaol is unknown; did you mean goal?"),
             ("~commands.type", "commands lacks its type: give commands.type=..., one of velocity, goal"),
             ("+terrain.tiles={hills: {}}", "terrain.tiles is unknown"),
+            ("terrain=mixed terrain.tiles.rough=3", "terrain.tiles.rough=3 must be a group of settings"),
             ("lidar.mount=had", "lidar.mount=had is unknown; robot.mounts has head"),
             ("lidar.mount_pos=[0,0,0]", "lidar.mount_pos is unknown; a mount has it"),
             ("lidar.device=mid306", "lidar.device=mid306 is unknown; known: mid360"),
@@ -122,7 +123,7 @@ class TestNames:
     )
     def test_mistakes_are_named_in_one_line(self, override, message):
         with pytest.raises(ConfigError) as error:
-            build.assemble(config.compose([override]))
+            build.assemble(config.compose([override] if override[0] in "+~" else override.split(" ")))
         assert message in str(error.value) and "\n" not in str(error.value)
 
 
