@@ -89,6 +89,7 @@ class OmniEnv(VecEnv):
             self._frame_heights = torch.zeros_like(self.state.heights)
         all_envs = torch.arange(self.num_envs, device=self.device)
         self._reset(all_envs)
+        self.healthy = ~self.sim.failed
         self._sense()
         self.observations = self._observe(all_envs)
 
