@@ -253,8 +253,8 @@ def _folder(entry: str) -> Path:
     if entry.startswith("pkg://"):
         with contextlib.suppress(ImportError):
             spec = importlib.util.find_spec(entry.removeprefix("pkg://").replace("/", "."))
-            for folder in (spec and spec.submodule_search_locations) or ():
-                return Path(folder)
+            for location in (spec and spec.submodule_search_locations) or ():
+                return Path(location)
         raise ConfigError(f"hydra.searchpath: there is no package {entry.removeprefix('pkg://')}")
     folder = Path(entry.removeprefix("file://")).resolve()
     if not folder.is_dir():

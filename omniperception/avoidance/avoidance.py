@@ -81,15 +81,18 @@ class Avoidance:
             seen: (num_envs, O) bool: obstacles that a ray has hit lately; None without obstacles.
         """
         if self.true_sectors is None:
+            assert self.sector_distance is not None  # without a law only V_avoid is read
             self.velocity = avoidance_velocity(self.sector_distance, self.config)
             return
         self.motion = self.true_sectors.measure(base_pos_w, yaw, seen)
         if self.risk is not None:
+            assert self.config.risk is not None
             self.risk = self.config.risk.risk(self.motion, self._candidates)
 
     def choose(self, command: torch.Tensor) -> None:
         """V_avoid under commanded velocities (num_envs, 2) m/s; the paper's does not depend on them."""
         if self.risk is not None:
+            assert self.config.risk is not None
             self.velocity = self.config.risk.avoidance(self.risk, command, self._candidates)
 
     def no_obstacle_near(self) -> torch.Tensor | None:
@@ -98,12 +101,14 @@ class Avoidance:
 
     def targets(self, names: Collection[str]) -> dict[str, torch.Tensor]:
         """Those of SECTOR_TARGET, AVOIDANCE_TARGET and MOTION_TARGET that are in `names`; (num_envs, ...)."""
-        targets = {}
+        targets: dict[str, torch.Tensor] = {}
         if SECTOR_TARGET in names:
+            assert self.sector_distance is not None  # it is supervised, so V_avoid is read
             targets[SECTOR_TARGET] = (1.0 - self.sector_distance / NEARNESS_RANGE).clamp(min=0.0)
         if AVOIDANCE_TARGET in names:
             targets[AVOIDANCE_TARGET] = self.velocity
         if MOTION_TARGET in names:
+            assert self.motion is not None  # it is supervised with a law alone
             targets[MOTION_TARGET] = encode(self.motion).flatten(1)
         return targets
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 import warp as wp
 
+from omniperception.avoidance.kernels import nearest_by_sector
 from omniperception.avoidance.sector_motion import nothing_near
 from omniperception.common.launch import launch_over_envs, view
 from omniperception.common.rotations import rotate_yaw
@@ -91,82 +90,3 @@ class TrueSectors:
             torch.cat((field.velocity_w.float(), still), 1),
             torch.cat((counts, always), 1),
         )
-
-
-@wp.func
-def slab(start: float, direction: float, half: float):
-    """Where a line enters and leaves |x| <= half."""
-    step = direction
-    if wp.abs(step) < 1.0e-9:
-        step = wp.float32(1.0e-9)
-    a = (-half - start) / step
-    b = (half - start) / step
-    return wp.vec2(wp.min(a, b), wp.max(a, b))
-
-
-@wp.func
-def entry(place: wp.vec2, axis: wp.vec2, outline: wp.vec2, direction: wp.vec2) -> float:
-    """Distance at which a ray from the origin enters an outline, 0 inside, infinite if it misses."""
-    if outline[1] < 0.0:
-        along = wp.dot(place, direction)
-        chord = outline[0] * outline[0] - wp.dot(place, place) + along * along
-        if chord <= 0.0 or along + wp.sqrt(chord) <= 0.0:
-            return wp.inf
-        return wp.max(along - wp.sqrt(chord), 0.0)
-    across = wp.vec2(-axis[1], axis[0])
-    x = slab(-wp.dot(place, axis), wp.dot(direction, axis), outline[0])
-    y = slab(-wp.dot(place, across), wp.dot(direction, across), outline[1])
-    enter = wp.max(x[0], y[0])
-    leave = wp.min(x[1], y[1])
-    if enter > leave or leave <= 0.0:
-        return wp.inf
-    return wp.max(enter, 0.0)
-
-
-@wp.func
-def nearest_point(place: wp.vec2, axis: wp.vec2, outline: wp.vec2) -> wp.vec2:
-    """The point of an outline that is nearest to the origin."""
-    if outline[1] < 0.0:
-        return place * wp.max(1.0 - outline[0] / wp.max(wp.length(place), 1.0e-9), 0.0)
-    across = wp.vec2(-axis[1], axis[0])
-    x = wp.clamp(-wp.dot(place, axis), -outline[0], outline[0])
-    y = wp.clamp(-wp.dot(place, across), -outline[1], outline[1])
-    return place + x * axis + y * across
-
-
-@wp.func
-def keep_nearer(distance: float, velocity: wp.vec2, sector: wp.vec3) -> wp.vec3:
-    if distance < sector[0]:
-        return wp.vec3(distance, velocity[0], velocity[1])
-    return sector
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def nearest_by_sector(
-    env_offset: int,
-    place: wp.array2d(dtype=wp.vec2),
-    axis: wp.array2d(dtype=wp.vec2),
-    velocity: wp.array2d(dtype=wp.vec2),
-    counts: wp.array2d(dtype=wp.bool),
-    outline: wp.array(dtype=wp.vec2),
-    # out
-    sectors_out: wp.array2d(dtype=wp.vec3),
-):
-    """Every obstacle of one environment in turn; see `TrueSectors`."""
-    env = wp.tid() + env_offset
-    num_sectors = sectors_out.shape[1]
-    width = 2.0 * wp.static(math.pi) / float(num_sectors)
-    for o in range(place.shape[1]):
-        if counts[env, o]:
-            p = place[env, o]
-            a = axis[env, o]
-            w = velocity[env, o]
-            near = nearest_point(p, a, outline[o])
-            bearing = wp.atan2(near[1], near[0]) + wp.static(math.pi)
-            own = wp.min(int(bearing / width), num_sectors - 1)
-            sectors_out[env, own] = keep_nearer(wp.length(near), w, sectors_out[env, own])
-            for s in range(num_sectors):
-                angle = (float(s) + 0.5) * width - wp.static(math.pi)
-                distance = entry(p, a, outline[o], wp.vec2(wp.cos(angle), wp.sin(angle)))
-                if distance < sectors_out[env, s][0]:
-                    sectors_out[env, s] = keep_nearer(distance, w, sectors_out[env, s])

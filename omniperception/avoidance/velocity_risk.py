@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
+from omniperception.avoidance.kernels import worst_sectors
 from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.common.launch import constant, launch_over_envs, view
 
@@ -151,20 +152,22 @@ class VelocityRisk:
         self, place: torch.Tensor, velocity: torch.Tensor, candidates: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(n, K) which sector's obstacle makes each candidate's risk, and when (s)."""
-        least = sector = when = None
+        worst: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
         for time in self.times:  # the squared distance is |p|^2 - 2 p.c t + |c t|^2, the middle term a matrix product
             point, goal = place + time * velocity, time * candidates
             squared, nearest = (point.square().sum(-1, keepdim=True) - 2.0 * point @ goal.T).min(1)
             distance = (squared + goal.square().sum(-1)).clamp(min=0.0).sqrt()
             now = 0.0 * distance + time  # not full_like, which an exporter takes for a constant
             exponent = self._exponent(distance, now)
-            if least is None:
-                least, sector, when = exponent, nearest, now
+            if worst is None:
+                worst = exponent, nearest, now
                 continue
+            least, sector, when = worst
             worse = exponent < least
             least, sector = torch.where(worse, exponent, least), torch.where(worse, nearest, sector)
-            when = torch.where(worse, now, when)
-        return sector, when
+            worst = least, sector, torch.where(worse, now, when)
+        assert worst is not None  # there is a time
+        return worst[1:]
 
     def _exponent(self, distance: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
         """Minus the logarithm of the risk of passing an obstacle at a distance (m) after a time (s)."""
@@ -192,52 +195,3 @@ class VelocityRisk:
         heading = command / command.square().sum(-1, keepdim=True).clamp(min=_SLOW**2).sqrt()
         across = away[..., 0] * heading[..., 1] - away[..., 1] * heading[..., 0]
         return away.square().sum(-1) - (1.0 - self.sideways) * across.square()
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def worst_sectors(
-    env_offset: int,
-    place: wp.array2d(dtype=wp.vec2),
-    velocity: wp.array2d(dtype=wp.vec2),
-    candidates: wp.array(dtype=wp.vec2),
-    times: wp.array(dtype=wp.float32),
-    robot_radius: float,
-    decay: float,
-    time_constant: float,
-    out_of_reach: float,
-    # work memory
-    points: wp.array2d(dtype=wp.vec2),
-    sectors: wp.array2d(dtype=wp.int32),
-    least: wp.array2d(dtype=wp.float32),
-    # out
-    sector_out: wp.array2d(dtype=wp.int64),
-    time_out: wp.array2d(dtype=wp.float32),
-):
-    """Of one environment, the sector and the time that make each candidate's risk; see `VelocityRisk`."""
-    env = wp.tid() + env_offset
-    for k in range(candidates.shape[0]):
-        least[env, k] = wp.inf
-    for t in range(times.shape[0]):
-        time = times[t]
-        present = wp.int32(0)
-        for s in range(place.shape[1]):
-            p = place[env, s]
-            if wp.abs(p[0]) + wp.abs(p[1]) < out_of_reach:
-                points[env, present] = p + time * velocity[env, s]
-                sectors[env, present] = s
-                present += 1
-        for k in range(candidates.shape[0]):
-            goal = time * candidates[k]
-            nearest = float(wp.inf)
-            at = wp.int32(0)
-            for j in range(present):
-                squared = wp.length_sq(points[env, j] - goal)
-                if squared < nearest:
-                    nearest = squared
-                    at = j
-            if present > 0:
-                exponent = wp.max(wp.sqrt(nearest) - robot_radius, 0.0) / decay + time / time_constant
-                if exponent < least[env, k]:
-                    least[env, k] = exponent
-                    sector_out[env, k] = wp.int64(sectors[env, at])
-                    time_out[env, k] = time

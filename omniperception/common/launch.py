@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Hashable
 from functools import lru_cache
+from typing import Any
 
 import torch
 import warp as wp
@@ -98,7 +100,7 @@ def launch_over_envs(
     known[0]()
 
 
-def _identity(argument: object) -> object:
+def _identity(argument: Any) -> Hashable:
     """Key of a launch's argument: arrays and structs by identity, numbers and vectors by value."""
     if isinstance(argument, int | float):
         return argument

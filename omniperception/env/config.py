@@ -114,7 +114,8 @@ class EnvConfig:
     @property
     def lidar_noise(self) -> tuple[Noise, ...]:
         """The device's own noise, where asked for, and the randomization's."""
-        own = DEVICES[self.lidar.device].noise() if self.randomization.lidar_device else ()
+        device = self.lidar.device if self.lidar is not None else None
+        own = DEVICES[device].noise() if self.randomization.lidar_device and device is not None else ()
         return (*own, *self.randomization.noise)
 
     @property

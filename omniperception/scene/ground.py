@@ -149,5 +149,5 @@ class Ground:
         surface = kernels.Surface()
         surface.heights, surface.level = view(self._heights, wp.float32), view(self._middle_height, wp.float32)
         surface.middle = view(self._middle, wp.int64)
-        surface.rows, surface.cols, surface.cell = self._rows, self._cols, self.config.cell
+        surface.rows, surface.cols, surface.cell = self._rows, self._cols, wp.float64(self.config.cell)
         return surface

@@ -15,8 +15,8 @@ class Surface:
     """The height field and where each environment's frame lies on it; see `Ground`."""
 
     heights: wp.array(dtype=wp.float32)  # (rows * cols,) m, row by row
-    rows: wp.int32
-    cols: wp.int32
+    rows: int
+    cols: int
     cell: wp.float64  # m between two points of the grid
     middle: wp.array2d(dtype=wp.int64)  # (num_envs, 2) column and row of the point at an environment's origin
     level: wp.array(dtype=wp.float32)  # (num_envs,) height there, m

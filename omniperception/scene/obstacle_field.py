@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -53,7 +54,7 @@ class ObstacleField:
         slots, device = config.placed_slots(), pos_w.device
         self._dtype = pos_w.dtype
 
-        def column(*values: float | tuple[float, ...]) -> torch.Tensor:
+        def column(*values: float | Sequence[float]) -> torch.Tensor:
             return torch.tensor(values, dtype=self._dtype, device=device)
 
         groups = [slot.group for slot in slots]
@@ -223,6 +224,7 @@ class ObstacleField:
         in_the_way = self._stands & (bottom < config.headroom)
         fits = (places - robot[:, None, None]).norm(dim=-1) - self.radius[:, None] >= config.clearance
         if config.free_path is not None:
+            assert goal is not None
             bends = config.free_path.bend * (2 * self._random.uniform(env_ids, (2,)).to(self._dtype) - 1)
             off_path = distance_to_path(places, bent_path(robot, goal.to(self._dtype), bends)) - self.radius[:, None]
             fits &= (off_path >= config.free_path.width / 2) | ~in_the_way[..., None]
@@ -256,6 +258,7 @@ class ObstacleField:
 
     def _over_ground(self, xy: torch.Tensor, env_ids: torch.Tensor) -> torch.Tensor:
         """Heights (n, num_placed) of the obstacles' centres where they are at (n, num_placed, 2)."""
+        assert self._ground is not None
         above = self._above_ground[env_ids] + self._ground.height(xy, env_ids)
         return torch.where(self.active[env_ids], above, PARKED_HEIGHT)
 

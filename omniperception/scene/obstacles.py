@@ -221,10 +221,10 @@ class ObstaclesConfig:
             if getattr(self, key) < 0:
                 raise ValueError(f"obstacles.{key}={getattr(self, key)} must not be negative")
         for slot in self.slots():
-            start = slot.group.approach.distance[0] if slot.group.approach is not None else math.inf
-            if start < self.clearance + slot.radius:
+            approach = slot.group.approach
+            if approach is not None and approach.distance[0] < self.clearance + slot.radius:
                 raise ValueError(
-                    f"obstacles: approach.distance={list(slot.group.approach.distance)} lets {slot.name} start on the"
+                    f"obstacles: approach.distance={list(approach.distance)} lets {slot.name} start on the"
                     f" robot; its low end must be at least clearance + radius = {self.clearance + slot.radius:.2f}"
                 )
 
@@ -239,7 +239,8 @@ class ObstaclesConfig:
         for group_name, group in self.groups.items():
             for i in range(group.count):
                 size = tuple(float(rng.uniform(low, high)) for low, high in group.size)
-                pose = group.poses[i] if group.poses is not None else None
+                x_y_yaw = group.poses[i] if group.poses is not None else None
+                pose = None if x_y_yaw is None else (x_y_yaw[0], x_y_yaw[1], x_y_yaw[2])
                 slots.append(Obstacle(f"obstacle_{group_name}_{i}", group, size, pose))
         return tuple(slots)
 
@@ -254,11 +255,11 @@ class ObstaclesConfig:
         """Adds the obstacles: fixed ones as geoms of the world, the others as kinematic (mocap) bodies."""
         for slot in self.slots():
             if slot.pose is None:
-                body, pos, quat = spec.worldbody.add_body(name=slot.name, mocap=True), [0, 0, 0], [1, 0, 0, 0]
+                body, pos, quat = spec.worldbody.add_body(name=slot.name, mocap=True), [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
             else:
                 x, y, yaw = slot.pose[0], slot.pose[1], math.radians(slot.pose[2])
                 body, pos = spec.worldbody, [x, y, slot.half_height]
-                quat = [math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]
+                quat = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
             size = list(slot.size) + [0.0] * (3 - len(slot.size))
             body.add_geom(
                 name=slot.name,

@@ -47,7 +47,8 @@ class Tile(Protocol):
         share: of the terrain's columns, in proportion to those of the other kinds.
     """
 
-    share: float
+    @property
+    def share(self) -> float: ...
 
     def heights(self, grid: TileGrid, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         """(num, num) heights (m) of a tile of a difficulty in [0, 1]."""
@@ -155,8 +156,9 @@ class Stones:
 
     def heights(self, grid: TileGrid, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         heights, highest = np.zeros((grid.num, grid.num)), _at(self.height, difficulty)
+        low, high = self.size
         for _ in range(round(self.count * (2 * grid.half * grid.cell) ** 2)):
-            sides = np.maximum(np.round(rng.uniform(*self.size, 2) / grid.cell).astype(int), 1)
+            sides = np.maximum(np.round(rng.uniform(low, high, 2) / grid.cell).astype(int), 1)
             row, col = rng.integers(0, grid.num, 2) - sides // 2
             block = slice(max(row, 0), row + sides[0] + 1), slice(max(col, 0), col + sides[1] + 1)
             heights[block] = rng.uniform(-highest, highest)

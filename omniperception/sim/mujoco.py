@@ -221,8 +221,8 @@ class MujocoSimulator:
 
     def _root_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         """`body_poses` of bodies whose poses are part of the state, without computing anything."""
-        pos, quat = zip(*(self._roots[body] for body in bodies), strict=True)
-        pos, quat = torch.stack(pos, 1), torch.stack(quat, 1)
+        roots = [self._roots[body] for body in bodies]
+        pos, quat = torch.stack([pos for pos, _ in roots], 1), torch.stack([quat for _, quat in roots], 1)
         return pos.float(), torch.nn.functional.normalize(quat, dim=-1).float()
 
     def geom_poses(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:

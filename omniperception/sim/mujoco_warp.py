@@ -16,6 +16,7 @@ import warp as wp
 from omniperception.lidar.launch import wp_device
 from omniperception.scene import World
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder
+from omniperception.sim.kernels import move_kinematic, record
 from omniperception.sim.mujoco import SimConfig, apply_options
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
@@ -280,7 +281,7 @@ class MujocoWarpSimulator:
         first = 0 if self.ground_pos is None else 1
         for step in range(self._num_steps):
             wp.launch(
-                _move_kinematic,
+                move_kinematic,
                 dim=(self.num_envs, self._path.shape[2]),
                 inputs=[step, first, self._wp_path],
                 outputs=[self.data.mocap_pos],
@@ -290,7 +291,7 @@ class MujocoWarpSimulator:
 
     def _record(self, step: int) -> None:
         for name, out in self._wp_records.items():
-            wp.launch(_record, dim=(out.shape[0], out.shape[2]), inputs=[step, getattr(self.data, name)], outputs=[out])
+            wp.launch(record, dim=(out.shape[0], out.shape[2]), inputs=[step, getattr(self.data, name)], outputs=[out])
 
     def _kinematics(self) -> None:
         self._engine.kinematics(self.model, self.data)
@@ -316,9 +317,10 @@ class MujocoWarpSimulator:
                     work()
                 self._graphs[name] = None
                 return
-            if self._graphs[name] is None:
-                self._graphs[name] = self._captured(work)
-            wp.capture_launch(self._graphs[name], stream=stream)
+            graph = self._graphs[name]
+            if graph is None:
+                graph = self._graphs[name] = self._captured(work)
+            wp.capture_launch(graph, stream=stream)
 
     def _captured(self, work: Callable[[], None]) -> wp.Graph:
         """A graph of the work, captured on a stream of its own, since PyTorch's default stream cannot be captured."""
@@ -333,11 +335,11 @@ class MujocoWarpSimulator:
     def _allocate_steps(self, num_steps: int) -> None:
         """Buffers for what goes in and comes out with every physics step of a call."""
         self._num_steps = num_steps
-        model, kind = self.world.model, {"dtype": torch.float32, "device": self.device}
+        model, device = self.world.model, self.device
         widths = {"sensordata": model.nsensordata, "qpos": model.nq, "qvel": model.nv}
-        self._records = {n: torch.zeros(self.num_envs, num_steps, widths[n], **kind) for n in self._recorded}
+        self._records = {n: torch.zeros(self.num_envs, num_steps, widths[n], device=device) for n in self._recorded}
         self._wp_records = {name: wp.from_torch(values) for name, values in self._records.items()}
-        self._path = torch.zeros(self.num_envs, num_steps, self.mocap_pos.shape[1], 3, **kind)
+        self._path = torch.zeros(self.num_envs, num_steps, self.mocap_pos.shape[1], 3, device=device)
         self._wp_path = wp.from_torch(self._path, dtype=wp.vec3)
         self._graphs.clear()
 
@@ -352,7 +354,7 @@ class MujocoWarpSimulator:
         values = wp.to_torch(shared)
         self._fields[name] = values.expand(self.num_envs, *values.shape[1:]).clone()
         own = wp.from_torch(self._fields[name], dtype=shared.dtype)
-        own._is_batched = True  # as the engine marks its own
+        own._is_batched = True  # type: ignore[union-attr]  # as the engine marks its own; Warp does not declare it
         setattr(owner, last, own)
         self._graphs.clear()  # they hold the old address
 
@@ -368,18 +370,6 @@ class MujocoWarpSimulator:
 
 _STATE = ("qpos", "qvel", "qacc_warmstart", "time", "ctrl", "mocap_pos", "mocap_quat", "actuator_force")
 """Arrays of the engine's data that the next step, or a reader before it, depends on."""
-
-
-@wp.kernel(enable_backward=False)
-def _move_kinematic(step: int, first: int, path: wp.array3d[wp.vec3], mocap_pos_out: wp.array2d[wp.vec3]):
-    env, body = wp.tid()
-    mocap_pos_out[env, first + body] = path[env, step, body]
-
-
-@wp.kernel(enable_backward=False)
-def _record(step: int, values: wp.array2d[float], out: wp.array3d[float]):
-    env, k = wp.tid()
-    out[env, step, k] = values[env, k]
 
 
 def _load_engine() -> ModuleType:

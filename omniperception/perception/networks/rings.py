@@ -13,26 +13,19 @@ from torch import nn
 from torch.nn import functional
 
 from omniperception.common.launch import constant, launch_over_envs, view
+from omniperception.perception.networks.kernels import EMPTY_DISTANCE, FAINT, LATERAL, write_rings
 from omniperception.perception.networks.motion_match import NOTHING, MotionMatch
 from omniperception.perception.networks.windows import valid_frames, window_count
 
 MOTION_CHANNELS = 3
 """Per sector: nearness, radial and tangential velocity of the nearest obstacle (:mod:`sector_motion`)."""
 
-_FAINT = 1e-6
-"""Proximity below which a cell counts as empty; with a decay of 0.5 m, a distance of 6.9 m."""
-
-_NOTHING = 1e3
-"""Distance (m) of an empty cell."""
 
 _GAIN = 8.0
 """Factor on all inputs, which are small because most cells are far or empty; speeds learning up several times."""
 
 _REACH, _NEARNESS = 6.0, 2.0
 """Distance (m) at which the nearness of the nearest hit falls to 0, and the nearness of a hit at the base."""
-
-_LATERAL = 5.0
-"""Scale of the sine of the bearing within a sector, which is at most 0.09 for 36 of them."""
 
 
 def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape) -> torch.Tensor:
@@ -79,8 +72,8 @@ def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, s
 def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape) -> torch.Tensor:
     """:func:`moved_rings` in operations that can be exported."""
     bearing, proximity = cells[..., :2], cells[..., 2]
-    hit = proximity > _FAINT
-    known = proximity.clamp(min=_FAINT)
+    hit = proximity > FAINT
+    known = proximity.clamp(min=FAINT)
     places = bearing / known[..., None] * (-shape.decay * known.log())[..., None]
     places, hit = places.unflatten(2, (-1, shape.num_sectors)), hit.unflatten(2, (-1, shape.num_sectors))
     origin, yaw = _poses(moved)
@@ -90,16 +83,16 @@ def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, 
     here = _turned(-yaw[:, newest, None, None, None], windows - origin[:, newest, None, None, None])
     hit = _windows(hit, shape.history) & valid_frames(count, shape.history)[..., None, None]
     x, y = here.unbind(-1)
-    distance = torch.where(hit, (x * x + y * y).sqrt(), _NOTHING)
+    distance = torch.where(hit, (x * x + y * y).sqrt(), EMPTY_DISTANCE)
     turned = (torch.atan2(y, x) + math.pi) * (shape.num_sectors / (2 * math.pi))
     sector = turned.long().clamp(0, shape.num_sectors - 1)
     empty = 0.0 * distance  # not zeros_like, whose shape an exporter takes for a constant
-    nearest = (empty + _NOTHING).scatter_reduce(-1, sector, distance, "amin")
+    nearest = (empty + EMPTY_DISTANCE).scatter_reduce(-1, sector, distance, "amin")
     is_nearest = (distance <= nearest.gather(-1, sector)) & hit
     within = (turned - sector - 0.5) * (2 * math.pi / shape.num_sectors)
     lateral = empty.scatter_reduce(-1, sector, torch.where(is_nearest, within, 0.0), "sum")
     proximities = [torch.exp(-nearest / decay) for decay in shape.decays]
-    return torch.stack((*proximities, _LATERAL * lateral * proximities[-1]), -2).flatten(2, 4)
+    return torch.stack((*proximities, LATERAL * lateral * proximities[-1]), -2).flatten(2, 4)
 
 
 def _windows(frames: torch.Tensor, history: int) -> torch.Tensor:
@@ -137,65 +130,14 @@ class RingShape:
         return len(self.decays) + 1
 
 
-@wp.kernel(module="unique", enable_backward=False)
-def write_rings(
-    env_offset: int,
-    cells: wp.array3d(dtype=wp.vec3),
-    origin: wp.array2d(dtype=wp.vec2),
-    yaw: wp.array2d(dtype=wp.float32),
-    count: wp.array2d(dtype=wp.int64),
-    decay: float,
-    decays: wp.array(dtype=wp.float32),
-    history: int,
-    bands: int,
-    nearest: wp.array3d(dtype=wp.float32),  # work memory
-    # out
-    rings_out: wp.array4d(dtype=wp.float32),
-):
-    """The windows of one environment, see `moved_rings`."""
-    env = wp.tid() + env_offset
-    num_sectors = rings_out.shape[3]
-    per_cell = decays.shape[0] + 1
-    for window in range(rings_out.shape[1]):
-        newest = window + history - 1
-        for k in range(history - int(count[env, window]), history):
-            frame = window + k
-            step = origin[env, frame] - origin[env, newest]
-            back = -yaw[env, newest]
-            cos_back = wp.cos(back)
-            sin_back = wp.sin(back)
-            shift = wp.vec2(cos_back * step[0] - sin_back * step[1], sin_back * step[0] + cos_back * step[1])
-            cos = wp.cos(yaw[env, frame] + back)
-            sin = wp.sin(yaw[env, frame] + back)
-            for band in range(bands):
-                for sector in range(num_sectors):
-                    nearest[env, band, sector] = wp.static(_NOTHING)
-            for cell in range(bands * num_sectors):
-                c = cells[env, frame, cell]
-                if c[2] > wp.static(_FAINT):
-                    far = -decay * wp.log(c[2]) / c[2]
-                    x = far * (cos * c[0] - sin * c[1]) + shift[0]
-                    y = far * (sin * c[0] + cos * c[1]) + shift[1]
-                    distance = wp.sqrt(x * x + y * y)
-                    turned = (wp.atan2(y, x) + wp.static(math.pi)) * float(num_sectors) / wp.static(2.0 * math.pi)
-                    sector = wp.clamp(int(turned), 0, num_sectors - 1)
-                    band = cell / num_sectors
-                    if distance < nearest[env, band, sector]:
-                        nearest[env, band, sector] = distance
-                        first = (k * bands + band) * per_cell
-                        for j in range(decays.shape[0]):
-                            rings_out[env, window, first + j, sector] = wp.exp(-distance / decays[j])
-                        within = (turned - float(sector) - 0.5) * wp.static(2.0 * math.pi) / float(num_sectors)
-                        last = rings_out[env, window, first + decays.shape[0] - 1, sector]
-                        rings_out[env, window, first + decays.shape[0], sector] = wp.static(_LATERAL) * within * last
-
-
 class RingPath(nn.Module):
     """A window's rings, stacked as channels, through convolutions around the azimuth.
 
     The path is equivariant to turns by whole sectors, so what is learned about an obstacle ahead holds on either side
     as well. All frames show an obstacle that stands still in the same cell, because they are moved to the same pose.
     """
+
+    _velocities: torch.Tensor
 
     def __init__(
         self,
@@ -249,6 +191,7 @@ class RingPath(nn.Module):
             width = size
         last = nn.Conv1d(width, MOTION_CHANNELS, 1)
         nn.init.zeros_(last.weight)
+        assert last.bias is not None
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(*layers, last)
 
@@ -262,22 +205,20 @@ class RingPath(nn.Module):
         window_count(cells, count, self.shape.history)
         rings = moved_rings(cells, moved, count, self.shape).flatten(0, 1)
         if self.match is not None:
-            rings = torch.cat((rings, self._matched(rings)), 1)
+            rings = torch.cat((rings, self._matched(rings, self.match)), 1)
         motion = self.layers(_GAIN * rings)  # (B * W, 3, S)
         return motion.transpose(1, 2).flatten(1).unflatten(0, count.shape)
 
-    def _matched(self, rings: torch.Tensor) -> torch.Tensor:
+    def _matched(self, rings: torch.Tensor, match: MotionMatch) -> torch.Tensor:
         """(n, (H - 1) * K + 2 H, S): scores of candidate velocities, then nearness and bearing of each frame's nearest
         hit."""
         cells = rings.unflatten(1, (self.shape.history, -1, self.shape.channels))[:, :, self.ground_bands :]
         proximity, band = cells[:, :, :, -2].max(2)
-        bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (_LATERAL * proximity.clamp(min=_FAINT))
-        reach = -self.shape.decays[-1] * proximity.clamp(min=_FAINT).log()
-        distance = torch.where(proximity > _FAINT, reach, NOTHING)
+        bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (LATERAL * proximity.clamp(min=FAINT))
+        reach = -self.shape.decays[-1] * proximity.clamp(min=FAINT).log()
+        distance = torch.where(proximity > FAINT, reach, NOTHING)
         nearness = _NEARNESS * (1.0 - distance / _REACH).clamp(min=0.0)
-        return torch.cat(
-            (self.match(distance, bearing[:, -1], self._velocities), nearness, 2.0 * _LATERAL * bearing), 1
-        )
+        return torch.cat((match(distance, bearing[:, -1], self._velocities), nearness, 2.0 * LATERAL * bearing), 1)
 
 
 class _RingConv(nn.Conv1d):

@@ -36,12 +36,17 @@ class WindowedGru(nn.GRU):
     a window's count are skipped: the state stays zero until the first valid frame.
     """
 
+    weight_ih_l0: torch.Tensor
+    bias_ih_l0: torch.Tensor
+    weight_hh_l0: torch.Tensor
+    bias_hh_l0: torch.Tensor
+
     def __init__(self, input_size: int, hidden_size: int, history: int) -> None:
         """Args: input_size: numbers per frame; hidden_size: size of the embedding; history: H, frames per window."""
         super().__init__(input_size, hidden_size, batch_first=True)
         self.history = history
 
-    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:  # type: ignore[override]  # own inputs
         """Frames (B, F, input_size) and count (B, W) -> last hidden states (B, W, hidden_size)."""
         num_windows = window_count(frames, count, self.history)
         gates, new = 2 * self.hidden_size, self.hidden_size  # PyTorch's order: reset, update, new
@@ -72,7 +77,7 @@ class WindowedLinear(nn.Module):
         num_windows = window_count(frames, count, self.history)
         valid = valid_frames(count, self.history).unsqueeze(-1)  # (B, W, H, 1)
         weights = self.linear.weight.unflatten(1, (self.history, -1)).unbind(1)  # H x (output, frame_size)
-        total = self.linear.bias
+        total: torch.Tensor = self.linear.bias
         for k, weight in enumerate(weights):
             part = functional.linear(frames[:, k : k + num_windows], weight)
             total = total + part.masked_fill(~valid[:, :, k], 0.0)

@@ -10,8 +10,9 @@ import torch
 import warp as wp
 
 from omniperception.common.launch import launch_over_envs, view
-from omniperception.perception.samplers import kernels, sorting
+from omniperception.perception.samplers import kernels, sorting, sorting_kernels
 from omniperception.perception.samplers.base import Sampler
+from omniperception.perception.samplers.kernels import Work
 
 BUCKETS_FROM = 1024
 """Points from which on farthest point sampling by buckets is faster on a CPU than looking at every point."""
@@ -83,7 +84,7 @@ class PdSampler(Sampler):
         self.num_distal = num_distal
         self.split = math.radians(split_deg)
         self.ring = math.radians(ring_deg)
-        self._work: kernels.Work | None = None
+        self._work: Work | None = None
         self._work_fits: tuple[int, tuple] = (0, ())
         self._tensors: dict[str, torch.Tensor] = {}
 
@@ -103,11 +104,12 @@ class PdSampler(Sampler):
     def _write_halves(self, ranges, directions_s, elevation, azimuth, out, num_bins: int) -> None:
         """Writes the proximal half and the bins of the distal one."""
         device, lanes = ranges.device, kernels.LANES[ranges.device.type]
-        work, launch = self._work_for(*ranges.shape, device), _launcher(ranges, self.num_threads)
+        num_envs, num_rays = ranges.shape
+        work, launch = self._work_for(num_envs, num_rays, device), _launcher(ranges, self.num_threads)
         cloud = view(ranges, wp.float32), view(directions_s, wp.vec3)
         angles, points = (view(elevation, wp.float32), view(azimuth, wp.float32)), view(out, wp.vec3)
         order = cloud[0], *angles, self.split, self.ring, int(num_bins > 0)
-        sorting.sort_rays(launch, lanes, work, self._tensors, len(ranges), order)
+        sorting.sort_rays(launch, lanes, work, self._tensors, num_envs, order)
         scale, k = 1.0 / self.max_range, self.num_proximal
         if k:
             block = kernels.BLOCK[device.type]
@@ -117,10 +119,10 @@ class PdSampler(Sampler):
         if num_bins:
             launch(kernels.write_bins, lanes, *cloud, scale, k, num_bins, lanes, work, points)
 
-    def _work_for(self, n: int, r: int, device: torch.device) -> kernels.Work:
+    def _work_for(self, n: int, r: int, device: torch.device) -> Work:
         """Work memory for N environments of R rays, allocated when there are more of them than before."""
         most, fits = self._work_fits
-        if n <= most and fits == (r, device):
+        if self._work is not None and n <= most and fits == (r, device):
             return self._work
         by_bucket = device.type == "cpu" and self.num_proximal and r >= self.buckets_from
         num_words = -(-r // kernels.BUCKET_SIZE) * kernels.WORDS_PER_BUCKET if by_bucket else 0
@@ -132,12 +134,12 @@ class PdSampler(Sampler):
             "picked_keys": (n, self.num_proximal),
             "keys": (2, n, r),
             "items": (2, n, r),
-            "histogram": (n, sorting.RADIX_SIZE),
+            "histogram": (n, sorting_kernels.RADIX_SIZE),
         }
         tensors = {name: torch.empty(shape, dtype=torch.int32, device=device) for name, shape in shapes.items()}
         tensors |= {name: torch.empty(n, r, device=device) for name in "xyz"}
         tensors["rays"] = sorting.memory_of_order(tensors["items"])
-        self._work, self._work_fits, self._tensors = kernels.Work(), (n, (r, device)), tensors
+        self._work, self._work_fits, self._tensors = Work(), (n, (r, device)), tensors
         for name, tensor in tensors.items():
             setattr(self._work, name, view(tensor, wp.float32 if tensor.is_floating_point() else wp.int32))
         return self._work
@@ -193,8 +195,14 @@ class ProximitySampler(PdSampler):
             raise ValueError(f"blind={blind} must lie in [0, max_range={max_range})")
         if len(body) != 2 or min(body) < 0.0:
             raise ValueError(f"body={list(body)} must be [half length, half width] in metres")
-        options = {"split_deg": split_deg, "ring_deg": ring_deg, "num_threads": num_threads}
-        super().__init__(num_proximal, num_sectors * (len(edges) - 1), max_range=max_range, **options)
+        super().__init__(
+            num_proximal,
+            num_sectors * (len(edges) - 1),
+            max_range=max_range,
+            split_deg=split_deg,
+            ring_deg=ring_deg,
+            num_threads=num_threads,
+        )
         self.num_sectors = num_sectors
         self.edges, self.decay, self.blind, self.body = torch.tensor(edges), decay, blind, tuple(body)
         self._nearest: torch.Tensor | None = None
