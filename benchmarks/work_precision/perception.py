@@ -23,8 +23,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.env.heights import height_grid
 from omniperception.lidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
 from omniperception.perception import Attitude, PdRiskNet, PdSampler, ProximitySampler, Sampler
-from omniperception.scene import ray_shapes
-from omniperception.scene.rays import HitClass
+from omniperception.scene.rays import HitClass, ray_shapes
 
 from .scene import dense_directions
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from omniperception.env.height_lookup import HeightLookup
     from omniperception.env.sensing import LidarSensing
     from omniperception.env.terrain_levels import TerrainLevels
-    from omniperception.scene import Ground
+    from omniperception.scene.ground import Ground
 
 
 def build_ground(
@@ -29,7 +29,7 @@ def build_ground(
         return None, None, None
     from omniperception.env.height_lookup import HeightLookup
     from omniperception.env.terrain_levels import TerrainLevels
-    from omniperception.scene import Ground
+    from omniperception.scene.ground import Ground
 
     ground = Ground(config.terrain, sim.world.model, sim.ground_pos, config.sim.num_threads or None)
     max_steps = round(config.terminations.episode_length_s / config.sim.control_dt)

@@ -156,7 +156,7 @@ class OmniEnv(VecEnv):
         sim, robot_xy_w = self.config.sim, self.sim.qpos[:, :2]
         if self.obstacles.any_approaches:
             commanded = rotate_yaw(self.state.kinematics.yaw, self.command.value[:, :2])
-            self.obstacles.start_anew(robot_xy_w, commanded)
+            self.obstacles.restart_approaching(robot_xy_w, commanded)
         return self.obstacles.travel(sim.timestep, sim.decimation, robot_xy_w)
 
     def _follow_sensors(self) -> None:

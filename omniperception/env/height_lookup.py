@@ -8,7 +8,7 @@ import warp as wp
 from omniperception.common.launch import view
 from omniperception.env.heights import MAX_HEIGHT, NUM_HEIGHTS, footprint_grid, height_grid
 from omniperception.env.kinematics import Kinematics
-from omniperception.scene import Ground
+from omniperception.scene.ground import Ground
 from omniperception.scene.ground_kernels import base_heights, heights_around
 
 

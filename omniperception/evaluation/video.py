@@ -14,8 +14,7 @@ from omniperception.common.rotations import rotate_inverse, rotate_yaw
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.render import COMMAND, VELOCITY, Arrow, Renderer, View
 from omniperception.perception import PdSampler
-from omniperception.scene import ray_shapes
-from omniperception.scene.rays import HitClass
+from omniperception.scene.rays import HitClass, ray_shapes
 
 FPS = 25
 BEHIND_M, ABOVE_M, AHEAD_M = 2.4, 1.45, 1.0

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 PARKED_HEIGHT = -100.0
 """Height (m) at which an obstacle that takes no part waits, below the ground where no ray and no contact finds it."""
 LOSE_SIGHT = 1.0
-"""How far (m) beyond its farthest start an approaching obstacle gets before it starts anew."""
+"""How far (m) beyond its farthest start an approaching obstacle gets before it starts again."""
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PUSH_OFF_TURNS = 16
 _CANDIDATES = 48
@@ -35,7 +35,7 @@ class ObstacleField:
         active: (num_envs, num_placed) bool: whether an obstacle takes part in the current episode.
         radius: (num_placed,) m, of the circle around the footprint.
         approaches: (num_placed,) bool: which obstacles come at the robot.
-        any_approaches: whether some do, and `start_anew` has to be called.
+        any_approaches: whether some do, and `restart_approaching` has to be called.
         level: share of obstacles and of their speed that the curriculum lets in, 0 to 1.
     """
 
@@ -159,7 +159,7 @@ class ObstacleField:
         bottom = self.pos_w[..., 2] - self._half_height
         return bottom if self._ground is None else bottom - self._ground.height(self.pos_w[..., :2])
 
-    def start_anew(self, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
+    def restart_approaching(self, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
         """Lets approaching obstacles that have left the robot behind come again; see `reset` for the arguments."""
         distance = (self.pos_w[..., :2] - robot_xy_w.to(self._dtype)[:, None]).norm(dim=-1)
         gone = self.approaches & self.active & (distance > self._start[:, 1] + LOSE_SIGHT)
@@ -301,8 +301,8 @@ def passing_velocity(
     along = (robot_vel * course).sum(-1)
     discriminant = along.square() + speed.square() - robot_vel.square().sum(-1)
     relative = discriminant.clamp(min=0.0).sqrt() - along
-    meets = (discriminant >= 0) & (relative > 1e-3)
-    return torch.where(meets[..., None], robot_vel + relative[..., None] * course, speed[..., None] * course)
+    catches = (discriminant >= 0) & (relative > 1e-3)
+    return torch.where(catches[..., None], robot_vel + relative[..., None] * course, speed[..., None] * course)
 
 
 def bent_path(start: torch.Tensor, goal: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:

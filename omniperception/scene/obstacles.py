@@ -24,7 +24,7 @@ class ApproachConfig:
     One starts at a random bearing, all sides alike. Its course is such that its centre would pass within `within` of
     the robot's base if the robot kept the velocity that it is commanded at that moment; where no course does because
     the robot outruns it, it heads for where the robot is. Once it is farther than `distance[1]` + 1 m from the robot
-    it starts anew.
+    it starts again.
 
     Attributes:
         within: (m); the miss distance is uniform in [-within, within].
@@ -54,7 +54,7 @@ class ObstacleGroup:
         count: number of them.
         size: one (low, high) range (m) per size: box half extents x, y, z; cylinder radius, half height; sphere radius.
         speed: (low, high) range (m/s); (0, 0) stands still.
-        poses: fixed (x, y, yaw in degrees) of each obstacle, for walls; None: placed anew at every reset.
+        poses: fixed (x, y, yaw in degrees) of each obstacle, for walls; None: placed at every reset.
         bottom: (low, high) range (m) of the height of its lowest point above the ground; (0, 0) stands on it.
         heading_deg: (low, high) range (deg) of the direction in which it sets out, 0 along x.
         yaw_deg: (low, high) range (deg) of its orientation about the vertical.
@@ -158,7 +158,7 @@ class CurriculumConfig:
 
 @dataclass(frozen=True)
 class FreePathConfig:
-    """A way from the robot's start to its goal that no standing obstacle blocks, drawn anew at every reset.
+    """A way from the robot's start to its goal that no standing obstacle blocks, drawn at every reset.
 
     It is the set of points within width / 2 of a line with two bends: from the start over one point each at a third
     and at two thirds of the way, both off the straight line by up to `bend` to either side, to the goal.
@@ -248,7 +248,7 @@ class ObstaclesConfig:
         return tuple(slot.name for slot in self.slots())
 
     def placed_slots(self) -> tuple[Obstacle, ...]:
-        """The obstacles that are placed anew at a reset, in the order of the kinematic bodies."""
+        """The obstacles that are placed at every reset, in the order of the kinematic bodies."""
         return tuple(slot for slot in self.slots() if slot.pose is None)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:

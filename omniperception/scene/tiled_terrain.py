@@ -47,7 +47,7 @@ class TerrainCurriculumConfig:
 class TiledTerrainConfig:
     """Square tiles in rows of equal difficulty and columns of one kind, with a flat border around them.
 
-    An environment has a column for good and a level that may change at its resets. It starts in the middle of its tile,
+    An environment keeps its column and has a level that may change at its resets. It starts in the middle of its tile,
     which is the origin of its frame, and may walk on to the tiles beside. At a metre from the border's outer edge its
     episode ends as a time-out.
 

@@ -106,7 +106,7 @@ class Simulator(Protocol):
         """(num_envs, ...) per-environment values of a model field, made per-environment on the first call."""
 
     def anomalies(self) -> dict[str, float]:
-        """By name, how many environments met a limit of the engine since the last call."""
+        """By name, how many environments reached a limit of the engine since the last call."""
 
     def state_dict(self) -> dict:
         """Everything that the physics needs to go on exactly."""

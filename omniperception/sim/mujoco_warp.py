@@ -235,7 +235,7 @@ class MujocoWarpSimulator:
         return self._fields[name]
 
     def update_model(self, env_ids: torch.Tensor) -> None:
-        """Derives anew for all worlds, whose other constants come out as they were, in one launch for all."""
+        """Derives them for all worlds in one launch; those of the others come out as they were."""
         self._launch("constants", self._constants)
 
     def anomalies(self) -> dict[str, float]:

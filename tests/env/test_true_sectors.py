@@ -9,7 +9,8 @@ from omniperception.avoidance.sector_motion import encode
 from omniperception.avoidance.true_sectors import TrueSectors
 from omniperception.common.random import EnvRandom
 from omniperception.env.env import OmniEnv
-from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig, ray_shapes
+from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.scene.rays import ray_shapes
 
 POST = ObstacleGroup("cylinder", 1, [[0.5, 0.5], [0.5, 0.5]])
 SOUTH_EAST, EAST, NORTH = 1, 2, 3  # of four sectors that begin at -180, -90, 0 and 90 degrees: EAST is 0 to 90 degrees

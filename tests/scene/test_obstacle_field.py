@@ -115,14 +115,14 @@ class TestApproach:
         speed = field.velocity_w.norm(dim=-1)
         assert 1.0 <= speed.min() < 1.01 and 1.49 < speed.max() <= 1.5 + 1e-9
 
-    def test_starts_anew_once_it_is_far_behind_and_not_before(self):
+    def test_starts_again_once_it_is_far_behind_and_not_before(self):
         field = self.approaching(3)
         robot, command = torch.zeros(3, 2), torch.zeros(3, 2)
         reset(field)
         field.pos_w[0, 1, :2] = torch.tensor([6.0 + LOSE_SIGHT + 0.01, 0.0])
         field.pos_w[1, 0, :2] = torch.tensor([0.0, 6.0 + LOSE_SIGHT - 0.01])
         pos, velocity, counter = field.pos_w.clone(), field.velocity_w.clone(), field._random.counter.clone()
-        field.start_anew(robot, command)
+        field.restart_approaching(robot, command)
         assert 3 <= field.pos_w[0, 1, :2].norm() <= 6
         changed = (field.pos_w != pos).any(-1)
         assert changed.tolist() == [[False, True], [False, False], [False, False]]
@@ -148,7 +148,7 @@ class TestApproach:
         field = self.approaching(50)
         field.level = 0.0
         reset(field)
-        field.start_anew(torch.full((50, 2), 100.0), torch.zeros(50, 2))
+        field.restart_approaching(torch.full((50, 2), 100.0), torch.zeros(50, 2))
         assert (field.pos_w[..., 2] == PARKED_HEIGHT).all() and (field.velocity_w == 0).all()
 
     def test_wrong_settings_are_refused(self):

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from omniperception.lidar import RayScene
-from omniperception.scene import build_world, ray_shapes
-from omniperception.scene.rays import HitClass
+from omniperception.scene import build_world
+from omniperception.scene.rays import HitClass, ray_shapes
 
 NUM_RAYS = 400
 

@@ -9,8 +9,8 @@ import torch
 
 from omniperception.config import ConfigError
 from omniperception.lidar import RayScene
-from omniperception.scene import TerrainCurriculumConfig, TiledTerrainConfig, build_world, ray_shapes
-from omniperception.scene.rays import HitClass
+from omniperception.scene import TerrainCurriculumConfig, TiledTerrainConfig, build_world
+from omniperception.scene.rays import HitClass, ray_shapes
 from omniperception.scene.tiles import Rough, Slope, Stairs, Stones, TileGrid
 
 HEIGHTS = "+observations.groups.privileged.terms.heights={}"
