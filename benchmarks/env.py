@@ -63,7 +63,7 @@ class Timed:
     Attributes:
         call: one block of it.
         steps: control steps of a block, of all environments together.
-        env: whose stages are told, or none.
+        env: whose stages are reported, or none.
     """
 
     call: Callable[[int], object]

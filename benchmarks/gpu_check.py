@@ -6,7 +6,7 @@
 tests      the tests marked gpu
 lidar      ranges against mj_ray
 steps      one physics step against mj_step; graph replay against the CPU
-syncs      where the host waits for the GPU in a control step
+syncs      host synchronisations in a control step
 rays       the paper's rendering-time table, also beside the paper's scheme and mujoco_warp.rays
 env        environment steps per second at 4096 environments, by stage
 training   whole PPO iterations of experiment=paper, and memory beside its prediction
@@ -55,8 +55,9 @@ LARGEST_CELL_MS = 100.0
 """What 4096 environments with 32,000 rays each may take, ms."""
 ENGINE_ERROR = 5e-3
 """Largest difference (m/s or rad/s) from `mj_step` after one step that passes."""
-SYNCS_PER_STEP = 1
-"""Times that the host may wait in a control step: finished environments are counted."""
+SYNCS_PER_STEP = 3
+"""Host synchronisations allowed in a control step, each to count environments: those that end, those whose command is
+drawn again, and those with an approaching obstacle that has passed."""
 PERCEPTION_STAGES = ("rays", "sampling", "sectors")
 PART_NAMES = ("tests", "lidar", "steps", "syncs", "rays", "env", "training")
 
@@ -137,8 +138,8 @@ def _compare_replay(given: Arguments) -> Table:
 
 
 def check_syncs(given: Arguments) -> list[Table]:
-    """Where the host waits for the GPU in control steps in which an episode ends, as PyTorch tells."""
-    table = Table("syncs", "Places of a control step where the host waits for the GPU", ("place", "times in a step"))
+    """Host synchronisations in control steps in which an episode ends, as PyTorch reports them."""
+    table = Table("syncs", "Host synchronisations of a control step", ("place", "times in a step"))
     if not given.on_gpu:
         table.notes = ["left out: it needs a GPU"]
         return [table]
@@ -154,7 +155,7 @@ def check_syncs(given: Arguments) -> list[Table]:
         torch.cuda.set_sync_debug_mode("default")
     places = [f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchroniz" in str(w.message)]
     table.rows = [(place, places.count(place) / steps) for place in sorted(set(places))]
-    table.notes = ["Warp's and the physics' own waits, of which there should be none, are not seen by this"]
+    table.notes = ["synchronisations by Warp and the physics, of which there should be none, are not seen by this"]
     return [_judged(table, len(places) <= SYNCS_PER_STEP * steps)]
 
 
@@ -189,12 +190,12 @@ def measure_env(given: Arguments) -> list[Table]:
 
 
 def _measure_steps(given: Arguments, name: str, *overrides: str) -> Table:
-    run, wait = given.run(*overrides), device_barrier(given.device)
+    run, synchronise = given.run(*overrides), device_barrier(given.device)
     timed = env_benchmark.step_of(run)
     timed.call(0)
 
     def clock() -> float:
-        wait()
+        synchronise()
         return time.perf_counter()
 
     start = clock()
@@ -246,7 +247,7 @@ PARTS: dict[str, Callable[[Arguments], list[Table]]] = dict(
 def execute(given: Arguments) -> bool:
     """Runs the parts, prints and writes their tables and a summary; whether none of them failed.
 
-    A part that fails is told with its last line and does not keep the others from running.
+    A part that fails is reported with its last line and does not keep the others from running.
     """
     where, began, good = about(2, given.device), time.perf_counter(), True
     summary = Table("summary", f"Checks on {where['machine']['device']}", ("part", "s", "result"))

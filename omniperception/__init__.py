@@ -3,5 +3,5 @@
 import os
 
 # Physics, rays and PyTorch take turns on the same cores. PyTorch's OpenMP threads spin for milliseconds after work
-# by default, which takes a core from whoever is next; this is read when PyTorch is loaded.
+# by default, which takes a core from the next computation; this is read when PyTorch is loaded.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")

@@ -124,7 +124,7 @@ def arguments(
         values: by name.
         key: where they stand.
         trust: see `make`.
-        given: number of leading arguments that somebody else adds; None: any, and none counts as missing.
+        given: number of leading arguments that the caller adds; None: any, and none counts as missing.
         others: keys that stand beside them, for suggestions.
     """
     parameters = list(inspect.signature(target).parameters.values())[given or 0 :]

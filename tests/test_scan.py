@@ -47,7 +47,7 @@ def test_pictures_and_a_cloud_are_written(command, capsys, tmp_path, preset):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "expected"),
     [
         (("lidar=none",), "lidar=none has nothing to view"),
         (("colour=pink",), "colour=pink must be one of class, height"),
@@ -55,11 +55,11 @@ def test_pictures_and_a_cloud_are_written(command, capsys, tmp_path, preset):
         (("seed=-1",), "seed=-1 must be a whole number >= 0"),
     ],
 )
-def test_wrong_arguments_are_told_in_one_line(command, capsys, arguments, told):
+def test_wrong_arguments_end_with_one_line(command, capsys, arguments, expected):
     with pytest.raises(SystemExit, match="2"):
         command(*arguments)
     error = capsys.readouterr().err
-    assert told in error and error.count("\n") == 1
+    assert expected in error and error.count("\n") == 1
 
 
 def test_a_scan_has_every_class_and_the_robot_sees_itself(make_config):

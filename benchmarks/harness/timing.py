@@ -64,17 +64,17 @@ def paired_timings(
         block_s: about how long a method is timed at once, s.
         calls_per_block: calls that are timed at once, instead of as many as fill ``block_s``.
     """
-    wait = device_barrier(device)
+    synchronise = device_barrier(device)
     if calls_per_block:
         sizes = dict.fromkeys(calls, calls_per_block)
         for call in calls.values():
-            _seconds(call, calls_per_block, wait)
+            _seconds(call, calls_per_block, synchronise)
     else:
-        sizes = {name: _calls_per_block(call, block_s, wait) for name, call in calls.items()}
+        sizes = {name: _calls_per_block(call, block_s, synchronise) for name, call in calls.items()}
     timings, names = {name: Timing() for name in calls}, list(calls)
     for k in range(rounds):
         for name in names[k % len(names) :] + names[: k % len(names)]:
-            wall, cpu = _seconds(calls[name], sizes[name], wait)
+            wall, cpu = _seconds(calls[name], sizes[name], synchronise)
             timings[name].wall_s.append(wall)
             timings[name].cpu_s.append(cpu)
     return timings
@@ -88,28 +88,28 @@ def paired_ratio(others: Timing, ours: Timing, clock: str = "wall") -> Ratio:
 
 
 def device_barrier(device: str) -> Callable[[], None]:
-    """Waits until a device has done everything; nothing to wait for on a CPU."""
+    """Returns a function that synchronises the host with a device; on a CPU it does nothing."""
     if not device.startswith("cuda"):
         return lambda: None
 
-    def wait() -> None:
+    def synchronise() -> None:
         torch.cuda.synchronize(device)
         wp.synchronize_device(device)
 
-    return wait
+    return synchronise
 
 
-def _calls_per_block(call: Callable[[int], object], block_s: float, wait: Callable[[], None]) -> int:
+def _calls_per_block(call: Callable[[int], object], block_s: float, synchronise: Callable[[], None]) -> int:
     """Compiles and warms up, then finds how many calls fill a block."""
-    _seconds(call, 1, wait)
-    seconds, _ = _seconds(call, 1, wait)
+    _seconds(call, 1, synchronise)
+    seconds, _ = _seconds(call, 1, synchronise)
     return min(1000, max(1, math.ceil(block_s / seconds)))
 
 
-def _seconds(call: Callable[[int], object], count: int, wait: Callable[[], None]) -> tuple[float, float]:
-    wait()
+def _seconds(call: Callable[[int], object], count: int, synchronise: Callable[[], None]) -> tuple[float, float]:
+    synchronise()
     cpu, wall = time.process_time(), time.perf_counter()
     for number in range(count):
         call(number)
-    wait()
+    synchronise()
     return (time.perf_counter() - wall) / count, (time.process_time() - cpu) / count

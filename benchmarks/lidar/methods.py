@@ -1,4 +1,4 @@
-"""What a ray-casting method owes the benchmark, how its environments are split over threads, and how wrong it is."""
+"""Interface of a ray-casting method, how its environments are split over threads, and its error."""
 
 from __future__ import annotations
 

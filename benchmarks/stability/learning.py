@@ -46,7 +46,7 @@ class Case:
 
 
 def cases() -> list[Case]:
-    """The extremes in numbers that training meets."""
+    """Extreme numbers in rewards, observations, actions and gradients during training."""
     end_to_end = ("perception.supervised_epochs=0",)
     whole = ("ppo.num_mini_batches=8",)
     return [

@@ -160,7 +160,7 @@ def sensor_limits() -> list[Row]:
 
 
 def poses(count: int, rng: np.random.Generator) -> list[Row]:
-    """Bodies whose pose is broken are not there and are told; other lengths of a quaternion turn as the unit one."""
+    """Bodies with a broken pose are not there and are reported; quaternions of another length turn as unit ones."""
     rows = []
     quat = np.array([0.9, 0.1, -0.2, 0.3])
     quat /= np.linalg.norm(quat)
@@ -184,11 +184,11 @@ def poses(count: int, rng: np.random.Generator) -> list[Row]:
         both = [torch.from_numpy(v)[None].expand(2, -1, -1).contiguous() for v in (origins, directions)]
         ranges = scene.cast(*both).ranges.double().numpy()
         there = not (x or norm == 0 or math.isnan(norm))
-        told = scene.broken_poses().tolist() == [[False], [not there]]
+        reported = scene.broken_poses().tolist() == [[False], [not there]]
         loose = _near_silhouette(lambda o, d: box_ranges(o, d, np.array([1, 0.5, 0.25])), *turned, 2e-5)
         row = _row(name, ranges[1], true if there else np.full(count, math.inf), 2e-5, loose & there)
         other = _row("", ranges[0], true, 2e-5, loose)["good"]
-        rows.append({**row, "good": row["good"] and told and other})
+        rows.append({**row, "good": row["good"] and reported and other})
     return rows
 
 

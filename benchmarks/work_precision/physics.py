@@ -165,7 +165,7 @@ class Bench:
             self._find_horizon(trajectory)
 
     def truth(self, trajectory: Trajectory, cone: str = "elliptic") -> Course:
-        """At the reference's step, with the true friction cone unless told otherwise, up to the end."""
+        """At the reference's step, with the true friction cone unless another is given, up to the end."""
         key = (trajectory.name, cone)
         if key not in self._truths:
             self._truths[key] = follow(trajectory, reference(cone), self.sim)

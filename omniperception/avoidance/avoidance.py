@@ -27,7 +27,7 @@ class Avoidance:
         true_sectors: measures `motion`; None where V_avoid is the paper's.
         velocity: (num_envs, 2) m/s in the yaw-aligned frame: V_avoid; 0 before an episode's first frame.
         sector_distance: (num_envs, num_sectors) horizontal distance (m) from the base to the nearest obstacle hit at
-            the newest frame, without noise, in the yaw-aligned frame; written by the LiDAR. None when nobody reads it.
+            the newest frame, without noise, in the yaw-aligned frame; written by the LiDAR. None if no term reads it.
         motion: (num_envs, num_sectors, 3) distance (m) and velocity (m/s, yaw-aligned) of the nearest true obstacle
             that the LiDAR has seen, at the newest frame; None where V_avoid is the paper's.
         risk: (num_envs, K) of each candidate velocity, from `motion`; None when no V_avoid follows from it.
@@ -69,7 +69,7 @@ class Avoidance:
 
     @property
     def obstacle_names(self) -> tuple[str, ...]:
-        """Geoms of the obstacles whose sightings `see` is told, in its order."""
+        """Geoms of the obstacles whose sightings `see` takes, in its order."""
         return () if self.true_sectors is None else self.true_sectors.names
 
     def see(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, seen: torch.Tensor | None) -> None:
@@ -81,7 +81,7 @@ class Avoidance:
             seen: (num_envs, O) bool: obstacles that a ray has hit lately; None without obstacles.
         """
         if self.true_sectors is None:
-            assert self.sector_distance is not None  # without a law only V_avoid is read
+            assert self.sector_distance is not None  # without a velocity risk only V_avoid is read
             self.velocity = avoidance_velocity(self.sector_distance, self.config)
             return
         self.motion = self.true_sectors.measure(base_pos_w, yaw, seen)
@@ -108,7 +108,7 @@ class Avoidance:
         if AVOIDANCE_TARGET in names:
             targets[AVOIDANCE_TARGET] = self.velocity
         if MOTION_TARGET in names:
-            assert self.motion is not None  # it is supervised with a law alone
+            assert self.motion is not None  # only a velocity risk supervises it
             targets[MOTION_TARGET] = encode(self.motion).flatten(1)
         return targets
 

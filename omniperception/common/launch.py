@@ -72,7 +72,7 @@ def launch_over_envs(
     block_dim: int = 256,
     num_threads: int | None = None,
 ) -> None:
-    """Launch ``kernel(env_offset, *inputs)`` for all environments and, on the CPU, wait for it.
+    """Launch ``kernel(env_offset, *inputs)`` for all environments; on the CPU it has finished at the return.
 
     A launch with the memory and numbers of an earlier one is replayed, because recording it takes longer than sampling
     a few environments.

@@ -24,7 +24,7 @@ HEIGHT_TARGET = "height_target"
 """Observation group with the height grid that a network can be supervised with."""
 
 FROM_LIDAR = frozenset({AVOIDANCE, DISTAL_RANGE, CLOUD})
-"""Requirements of terms that only a LiDAR meets."""
+"""Requirements of terms that only a LiDAR fulfils."""
 
 
 @dataclass(frozen=True)

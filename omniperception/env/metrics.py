@@ -13,7 +13,7 @@ OUTCOMES = ("time_out", "fall", "goal", "collision_end", "diverged")
 
 
 class EpisodeMetrics:
-    """Sums on the device, read out at the end of a log interval: a step itself never waits for the device.
+    """Sums on the device, read out at the end of a log interval: a step itself never synchronises with the host.
 
     Attributes:
         collided: (num_envs,) bool: whether the current episode has had a contact with an obstacle.
@@ -63,7 +63,7 @@ class EpisodeMetrics:
         self.collided &= ~done
 
     def free_velocity_error(self) -> float:
-        """Mean linear velocity error (m/s) away from obstacles since the last drain; inf if nobody was."""
+        """Mean linear velocity error (m/s) away from obstacles since the last drain; inf if no robot was."""
         return float(self._errors[2] / self._errors[3]) if self._errors[3] > 0 else float("inf")
 
     def state_dict(self) -> dict:

@@ -73,7 +73,7 @@ class Obstacles(NamedTuple):
 
 
 class EnvState:
-    """State of all environments, (num_envs, ...): read it freely, what nobody reads is never computed.
+    """State of all environments, (num_envs, ...): a quantity is computed when it is first read, and never otherwise.
 
     Quantities are computed at first use and hold until the environment calls `invalidate`, after the physics steps of a
     control step and again after resets. They describe the newest moment but for these: contact forces and torques are
@@ -156,7 +156,7 @@ class EnvState:
             del self.__dict__[name]
 
     def has_computed(self, name: str) -> bool:
-        """Whether somebody has read a quantity since the last `invalidate`."""
+        """Whether a quantity has been read since the last `invalidate`."""
         return name in self.__dict__
 
     def state_dict(self) -> dict:
@@ -342,7 +342,7 @@ class StateHistory:
 
 
 class ContactTimes:
-    """How long each foot has been in the air or in contact, told at every control step; all (num_envs, F).
+    """How long each foot has been in the air or in contact, updated in every control step; all (num_envs, F).
 
     Attributes:
         air, contact: s: of the present phase in the air and in contact; 0 in the other one.

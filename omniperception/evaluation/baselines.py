@@ -43,7 +43,7 @@ def covered(env: OmniEnv, policy: Policy) -> Policy:
 
 
 def steered(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
-    """The policy told V_cmd + V_avoid in place of V_cmd, with V_avoid from the obstacles' true distances.
+    """The policy with V_cmd + V_avoid in place of V_cmd, with V_avoid from the obstacles' true distances.
 
     To a policy that sees, too, it is always before the first frame, so that it adds no avoidance of its own.
 

@@ -53,13 +53,13 @@ class ExportedPolicies:
 
 def robot_states(env: OmniEnv) -> list[RobotState]:
     """What each robot senses of itself, with the latency that the environment gives it."""
-    sensed = env.state.measured
+    measured = env.state.measured
     tensors = (
-        sensed.joint_pos,
-        sensed.joint_vel,
-        sensed.base_quat_w,
-        sensed.base_ang_vel_b,
-        sensed.base_lin_vel_b,
+        measured.joint_pos,
+        measured.joint_vel,
+        measured.base_quat_w,
+        measured.base_ang_vel_b,
+        measured.base_lin_vel_b,
     )
     return [RobotState(*values) for values in zip(*(tensor.cpu().numpy() for tensor in tensors), strict=True)]
 

@@ -15,7 +15,7 @@ COLOURS = {
     HitClass.OBSTACLE: (0.82, 0.68, 0.45),
     HitClass.ROBOT: (0.13, 0.14, 0.18),
 }
-"""Linear RGB reflectance by what a ray has met; the terrain's is that of the lighter squares."""
+"""Linear RGB reflectance by what a ray has hit; the terrain's is that of the lighter squares."""
 DARK_SQUARES = 0.76
 SQUARE_M = 0.5
 PROXIMAL, DISTAL = (0.95, 0.09, 0.03), (0.02, 0.22, 0.95)
@@ -90,7 +90,7 @@ class Renderer:
     ) -> None:
         """
         Args:
-            shapes: what there is to see.
+            shapes: shapes that are drawn.
             width, height: size of the picture, pixels.
             samples: rays per pixel along each axis, averaged.
             fov_deg: vertical field of view.
@@ -129,7 +129,7 @@ class Renderer:
         return (colour * 255.0 + 0.5).to(torch.uint8).cpu()
 
     def _shade(self, view: View, rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Distance (m), class and linear colour of what each ray has met."""
+        """Distance (m), class and linear colour of what each ray has hit."""
         strips = (self._scene.num_envs, -1)
         origins = view.eye_w.expand_as(rays)
         hits = self._scene.cast(origins.unflatten(0, strips), rays.unflatten(0, strips), normals=True)

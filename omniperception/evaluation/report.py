@@ -21,7 +21,7 @@ DEFINITIONS = {
     "energy_j": "sum over joints and control steps of |torque * joint velocity| * control step",
     "cost_of_transport": "energy / (weight * length of the base's horizontal way), over all trials",
 }
-"""What the figures of a summary mean."""
+"""What the entries of a summary mean."""
 
 
 def table(summaries: Mapping[str, dict]) -> str:

@@ -35,7 +35,7 @@ POLICIES = {
 """What can be evaluated; the walking policy is the one of `walker`, or for `scripted` the run's own, LiDAR covered."""
 
 ENVS = 256
-"""Most environments at a time, unless told otherwise."""
+"""Most environments at a time, unless `num_envs` is given."""
 
 
 @dataclass(frozen=True)

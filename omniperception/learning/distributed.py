@@ -41,7 +41,7 @@ def connect(device: torch.device | str) -> None:
 
 
 def disconnect() -> None:
-    """Leaves the others, which a process owes them before it ends."""
+    """Leaves the process group, as every process must before it ends."""
     if dist.is_available() and dist.is_initialized():
         dist.destroy_process_group()
 

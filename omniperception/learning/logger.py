@@ -55,7 +55,7 @@ class Logger:
             self._writer = None
 
     def add_step(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping) -> None:
-        """Note a control step; finished episodes are read out by :meth:`log`: a step does not wait for a GPU."""
+        """Note a control step; finished episodes are read out by :meth:`log`, so no step waits for a GPU."""
         if self._writer is None:
             return
         if "log" in extras:

@@ -94,7 +94,7 @@ class MujocoScene(RayScene):
         num_envs: Environments, each with poses of its own.
         class_of: Class id (>= 0) of a geom by its id; 0 for all if None.
         geoms: Ids of the geoms to take; all that ``mj_ray`` hits if None.
-        device, num_threads, pose_dtype: As for ``RayScene``; poses are MuJoCo's float64 unless told otherwise.
+        device, num_threads, pose_dtype: As for ``RayScene``; poses are MuJoCo's float64 by default.
     """
 
     def __init__(

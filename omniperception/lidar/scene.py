@@ -236,7 +236,7 @@ class RayScene:
 
     @property
     def visible_if_used(self) -> torch.Tensor | None:
-        """``visible``, or None as long as nobody has asked for it."""
+        """``visible``, or None until it is first read."""
         return self._visible
 
     @property

@@ -208,7 +208,7 @@ class Lidar:
         Args:
             config: Mount, rate and limits.
             pattern: Where the device looks, as a function of time.
-            scene: What there is to see.
+            scene: Shapes and poses that rays are cast at.
             mount_body: Body of the scene that carries the sensor; -1 for a sensor fixed in each environment.
             exclude_shapes: Indices of shapes that the rays pass through.
             noise: At most one model of each kind.

@@ -131,7 +131,7 @@ def lift_kernel(real: type) -> wp.Kernel:
         # in and out
         path: wp.array3d(dtype=vec3),
     ):
-        """Lifts one environment's obstacles, by step, ``above`` the ground; the others wait at ``parked``."""
+        """Lifts one environment's obstacles, by step, ``above`` the ground; the others are parked at ``parked``."""
         env = wp.tid() + env_offset
         for step in range(path.shape[1]):
             for k in range(path.shape[2]):

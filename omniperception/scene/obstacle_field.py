@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from omniperception.scene.ground import Ground
 
 PARKED_HEIGHT = -100.0
-"""Height (m) at which an obstacle that takes no part waits, below the ground where no ray and no contact finds it."""
+"""Height (m) at which an inactive obstacle is parked, below the ground where no ray and no contact finds it."""
 LOSE_SIGHT = 1.0
 """How far (m) beyond its farthest start an approaching obstacle gets before it starts again."""
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))

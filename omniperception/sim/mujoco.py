@@ -153,7 +153,7 @@ class MujocoSimulator:
         return torch.where(finite[:, None], joint_target.double(), self._ctrl)
 
     def _roll_out(self, num_steps: int, mocap_path: torch.Tensor | None) -> None:
-        """Steps with the kinematic bodies on their way, recording what somebody reads after every step."""
+        """Steps with the kinematic bodies on their way, recording the requested fields after every step."""
         if self._records and next(iter(self._records.values())).shape[1] != num_steps:
             self._records = self._allocate_records(num_steps)
         if mocap_path is not None and self.ground_pos is not None:

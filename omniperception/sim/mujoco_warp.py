@@ -108,7 +108,7 @@ class MujocoWarpSimulator:
     """`num_envs` worlds on one device; every tensor is a view of the engine's own float32 memory.
 
     A call of `step` is one CUDA graph on a GPU: the obstacles' way, the physics steps and the recording of what
-    somebody reads after each of them. Nothing here waits for the device but `anomalies`, `state_dict` and
+    is read after each of them. Only these synchronise the host with the device: `anomalies`, `state_dict` and
     `load_state_dict`.
 
     Attributes:
@@ -239,7 +239,7 @@ class MujocoWarpSimulator:
         self._launch("constants", self._constants)
 
     def anomalies(self) -> dict[str, float]:
-        """Environments for whose contacts or constraints there was no room since the last call; waits for the device.
+        """Environments for whose contacts or constraints there was no room since the last call; synchronises the host.
 
         A warning names the override that makes room, once.
         """

@@ -1,4 +1,4 @@
-"""Rates of the environment: what is timed is what is told, and a slower task is found slower."""
+"""Rates of the environment: what is timed is what is reported, and a slower task is found slower."""
 
 import pytest
 import torch

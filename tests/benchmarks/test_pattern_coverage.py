@@ -1,4 +1,4 @@
-"""Coverage figures on cases with known answers, and the command that prints them."""
+"""Coverage on cases with known answers, and the command that prints them."""
 
 import math
 
@@ -77,10 +77,10 @@ def test_angle_between_equal_rows_and_the_nearest_rows():
 
 
 def test_every_strategy_is_measured_beside_all_points():
-    figures = strategy_coverage(circle(), period_s=0.5, num_rays=20, durations_s=(0.5,), cell_deg=5.0)
-    assert list(figures) == ["every_kth", "stratified", "all"]
-    assert figures["all"][0].seen == pytest.approx(0.5)
-    assert all(0.0 < rows[0].seen <= 0.5 + 1e-9 for rows in figures.values())
+    coverage = strategy_coverage(circle(), period_s=0.5, num_rays=20, durations_s=(0.5,), cell_deg=5.0)
+    assert list(coverage) == ["every_kth", "stratified", "all"]
+    assert coverage["all"][0].seen == pytest.approx(0.5)
+    assert all(0.0 < rows[0].seen <= 0.5 + 1e-9 for rows in coverage.values())
 
 
 def test_the_command_prints_and_draws(capsys, tmp_path):

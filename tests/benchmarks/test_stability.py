@@ -88,17 +88,17 @@ def test_float32_is_precise_enough_in_every_layer():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "expected"),
     [
         (["subject=weather"], "subject=weather must be one of physics, lidar, learning"),
         (["subject=lidar", "sim.timestep=0.1"], "sim.timestep=0.1 is unknown for subject=lidar"),
         (["subject=lidar", "rays=0"], "rays=0 must be"),
     ],
 )
-def test_wrong_arguments_are_refused(arguments, told, capsys):
+def test_wrong_arguments_are_refused(arguments, expected, capsys):
     with pytest.raises(SystemExit) as ended:
         command(arguments)
-    assert ended.value.code == 2 and told in capsys.readouterr().err
+    assert ended.value.code == 2 and expected in capsys.readouterr().err
 
 
 def test_the_exit_status_says_whether_all_is_well(tmp_path, monkeypatch, capsys):

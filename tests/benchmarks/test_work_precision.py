@@ -217,7 +217,7 @@ def test_the_command_writes_tables_and_plot(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "expected"),
     [
         (["subject=lidr"], "lidar, physics, perception, policy"),
         (["subject=lidar", "only=shape"], "only=shape"),
@@ -226,8 +226,8 @@ def test_the_command_writes_tables_and_plot(tmp_path, capsys):
         (["subject=policy", "num_envs=4"], "num_envs=4: policies are taken as they were trained"),
     ],
 )
-def test_wrong_arguments_end_with_one_line(arguments, told, capsys):
+def test_wrong_arguments_end_with_one_line(arguments, expected, capsys):
     with pytest.raises(SystemExit) as ended:
         command(arguments)
     error = capsys.readouterr().err
-    assert ended.value.code == 2 and told in error and error.count("\n") == 1
+    assert ended.value.code == 2 and expected in error and error.count("\n") == 1

@@ -243,7 +243,7 @@ class TestYawEquivariance:
         ahead, aside = (env.sensing.frame.true_ranges for env in envs)
         assert ahead.isfinite().any()
         far = (ahead.nan_to_num(posinf=99.0) - aside.nan_to_num(posinf=99.0)).abs() > 1e-3
-        assert far.float().mean() < 0.03  # a ray at an edge may meet the other side of it
+        assert far.float().mean() < 0.03  # a ray at an edge may hit the other side of it
 
 
 class TestWithoutLidar:

@@ -18,7 +18,7 @@ ON_WARP = ("sim=mujoco_warp", "sim.device=cpu", "randomization=paper")
 
 
 class Synchronisations(TorchDispatchMode):
-    """Counts, by file of the package, the operators for which the host waits for a GPU."""
+    """Counts, by file of the package, the operators that synchronise the host with a GPU."""
 
     def __init__(self):
         super().__init__()

@@ -14,45 +14,47 @@ DT = 0.02
 CPU = torch.device("cpu")
 
 
-def sensed(yaw, vx, vy):
+def measured(yaw, vx, vy):
     """Two robots that do the same; velocity in the yaw-aligned frame."""
     return SimpleNamespace(yaw=torch.full((2,), yaw), base_lin_vel_yaw=torch.tensor([[vx, vy]]).expand(2, 2))
 
 
 def test_a_straight_walk_and_a_turn_by_hand():
     odometry = Odometry(2, DT, CPU)
-    odometry.start(torch.arange(2), sensed(1.0, 0.0, 0.0))
+    odometry.start(torch.arange(2), measured(1.0, 0.0, 0.0))
     for _ in range(5):
-        odometry.advance(sensed(1.0, 0.5, 0.1))
+        odometry.advance(measured(1.0, 0.5, 0.1))
     assert odometry.since_last_frame()[0].tolist() == pytest.approx([0.05, 0.01, 0.0], abs=1e-6)
-    odometry.advance(sensed(1.0 + math.pi / 2, 0.5, 0.0))  # has turned left and walks, as seen from before, to the left
+    odometry.advance(
+        measured(1.0 + math.pi / 2, 0.5, 0.0)
+    )  # has turned left and walks, as seen from before, to the left
     assert odometry.since_last_frame()[0].tolist() == pytest.approx([0.0, 0.01, math.pi / 2], abs=1e-6)
     assert odometry.since_last_frame()[0].tolist() == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
 
 
 def test_the_heading_may_wrap():
     odometry = Odometry(2, DT, CPU)
-    odometry.start(torch.arange(2), sensed(3.1, 0.0, 0.0))
-    odometry.advance(sensed(-3.1, 0.0, 0.0))
+    odometry.start(torch.arange(2), measured(3.1, 0.0, 0.0))
+    odometry.advance(measured(-3.1, 0.0, 0.0))
     assert odometry.since_last_frame()[0, 2].item() == pytest.approx(2 * math.pi - 6.2, abs=1e-5)
 
 
 def test_a_reset_touches_one_robot_alone():
     odometry = Odometry(2, DT, CPU)
-    odometry.start(torch.arange(2), sensed(0.0, 0.0, 0.0))
-    odometry.advance(sensed(0.2, 1.0, 0.0))
-    odometry.start(torch.tensor([1]), sensed(2.0, 0.0, 0.0))
+    odometry.start(torch.arange(2), measured(0.0, 0.0, 0.0))
+    odometry.advance(measured(0.2, 1.0, 0.0))
+    odometry.start(torch.tensor([1]), measured(2.0, 0.0, 0.0))
     moved = odometry.since_last_frame()
     assert moved[1].tolist() == [0.0, 0.0, 0.0] and moved[0, 2].item() == pytest.approx(0.2)
 
 
 def test_it_goes_on_from_its_state():
     one, other = Odometry(2, DT, CPU), Odometry(2, DT, CPU)
-    one.start(torch.arange(2), sensed(0.3, 0.0, 0.0))
-    one.advance(sensed(0.4, 1.0, 0.2))
+    one.start(torch.arange(2), measured(0.3, 0.0, 0.0))
+    one.advance(measured(0.4, 1.0, 0.2))
     other.load_state_dict(one.state_dict())
     for odometry in (one, other):
-        odometry.advance(sensed(0.5, 1.0, 0.2))
+        odometry.advance(measured(0.5, 1.0, 0.2))
     assert torch.equal(one.since_last_frame(), other.since_last_frame())
 
 

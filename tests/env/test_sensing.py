@@ -160,7 +160,7 @@ def take_frame(env, time_s):
 
 
 def test_motion_distortion_forgets_the_last_episode(make_env):
-    """A robot that is placed anew has not swept there; a robot that turns has."""
+    """A robot that is placed again has not swept there; a robot that turns has."""
     env = make_env("obstacles=static", "lidar.motion_segments=1", "lidar.motion_jump=100.0", num_envs=2)
     still_env = make_env("obstacles=static", num_envs=2)
     for each in (env, still_env):

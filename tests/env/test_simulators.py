@@ -91,7 +91,7 @@ def test_both_simulators_show_the_same(make_env):
         for name in ("command", "proprioception", "privileged", "height_target", "reward"):
             torch.testing.assert_close(one[name], other[name], atol=2e-3, rtol=0, msg=name)
     same = (one["frames"] - other["frames"]).abs().amax(-1) < 1e-3
-    assert (one["frames"] != 0).any() and same.float().mean() > 0.95  # a ray at an edge may meet the other side
+    assert (one["frames"] != 0).any() and same.float().mean() > 0.95  # a ray at an edge may hit the other side
 
 
 @pytest.mark.slow

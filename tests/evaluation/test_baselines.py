@@ -1,4 +1,4 @@
-"""The blind and the scripted policy: what they see and what they are told."""
+"""The blind and the scripted policy: what they observe and which command they get."""
 
 from pathlib import Path
 
@@ -18,11 +18,11 @@ SEEING = ("experiment=quickstart", "scenario=static", "num_envs=3", "randomizati
 
 
 class TestSteered:
-    law = AvoidanceConfig(num_sectors=36, threshold=1.5, alpha=2.0, max_speed=None)
+    controller = AvoidanceConfig(num_sectors=36, threshold=1.5, alpha=2.0, max_speed=None)
 
-    def told(self, env, limits):
+    def commanded(self, env, limits):
         heard = []
-        policy = steered(env, lambda obs: heard.append(obs["command"].clone()), self.law, limits)
+        policy = steered(env, lambda obs: heard.append(obs["command"].clone()), self.controller, limits)
         policy(env.get_observations())
         return heard[0]
 
@@ -31,29 +31,29 @@ class TestSteered:
         env.sim.mocap_pos[..., 2] = -100.0
         env.sim.mocap_pos[1, 2] = torch.tensor([50.0, 0.0, 0.3])
         given = env.get_observations()["command"].clone()
-        assert torch.equal(self.told(env, None), given)  # nothing near: V_cmd alone
+        assert torch.equal(self.commanded(env, None), given)  # nothing near: V_cmd alone
         side = max(slot.radius for slot in env.world.obstacles.slots())
         env.sim.mocap_pos[1, 0, :2] = env.state.kinematics.base_pos_w[1, :2] + torch.tensor([0.0, side + 0.3])
         env.sim.mocap_pos[1, 0, 2] = 0.5  # to its left
-        told = self.told(env, None)
-        assert torch.equal(told[0], given[0])
-        assert told[1, 1] < given[1, 1] - 0.5 and told[1, 2] == given[1, 2]
-        limited = self.told(env, ((-0.5, 1.0), (-0.5, 0.5)))
+        commanded = self.commanded(env, None)
+        assert torch.equal(commanded[0], given[0])
+        assert commanded[1, 1] < given[1, 1] - 0.5 and commanded[1, 2] == given[1, 2]
+        limited = self.commanded(env, ((-0.5, 1.0), (-0.5, 0.5)))
         assert limited[1, 1] == -0.5 and limited[0, 0] == given[0, 0].clamp(max=1.0)
         assert torch.equal(env.get_observations()["command"], given)  # the task's command is what it was
 
     def test_what_the_policy_perceives_itself_does_not_matter(self):
         run = config.load(ROOT / "pretrained/pd_risknet", ["scenario=corridor", "num_envs=4"])
         trained = load_policy(build.assemble(run), ROOT / "pretrained/pd_risknet")
-        env, law = trained.env, trained.env.config.rewards.avoidance
-        told = steered(env, trained.policy, law, None)
+        env, controller = trained.env, trained.env.config.rewards.avoidance
+        commanded = steered(env, trained.policy, controller, None)
         with torch.no_grad():
             for _ in range(30):
-                env.step(told(env.get_observations()))
+                env.step(commanded(env.get_observations()))
             seen = env.get_observations()
             other = seen.clone()
             other["frames"] = torch.rand_like(other["frames"])
-            assert torch.equal(told(seen), told(other))
+            assert torch.equal(commanded(seen), commanded(other))
             other["frame_tick"] += 1  # a new frame, as the policy embeds each once
             assert not torch.allclose(trained.policy(seen), trained.policy(other))
 
@@ -61,7 +61,7 @@ class TestSteered:
         env = make_env(*BLIND, "scenario=static", "num_envs=2", "observations.actor=[proprioception]")
         env.observations = env.observations.exclude("command")
         with pytest.raises(ValueError, match="group 'command'"):
-            steered(env, None, self.law, None)
+            steered(env, None, self.controller, None)
 
 
 @pytest.fixture(scope="module")

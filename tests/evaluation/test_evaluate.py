@@ -38,7 +38,7 @@ def seeing(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("seeing"), "experiment=quickstart", "obstacles.curriculum=null")
 
 
-def figures(report: dict) -> dict:
+def numbers(report: dict) -> dict:
     """What the same seed has to repeat: everything but wall times."""
     return {
         name: {key: value for key, value in summary.items() if key != "us_per_env_step"}
@@ -59,10 +59,10 @@ def test_the_same_seed_gives_the_same_result_bit_for_bit(seeing, walker):
     first = evaluate(Evaluation(**given, overrides=[SHORT]))["moving"]
     table = (seeing / "evaluation" / "moving.csv").read_text()
     second = evaluate(Evaluation(**given, overrides=[SHORT]))["moving"]
-    assert figures(first) == figures(second)
+    assert numbers(first) == numbers(second)
     assert (seeing / "evaluation" / "moving.csv").read_text() == table
     other = evaluate(Evaluation(**given, overrides=[SHORT, "seed=8"]))["moving"]
-    assert figures(other) != figures(first) and other["seed"] == 8 and first["seed"] == 1005
+    assert numbers(other) != numbers(first) and other["seed"] == 8 and first["seed"] == 1005
     run, blind = first["policies"]["run"], first["policies"]["blind"]
     assert run["episodes"] == 6 and run["velocity_error_m_s"] != blind["velocity_error_m_s"]
     assert first["policies"]["command"]["checkpoint"].startswith(str(walker))
@@ -89,7 +89,7 @@ def test_files_and_tables(walker, capsys):
 
 
 def test_only_a_law_that_the_policy_does_not_know_is_clipped(monkeypatch):
-    """To the walker's commands; a run whose own command follows from the law is told all that the law says."""
+    """To the walker's commands; a run whose own command follows from the law is given all of V_avoid."""
     given = []
 
     def spy(env, policy, avoidance, limits):
@@ -141,6 +141,6 @@ def test_the_number_of_threads_does_not_matter(walker):
         before = torch.get_num_threads()
         torch.set_num_threads(threads)
         given = [SHORT, f"sim.num_threads={threads}"]
-        results.append(figures(evaluate(Evaluation(walker, ["rod"], trials=4, plots=False, overrides=given))["rod"]))
+        results.append(numbers(evaluate(Evaluation(walker, ["rod"], trials=4, plots=False, overrides=given))["rod"]))
         torch.set_num_threads(before)
     assert results[0] == results[1]

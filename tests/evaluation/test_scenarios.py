@@ -75,12 +75,12 @@ class TestScenes:
     def test_a_trial_is_the_same_scene_for_every_policy(self, make_env):
         tracks = {}
         for policy in (stand, fling):
-            # people come anew all the time, and a fling falls early: the policies draw differently much
+            # people come again all the time, and a fling falls early: the policies draw differently much
             env = make_env(*BLIND, "scenario=moving", "terminations.min_base_height=0.25", SHORT, "num_envs=3")
             env.obstacles._start *= 0.2
             tracks[policy] = run_episodes(env, policy, 9, keep_tracks=True).tracks
         assert not torch.equal(tracks[stand].xy[1], tracks[fling].xy[1])
-        # the first control step has moved them already, by the same law
+        # the first control step has moved them already, by the same rule
         torch.testing.assert_close(tracks[stand].obstacles, tracks[fling].obstacles, atol=1e-6, rtol=0)
         assert len(tracks[stand].obstacles.flatten(1).unique(dim=0)) == 9  # nine different scenes
 

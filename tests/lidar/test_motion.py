@@ -48,7 +48,7 @@ def wall_scene(distance=5.0):
 
 
 def test_a_fast_turn_bends_a_straight_wall():
-    """Yaw rate 10 rad/s: a ray of azimuth phi at time t meets the wall at 5 m / (cos(theta) cos(phi + 10 t))."""
+    """Yaw rate 10 rad/s: a ray of azimuth phi at time t hits the wall at 5 m / (cos(theta) cos(phi + 10 t))."""
     at = torch.zeros(1, 1, 3)
     frame = sweep(wall_scene(), (at, yaw_quat(-0.5)), (at, yaw_quat(0.5)))
     theta, phi = angles(frame)

@@ -1,4 +1,4 @@
-"""The figures of every device against its pattern and its preset."""
+"""The parameters of every device against its pattern and its preset."""
 
 import math
 import re

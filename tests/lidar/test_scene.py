@@ -173,7 +173,7 @@ def test_a_view_has_everything_in_reach_nearest_first(num_shapes):
 
 @pytest.mark.parametrize("window", [(-0.3, -0.1), (-0.05, 0.9), (1.2, 1.5), (-1.57, -1.1), (-1.5708, 1.5708)])
 def test_what_is_left_out_is_outside_the_elevations(window):
-    """A direction within the window that meets a shape proves that the shape must be in the view."""
+    """A direction within the window that hits a shape proves that the shape must be in the view."""
     scene = random_crowd(200, seed=7, num_envs=1)
     placed = PlacedShapes(scene, (), View(elevation=window))
     placed.refresh()

@@ -313,8 +313,8 @@ def test_keeping_the_first_part_of_each_frame_is_told():
     angles = torch.linspace(-0.5, 0.5, 20_000).numpy()
     pattern = ScanPattern.from_angles(angles, 2.0 * angles, 200_000.0, num_lasers=4)
     assert [pattern.stride(0.1, n) for n in (1000, 2000, 4000, 6666, 10_000, 20_000)] == [19, 9, 5, 3, 1, 1]
-    told = r"num_rays=10000 keeps .* first 50% of each frame's 20000; num_rays=6666 or"
-    with pytest.warns(UserWarning, match=told) as warned:
+    expected = r"num_rays=10000 keeps .* first 50% of each frame's 20000; num_rays=6666 or"
+    with pytest.warns(UserWarning, match=expected) as warned:
         Lidar(LidarConfig(10_000, 0.1), pattern, RayScene([], 1, 0), -1)
     assert len(warned) == 1
     with warnings.catch_warnings():

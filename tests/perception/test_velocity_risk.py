@@ -23,45 +23,45 @@ GIVEN = {
 
 def test_candidates_are_standing_still_and_rings():
     expected = [[0, 0], [0.5, 0], [0, 0.5], [-0.5, 0], [0, -0.5], [1, 0], [0, 1], [-1, 0], [0, -1]]
-    law = VelocityRisk(**GIVEN)
-    assert law.num_candidates == 9
-    assert torch.allclose(law.candidates(), torch.tensor(expected, dtype=torch.float32), atol=1e-6)
+    controller = VelocityRisk(**GIVEN)
+    assert controller.num_candidates == 9
+    assert torch.allclose(controller.candidates(), torch.tensor(expected, dtype=torch.float32), atol=1e-6)
 
 
 def test_no_risk_and_equal_risks_change_nothing():
-    law, command = VelocityRisk(**GIVEN), torch.tensor([[0.7, -0.2], [0.0, 0.0], [2.0, 1.0]])
+    controller, command = VelocityRisk(**GIVEN), torch.tensor([[0.7, -0.2], [0.0, 0.0], [2.0, 1.0]])
     for risk in (0.0, 0.6):
-        velocity = law.avoidance(torch.full((3, 9), risk), command, law.candidates())
+        velocity = controller.avoidance(torch.full((3, 9), risk), command, controller.candidates())
         assert torch.allclose(velocity, torch.zeros(3, 2), atol=1e-6)
 
 
 def test_choice_is_the_weighted_mean_by_hand():
-    law = VelocityRisk(**GIVEN | {"num_rings": 1, "num_directions": 2, "weight": 2.0, "temperature": 0.5})
+    controller = VelocityRisk(**GIVEN | {"num_rings": 1, "num_directions": 2, "weight": 2.0, "temperature": 0.5})
     risk = torch.tensor([[0.1, 0.9, 0.0]])  # standing still, ahead, back
     weights = [math.exp(-(cost) / 0.5) for cost in (1.0 + 0.2, 0.0 + 1.8, 4.0)]
     free = [math.exp(-(cost) / 0.5) for cost in (1.0, 0.0, 4.0)]
     expected = (weights[1] - weights[2]) / sum(weights) - (free[1] - free[2]) / sum(free)
-    velocity = law.avoidance(risk, torch.tensor([[1.0, 0.0]]), law.candidates())
+    velocity = controller.avoidance(risk, torch.tensor([[1.0, 0.0]]), controller.candidates())
     assert velocity[0].tolist() == pytest.approx([expected, 0.0], abs=1e-6)
 
 
 def test_what_lies_ahead_is_passed_on_the_free_side():
-    law = VelocityRisk(**GIVEN)
+    controller = VelocityRisk(**GIVEN)
     risk = torch.zeros(1, 9)
     risk[0, [0, 1, 5, 2, 6]] = 1.0  # here, ahead and to the left
     command = torch.tensor([[1.0, 0.0]])
-    velocity = command + law.avoidance(risk, command, law.candidates())
+    velocity = command + controller.avoidance(risk, command, controller.candidates())
     assert velocity[0, 1] < -0.1 and velocity[0, 0] < 0.3
 
 
 @pytest.mark.parametrize("sideways", [1.0, 0.3])
 def test_a_deviation_counts_by_its_direction(sideways):
-    law, rng = VelocityRisk(**GIVEN, sideways=sideways), np.random.default_rng(3)
+    controller, rng = VelocityRisk(**GIVEN, sideways=sideways), np.random.default_rng(3)
     for command in (*rng.normal(size=(20, 2)), np.array([0.0, 0.0]), np.array([0.0, -0.02])):
         risk = rng.uniform(size=9)
         heading = command / max(np.hypot(*command), 0.1)
         cost = []
-        for candidate in law.candidates().numpy():
+        for candidate in controller.candidates().numpy():
             away = command - candidate
             across = away - (away @ heading) * heading if np.hypot(*command) >= 0.1 else None
             if across is not None:
@@ -69,9 +69,9 @@ def test_a_deviation_counts_by_its_direction(sideways):
             else:  # slow: the part beside counts less and less
                 cost.append(away @ away - (1.0 - sideways) * (away[0] * heading[1] - away[1] * heading[0]) ** 2)
         wary, free = (np.exp(-np.array(cost + extra) / 0.05) for extra in (8.0 * risk, 0.0 * risk))
-        expected = (wary / wary.sum() - free / free.sum()) @ law.candidates().numpy()
+        expected = (wary / wary.sum() - free / free.sum()) @ controller.candidates().numpy()
         given = (torch.tensor(x[None], dtype=torch.float32) for x in (risk, command))
-        assert law.avoidance(*given, law.candidates())[0].tolist() == pytest.approx(expected, abs=2e-5)
+        assert controller.avoidance(*given, controller.candidates())[0].tolist() == pytest.approx(expected, abs=2e-5)
 
 
 def test_goes_round_something_wide_instead_of_standing_before_it():
@@ -81,12 +81,12 @@ def test_goes_round_something_wide_instead_of_standing_before_it():
     sectors = torch.zeros(1, 36, 3)
     sectors[0, :, 0] = torch.where(ahead, 0.8 / angles.cos(), math.inf)
     times = (0.1, 0.3, 0.6, 0.9, 1.3, 1.8)
-    figures = GIVEN | {"num_rings": 4, "num_directions": 24, "times": times, "decay": 0.15, "max_speed": 1.4}
+    parameters = GIVEN | {"num_rings": 4, "num_directions": 24, "times": times, "decay": 0.15, "max_speed": 1.4}
     command, chosen = torch.tensor([[1.0, 0.0]]), {}
     for sideways in (1.0, 0.15):
-        law = VelocityRisk(**figures, sideways=sideways)
-        risk = law.risk(sectors, law.candidates())
-        chosen[sideways] = (command + law.avoidance(risk, command, law.candidates()))[0]
+        controller = VelocityRisk(**parameters, sideways=sideways)
+        risk = controller.risk(sectors, controller.candidates())
+        chosen[sideways] = (command + controller.avoidance(risk, command, controller.candidates()))[0]
     assert chosen[1.0].norm() < 0.1
     assert chosen[0.15][1] < -0.3 and chosen[0.15][0] > 0.1
 
@@ -106,16 +106,16 @@ def test_impossible_settings_are_refused(change, message):
 
 
 class TestRisk:
-    def by_search(self, law, sectors, candidate):
+    def by_search(self, controller, sectors, candidate):
         """The definition, obstacle by obstacle and time by time."""
         worst = 0.0
         for s, (distance, vx, vy) in enumerate(sectors.tolist()):
             bearing = -math.pi + (s + 0.5) * 2 * math.pi / len(sectors)
-            for time in law.times:
+            for time in controller.times:
                 x = distance * math.cos(bearing) + (vx - candidate[0]) * time
                 y = distance * math.sin(bearing) + (vy - candidate[1]) * time
-                gap = max(math.hypot(x, y) - law.robot_radius, 0.0)
-                worst = max(worst, math.exp(-gap / law.decay - time / law.time_constant))
+                gap = max(math.hypot(x, y) - controller.robot_radius, 0.0)
+                worst = max(worst, math.exp(-gap / controller.decay - time / controller.time_constant))
         return worst
 
     def scene(self, seed, n=6, num_sectors=12):
@@ -126,37 +126,40 @@ class TestRisk:
 
     @pytest.mark.parametrize("seed", [0, 1])
     def test_is_that_of_the_definition(self, seed):
-        law = VelocityRisk(**GIVEN)
-        sectors, candidates = self.scene(seed), law.candidates()
+        controller = VelocityRisk(**GIVEN)
+        sectors, candidates = self.scene(seed), controller.candidates()
         sectors[2, :, 0] = torch.inf
-        risk = law.risk(sectors, candidates)
+        risk = controller.risk(sectors, candidates)
         for n in range(6):
             rows = torch.where(sectors[n, :, :1].isinf(), torch.tensor([1e6, 0.0, 0.0]), sectors[n])
             for k in range(9):
-                expected = self.by_search(law, rows, candidates[k].tolist())
+                expected = self.by_search(controller, rows, candidates[k].tolist())
                 assert risk[n, k].item() == pytest.approx(expected, abs=1e-5)
         assert not risk[2].any() and risk.max() > 0.5
 
     def test_the_kernel_finds_what_the_exported_operations_find(self):
-        law = VelocityRisk(**GIVEN)
-        sectors, candidates = self.scene(3, n=40), law.candidates()
-        risk = law.risk(sectors, candidates)
+        controller = VelocityRisk(**GIVEN)
+        sectors, candidates = self.scene(3, n=40), controller.candidates()
+        risk = controller.risk(sectors, candidates)
         bearing = -math.pi + (torch.arange(12) + 0.5) * math.pi / 6
         place = sectors[..., :1].clamp(max=100.0) * torch.stack((bearing.cos(), bearing.sin()), -1)
-        sector, when = law._worst(place, sectors[..., 1:], candidates)
+        sector, when = controller._worst(place, sectors[..., 1:], candidates)
         index = sector[..., None].expand(-1, -1, 2)
         offset = place.gather(1, index) + when[..., None] * (sectors[..., 1:].gather(1, index) - candidates)
-        gap = (offset.norm(dim=-1) - law.robot_radius).clamp(min=0.0)
-        assert torch.allclose((-gap / law.decay - when / law.time_constant).exp(), risk, atol=1e-5)
+        gap = (offset.norm(dim=-1) - controller.robot_radius).clamp(min=0.0)
+        assert torch.allclose((-gap / controller.decay - when / controller.time_constant).exp(), risk, atol=1e-5)
 
     def test_gradient_is_that_of_differences(self):
-        law = VelocityRisk(**GIVEN)
+        controller = VelocityRisk(**GIVEN)
         sectors = self.scene(5, n=3)
         sectors[..., 0].clamp_(max=3.0)
         sectors.requires_grad_()
         weights = torch.randn(3, 9, generator=torch.Generator().manual_seed(0))
-        (gradient,) = torch.autograd.grad((law.risk(sectors, law.candidates()) * weights).sum(), sectors)
+        (gradient,) = torch.autograd.grad((controller.risk(sectors, controller.candidates()) * weights).sum(), sectors)
         with torch.no_grad():
             direction = torch.randn(sectors.shape, generator=torch.Generator().manual_seed(1))
-            up, down = ((law.risk(sectors + s * 2e-4 * direction, law.candidates()) * weights).sum() for s in (1, -1))
+            up, down = (
+                (controller.risk(sectors + s * 2e-4 * direction, controller.candidates()) * weights).sum()
+                for s in (1, -1)
+            )
         assert (gradient * direction).sum().item() == pytest.approx(((up - down) / 4e-4).item(), rel=3e-2, abs=2e-3)

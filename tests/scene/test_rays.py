@@ -1,4 +1,4 @@
-"""What rays meet is what bodies touch: the ray scene against mj_ray on the very model that is simulated."""
+"""What rays hit is what bodies touch: the ray scene against mj_ray on the very model that is simulated."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""What both simulators owe the task: the same tests for `sim=mujoco` and `sim=mujoco_warp`."""
+"""Both simulators behave alike: the same tests for `sim=mujoco` and `sim=mujoco_warp`."""
 
 import copy
 

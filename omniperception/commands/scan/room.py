@@ -20,7 +20,7 @@ ROOM = ((-2.6, 4.4), (-2.7, 2.7), 2.6)
 
 
 class DemoClass(IntEnum):
-    """What a ray has met."""
+    """What a ray has hit."""
 
     FLOOR = 0
     WALL = 1

@@ -1,6 +1,6 @@
 // Many rays of one sensor through a height field in waves, for CPUs.
 //
-// A step of a march waits for the one before it, and most of its branches are mispredicted: a ray alone leaves most of a
+// A step of a march depends on the one before it, and most of its branches are mispredicted: a ray alone leaves most of a
 // core idle. Here all rays of a block take a step each, and lists of those that go on are kept without branches, so that
 // steps of different rays overlap. A ray first jumps over windows: in a window, and above its highest point, it hits
 // nothing, and the window that lets it go farthest counts. Where none allows half a cell, it visits its cell, as

@@ -1,4 +1,4 @@
-"""All rays of a block through a height field at once, for CPUs, where one ray alone waits for every step."""
+"""All rays of a block through a height field at once, for CPUs, where the steps of a single ray stall each other."""
 
 from pathlib import Path
 

@@ -84,7 +84,7 @@ def passes_sphere(d: wp.vec3, c: wp.vec3, radius: float):
 
 @cache
 def search_functions(has: frozenset[str]) -> tuple[wp.Function, wp.Function]:
-    """Functions (search, locate) for what ``scan_kernel`` is told."""
+    """Functions (search, locate) for the arguments of ``scan_kernel``."""
     moving, displaced, marched = "motion" in has, "origins" in has, "marched" in has
     intersect, refine, _ = shape_functions("mesh" in has, "heightfield" in has)
 

@@ -15,7 +15,7 @@ class Wedge:
         angle_deg: Inclination of the inclined face.
         rpm: Turns per minute about the optical axis x, from y towards z.
         start_deg: Where the inclined face's normal points at time 0, from y towards z.
-        flat_first: Whether light meets the flat face first.
+        flat_first: Whether light enters through the flat face.
     """
 
     index: float

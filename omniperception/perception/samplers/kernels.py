@@ -26,7 +26,7 @@ WORDS_PER_BUCKET = 5 * BUCKET_SIZE + 7
 LANES = {"cpu": 1, "cuda": 128}
 """Threads that share one environment, by kind of device."""
 BLOCK = {"cpu": 1, "cuda": 128}
-"""The same where they wait for each other: a CUDA block, or one thread."""
+"""The same where they synchronise: a CUDA block, or one thread."""
 
 _HERE = Path(__file__).parent
 _HALF_PI = wp.constant(1.5707963267948966)

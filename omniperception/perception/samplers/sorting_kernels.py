@@ -89,7 +89,7 @@ def key_rays(
     num_lanes: int,
     work: Work,
 ):
-    """What each ray is sorted by: misses, and distal hits that nobody asks for, come first."""
+    """What each ray is sorted by: misses, and distal hits that are not used, come first."""
     thread, lane = wp.tid()
     env = env_offset + thread
     for ray in range(lane, ranges.shape[1], num_lanes):
