@@ -7,11 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 
-from omniperception.avoidance.kernels import worst_sectors
 from omniperception.avoidance.sector_motion import sector_bearings
-from omniperception.common.launch import constant, launch_over_envs, view
 
 _OUT_OF_REACH = 100.0
 """Distance (m) of an empty sector."""
@@ -123,7 +120,12 @@ class VelocityRisk:
     def _worst_by_kernel(
         self, place: torch.Tensor, velocity: torch.Tensor, candidates: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As :meth:`_worst`."""
+        """As :meth:`_worst`; loads Warp, which a run without obstacles does not."""
+        import warp as wp
+
+        from omniperception.avoidance.kernels import worst_sectors
+        from omniperception.common.launch import constant, launch_over_envs, view
+
         place, velocity = place.contiguous(), velocity.contiguous()
         sector = torch.zeros(len(place), len(candidates), dtype=torch.int64, device=place.device)
         when = place.new_zeros(sector.shape)
