@@ -177,6 +177,7 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
 
 def steps_per_frame(run: RunConfig) -> int:
     """Control steps between two LiDAR frames."""
+    assert run.env.lidar is not None  # a network looks at its frames
     return max(1, round(run.env.lidar.period_s / run.env.sim.control_dt))
 
 

@@ -94,13 +94,14 @@ class Command:
         if {"-h", "--help"} & set(argv):
             print(self.help(name or f"python {sys.argv[0]}"))
             return
+        for_the_user: tuple[type[Exception], ...] = (ConfigError, *self.errors)
         try:
             arguments, overrides = self.parse(argv)
             self.main(arguments, overrides) if self.overrides else self.main(arguments)
         except UnknownKey as error:
             own = () if "." in error.given else [field.name for field in dataclasses.fields(self.arguments)]
             fail(UnknownKey(error.given, (*error.known, *own), error.name))
-        except (ConfigError, *self.errors) as error:
+        except for_the_user as error:
             fail(error)
 
     def parse(self, argv: Sequence[str]) -> tuple[Any, list[str]]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import mujoco
 import numpy as np
@@ -17,6 +18,9 @@ from tensordict import TensorDictBase
 
 from omniperception.env.env import OmniEnv
 from omniperception.learning import Runner
+
+if TYPE_CHECKING:
+    from omniperception.lidar.launch import SplitLaunch
 
 PLAN_FILE = "plan.yaml"
 STEPS = 12
@@ -42,9 +46,9 @@ class Plan:
 
     def absent(self, fuller: Plan) -> dict[str, list[str]]:
         """By section what `fuller` has and this has not, buffers included."""
-        pairs = {title: (names, self.sections[title]) for title, names in fuller.sections.items()}
-        pairs["buffers"] = (fuller.buffers, self.buffers)
-        return {title: [name for name in theirs if name not in ours] for title, (theirs, ours) in pairs.items()}
+        ours: dict[str, Mapping[str, object]] = {**self.sections, "buffers": self.buffers}
+        theirs: dict[str, Mapping[str, object]] = {**fuller.sections, "buffers": fuller.buffers}
+        return {title: [name for name in names if name not in ours[title]] for title, names in theirs.items()}
 
     def summary(self) -> str:
         """One line."""
@@ -80,7 +84,7 @@ class Watch:
             then: called with the plan within control step number `STEPS`.
         """
         self._runner, self._then, self._left = runner, then, STEPS
-        self._computed, self._stages = set(vars(runner.env.state)), set()
+        self._computed, self._stages = set(vars(runner.env.state)), set[str]()
         runner.env.step_hooks.append(self._look)
 
     def _look(self) -> None:
@@ -95,7 +99,7 @@ class Watch:
 
 def look(runner: Runner) -> Plan:
     """The plan of a run, for which its environment takes a few steps with random actions and all obstacles."""
-    env, found = runner.env, []
+    env, found = runner.env, list[Plan]()
     if env.obstacles is not None:
         env.obstacles.level = 1.0
     Watch(runner, found.append)
@@ -186,7 +190,7 @@ def _terms(env: OmniEnv) -> dict[str, str]:
 def walk(roots: Mapping[str, object]) -> dict[str, object]:
     """Arrays of torch, NumPy and Warp and recorded launches below the roots, each once, by where they hang."""
     found, seen = {}, set()
-    left = list(reversed(roots.items()))
+    left = list(reversed(list(roots.items())))
     while left:
         path, thing = left.pop()
         if id(thing) in seen or isinstance(thing, torch.nn.Module | type):
@@ -204,9 +208,10 @@ def _children(thing: object) -> Iterable[tuple[object, object]]:
         return list(thing.items())
     if isinstance(thing, list | tuple):
         return list(enumerate(thing))
-    if type(thing).__name__ == "StructInstance":  # of Warp
-        return [(name, getattr(thing, name)) for name in type(thing)._cls.vars]
-    if type(thing).__module__.startswith(_ENTERED) and hasattr(thing, "__dict__"):
+    kind: Any = type(thing)
+    if kind.__name__ == "StructInstance":  # of Warp
+        return [(name, getattr(thing, name)) for name in kind._cls.vars]
+    if kind.__module__.startswith(_ENTERED) and hasattr(thing, "__dict__"):
         return list(vars(thing).items())
     return []
 
@@ -238,6 +243,6 @@ def _extent(thing: object) -> tuple[int, int] | None:
     return None
 
 
-def _is_launch(thing: object) -> bool:
+def _is_launch(thing: object) -> TypeGuard[SplitLaunch]:
     module = sys.modules.get("omniperception.lidar.launch")
     return module is not None and isinstance(thing, module.SplitLaunch)

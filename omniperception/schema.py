@@ -239,7 +239,7 @@ def _imported(path: str, key: str) -> Callable:
 @cache
 def types_of(target: Callable) -> dict[str, Any]:
     """Types of the parameters of a function, or fields of a class, but for those that only type checkers import."""
-    sources: list[Any] = [target]
+    sources: Sequence[Any] = [target]
     if inspect.isclass(target):
         sources = target.__mro__[::-1] if dataclasses.is_dataclass(target) else [target.__init__]
     hints = {}

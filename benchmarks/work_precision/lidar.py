@@ -67,7 +67,7 @@ class Bench:
 
     def __init__(self, run: RunConfig, sizes: Sizes) -> None:
         self.sizes, self.sensor = sizes, run.env.lidar
-        self.pattern: ScanPattern = run.env.lidar.pattern()
+        self.pattern: ScanPattern = run.env.lidar.scan_pattern()
         self.num_sectors = run.env.rewards.avoidance.num_sectors
         self.scene: MovingScene = moving_scene(run.env.obstacles, sizes.num_envs)
         self.truth = Truth(self.scene, self.sensor)

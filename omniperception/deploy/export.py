@@ -136,7 +136,7 @@ def _command_ranges(run: RunConfig) -> dict[str, list[float]]:
 
 
 def _lidar(sensor: SensorConfig) -> Lidar:
-    pattern = sensor.pattern()
+    pattern = sensor.scan_pattern()
     every_kth = sensor.selection == "every_kth"
     return Lidar(
         period_s=sensor.period_s,

@@ -49,7 +49,9 @@ def publish(run_dir: Path, folder: Path) -> dict:
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     composed.pop(config.SEARCH_PATH, None)  # a folder of this machine
-    config.save(OmegaConf.to_container(composed), folder)
+    plain = OmegaConf.to_container(composed)
+    assert isinstance(plain, dict)
+    config.save(plain, folder)
     save_checkpoint(checkpoint_path(folder, state["iteration"]), {**weights, "iteration": state["iteration"]})
     steps = state["iteration"] * composed.num_envs * composed.ppo.num_steps_per_env
     record = {

@@ -31,6 +31,7 @@ def build_ground(
     from omniperception.env.terrain_levels import TerrainLevels
     from omniperception.scene.ground import Ground
 
+    assert sim.ground_pos is not None  # tiles move
     ground = Ground(config.terrain, sim.world.model, sim.ground_pos, config.sim.num_threads or None)
     max_steps = round(config.terminations.episode_length_s / config.sim.control_dt)
     levels = TerrainLevels(ground, random, config.sim.control_dt, max_steps)
@@ -52,7 +53,7 @@ def build_obstacles(
 def build_avoidance(config: EnvConfig, field: ObstacleField | None, device: torch.device) -> Avoidance | None:
     """The avoidance velocity, where a term or a supervised network reads something of it."""
     reads_velocity = AVOIDANCE in config.requirements()
-    if not config.uses_lidar or not (reads_velocity or MOTION_TARGET in config.targets):
+    if config.lidar is None or not config.uses_lidar or not (reads_velocity or MOTION_TARGET in config.targets):
         return None
     from omniperception.avoidance.avoidance import Avoidance
 
@@ -69,7 +70,7 @@ def build_avoidance(config: EnvConfig, field: ObstacleField | None, device: torc
 
 def build_sensing(config: EnvConfig, sim: Simulator, avoidance: Avoidance | None) -> LidarSensing | None:
     """The LiDAR, where something reads it."""
-    if not config.uses_lidar:
+    if config.lidar is None or not config.uses_lidar:
         return None
     from omniperception.env.sensing import LidarSensing
 

@@ -18,7 +18,7 @@ from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.metrics import EpisodeMetrics
 from omniperception.env.state import CONTACT_SENSORS, EnvState
-from omniperception.scene import build_world
+from omniperception.scene import ObstacleField, build_world
 
 FOOTING = 0.35
 """Nothing of the ground within this distance (m) of the base reaches above the feet when a robot starts."""
@@ -146,18 +146,18 @@ class OmniEnv(VecEnv):
         path = None
         if self.obstacles is not None:
             with self.timer.stage("obstacles"):
-                path = self._move_obstacles()
+                path = self._move(self.obstacles)
         with self.timer.stage("physics"):
             self.sim.step(target, self.config.sim.decimation, path)
             self.sim.detect_failures()
 
-    def _move_obstacles(self) -> torch.Tensor:
+    def _move(self, obstacles: ObstacleField) -> torch.Tensor:
         """Moves the obstacles through the control step; where they are during each of its physics steps."""
         sim, robot_xy_w = self.config.sim, self.sim.qpos[:, :2]
-        if self.obstacles.any_approaches:
+        if obstacles.any_approaches:
             commanded = rotate_yaw(self.state.kinematics.yaw, self.command.value[:, :2])
-            self.obstacles.restart_approaching(robot_xy_w, commanded)
-        return self.obstacles.travel(sim.timestep, sim.decimation, robot_xy_w)
+            obstacles.restart_approaching(robot_xy_w, commanded)
+        return obstacles.travel(sim.timestep, sim.decimation, robot_xy_w)
 
     def _follow_sensors(self) -> None:
         """What the LiDAR and the avoidance velocity take from each control step, and a frame where one is due."""
@@ -172,7 +172,7 @@ class OmniEnv(VecEnv):
 
     def _sense(self) -> None:
         """One frame of the LiDAR and what follows from it."""
-        if not self._lidar_is_awake():
+        if self.sensing is None or not self._lidar_is_awake():
             return
         self.sensing.take_frame(self.step_count * self.control_dt, self.state.measured.base_quat_w, self.timer)
         if self.avoidance is not None:
@@ -231,7 +231,7 @@ class OmniEnv(VecEnv):
         low, high = self._spawn
         pose = low + self.random.uniform(env_ids, (3,)) * (high - low)
         height = torch.full((len(env_ids), 1), self.robot.base_height, device=self.device)
-        if self.ground is not None:
+        if self.ground is not None and self.terrain_levels is not None:
             self.terrain_levels.start(env_ids, pose[:, :2], self._completed(env_ids))
             height = height + self.ground.highest(pose[:, :2], FOOTING, env_ids)[:, None]
         joints = self.state.default_joint_pos.expand(len(env_ids), -1)

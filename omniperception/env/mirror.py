@@ -46,7 +46,10 @@ class Mirror:
     ) -> tuple[TensorDict | None, torch.Tensor | None]:
         """Samples (B, ...), then their mirror images: (2 B, ...)."""
         if obs is not None:
-            images = {name: self._with_image(value, *self._groups[name]) for name, value in obs.items()}
+            images = {}
+            for name, value in obs.items():
+                assert isinstance(value, torch.Tensor)  # groups of observations are not nested
+                images[name] = self._with_image(value, *self._groups[name])
             obs = TensorDict(images, batch_size=[2 * len(obs)])
         if actions is not None:
             actions = self._with_image(actions, *self._joints)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,7 +22,7 @@ from omniperception.lidar import (
     env_slices,
     ray_bytes,
 )
-from omniperception.perception import Attitude
+from omniperception.perception import Attitude, Sampler
 from omniperception.scene.rays import HitClass, ray_shapes
 from omniperception.sim import Simulator
 
@@ -61,6 +61,11 @@ class SensorConfig(LidarConfig):
                 raise ValueError("lidar.pattern must be given where lidar.device is null")
             object.__setattr__(self, "pattern", DEVICES[self.device].pattern)
 
+    def scan_pattern(self) -> ScanPattern:
+        """The pattern, made."""
+        assert self.pattern is not None  # by now the device's
+        return self.pattern()
+
 
 class LidarSensing:
     """Casts a frame every `period_steps` control steps, for all environments at the same moment.
@@ -87,7 +92,7 @@ class LidarSensing:
         noise: Sequence[Noise],
         seed: int,
         num_threads: int | None,
-        sampler: Callable | None = None,
+        sampler: Sampler | None = None,
         history: int = 0,
         base_motion: bool = False,
         sector_distance: torch.Tensor | None = None,
@@ -124,7 +129,7 @@ class LidarSensing:
             )
         self._steps_per_segment = self.period_steps // segments
         self._sim, self.sampler, self.whole = sim, sampler, whole
-        self.config, pattern = config, config.pattern()
+        self.config, pattern = config, config.scan_pattern()
         shapes = ray_shapes(sim.world, config.exclude_geoms)
         self._bodies, self.base = shapes.bodies, shapes.base
         self.scene = RayScene(
@@ -236,18 +241,22 @@ class LidarSensing:
         self.scene.body_quat.copy_(quat)
 
     def _note_sightings(self, envs: slice, frame: LidarFrame) -> None:
+        assert self.unseen is not None and frame.shape_id is not None
         hit = self._obstacle_of[frame.shape_id.long() + 1]
         seen = torch.zeros(len(hit), self.unseen.shape[1] + 1, dtype=torch.bool, device=hit.device)
         seen.scatter_(1, hit, True)
         self.unseen[envs] = torch.where(seen[:, :-1], 0, self.unseen[envs] + 1)
 
     def _sample(self, envs: slice, frame: LidarFrame, base_quat: torch.Tensor) -> None:
+        assert self.sampler is not None and frame.ranges is not None and frame.directions_s is not None
+        assert frame.elevation is not None and frame.azimuth is not None
         sensor, points = self.config, self._newest[envs, : self.sampler.num_points]
         attitude = Attitude(base_quat[envs].contiguous(), sensor.mount_pos, sensor.quat)
         self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
 
     def _append_newest(self) -> None:
         """Appends the sampled points to the history."""
+        assert self.frames is not None
         if self.odometry is not None:
             self._newest[:, -1] = self.odometry.since_last_frame()
         self.frames = torch.cat((self.frames[:, 1:], self._newest[:, None]), 1)
@@ -262,6 +271,7 @@ class LidarSensing:
         return self._distal_range[max_distance]
 
     def _mean_distal_range(self, frame: LidarFrame, max_distance: float) -> torch.Tensor:
+        assert frame.elevation is not None and frame.true_ranges is not None
         distal = frame.elevation < torch.pi / 180 * self.config.distal_below_deg
         capped = frame.true_ranges.clamp(max=max_distance) * distal
         return capped.sum(1) / distal.sum(1).clamp(min=1)
@@ -310,9 +320,10 @@ class LidarSensing:
 
     def _record_sectors(self, out: torch.Tensor, num_threads: int | None) -> list[SectorDistances]:
         """A launch for each slice of environments."""
-        sensor = self.config
-        return [
-            SectorDistances(
+        sensor, launches = self.config, []
+        for envs, frame in zip(self.lidar.env_slices, self.lidar.slice_frames, strict=True):
+            assert frame.true_ranges is not None and frame.directions_s is not None and frame.class_id is not None
+            launch = SectorDistances(
                 frame.true_ranges,
                 frame.directions_s,
                 frame.class_id,
@@ -326,8 +337,8 @@ class LidarSensing:
                 num_threads=num_threads,
                 out=out[envs],
             )
-            for envs, frame in zip(self.lidar.env_slices, self.lidar.slice_frames, strict=True)
-        ]
+            launches.append(launch)
+        return launches
 
 
 def _outputs(sampled: bool, sectors: bool, sightings: bool, distal: bool, whole: bool) -> tuple[str, ...]:
@@ -342,6 +353,6 @@ def _outputs(sampled: bool, sectors: bool, sightings: bool, distal: bool, whole:
     return tuple(sorted({name for names, is_read in read.items() if is_read for name in names}))
 
 
-def envs_at_once(config: SensorConfig, outputs: Sequence[str]) -> int:
+def envs_at_once(config: SensorConfig, outputs: Collection[str]) -> int:
     """Environments whose clouds fit into `cloud_mb`, at least one."""
     return max(int(min(1e6 * config.cloud_mb / (config.num_rays * ray_bytes(outputs)), 2**31)), 1)

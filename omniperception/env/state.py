@@ -34,6 +34,7 @@ CONTACT_FORCE = 1.0
 """Vertical force (N) from which on a foot is in contact."""
 
 Marked = TypeVar("Marked", bound=Callable)
+Part = TypeVar("Part")
 
 
 def requires(*names: str) -> Callable[[Marked], Marked]:
@@ -43,7 +44,7 @@ def requires(*names: str) -> Callable[[Marked], Marked]:
         raise ValueError(f"@requires({', '.join(sorted(unknown))}) is unknown; known: {', '.join(REQUIREMENTS)}")
 
     def mark(term: Marked) -> Marked:
-        term.requires = frozenset(names)
+        term.requires = frozenset(names)  # type: ignore[attr-defined]  # functions and classes take attributes
         return term
 
     return mark
@@ -122,7 +123,7 @@ class EnvState:
         self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
         self.default_base_height = robot.base_height
         self._foot_geoms = tuple(model.geom(name).id for name in robot.foot_geoms)
-        self.actions = (torch.zeros(self.num_envs, robot.num_joints, device=self.device),) * 3
+        self.actions: tuple[torch.Tensor, ...] = (torch.zeros(self.num_envs, robot.num_joints, device=self.device),) * 3
         self._history = None if randomizer.delay is None else StateHistory(sim, randomizer)
         self._foot_times: ContactTimes | None = None
         self.before = self.kinematics
@@ -243,7 +244,7 @@ class EnvState:
         return self._sim.touched(OBSTACLE_CONTACT)
 
     def _contact_force(self, kind: str) -> torch.Tensor:
-        _check(kind in self._sim.world.sensors, kind)
+        _declared(kind if kind in self._sim.world.sensors else None, kind)
         return self._sim.contact_sensor(kind).unflatten(1, (-1, 3))
 
     # ---- feet, in the order of robot.foot_geoms ----------------------------------------------------------------------
@@ -286,34 +287,34 @@ class EnvState:
     @property
     def avoidance_velocity(self) -> torch.Tensor:
         """(num_envs, 2) m/s, yaw-aligned frame: V_avoid, chosen at the control step's end. Requires "avoidance"."""
-        _check(self._avoidance is not None, AVOIDANCE)
-        return self._avoidance.velocity
+        return _declared(self._avoidance, AVOIDANCE).velocity
 
     @property
     def cloud(self) -> LidarFrame | None:
         """The newest frame of the LiDAR, with noise-free ranges; None before the first. Requires "cloud"."""
-        _check(self._sensing is not None, CLOUD)
-        return self._sensing.frame
+        return _declared(self._sensing, CLOUD).frame
 
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
         """(num_envs,) m: mean of the noise-free distal ranges of the newest frame, each capped at `max_distance` (m);
         the cap before the first frame. Requires "distal_range"."""
-        _check(self._sensing is not None, DISTAL_RANGE)
-        return self._sensing.mean_distal_range(max_distance)
+        return _declared(self._sensing, DISTAL_RANGE).mean_distal_range(max_distance)
 
 
 _CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance(value, lazy))
 
 
-def _check(there: bool, name: str) -> None:
-    if not there:
+def _declared(part: Part | None, name: str) -> Part:
+    """What a term reads, which is there if the term has declared it."""
+    if part is None:
         raise ValueError(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
+    return part
 
 
 class StateHistory:
     """The physics states that a delayed measurement may show."""
 
     def __init__(self, sim: Simulator, randomizer: Randomizer) -> None:
+        assert randomizer.delay is not None  # measurements are late
         self._sim, self._delay = sim, randomizer.delay
         self._past = tuple(x[:, None].repeat(1, randomizer.max_delay + 1, 1) for x in sim.robot_state())
         self._all_envs = torch.arange(sim.num_envs, device=sim.device)

@@ -83,7 +83,7 @@ def _true_avoidance(env: OmniEnv, avoidance: AvoidanceConfig) -> Callable[[], to
     def velocity() -> torch.Tensor:
         kinematics = env.state.kinematics
         motion = sectors.measure(kinematics.base_pos_w, kinematics.yaw)
-        if avoidance.risk is None:
+        if avoidance.risk is None or candidates is None:
             return avoidance_velocity(motion[..., 0], avoidance)
         risk = avoidance.risk.risk(motion, candidates)
         return avoidance.risk.avoidance(risk, env.command.value[:, :2], candidates)
@@ -93,6 +93,7 @@ def _true_avoidance(env: OmniEnv, avoidance: AvoidanceConfig) -> Callable[[], to
 
 def _empty_points(env: OmniEnv) -> torch.Tensor:
     """(1, 1, num_points, 3) what the run's sampler makes of a frame without a hit."""
+    assert env.config.sampler is not None and env.config.lidar is not None  # it has frames
     sampler, sensor = env.config.sampler(), env.config.lidar
     rays = sampler.num_points  # as many as the raw sampler needs; any number of misses is the same to the others
     points = torch.zeros(1, rays, 3, device=env.device)

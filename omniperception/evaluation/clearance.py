@@ -32,7 +32,7 @@ class Clearance:
     def __init__(self, env: OmniEnv) -> None:
         model, names = env.world.model, env.world.obstacles.geom_names()
         robot = np.flatnonzero(model.body_rootid[model.geom_bodyid] == env.world.base_body)
-        self._robot = Geoms(model, robot, env.device)
+        self._robot = Geoms(model, robot.tolist(), env.device)
         self._obstacles = Geoms(model, [model.geom(name).id for name in names], env.device)
         self._sim = env.sim
 
@@ -131,7 +131,7 @@ def convex_distance(
     """
     result = torch.zeros(len(pos), device=pos.device)
     left = torch.arange(len(pos), device=pos.device)
-    pairs = kind_a, size_a, kind_b, size_b, pos, mat, below
+    pairs: tuple[torch.Tensor, ...] = kind_a, size_a, kind_b, size_b, pos, mat, below
     point = nearest_point(kind_a, size_a, pos)
     ahead, momentum = point, torch.ones_like(pos[:, :1])
     for _ in range(_ITERATIONS // _BETWEEN_CHECKS):

@@ -190,13 +190,13 @@ class _Tally:
 
     def __init__(self, env: OmniEnv, per_env: int) -> None:
         self._env, self._per_env = env, per_env
-        shape, kind = (env.num_envs,), {"dtype": torch.float64, "device": env.device}
-        self._index = torch.zeros(shape, dtype=torch.int64, device=env.device)
-        self._sums = torch.zeros(*shape, len(_SUMS), **kind)
-        self._filed = torch.zeros(*shape, per_env, len(_SUMS), **kind)
-        self._outcome = torch.zeros(*shape, per_env, dtype=torch.int64, device=env.device)
-        self._first_contact = torch.full(shape, math.inf, **kind)
-        self._filed_contact = torch.zeros(*shape, per_env, **kind)
+        shape, device, double = (env.num_envs,), env.device, torch.float64
+        self._index = torch.zeros(shape, dtype=torch.int64, device=device)
+        self._sums = torch.zeros(*shape, len(_SUMS), dtype=double, device=device)
+        self._filed = torch.zeros(*shape, per_env, len(_SUMS), dtype=double, device=device)
+        self._outcome = torch.zeros(*shape, per_env, dtype=torch.int64, device=device)
+        self._first_contact = torch.full(shape, math.inf, dtype=double, device=device)
+        self._filed_contact = torch.zeros(*shape, per_env, dtype=double, device=device)
         self._clearance = Clearance(env) if env.config.obstacles.num_obstacles else None
         self._least = torch.full(shape, CLEARANCE_CAP, device=env.device)
         self._filed_least = torch.zeros(*shape, per_env, device=env.device)
@@ -216,8 +216,10 @@ class _Tally:
 
     def _add_step(self) -> None:
         env, dt = self._env, self._env.control_dt
-        self._knows_free = env.no_obstacle_near is not None
-        free = env.no_obstacle_near if self._knows_free else torch.zeros_like(env.done)
+        free = env.no_obstacle_near
+        self._knows_free = free is not None
+        if free is None:
+            free = torch.zeros_like(env.done)
         began = env.contacts & ~self._was_touching
         kinematics = env.state.kinematics
         step = {
@@ -320,6 +322,6 @@ _TIME, _UNIT = "Time/", "_us_per_env_step"
 
 def _weighted(mean: torch.Tensor | None, weight: torch.Tensor | None) -> float | None:
     """Mean of per-episode means, weighted by their durations; None where nothing was measured."""
-    if mean is None or not bool((weight > 0).any()):
+    if mean is None or weight is None or not bool((weight > 0).any()):
         return None
     return float(torch.where(weight > 0, mean * weight, 0.0).sum() / weight.sum())

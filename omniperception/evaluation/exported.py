@@ -47,7 +47,9 @@ class ExportedPolicies:
         if self.robots[0].frames is None or env.sensing is None or env.sensing.tick == self._tick:
             return [None] * env.num_envs
         self._tick = env.sensing.tick
-        clouds = raw_points(env.sensing.frame)
+        frame = env.sensing.frame
+        assert frame is not None  # it has ticked
+        clouds = raw_points(frame)
         return [cloud if count else None for cloud, count in zip(clouds, env.sensing.frame_count, strict=True)]
 
 
@@ -66,6 +68,7 @@ def robot_states(env: OmniEnv) -> list[RobotState]:
 
 def raw_points(frame: LidarFrame) -> np.ndarray:
     """(num_envs, num_rays, 3) points (m, sensor frame) of a frame, noise included, misses as zeros."""
+    assert frame.ranges is not None and frame.directions_s is not None  # asked for
     points = torch.where(frame.ranges.isfinite()[..., None], frame.ranges[..., None] * frame.directions_s, 0.0)
     return points.cpu().numpy()
 
@@ -81,15 +84,16 @@ def record(env: OmniEnv, policy: ExportedPolicy, steps: int, whole_frames: bool)
     """
     policies = ExportedPolicies(env, policy)
     device = _whole_device(env) if whole_frames else None
+    sensing = env.sensing if policies.robots[0].frames is not None else None
     readings, tick = [], 0
     for _ in range(steps):
         state, command, points = robot_states(env)[0], env.command.value[0].cpu().numpy().copy(), None
-        if policies.robots[0].frames is not None and env.sensing.tick != tick:
-            tick = env.sensing.tick
-            frame = env.sensing.frame
+        if sensing is not None and sensing.tick != tick:
+            tick, frame = sensing.tick, sensing.frame
             if device is not None:
                 time_s = torch.full((env.num_envs,), env.step_count * env.control_dt, dtype=torch.float64)
                 frame = device.cast(time_s.to(env.device))
+            assert frame is not None  # it has ticked
             points = raw_points(frame)[0].copy()
         readings.append(Reading(state, command, points))
         with torch.no_grad():
@@ -99,7 +103,9 @@ def record(env: OmniEnv, policy: ExportedPolicy, steps: int, whole_frames: bool)
 
 def _whole_device(env: OmniEnv) -> Lidar:
     """The environment's LiDAR with every point that it measures."""
-    config, sensing, pattern = env.config.lidar, env.sensing, env.config.lidar.pattern()
+    sensing = env.sensing
+    assert sensing is not None  # the policy looks at points
+    config, pattern = sensing.config, sensing.config.scan_pattern()
     lidar = Lidar(
         replace(config, num_rays=pattern.points_per_frame(config.period_s), selection="every_kth"),
         pattern,

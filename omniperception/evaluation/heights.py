@@ -58,13 +58,15 @@ def height_errors(env: OmniEnv, policy: Policy, actor: PerceptionActor, steps: i
             "this policy's perception says nothing about heights; it needs perception.height_weight above 0 in training"
         )
     part = actor.perception.supervised[HEIGHT_TARGET]
+    sensing = env.sensing
+    assert sensing is not None  # the perception looks at points
     squared, targets, weights = [], [], []
     tick = -1
     for _ in range(steps):
         obs = env.get_observations()
         actions = policy(obs)
-        if env.sensing.tick != tick:
-            tick = env.sensing.tick
+        if sensing.tick != tick:
+            tick = sensing.tick
             seen = (obs["frame_count"] > 0).squeeze(-1)
             predicted = actor.embed_newest(obs)[:, part]
             squared.append((predicted - obs[HEIGHT_TARGET]).square() * seen[:, None])

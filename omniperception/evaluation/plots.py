@@ -50,7 +50,7 @@ def draw_tracks(path: Path, scenario: str, by_policy: Mapping[str, Episodes], ob
 def _draw_all(axis, policy: str, episodes: Episodes, obstacles: ObstaclesConfig) -> None:
     from matplotlib.collections import LineCollection
 
-    tracks, verdicts = episodes.tracks, episodes.verdict
+    tracks, verdicts = _tracks(episodes), episodes.verdict
     _draw_walls(axis, obstacles)
     every = math.ceil(len(episodes) / SHOWN)
     for verdict in VERDICTS:
@@ -69,7 +69,7 @@ def _draw_all(axis, policy: str, episodes: Episodes, obstacles: ObstaclesConfig)
 
 
 def _draw_one(axis, episodes: Episodes, index: int, obstacles: ObstaclesConfig) -> None:
-    tracks, verdict = episodes.tracks, episodes.verdict[index]
+    tracks, verdict = _tracks(episodes), episodes.verdict[index]
     _draw_walls(axis, obstacles)
     for slot, (x, y, z, yaw) in zip(obstacles.placed_slots(), tracks.obstacles[index].tolist(), strict=True):
         if z > PARKED_HEIGHT / 2:
@@ -82,6 +82,11 @@ def _draw_one(axis, episodes: Episodes, index: int, obstacles: ObstaclesConfig) 
     env, trial = divmod(index, episodes.per_env)
     axis.set_title(f"environment {env}, trial {trial}: {verdict}", fontsize=9)
     axis.set_aspect("equal")
+
+
+def _tracks(episodes: Episodes) -> Tracks:
+    assert episodes.tracks is not None  # recorded for pictures
+    return episodes.tracks
 
 
 def _draw_walls(axis, obstacles: ObstaclesConfig) -> None:
@@ -125,6 +130,6 @@ def _bounds(all_episodes: list[Episodes]) -> tuple[float, float, float, float]:
     def points(tracks: Tracks) -> torch.Tensor:
         return torch.cat([*tracks.xy, *([tracks.goal] if tracks.goal is not None else [])])
 
-    xy = torch.cat([points(episodes.tracks) for episodes in all_episodes])
+    xy = torch.cat([points(_tracks(episodes)) for episodes in all_episodes])
     low, high = xy.amin(0) - 0.8, xy.amax(0) + 0.8
     return float(low[0]), float(high[0]), min(float(low[1]), -2.2), max(float(high[1]), 2.2)

@@ -133,6 +133,7 @@ class Renderer:
         strips = (self._scene.num_envs, -1)
         origins = view.eye_w.expand_as(rays)
         hits = self._scene.cast(origins.unflatten(0, strips), rays.unflatten(0, strips), normals=True)
+        assert hits.normals_w is not None  # asked for
         ranges, shape = hits.ranges.flatten(), hits.shape_id.flatten().long()
         normals, classes = hits.normals_w.flatten(0, 1), self._class[shape]
         points = view.eye_w + torch.where(classes >= 0, ranges, 0.0)[:, None] * rays

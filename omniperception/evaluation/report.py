@@ -6,6 +6,8 @@ import csv
 from collections.abc import Mapping
 from pathlib import Path
 
+import torch
+
 from omniperception.common.tables import markdown
 from omniperception.evaluation.episodes import CLEARANCE_CAP, Episodes
 
@@ -97,7 +99,7 @@ def _figure(value: float | None) -> str:
     return "" if value is None else f"{value:.3f}"
 
 
-def _plain(values: object, count: int) -> list:
+def _plain(values: torch.Tensor | None, count: int) -> list:
     """A tensor as numbers with six digits; nothing where there is none, or where it is infinite."""
     if values is None:
         return [""] * count

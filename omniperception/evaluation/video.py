@@ -147,7 +147,7 @@ class Recorder:
         if sensing is None or sensing.frame is None or sensing.tick < self._blind_until:
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         frame, config = sensing.frame, sensing.config
-        if frame.ranges is None:  # no network looks at points
+        if frame.ranges is None or frame.directions_s is None or frame.elevation is None:  # no network looks at points
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         hit = frame.ranges[self._id].isfinite()
         points_s = frame.directions_s[self._id, hit] * frame.ranges[self._id, hit, None]

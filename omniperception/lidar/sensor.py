@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import get_args
 
@@ -488,7 +488,7 @@ class Lidar:
         return arrays
 
 
-def ray_bytes(outputs: Sequence[str]) -> int:
+def ray_bytes(outputs: Collection[str]) -> int:
     """Memory for one ray of a frame with these outputs, bytes."""
     return sum(1 if name == "valid" else 12 if name in _VECTORS else 4 for name in outputs)
 

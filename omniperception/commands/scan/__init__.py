@@ -43,6 +43,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     for name in arguments.lidar:
         composed = config.compose([*NO_TASK, f"lidar={name}", *overrides])
         env = build.assemble(composed).env
+        assert env.lidar is not None  # only lidar=none has none
         demo = demo_scene(env.robot)
         scans.append(take_scan(name, env.lidar, demo, arguments.seconds, arguments.rays, arguments.seed))
         folder = out if arguments.out and len(arguments.lidar) == 1 else out / name

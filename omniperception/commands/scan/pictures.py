@@ -77,7 +77,7 @@ def take_scan(
         seed: Of the time at which the device is, and of random choices.
     """
     seconds = seconds or sensor.period_s
-    pattern = sensor.pattern()
+    pattern = sensor.scan_pattern()
     config = replace(sensor, period_s=seconds, num_rays=num_rays or pattern.points_per_frame(seconds))
     unknown = sorted(set(sensor.exclude_geoms) - set(demo.robot_geoms))
     if unknown:
@@ -93,6 +93,7 @@ def take_scan(
         reflectivity={int(kind): value for kind, value in REFLECTIVITY.items()},
     )
     frame = lidar.cast(torch.full((1,), seconds, dtype=torch.float64))
+    assert frame.valid is not None  # asked for
     hit = frame.valid[0]
     values = {key: getattr(frame, key)[0][hit].numpy() for key in OUTPUTS if key != "valid"}
     across, along, labels = _coordinates(pattern)
@@ -113,7 +114,7 @@ def take_scan(
 def write_scan(scan: Scan, sensor: SensorConfig, demo: DemoScene, out: Path, colour: str = "class") -> None:
     """Writes ``pattern.png``, ``scan.png`` and ``scan.ply`` (coloured by "class" or by "height") into ``out``."""
     out.mkdir(parents=True, exist_ok=True)
-    draw_pattern(scan.name, sensor.pattern(), out / "pattern.png")
+    draw_pattern(scan.name, sensor.scan_pattern(), out / "pattern.png")
     draw_scan(scan, demo, out / "scan.png")
     rgb = _class_colours(scan) if colour == "class" else _height_colours(scan)
     fields = {"class_id": scan.class_id, "intensity": scan.intensity, "time_s": scan.time_s}
@@ -165,12 +166,12 @@ def _coordinates(pattern: ScanPattern) -> tuple[np.ndarray, np.ndarray, tuple[st
 def draw_scan(scan: Scan, demo: DemoScene, path: Path) -> None:
     """The points in the room from outside, as the sensor sees them, and from above."""
     figure = new_figure(14.0, 11.6)
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.55, 1.0))
+    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.55, 1.0))
     _draw_outside(upper.subplots(), scan, demo, _picture(demo), mark_area=60_000.0)
     seen, above = lower.subplots(1, 2, width_ratios=(1.25, 1.0))
     _draw_ranges(seen, scan)
     _draw_from_above(above, scan)
-    figure.get_layout_engine().set(w_pad=0.12)
+    figure.set_layout_engine("constrained", w_pad=0.12)
     figure.suptitle(
         f"{scan.name}: one scan of {scan.seconds:g} s, {len(scan.ranges):,} of {scan.num_rays:,} rays hit", fontsize=14
     )
@@ -275,6 +276,7 @@ def _picture(demo: DemoScene) -> np.ndarray:
     towards = torch.from_numpy(rays).float()[None]
     origins = torch.from_numpy(eye).float().expand_as(towards)
     hits = demo.scene.cast(origins, towards, exclude_shapes=demo.open_side, normals=True)
+    assert hits.normals_w is not None  # asked for
     normals, shape = hits.normals_w[0].numpy(), hits.shape_id[0].numpy()
     light = np.array(TO_LIGHT) / np.linalg.norm(TO_LIGHT)
     facing = normals * np.sign(-(normals * rays).sum(1, keepdims=True))  # a surface is lit from the side that is seen

@@ -103,7 +103,7 @@ def _room() -> tuple[list[Shape], list[Shape]]:
     def slab(axis: int, at: float, outwards: float, class_id: DemoClass) -> Shape:
         pos, size = list(middle), [h + 0.1 for h in half]
         pos[axis], size[axis] = at + 0.05 * outwards, 0.05
-        return Shape(ShapeKind.BOX, tuple(size), pos=tuple(pos), class_id=class_id)
+        return Shape(ShapeKind.BOX, tuple(size), pos=(pos[0], pos[1], pos[2]), class_id=class_id)
 
     wall = DemoClass.WALL
     removed = [slab(2, top, 1.0, wall), slab(0, left, -1.0, wall), slab(1, back, -1.0, wall)]
@@ -169,7 +169,7 @@ def _rock(rng: np.random.Generator, rings: int = 16, sectors: int = 28) -> Trian
     theta, phi = np.meshgrid(polar, azimuth, indexing="ij")
     waves = [rng.normal(size=3) * k for k in (1.0, 2.0)]
     unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
-    bumps = 1.0 + sum(0.10 * np.sin(unit @ wave + k) for k, wave in enumerate(waves))
+    bumps = 1.0 + np.sum([0.10 * np.sin(unit @ wave + k) for k, wave in enumerate(waves)], axis=0)
     vertices = (unit * bumps[..., None] * np.array([0.45, 0.38, 0.34])).reshape(-1, 3)
     ring, sector = (a.ravel() for a in np.meshgrid(np.arange(rings), np.arange(sectors), indexing="ij"))
     a, b = ring * sectors + sector, ring * sectors + (sector + 1) % sectors

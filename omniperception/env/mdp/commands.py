@@ -116,7 +116,9 @@ class Command(Protocol):
     """
 
     value: torch.Tensor
-    goal_w: torch.Tensor | None
+
+    @property
+    def goal_w(self) -> torch.Tensor | None: ...
 
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
         """Draws new commands for some environments (n,); `kinematics` of all."""

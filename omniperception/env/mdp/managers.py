@@ -17,7 +17,7 @@ class RewardManager:
         weighted: (num_envs,) of each term in the last step, times its weight and the control step.
     """
 
-    def __init__(self, terms: dict[str, RewardTerm], state: EnvState) -> None:
+    def __init__(self, terms: Mapping[str, RewardTerm], state: EnvState) -> None:
         """Raises ValueError for a term that does not return (num_envs,)."""
         self._weights = {name: term.weight for name, term in terms.items()}
         self._terms = {name: build_term(term.func) for name, term in terms.items()}

@@ -171,7 +171,8 @@ class Randomizer:
     def _write(self, field: str, env_ids: torch.Tensor, values: torch.Tensor, *index: int) -> None:
         """Writes float64 values into a model field of some environments, at an index, in the engine's precision."""
         model_field = self._sim.model_field(field)
-        model_field[(env_ids, *index)] = values.to(model_field.dtype)
+        where: tuple[torch.Tensor | int, ...] = (env_ids, *index)
+        model_field[where] = values.to(model_field.dtype)
 
     def _check_mass(self) -> None:
         """Refuses ranges that can leave the base without mass, with which physics diverges at once."""

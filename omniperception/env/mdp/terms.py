@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import torch
 
@@ -42,7 +43,7 @@ def is_class(term: Term) -> bool:
 
 def build_term(term: Term) -> Callable[[EnvState], torch.Tensor]:
     """The term as a function of the state alone."""
-    return term() if is_class(term) else term
+    return cast(Callable[[EnvState], torch.Tensor], term() if is_class(term) else term)
 
 
 JOINTS = "joints"
@@ -58,7 +59,7 @@ def mirrors(*parts: str | Sequence[float]) -> Callable[[Marked], Marked]:
     is repeated as often as the term is wide."""
 
     def mark(term: Marked) -> Marked:
-        term.mirror = parts
+        term.mirror = parts  # type: ignore[attr-defined]  # functions and classes take attributes
         return term
 
     return mark
