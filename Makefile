@@ -19,7 +19,7 @@ train: setup
 	$(RUN) train.py experiment=quickstart $(ARGS)
 
 test: setup
-	$(RUN) -m pytest $(ARGS)
+	$(RUN) -m pytest -m "not slow" $(ARGS)
 
 test-fast: setup
 	$(RUN) -m pytest -m "not slow and not integration" $(ARGS)

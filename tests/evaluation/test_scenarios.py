@@ -57,7 +57,7 @@ class TestOverlay:
                 compose(["scenario=static", group])
 
     def test_unknown_scenarios_are_named_with_the_known(self, run_dir):
-        with pytest.raises(ConfigError, match="abs_hard aerial corridor"):
+        with pytest.raises(ConfigError, match="known: abs_hard, aerial, corridor"):
             config.load(run_dir, ["scenario=dragons"])
 
     @pytest.mark.parametrize("scenario", config.presets("scenario"))
