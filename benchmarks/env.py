@@ -1,4 +1,4 @@
-"""How much of the bare physics rate is left for the environment, the PPO iteration and the update; and what costs what.
+"""Rates of the environment, a PPO iteration and its update, beside bare physics, and the cost of each stage.
 
     python scripts/benchmark_env.py what=step experiment=walk
     python scripts/benchmark_env.py what=step against=terrain=flat terrain=mixed obstacles=all

@@ -1,4 +1,4 @@
-"""Everything that a GPU has to show, in under nine minutes: correctness, then measurements, then a short training.
+"""Checks for a GPU, in under nine minutes: correctness, then measurements, then a short training.
 
     python scripts/gpu_check.py
     python scripts/gpu_check.py device=cpu size=small        # without a GPU: everything runs, at tiny sizes
@@ -33,9 +33,9 @@ from benchmarks import env as env_benchmark
 from benchmarks import memory
 from benchmarks.harness.table import Table, about, machine_line, write
 from benchmarks.harness.timing import device_barrier
+from benchmarks.lidar.baselines import ONE_MESH
 from benchmarks.lidar.compare import Options
 from benchmarks.lidar.paper import measure_table
-from benchmarks.lidar.peers import ONE_MESH
 from benchmarks.lidar_accuracy import accuracy
 from benchmarks.step_errors import step_errors
 from omniperception import build, config
@@ -171,7 +171,7 @@ def measure_rays(given: Arguments) -> list[Table]:
     rays, num_envs, most = ours.rows[-1][:3]
     ours.notes.append(f"cells slower than the paper's: {slower or 'none'}")
     ours.notes.append(f"{num_envs} x {rays:,} rays in {most:.1f} ms (target: 4096 x 32,000 in {LARGEST_CELL_MS:g} ms)")
-    beside.name = "paper_table_peers"
+    beside.name = "paper_table_baselines"
     for name, target in ((ONE_MESH, 3.0), (RAYS_TREE, 2.0)):
         pairs = zip(beside.column(name), beside.column("ours"), strict=True)
         least = min((theirs / own for theirs, own in pairs if theirs == theirs), default=0.0)

@@ -406,7 +406,7 @@ class Arguments:
 
     rays: int = argument(1_000_000, "rays of each case", least=1)
     seed: int = argument(0, "seed of the scenes", least=0)
-    only: str = argument("", "part of the names of the cases to run")
+    only: str = argument("", "run the cases whose names contain this")
     out: Path = argument(Path("outputs/lidar_accuracy"), "folder of the results")
 
 

@@ -1,11 +1,11 @@
-"""How much memory a run needs, by part, predicted from two small builds, and how much it uses.
+"""Memory that a run needs, by component, predicted from two small builds, and memory that it uses.
 
     python scripts/memory.py experiment=paper sim=mujoco_warp num_envs=4096
     python scripts/memory.py measure=true num_envs=256
 
-Physics, rays, environment, rollout and networks are counted from two builds with a handful of environments, so that a
-run can be judged that fits nowhere; the update's mini-batch is computed. Not counted: what the engines take for the
-duration of a call. `measure=true` trains the run at its real size for two iterations and says what it has used.
+Physics, rays, environment, rollout and networks are counted from two builds with a few environments, so that the
+run itself need not fit into memory; the update's mini-batch is computed. Not counted: scratch memory of the engines
+during a call. `measure=true` also trains the run at its real size for two iterations and prints what it used.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def main(given: Arguments, overrides: list[str]) -> None:
     report([table], about(torch.get_num_threads(), str(device)), given.out)
 
 
-command = Command(main, Arguments, __doc__, "of the run; experiment=paper without any")
+command = Command(main, Arguments, __doc__, "of the run (experiment=paper if none is given)")
 
 if __name__ == "__main__":
     command()

@@ -1,4 +1,4 @@
-"""Speed, error and memory of the LiDAR toolkit beside every peer that is installed."""
+"""Speed, error and memory of the LiDAR toolkit beside every baseline that is installed."""
 
 import sys
 from pathlib import Path

@@ -1,21 +1,21 @@
 """How fast and how exact the LiDAR toolkit is, beside every other way of casting rays that is installed.
 
-    python scripts/benchmark_lidar.py what=peers repeats=7 motions=smooth,static
+    python scripts/benchmark_lidar.py what=baselines repeats=7 motions=smooth,static
 
-peers     the same moving scene for every method in turn, with pose update: speed, error against float64, and targets
-terrain   a terrain of 80,000 triangles against Embree
-scaling   cost against rays, environments, bodies and triangles, and memory per environment (CSV and PNG)
-paper     the paper's appendix case, and its rendering-time table; on a CPU the sizes that fit
-features  time and memory with and without each output, noise, motion distortion and moving bodies
+baselines  the same moving scene for every method in turn, with pose update: speed, error against float64, and targets
+terrain    a terrain of 80,000 triangles against Embree
+scaling    cost against rays, environments, bodies and triangles, and memory per environment (CSV and PNG)
+paper      the paper's appendix case, and its rendering-time table; on a CPU the sizes that fit
+features   time and memory with and without each output, noise, motion distortion and moving bodies
 
-Peers that are not installed are named and left out. To have them all:
+Baselines that are not installed are named and left out. To have them all:
 
     pip install embreex mujoco-lidar jax
     pip install --no-deps newton mujoco-warp etils taichi tibvh colorama
     pip install open3d                        (and the system's libusb-1.0)
 
 Everything is also written to `out` as JSON, CSV and Markdown, with the commit, the machine and all versions. On a
-machine that does other work, trust the ratios by CPU time. What was measured stands in docs/lidar.md.
+machine that does other work, trust the ratios by CPU time. What was measured stands in docs/lab/lidar.md.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from omniperception.cli import Command, argument
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
 
-from .compare import Options, compare_peers, compare_terrain, measure_features
+from .baselines import MUJOCO_LIDAR, NEWTON, ONE_MESH
+from .compare import Options, compare_baselines, compare_terrain, measure_features
 from .paper import measure_appendix, measure_table
-from .peers import MUJOCO_LIDAR, NEWTON, ONE_MESH
 from .scaling import measure_scaling, plot_scaling, sweeps
 from .scenes import MOTIONS
 
 FEW_FEATURES = ("output points_s", "mask noise")
 GPU_RIVALS = (f"{MUJOCO_LIDAR} warp tree", NEWTON, "mujoco_warp rays", ONE_MESH)
-"""Peers beside ours in the paper's table on a GPU."""
+"""Baselines beside ours in the paper's table on a GPU."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
     """The command line."""
 
-    what: str = argument("peers", "study", choices=("peers", "terrain", "scaling", "paper", "features"))
+    what: str = argument("baselines", "study", choices=("baselines", "terrain", "scaling", "paper", "features"))
     repeats: int = argument(7, "rounds in which every method is timed", least=1)
     threads: int = argument(2, "CPU threads of each method", least=1)
     device: str = argument("cpu", "cpu or cuda:<index>")
-    motions: tuple[str, ...] = argument(MOTIONS, "scenes of what=peers", choices=MOTIONS)
+    motions: tuple[str, ...] = argument(MOTIONS, "scenes of what=baselines", choices=MOTIONS)
     size: str = argument("full", "small: in seconds, to see that everything works", choices=("full", "small"))
     out: Path = argument(Path("outputs/benchmark_lidar"), "folder of the results")
 
@@ -81,7 +81,7 @@ def _paper(given: Arguments) -> list[Table]:
 
 
 STUDIES: dict[str, Callable[[Arguments], list[Table]]] = {
-    "peers": lambda given: compare_peers(given.options, given.motions),
+    "baselines": lambda given: compare_baselines(given.options, given.motions),
     "terrain": lambda given: compare_terrain(given.options, cells=20 if given.small else 200),
     "scaling": _scaling,
     "paper": _paper,

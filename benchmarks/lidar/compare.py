@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from benchmarks.harness.table import Table
 from benchmarks.harness.timing import Timing, paired_ratio, paired_timings
 
+from .baselines import BASELINES, BATCH_RAY, EMBREE, MUJOCO_LIDAR, NEWTON, NOT_COMPARED, ONE_MESH, OPEN3D
 from .methods import Checker, Entry, build_all
 from .ours import OURS, OURS_NAME, TERRAIN_FORMS, Ours, buffer_sizes, feature_cases, mid360_scan, terrain_entries
-from .peers import BATCH_RAY, EMBREE, MUJOCO_LIDAR, NEWTON, NOT_COMPARED, ONE_MESH, OPEN3D, PEERS
 from .scenes import MOTIONS, BenchmarkScene, obstacle_scene, terrain_scene
 
 COLUMNS = (
@@ -27,8 +27,8 @@ COLUMNS = (
     "beyond 1e-3, %",
     "hit/miss wrong, %",
 )
-STATIC_PEERS = (EMBREE, OPEN3D, ONE_MESH)
-"""Peers for a scene in which nothing moves: they look at triangles in a tree that is built once."""
+STATIC_BASELINES = (EMBREE, OPEN3D, ONE_MESH)
+"""Baselines for a scene in which nothing moves: they look at triangles in a tree that is built once."""
 
 
 @dataclass(frozen=True)
@@ -81,28 +81,30 @@ STATIC_TARGETS = (Target(0.8, (EMBREE,)),)
 TERRAIN_TARGETS = tuple(Target(0.5, (EMBREE,), f"{OURS_NAME}, {form}") for form in TERRAIN_FORMS)
 
 
-def compare_peers(options: Options, motions: Sequence[str] = MOTIONS, peers: Sequence[Entry] = PEERS) -> list[Table]:
+def compare_baselines(
+    options: Options, motions: Sequence[str] = MOTIONS, baselines: Sequence[Entry] = BASELINES
+) -> list[Table]:
     """One table per motion of the obstacles."""
     tables = []
     for motion in motions:
         scan = mid360_scan(options.num_envs, options.num_rays, seed=options.seed)
         scene = obstacle_scene(scan, options.num_bodies, options.num_frames, motion, options.seed)
         moving = motion != "static"
-        rivals = [peer for peer in peers if moving or peer.name in STATIC_PEERS]
+        rivals = [baseline for baseline in baselines if moving or baseline.name in STATIC_BASELINES]
         title = (
             f"{options.num_envs} environments, a plane and {options.num_bodies} obstacles ({motion}), "
             f"{options.num_rays} Mid-360 rays to {scene.max_range:g} m, {options.num_threads} threads, "
             f"{'pose update included' if moving else 'building of trees not counted'}"
         )
         targets = MOVING_TARGETS if moving else STATIC_TARGETS
-        tables.append(compare(f"peers_{motion}", title, scene, [OURS, *rivals], targets, options))
+        tables.append(compare(f"baselines_{motion}", title, scene, [OURS, *rivals], targets, options))
     return tables
 
 
-def compare_terrain(options: Options, cells: int = 200, peers: Sequence[Entry] = PEERS) -> list[Table]:
+def compare_terrain(options: Options, cells: int = 200, baselines: Sequence[Entry] = BASELINES) -> list[Table]:
     """Triangles of one terrain that all environments share."""
     scene = terrain_scene(mid360_scan(options.num_envs, options.num_rays, seed=options.seed), cells=cells)
-    rivals = [peer for peer in peers if peer.name in STATIC_PEERS]
+    rivals = [baseline for baseline in baselines if baseline.name in STATIC_BASELINES]
     title = (
         f"a terrain of {2 * cells * cells:,} triangles, {options.num_envs} environments, {options.num_rays} Mid-360 "
         f"rays to {scene.max_range:g} m, {options.num_threads} threads, building of trees not counted"
@@ -116,7 +118,7 @@ def compare(
     """Times all methods of ``entries`` in turn; ratios and targets are those of the first one."""
     methods, skipped = build_all(entries, scene, options.num_threads, options.device)
     table = Table(name, title, COLUMNS)
-    table.notes += [f"left out: {peer}: {reason}" for peer, reason in (skipped | NOT_COMPARED).items()]
+    table.notes += [f"left out: {baseline}: {reason}" for baseline, reason in (skipped | NOT_COMPARED).items()]
     if not any(method.startswith(OURS_NAME) for method in methods):
         return table
     # Every ray of the reference is intersected with all triangles of a terrain: fewer rays, so that it takes seconds.

@@ -103,7 +103,7 @@ def build_all(
 ) -> tuple[dict[str, Method], dict[str, str]]:
     """The methods that run here by name, each having cast a frame, and why each of the others was left out.
 
-    A peer that fails is named with its message rather than ending the run.
+    A baseline that fails is named with its message rather than ending the run.
     """
     methods, skipped = {}, {}
     for entry in entries:

@@ -10,10 +10,10 @@ from dataclasses import replace
 from benchmarks.harness.table import Table
 from benchmarks.harness.timing import Timing, paired_timings
 
+from .baselines import BASELINES, BATCH_RAY, MUJOCO_LIDAR
 from .compare import Options
 from .methods import Checker, build_all
 from .ours import OURS, OURS_NAME, long_scan
-from .peers import BATCH_RAY, MUJOCO_LIDAR, PEERS
 from .scenes import obstacle_scene, spinning_scan
 
 APPENDIX_GEOMS = 199
@@ -49,7 +49,7 @@ def measure_appendix(options: Options, scale: float = 1.0, rivals: Sequence[str]
     scan = spinning_scan(1, columns=columns)
     scene = obstacle_scene(scan, bodies, options.num_frames, seed=options.seed, mount_rpy=(0.0, 0.0, 0.0))
     lone = replace(scene, scan=replace(scan, num_rays=1, stride=scan.num_rays))
-    entries = [OURS, *(peer for peer in PEERS if peer.name.startswith(tuple(rivals)))]
+    entries = [OURS, *(baseline for baseline in BASELINES if baseline.name.startswith(tuple(rivals)))]
     whole, skipped = build_all(entries, scene, options.num_threads, options.device)
     single, _ = build_all(entries, lone, options.num_threads, options.device)
     casts = {name: method.cast for name, method in whole.items()}
@@ -78,7 +78,7 @@ def measure_appendix(options: Options, scale: float = 1.0, rivals: Sequence[str]
     theirs = (PAPER_HZ, 1e3 / PAPER_HZ, math.nan, PAPER_SHARE)
     table.rows.append(("the paper's, on its machines", *theirs, math.nan, math.nan, math.nan))
     table.notes = [f"left out: {name}: {reason}" for name, reason in skipped.items()] + [
-        f"medians of {options.rounds} rounds; preparation: the time of a frame with one ray; a peer that spreads "
+        f"medians of {options.rounds} rounds; preparation: the time of a frame with one ray; a baseline that spreads "
         "environments over threads has one thread here",
         "the paper states 500 Hz and more, and more than 60 % preparation",
     ]
@@ -91,7 +91,7 @@ def measure_table(options: Options, max_rays: float | None = None, rivals: Seque
     Args:
         options: Threads, device, rounds.
         max_rays: Casts of more rays are left out; None for all on a GPU and ``CPU_RAYS`` on a CPU.
-        rivals: Names of peers that get a column of their own.
+        rivals: Names of baselines that get a column of their own.
     """
     on_gpu = options.device.startswith("cuda")
     limit = max_rays or (math.inf if on_gpu else CPU_RAYS)
@@ -121,6 +121,6 @@ def measure_table(options: Options, max_rays: float | None = None, rivals: Seque
 def _table_times(rays: int, num_envs: int, options: Options, rivals: Sequence[str]) -> dict[str, Timing]:
     scan = long_scan(num_envs, rays, options.seed)
     scene = obstacle_scene(scan, options.num_bodies, 1, "static", options.seed)
-    entries = [OURS, *(replace(peer, own_threads=True) for peer in PEERS if peer.name in rivals)]
+    entries = [OURS, *(replace(baseline, own_threads=True) for baseline in BASELINES if baseline.name in rivals)]
     methods, _ = build_all(entries, scene, options.num_threads, options.device)
     return paired_timings({name: method.cast for name, method in methods.items()}, options.rounds, options.device)

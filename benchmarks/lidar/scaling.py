@@ -11,10 +11,10 @@ from benchmarks.harness.table import Table
 from benchmarks.harness.timing import paired_timings
 from omniperception.common.figures import new_figure
 
+from .baselines import BASELINES, BATCH_RAY, EMBREE
 from .compare import Options
 from .methods import Entry, build_all
 from .ours import OURS, OURS_NAME, buffer_sizes, long_scan, terrain_entries
-from .peers import BATCH_RAY, EMBREE, PEERS
 from .scenes import BenchmarkScene, obstacle_scene, terrain_scene
 
 COLUMNS = (
@@ -81,12 +81,12 @@ def sweeps(quick: bool = False) -> list[Sweep]:
 
 
 def measure_scaling(options: Options, chosen: Sequence[Sweep], rivals: Sequence[str] = (BATCH_RAY, EMBREE)) -> Table:
-    """Ours, and the named peers where they can show the scene, at every value of every sweep."""
+    """Ours, and the named baselines where they can show the scene, at every value of every sweep."""
     table = Table("scaling", f"cost of a frame, {options.num_threads} threads", COLUMNS)
-    peers = [peer for peer in PEERS if peer.name in rivals]
+    baselines = [baseline for baseline in BASELINES if baseline.name in rivals]
     for sweep in chosen:
         for value in sweep.values:
-            table.rows += _measure(sweep, value, peers, options)
+            table.rows += _measure(sweep, value, baselines, options)
         table.notes += [f"{sweep.name}: {sweep.fixed}"]
     slope = growth(table, "bodies per environment", 100)
     if not math.isnan(slope):
@@ -104,10 +104,10 @@ def growth(table: Table, sweep: str, start: int, method: str = OURS_NAME) -> flo
     return math.log(times[last] / times[start]) / math.log(last / start)
 
 
-def _measure(sweep: Sweep, value: int, peers: Sequence[Entry], options: Options) -> list[tuple]:
+def _measure(sweep: Sweep, value: int, baselines: Sequence[Entry], options: Options) -> list[tuple]:
     scene = sweep.scene(value)
     ours = [OURS] if scene.terrain is None else terrain_entries()
-    methods, _ = build_all([*ours, *peers], scene, options.num_threads, options.device)
+    methods, _ = build_all([*ours, *baselines], scene, options.num_threads, options.device)
     timings = paired_timings({name: method.cast for name, method in methods.items()}, options.rounds, options.device)
     per_ray = 1e9 / (scene.num_envs * scene.num_rays)
     rows = []

@@ -1,4 +1,4 @@
-"""Where things hold and where they break, and that nothing breaks silently.
+"""Where physics, LiDAR and learning hold and where they break, and that nothing breaks silently.
 
     python scripts/stability.py subject=physics sim.timestep=0.002
     python scripts/stability.py subject=lidar rays=10000
@@ -12,7 +12,7 @@ learning  extreme rewards, observations, clouds, noise, gradients and batches, w
           against float64 by layer
 
 Writes CSV, JSON, Markdown and figures (extra `plots`). Exit status 1 if something is not as it should be.
-docs/stability.md holds what was measured.
+docs/lab/stability.md holds what was measured.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Arguments:
 
     subject: str = argument(doc="what is tried", choices=("physics", "lidar", "learning"))
     out: Path | None = argument(None, "folder of the results; outputs/stability/<subject>")
-    only: str = argument("", "part of the names of learning's cases, or a part of physics")
+    only: str = argument("", "learning: cases whose names contain this; physics: floating, standing or scenes")
     size: int = argument(12, "physics: gains along each axis of a map", least=2)
     num_envs: int = argument(32, "physics: robots of a scene", least=1)
     seconds: float = argument(4.0, "physics: of a scene", positive=True)

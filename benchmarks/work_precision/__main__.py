@@ -13,7 +13,7 @@ policy      what scripts/evaluate.py measured against the time of the policy tha
 
 Everything runs on one thread, choices in turn; a cost is this process's CPU time in the quickest round. Writes a table
 (CSV, JSON, Markdown) for each study and one plot with all fronts, the default marked, into <out>/<subject>/. The
-default is what the composed configuration chooses. What was measured stands in docs/work_precision.md.
+default is what the composed configuration chooses. What was measured stands in docs/lab/work_precision.md.
 """
 
 from __future__ import annotations

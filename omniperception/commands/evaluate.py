@@ -34,7 +34,7 @@ class Arguments:
 
     run: str = argument("latest", "run directory, or latest for the newest under outputs/")
     scenario: tuple[str, ...] = argument(("corridor",), "scenarios, or all")
-    trials: int = argument(1000, "at least so many of each policy in each scenario", least=1)
+    trials: int = argument(1000, "trials of each policy in each scenario, at least", least=1)
     policy: tuple[str, ...] = argument(("run",), "policies", choices=tuple(POLICIES))
     num_envs: int | None = argument(None, "environments at a time; null: even rounds of at most 256", least=1)
     walker: str | None = argument(None, "run directory of experiment=walk, for policies that only walk")

@@ -3,7 +3,7 @@
     play run=latest obstacles=static num_envs=64 seed=3
     play run=pretrained/pd_risknet scenario=moving viewer=none
 
-Obstacles are all there from the first step. Writes replay.json and, with viewer=video, replay.mp4 and replay.png into
+All obstacles are present from the first step. Writes replay.json and, with viewer=video, replay.mp4 and replay.png into
 the run directory.
 """
 
@@ -28,7 +28,7 @@ class Arguments:
 
     run: str = argument("latest", "run directory, or latest for the newest under outputs/")
     viewer: str = argument("video", "how it is shown", choices=("video", "none"))
-    trials: int = argument(200, "at least so many episodes", least=1)
+    trials: int = argument(200, "episodes, at least", least=1)
     video_s: float = argument(20.0, "length of the video (s)", positive=True)
     trust: tuple[str, ...] = trust()
 

@@ -13,11 +13,11 @@ import torch
 from benchmarks.harness.table import Table
 from benchmarks.harness.timing import Timing
 from benchmarks.lidar.__main__ import command
-from benchmarks.lidar.compare import Options, Target, compare_peers, compare_terrain, measure_features
+from benchmarks.lidar.baselines import BASELINES, BATCH_RAY, EMBREE, ONE_MESH, OPEN3D
+from benchmarks.lidar.compare import Options, Target, compare_baselines, compare_terrain, measure_features
 from benchmarks.lidar.methods import Checker, Entry, NotForThisScene, SplitMethod, build_all, true_ranges
 from benchmarks.lidar.ours import OURS, Ours, buffer_sizes, feature_cases, mid360_scan, terrain_entries
 from benchmarks.lidar.paper import measure_appendix, measure_table
-from benchmarks.lidar.peers import BATCH_RAY, EMBREE, ONE_MESH, OPEN3D, PEERS
 from benchmarks.lidar.scaling import growth, measure_scaling, plot_scaling, sweeps
 from benchmarks.lidar.scenes import SPEED, environment_mesh, obstacle_scene, spinning_scan, terrain_scene
 from omniperception import lidar
@@ -26,7 +26,7 @@ SCAN = spinning_scan(3, channels=4, columns=8)
 TINY = Options(num_envs=2, num_rays=50, num_bodies=8, num_frames=2, rounds=2, num_samples=100)
 NUM_ENVS, NUM_RAYS = 3, 200
 TRIANGLES = (EMBREE, OPEN3D, ONE_MESH)
-ENTRIES = {entry.name: entry for entry in (OURS, *PEERS)}
+ENTRIES = {entry.name: entry for entry in (OURS, *BASELINES)}
 ROOT = Path(__file__).resolve().parents[2]
 REQUIRED = {
     re.match(r"[\w.-]+", line).group()
@@ -38,7 +38,7 @@ REQUIRED = {
 
 
 def needs_its_package(entry):
-    """A parameter that is skipped, with what to install, where a peer is missing that `make setup` does not bring."""
+    """A parameter, skipped with what to install where a baseline that `make setup` does not bring is missing."""
     optional = not set(entry.package.split()) <= REQUIRED
     skip = pytest.mark.skipif(optional and bool(entry.missing()), reason=f"pip install {entry.package}")
     return pytest.param(entry, marks=skip, id=entry.name)
@@ -136,7 +136,7 @@ def test_splitting_over_threads_changes_nothing():
     assert (split.ranges() == whole.ranges()).all()
 
 
-def test_a_peer_that_is_missing_or_fails_is_named_and_left_out():
+def test_a_baseline_that_is_missing_or_fails_is_named_and_left_out():
     def fails(scene, num_threads, device):
         raise RuntimeError("no such thing\nsecond line")
 
@@ -210,16 +210,18 @@ def test_a_target_is_held_against_the_fastest_of_its_rivals():
     assert "not measured" in Target(2.0, ("c",)).verdict(timings)
 
 
-def test_peers_are_compared_with_errors_and_verdicts():
-    peers = [peer for peer in PEERS if peer.name in (BATCH_RAY, ONE_MESH)]
-    smooth, static = compare_peers(TINY, ("smooth", "static"), peers)
+def test_baselines_are_compared_with_errors_and_verdicts():
+    baselines = [baseline for baseline in BASELINES if baseline.name in (BATCH_RAY, ONE_MESH)]
+    smooth, static = compare_baselines(TINY, ("smooth", "static"), baselines)
     assert smooth.column("method") == ["ours", BATCH_RAY, ONE_MESH, f"{ONE_MESH}, 2 threads"]
     assert static.column("method") == ["ours", ONE_MESH, f"{ONE_MESH}, 2 threads"]
     assert max(smooth.column("largest error")[:2]) < 1e-4 < smooth.column("largest error")[2]
     assert max(smooth.column("hit/miss wrong, %")[:2]) == 0.0
     assert sum(note.startswith("target:") for note in smooth.notes) == 2
     assert "Embree (embreex): not measured" in static.notes[-1]
-    (terrain,) = compare_terrain(TINY, cells=10, peers=[peer for peer in peers if peer.name == ONE_MESH])
+    (terrain,) = compare_terrain(
+        TINY, cells=10, baselines=[baseline for baseline in baselines if baseline.name == ONE_MESH]
+    )
     assert "200 triangles" in terrain.title and max(terrain.column("largest error")) < 1e-4
 
 

@@ -29,7 +29,7 @@ class Arguments:
 
     lidar: tuple[str, ...] = argument(("mid360",), "presets of conf/lidar")
     out: Path | None = argument(None, "folder; null: outputs/view_scan/<lidar>")
-    seed: int = argument(0, "of the time at which the device is, and of random choices", least=0)
+    seed: int = argument(0, "seed of the moment at which the scan starts, and of random choices", least=0)
     rays: int | None = argument(None, "how many of the points are kept; null: all", least=1)
     seconds: float | None = argument(None, "how long the sensor measures; null: one frame of the preset", positive=True)
     colour: str = argument("class", "of the points in scan.ply", choices=("class", "height"))

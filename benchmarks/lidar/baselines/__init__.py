@@ -1,4 +1,4 @@
-"""One adapter per peer; nothing of a peer is imported before it is asked for."""
+"""One adapter per baseline; nothing of a baseline is imported before it is asked for."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def _later(module: str, name: str, **options) -> Build:
 
 
 NOT_COMPARED = {"Genesis": "no adapter; its LiDAR sensor needs some 35 further packages, among them a renderer and VTK"}
-"""Peers that are known and not compared, and why."""
+"""Baselines that are known and not compared, and why."""
 
 ANY = ("cpu", "cuda")
 BATCH_RAY, EMBREE, ONE_MESH = "mujoco.batch Batch.ray", "Embree (embreex)", "paper's scheme"
 MUJOCO_LIDAR, NEWTON, OPEN3D = "mujoco-lidar", "Newton intersect_ray", "Open3D"
 
-PEERS = (
+BASELINES = (
     Entry(BATCH_RAY, _later("mujoco_native", "BatchRay"), ("mujoco",), "mujoco-core", own_threads=True),
     Entry(
         f"{MUJOCO_LIDAR} warp tree",
