@@ -63,9 +63,10 @@ class _Arrays:
         extremes, columns = asset.pyramid
         part = FieldPart()
         part.rows, part.cols = asset.heights.shape
-        part.half_x, part.half_y, part.base, part.scale = asset.half_x, asset.half_y, asset.base, asset.scale
-        part.per_x = (part.cols - 1) / (2.0 * asset.half_x)
-        part.per_y = (part.rows - 1) / (2.0 * asset.half_y)
+        part.half_x, part.half_y = wp.float64(asset.half_x), wp.float64(asset.half_y)
+        part.base, part.scale = wp.float64(asset.base), wp.float64(asset.scale)
+        part.per_x = wp.float64((part.cols - 1) / (2.0 * asset.half_x))
+        part.per_y = wp.float64((part.rows - 1) / (2.0 * asset.half_y))
         part.top = float(asset.heights.max())
         part.first_height, part.first_level, part.top_level = self.num_heights, len(self.levels), len(columns)
         self.heights.append(asset.heights.ravel())
@@ -86,21 +87,24 @@ class _Arrays:
 def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[Geometry, dict[int, MeshPart]]:
     """The shapes on the device, and the part of each deformable shape; an asset that shapes share is there once."""
     arrays = _Arrays(windowed=device.is_cpu)
-    parts, shared, deformables = [], {}, {}
+    parts: list[int] = []
+    shared: dict[int, int] = {}
+    deformables: dict[int, MeshPart] = {}
     for k, shape in enumerate(shapes):
         part = 0
         if shape.kind == ShapeKind.DEFORMABLE:
+            assert isinstance(shape.asset, TriangleMesh)
             part = arrays.add_mesh(shape.asset, num_envs)
             deformables[k] = arrays.mesh_parts[part]
         elif shape.asset is not None and id(shape.asset) in shared:
             part = shared[id(shape.asset)]
         elif shape.asset is not None:
-            is_mesh = shape.kind == ShapeKind.MESH
-            part = arrays.add_mesh(shape.asset, 0) if is_mesh else arrays.add_field(shape.asset)
+            asset = shape.asset
+            part = arrays.add_mesh(asset, 0) if isinstance(asset, TriangleMesh) else arrays.add_field(asset)
             shared[id(shape.asset)] = part
         parts.append(part)
 
-    def upload(values: Sequence, dtype: type) -> wp.array:
+    def upload(values: list, dtype: type) -> wp.array:
         return wp.array(values if len(values) else [dtype()], dtype=dtype, device=device)
 
     def concatenated(chunks: list[np.ndarray], dtype: type, ndim: int = 1) -> wp.array:
@@ -132,4 +136,5 @@ def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[
 def wp_pose(pos: Sequence[float], quat: Sequence[float]) -> wp.transformd:
     """A position and an orientation (w, x, y, z) of any norm as Warp's transform in float64."""
     w, x, y, z = quat
-    return wp.transformd(wp.vec3d(*pos), wp.normalize(wp.quatd(x, y, z, w)))
+    unit = wp.normalize(wp.quatd(x, y, z, w))  # type: ignore[call-overload]  # Warp's stubs leave quatd out
+    return wp.transformd(wp.vec3d(*pos), unit)

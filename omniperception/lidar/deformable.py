@@ -31,8 +31,8 @@ class Deformable:
         num_leaves = len(leaf_vertex)
         wp_device = geometry.mesh_child.device
         vertices = wp.from_torch(self.vertices, dtype=wp.vec3)
-        self._corners = wp.array(leaf_vertex, dtype=wp.vec4i, device=wp_device)
-        self._child = wp.array(tree.child, dtype=wp.int32, device=wp_device)
+        self._corners: wp.array = wp.array(leaf_vertex, dtype=wp.vec4i, device=wp_device)
+        self._child: wp.array = wp.array(tree.child, dtype=wp.int32, device=wp_device)
         gather = [vertices, self._corners, part.first_leaf, geometry.mesh_triangle]
         self._launches = [
             SplitLaunch(gather_leaves, num_envs, (num_leaves,), gather, device, num_threads, 64 * num_leaves)

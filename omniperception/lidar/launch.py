@@ -106,16 +106,16 @@ class SplitLaunch:
             for command in self.commands:
                 command.launch()
         else:
-            self._run_in_threads()
+            self._run_in_threads(self.pool)
 
-    def _run_in_threads(self) -> None:
+    def _run_in_threads(self, pool: ThreadPoolExecutor) -> None:
         queue = iter(self.commands)  # next() of a list iterator is atomic: each command is run by one thread
 
         def drain() -> None:
             for command in queue:
                 command.launch()
 
-        helpers = [self.pool.submit(drain) for _ in range(self.width - 1)]
+        helpers = [pool.submit(drain) for _ in range(self.width - 1)]
         drain()
         for helper in helpers:
             helper.result()

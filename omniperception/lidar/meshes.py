@@ -77,12 +77,14 @@ class TriangleMesh:
         except ImportError:
             raise ImportError(f"reading {path} needs trimesh: pip install 'omniperception[meshes]'") from None
         mesh = trimesh.load(path, force="mesh", process=False)
+        assert isinstance(mesh, trimesh.Trimesh)  # forced
         return cls(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces)
 
     @property
     def half_extents(self) -> tuple[float, float, float]:
         """Half of the smallest box around the frame's origin that holds the mesh, metres."""
-        return tuple(float(x) for x in self._reach) if len(self.triangles) else (0.0, 0.0, 0.0)
+        x, y, z = self._reach.tolist() if len(self.triangles) else (0.0, 0.0, 0.0)
+        return x, y, z
 
     @property
     def radius(self) -> float:
@@ -129,18 +131,19 @@ def _build_tree(corners: np.ndarray, heuristic_depth: int) -> tuple[Tree, int]:
     count = len(corners)
     size = 2 * count
 
-    def new(shape: int, dtype: type = wp.int32) -> wp.array:
+    def new(shape: int | tuple[int, ...], dtype: type = wp.int32) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device="cpu")
 
-    lower, upper = (wp.array(extreme(axis=1), dtype=wp.vec3, device="cpu") for extreme in (corners.min, corners.max))
-    order = wp.array(np.arange(count, dtype=np.int32), dtype=wp.int32, device="cpu")
+    lower: wp.array = wp.array(corners.min(axis=1), dtype=wp.vec3, device="cpu")
+    upper: wp.array = wp.array(corners.max(axis=1), dtype=wp.vec3, device="cpu")
+    order: wp.array = wp.array(np.arange(count, dtype=np.int32), dtype=wp.int32, device="cpu")
     bins = [new(NUM_BINS, dtype) for dtype in (wp.vec3, wp.vec3, wp.int32, wp.float32)]
     first, number, left, depth = (new(size) for _ in range(4))
     node_lower, node_upper = new(size, wp.vec3), new(size, wp.vec3)
     split = [lower, upper, heuristic_depth, *bins, order, first, number, left, depth, node_lower, node_upper]
     wp.launch(split_triangles, dim=1, inputs=split, device="cpu")
 
-    bounds = wp.array(_no_boxes(count), dtype=wp.float32, device="cpu")
+    bounds: wp.array = wp.array(_no_boxes(count), dtype=wp.float32, device="cpu")
     child, leaf = new((count, 4)), wp.full((count, 4), -1, dtype=wp.int32, device="cpu")
     depth, totals = new(count), new(3)
     binary = [order, first, number, left, node_lower, node_upper, new(size), new(size)]

@@ -108,7 +108,7 @@ class SweptShapes:
         self._scene, self._view, self._track = scene, view, track
         self.slots, viewed = empty_slots(scene, exclude_shapes, view)
         self._num_viewed = len(viewed)
-        self._viewed = wp.array(viewed or [0], dtype=wp.int32, device=scene.wp_device)
+        self._viewed: wp.array = wp.array(viewed or [0], dtype=wp.int32, device=scene.wp_device)
         self._visible: torch.Tensor | None = None
         self._launch = self._record()
 

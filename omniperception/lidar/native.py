@@ -19,4 +19,7 @@ def function_body(header: str | Path) -> str:
 
 def constant(header: str | Path, name: str) -> int:
     """The value of ``constexpr int name`` in a header, for Python code that needs it as well."""
-    return int(re.search(rf"constexpr int {name} = (-?\d+);", Path(header).read_text(encoding="utf-8"))[1])
+    found = re.search(rf"constexpr int {name} = (-?\d+);", Path(header).read_text(encoding="utf-8"))
+    if found is None:
+        raise ValueError(f"{header}: constexpr int {name} was expected")
+    return int(found[1])

@@ -170,18 +170,18 @@ def noise_parameters(named: dict[str, Noise], seed: int, min_range: float, max_r
 
     parameters = NoiseParameters()
     parameters.seed, parameters.min_range, parameters.max_range = seed & 0x7FFFFFFF, min_range, max_range
-    for name, model in named.items():
-        if name == "jitter":
+    for model in named.values():
+        if isinstance(model, AngularJitter):
             parameters.jitter_sigma = math.tan(math.radians(model.sigma_deg))
-        elif name == "mixed":
+        elif isinstance(model, MixedPixels):
             parameters.mixed_radius = math.tan(math.radians(model.divergence_deg) / 2.0)
             parameters.mixed_min_gap, parameters.mixed_max_gap = model.min_gap, model.max_gap
             parameters.mixed_weight = model.foreground
-        elif name == "gaussian":
+        elif isinstance(model, GaussianNoise):
             parameters.gaussian_sigma, parameters.gaussian_sigma_per_metre = model.sigma, model.sigma_per_metre
-        elif name == "distance":
+        elif isinstance(model, DistanceNoise):
             parameters.distance_ratio = model.ratio
-        elif name == "dropout":
+        elif isinstance(model, Dropout):
             parameters.dropout_ratio, parameters.dropout_ratio_per_metre = model.ratio, model.ratio_per_metre
         else:
             parameters.mask_ratio, parameters.mask_low, parameters.mask_high = model.ratio, model.low, model.high

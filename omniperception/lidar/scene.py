@@ -14,6 +14,7 @@ from .kernels.place import GROUP_SIZE, Limits, bound_groups, place_shapes
 from .kernels.rays import rays_kernel
 from .kernels.slots import WORD, Slots, Viewpoint
 from .launch import SplitLaunch, default_num_threads, wp_device
+from .meshes import TriangleMesh
 from .shapes import Shape, ShapeKind
 
 Array = torch.Tensor | np.ndarray
@@ -113,8 +114,8 @@ class PlacedShapes:
 
     def _record(self) -> list[SplitLaunch]:
         scene, slots, count = self._scene, self.slots, self._limits.num_viewed
-        place = [scene.wp_body_pos, scene.wp_body_quat, scene.geometry, scene.wp_visible, self._view.viewpoint]
-        place += [self._limits, self._order, self._spare, slots]
+        place: list[object] = [scene.wp_body_pos, scene.wp_body_quat, scene.geometry, scene.wp_visible]
+        place += [self._view.viewpoint, self._limits, self._order, self._spare, slots]
         launches = [scene.launch(place_shapes, (), place, work_per_env=120 * count)]
         if self.group is not None:
             args = [scene.geometry.radius, slots, self.group]
@@ -207,10 +208,11 @@ class RayScene:
         self.num_threads = num_threads or default_num_threads()
         self._place_bodies(pose_dtype)
         self.geometry, parts = lay_out(self.shapes, num_envs, self.wp_device)
-        self._deformables = {
-            k: Deformable(self.shapes[k].asset, part, self.geometry, num_envs, self.device, self.num_threads)
-            for k, part in parts.items()
-        }
+        self._deformables: dict[int, Deformable] = {}
+        for k, part in parts.items():
+            mesh = self.shapes[k].asset
+            assert isinstance(mesh, TriangleMesh)  # of a deformable
+            self._deformables[k] = Deformable(mesh, part, self.geometry, num_envs, self.device, self.num_threads)
         self._visible: torch.Tensor | None = None
         self._placed: dict[frozenset[int], PlacedShapes] = {}
 
@@ -242,7 +244,11 @@ class RayScene:
     @property
     def wp_visible(self) -> wp.array | None:
         """The same for the kernels."""
-        return None if self._visible is None else wp.from_torch(self._visible)
+        if self._visible is None:
+            return None
+        visible = wp.from_torch(self._visible)
+        assert isinstance(visible, wp.array)
+        return visible
 
     def shapes_of(self, body: int) -> tuple[int, ...]:
         """Indices of the shapes that a body carries; -1 for those fixed in the environment."""
@@ -377,7 +383,7 @@ class RayScene:
             placed.refresh()
             vec3 = wp.types.vector(3, POSE_TYPES[dtype])
             rays = [wp.from_torch(origins_w, dtype=vec3), wp.from_torch(directions_w, dtype=vec3), float(max_range)]
-            out = [wp.from_torch(ranges), wp.from_torch(shape_id)]
+            out: list[object] = [wp.from_torch(ranges), wp.from_torch(shape_id)]
             out.append(None if normals_w is None else wp.from_torch(normals_w, dtype=wp.vec3))
             args = [*rays, self.geometry, placed.group, placed.slots, *out]
             kernel = rays_kernel(self.has_mesh, self.has_heightfield)

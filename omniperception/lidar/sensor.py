@@ -449,7 +449,7 @@ class Lidar:
         rays.directions = wp.from_torch(self._rows.directions, dtype=wp.vec3)
         if self._rows.origins is not None:
             rays.origins = wp.from_torch(self._rows.origins, dtype=wp.vec3)
-        if angles:
+        if self._rows.angles is not None:
             rays.angles = wp.from_torch(self._rows.angles, dtype=wp.vec2)
         rays.cycle, rays.num_rows = self._rows.cycle, pattern.num_rows
         rays.start, rays.first_row = wp.from_torch(self._rows.start), wp.from_torch(self._first_row)

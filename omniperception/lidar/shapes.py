@@ -101,8 +101,10 @@ class Shape:
     def extents(self) -> tuple[float, float, float]:
         """What the kernels call the size: for a mesh or a height field, half of a box around ``pos`` that holds it."""
         if self.kind in (ShapeKind.MESH, ShapeKind.HEIGHTFIELD):
+            assert self.asset is not None
             return self.asset.half_extents
-        return (*self.size, 0.0, 0.0, 0.0)[:3]
+        x, y, z = (*self.size, 0.0, 0.0, 0.0)[:3]
+        return x, y, z
 
     @property
     def bounding_radius(self) -> float:
@@ -115,6 +117,7 @@ class Shape:
             return sum(self.size)
         if self.kind in (ShapeKind.SPHERE, ShapeKind.ELLIPSOID):
             return max(self.size)
+        assert self.asset is not None
         return self.asset.radius
 
 

@@ -23,20 +23,20 @@ class FieldPart:
     Lengths are in metres, heights and ``top`` in units of ``scale``.
     """
 
-    rows: wp.int32
-    cols: wp.int32
+    rows: int
+    cols: int
     half_x: wp.float64
     half_y: wp.float64
     base: wp.float64
     scale: wp.float64
     per_x: wp.float64
     per_y: wp.float64
-    top: wp.float32
-    first_height: wp.int32
-    first_level: wp.int32
-    top_level: wp.int32
-    first_window: wp.int32
-    window_cols: wp.int32
+    top: float
+    first_height: int
+    first_level: int
+    top_level: int
+    first_window: int
+    window_cols: int
 
 
 @wp.struct

@@ -17,11 +17,11 @@ STACK_SIZE = constant(HEADER, "stack_size")
 class MeshPart:
     """Where the tree of one shape's mesh lies in the arrays of its scene; strides are those of environments."""
 
-    first_child: wp.int32
-    first_node: wp.int32
-    node_stride: wp.int32
-    first_leaf: wp.int32
-    leaf_stride: wp.int32
+    first_child: int
+    first_node: int
+    node_stride: int
+    first_leaf: int
+    leaf_stride: int
 
 
 @wp.func_native(function_body(HEADER))

@@ -32,7 +32,7 @@ class Track:
     quat: wp.array3d(dtype=wp.quatd)  # (K + 1, num_envs, B) unit length
     turn: wp.array3d(dtype=wp.vec4d)  # (K + 1, num_envs, B) axis and half angle of the turn to the next moment
     oldest: wp.array(dtype=wp.int32)  # (1,)
-    segments: wp.int32  # K
+    segments: int  # K
     shape_body: wp.array(dtype=wp.int32)
     shape_pose: wp.array(dtype=wp.transformd)
 

@@ -21,22 +21,22 @@ GOLDEN_ANGLE = wp.constant(wp.float32(2.399963229728653))
 class NoiseParameters:
     """The parameters of all models; those of models that a sensor does not have are not read."""
 
-    seed: wp.int32
-    min_range: wp.float32
-    max_range: wp.float32
-    jitter_sigma: wp.float32  # tangent of the angle
-    mixed_radius: wp.float32  # of the circle on which the second ray lies, tangent of the angle
-    mixed_min_gap: wp.float32
-    mixed_max_gap: wp.float32
-    mixed_weight: wp.float32  # of the nearer surface
-    gaussian_sigma: wp.float32
-    gaussian_sigma_per_metre: wp.float32
-    distance_ratio: wp.float32
-    dropout_ratio: wp.float32
-    dropout_ratio_per_metre: wp.float32
-    mask_ratio: wp.float32
-    mask_low: wp.float32
-    mask_high: wp.float32
+    seed: int
+    min_range: float
+    max_range: float
+    jitter_sigma: float  # tangent of the angle
+    mixed_radius: float  # of the circle on which the second ray lies, tangent of the angle
+    mixed_min_gap: float
+    mixed_max_gap: float
+    mixed_weight: float  # of the nearer surface
+    gaussian_sigma: float
+    gaussian_sigma_per_metre: float
+    distance_ratio: float
+    dropout_ratio: float
+    dropout_ratio_per_metre: float
+    mask_ratio: float
+    mask_low: float
+    mask_high: float
 
 
 @wp.func

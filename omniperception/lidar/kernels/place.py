@@ -30,11 +30,11 @@ class Limits:
     """Which shapes a viewer may see at all."""
 
     viewed: wp.array(dtype=wp.int32)  # indices of shapes
-    num_viewed: wp.int32
-    cull: wp.bool  # whether shapes out of reach are left out; without it, neighbours stand together
-    max_range: wp.float32
-    elevation_min: wp.float32  # of rays, rad
-    elevation_max: wp.float32
+    num_viewed: int
+    cull: bool  # whether shapes out of reach are left out; without it, neighbours stand together
+    max_range: float
+    elevation_min: float  # of rays, rad
+    elevation_max: float
 
 
 @wp.func

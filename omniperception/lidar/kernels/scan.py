@@ -26,22 +26,22 @@ class Rays:
     directions: wp.array(dtype=wp.vec3)  # (M,) unit vectors in the sensor frame
     origins: wp.array(dtype=wp.vec3)  # (M,) where rays start, if beside the sensor's origin
     angles: wp.array(dtype=wp.vec2)  # (M,) elevation and azimuth
-    cycle: wp.int32  # rows before the table repeats
+    cycle: int  # rows before the table repeats
     start: wp.array2d(dtype=wp.int32)  # (num_envs, 2) the frame's first row: start of its cycle, steps into it
     offsets: wp.array2d(dtype=wp.int32)  # (V, N) rows after the first, if the rays are listed
     variant: wp.array(dtype=wp.int64)  # (num_envs,) which list
     first_row: wp.array(dtype=wp.int64)  # (num_envs,) the frame's first row in the pattern
-    num_rows: wp.int32  # M
-    stride: wp.int32  # rows of the pattern from ray to ray, if they are not listed
+    num_rows: int  # M
+    stride: int  # rows of the pattern from ray to ray, if they are not listed
     lag: wp.array(dtype=wp.float32)  # (num_envs,) time of the first row after the frame's start, s
-    seconds_per_row: wp.float32
-    rows_per_shot: wp.int32
-    period: wp.float32  # of a frame, s
-    count: wp.int32  # rays per frame, N
-    block: wp.int32  # rays per task
-    num_blocks: wp.int32  # tasks per frame
-    min_range: wp.float32
-    max_range: wp.float32
+    seconds_per_row: float
+    rows_per_shot: int
+    period: float  # of a frame, s
+    count: int  # rays per frame, N
+    block: int  # rays per task
+    num_blocks: int  # tasks per frame
+    min_range: float
+    max_range: float
 
 
 @wp.struct
@@ -56,7 +56,7 @@ class Labels:
 class ScanOutputs:
     """(E, N) each, of E environments from the first one on; only those that are asked for exist."""
 
-    first_env: wp.int32
+    first_env: int
     ranges: wp.array2d(dtype=wp.float32)
     true_ranges: wp.array2d(dtype=wp.float32)
     valid: wp.array2d(dtype=wp.bool)

@@ -17,7 +17,7 @@ WORD = wp.constant(constant(SLOTS_AHEAD, "word_size"))
 class Viewpoint:
     """Where the viewer is on which body; -1: in the environment."""
 
-    body: wp.int32
+    body: int
     pose: wp.transformd
 
 
@@ -33,7 +33,7 @@ class Slots:
     count: wp.array(dtype=wp.int32)  # (num_envs,) slots in use
     words: wp.array3d(dtype=wp.float32)  # (num_envs, W, 4 * WORD) x, y, z and threshold of a word's slots; no reach
     view: wp.array(dtype=wp.transformd)  # (num_envs,) the viewer's pose; none with motion
-    reach: wp.float32  # how far from the viewer's origin rays start, metres
+    reach: float  # how far from the viewer's origin rays start, metres
     marched_t: wp.array2d(dtype=wp.float32)  # (num_envs, N) what each ray hits of the height field, by march_block
     marched_face: wp.array2d(dtype=wp.int32)
     marched_uncertain: wp.array2d(dtype=wp.bool)

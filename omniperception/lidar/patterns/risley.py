@@ -74,7 +74,7 @@ def _refract_flat(ray: Ray, ratio: float) -> Ray:
     return np.sqrt(1.0 - y * y - z * z), y, z
 
 
-def _refract(ray: Ray, normal: Ray, ratio: float) -> Ray:
+def _refract(ray: Ray, normal: tuple[float, np.ndarray, np.ndarray], ratio: float) -> Ray:
     """Snell's law in vector form at a face with a unit normal along the light."""
     cosine = ray[0] * normal[0] + ray[1] * normal[1] + ray[2] * normal[2]
     shift = np.sqrt(1.0 - ratio * ratio * (1.0 - cosine * cosine)) - ratio * cosine

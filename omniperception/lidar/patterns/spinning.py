@@ -101,7 +101,8 @@ def hdl64e(frame_hz: float = 10.0) -> ScanPattern:
     upper, lower = 2.0 - np.arange(32) / 3.0, -8.83 - 0.5 * np.arange(32)
     cycle = 48.0 * MICROSECOND
     fire = np.repeat(np.arange(32) / 32.0 * cycle, 2)
-    return spinning(np.stack([upper, lower], axis=1).ravel(), _spin_rate(frame_hz, 5.0, 20.0), cycle, fire)
+    elevation = np.stack([upper, lower], axis=1).ravel()
+    return spinning(elevation.tolist(), _spin_rate(frame_hz, 5.0, 20.0), cycle, fire.tolist())
 
 
 def hdl32e(frame_hz: float = 10.0) -> ScanPattern:
@@ -114,7 +115,7 @@ def hdl32e(frame_hz: float = 10.0) -> ScanPattern:
     upper = lower + 64.0 / 3.0
     fire = 1.152 * MICROSECOND * np.arange(32)
     elevation = np.stack([lower, upper], axis=1).ravel()
-    return spinning(elevation, _spin_rate(frame_hz, 5.0, 20.0), 46.08 * MICROSECOND, fire)
+    return spinning(elevation.tolist(), _spin_rate(frame_hz, 5.0, 20.0), 46.08 * MICROSECOND, fire.tolist())
 
 
 def vlp16(frame_hz: float = 10.0) -> ScanPattern:
@@ -124,7 +125,7 @@ def vlp16(frame_hz: float = 10.0) -> ScanPattern:
         frame_hz: Turns per second, 5..20.
     """
     fire = 2.304 * MICROSECOND * np.arange(16)
-    return spinning(VLP16_ELEVATION_DEG, _spin_rate(frame_hz, 5.0, 20.0), 55.296 * MICROSECOND, fire)
+    return spinning(VLP16_ELEVATION_DEG, _spin_rate(frame_hz, 5.0, 20.0), 55.296 * MICROSECOND, fire.tolist())
 
 
 def vlp32c(frame_hz: float = 10.0) -> ScanPattern:
@@ -135,7 +136,7 @@ def vlp32c(frame_hz: float = 10.0) -> ScanPattern:
     """
     fire = 2.304 * MICROSECOND * (np.arange(32) // 2)
     rate = _spin_rate(frame_hz, 5.0, 20.0)
-    return spinning(VLP32C_ELEVATION_DEG, rate, 55.296 * MICROSECOND, fire, VLP32C_OFFSET_DEG)
+    return spinning(VLP32C_ELEVATION_DEG, rate, 55.296 * MICROSECOND, fire.tolist(), VLP32C_OFFSET_DEG)
 
 
 def os0(channels: int = 128, mode: str = "1024x10") -> ScanPattern:
@@ -176,7 +177,7 @@ def ouster(model: str, channels: int = 128, mode: str = "1024x10") -> ScanPatter
     offset = np.array([outer, inner, -inner, -outer])[kept % 4]
     columns, frame_hz = OUSTER_MODES[mode]
     elevation = np.linspace(fov / 2.0, -fov / 2.0, channels)
-    return spinning(elevation, frame_hz, 1.0 / (columns * frame_hz), offset_deg=offset)
+    return spinning(elevation.tolist(), frame_hz, 1.0 / (columns * frame_hz), offset_deg=offset.tolist())
 
 
 def xt32(frame_hz: float = 10.0) -> ScanPattern:
@@ -204,13 +205,14 @@ def airy(frame_hz: float = 10.0) -> ScanPattern:
         frame_hz: Turns per second, 5..20.
     """
     fire = MICROSECOND * np.repeat(AIRY_FIRE_US, 8)
-    return spinning(np.linspace(0.0, 90.0, 96), _spin_rate(frame_hz, 5.0, 20.0), 1.0 / 9000.0, fire)
+    return spinning(np.linspace(0.0, 90.0, 96).tolist(), _spin_rate(frame_hz, 5.0, 20.0), 1.0 / 9000.0, fire.tolist())
 
 
 def _hesai_xt(channels: int, frame_hz: float) -> ScanPattern:
     step = 32 // channels
     fire = 1.512 * MICROSECOND * step * np.arange(channels)  # Hesai's SDK, firetime corrections of the PandarXT
-    return spinning(15.0 - step * np.arange(channels), _spin_rate(frame_hz, 5.0, 20.0), 50.0 * MICROSECOND, fire)
+    elevation = 15.0 - step * np.arange(channels)
+    return spinning(elevation.tolist(), _spin_rate(frame_hz, 5.0, 20.0), 50.0 * MICROSECOND, fire.tolist())
 
 
 def _spin_rate(frame_hz: float, low: float, high: float) -> float:
