@@ -121,7 +121,7 @@ def _sensor(preset: object, robot: RobotConfig, trust: Sequence[str] | None) -> 
 
 
 def _names(value: object) -> tuple[str, ...]:
-    """One name, several, or none."""
+    """Run directories of `init`: none, one or several."""
     names = [] if value is None else value if isinstance(value, list) else [value]
     if not all(isinstance(name, str) for name in names):
         raise ConfigError(f"init={value} must be a run directory, a list of them, or null")
@@ -182,7 +182,7 @@ def steps_per_frame(run: RunConfig) -> int:
 
 
 def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
-    """What learns in the environment of a run."""
+    """The runner that trains in the environment of a run."""
     return LearningConfig(
         run.ppo,
         run.perception,

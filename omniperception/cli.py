@@ -148,7 +148,7 @@ class Command:
         return [*rest, f"hydra.searchpath=[{','.join(folders)}]"] if folders else rest
 
     def help(self, name: str) -> str:
-        """What `--help` prints."""
+        """Text that `--help` prints."""
         fields = dataclasses.fields(self.arguments)
         lines = [f"usage: {name} [key=value ...]", "", self.doc.strip(), ""]
         shown = {field.name: f"{field.name}={_text(field.default)}" for field in fields}
@@ -175,7 +175,7 @@ def fail(error: BaseException) -> typing.NoReturn:
 
 
 def _value(field: dataclasses.Field, hint: Any, text: str) -> Any:
-    """The value that `name=text` stands for."""
+    """The value of `name=text`."""
     if not text:
         raise ConfigError(f"{field.name}= is empty; it is {field.metadata['doc']}")
     if isinstance(hint, types.UnionType):

@@ -29,7 +29,7 @@ OUTPUTS = Path("outputs")
 SEARCH_PATH = "search_path"
 """Key of a configuration: folders of one's own with presets, from `--config-dir` or `hydra.searchpath`."""
 FIXED_BY_SCENARIO = ("seed", "terrain", "obstacles", "commands", "terminations", "randomization")
-"""What a scenario replaces in a run's configuration; the run keeps everything else."""
+"""Groups that a scenario replaces in a run's configuration; the run keeps all others."""
 DEFINED_BY_SCENARIO = ("obstacles", "commands")
 """Groups that a scenario writes out in full, so that another preset would be mixed with it."""
 OPTIONAL_GROUPS = ("experiment", "scenario")
@@ -68,7 +68,7 @@ class UnknownKey(ConfigError):
 
 
 def suggest(name: str, known: Sequence[str]) -> str:
-    """Which of the known names was probably meant, or all of them."""
+    """The known name that is most similar, or all of them."""
     near = difflib.get_close_matches(name, known, 1)
     return f"did you mean {near[0]}?" if near else f"known: {', '.join(sorted(known))}"
 
@@ -183,7 +183,7 @@ def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
 
 
 def _exists(config: DictConfig, override: Override) -> bool:
-    """Whether the key of an override is there; a ConfigError where it cannot be."""
+    """Whether the key of an override exists; raises ConfigError where it cannot."""
     node: Any = config
     text, names = str(override.input_line), override.key_or_group.split(".")
     for depth, name in enumerate(names):

@@ -80,7 +80,7 @@ NAMES: dict[str, Kind] = {
 
 
 def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -> Any:
-    """The object that a value of a configuration stands for.
+    """Builds the object of a value of a configuration.
 
     Args:
         hint: its type, as annotated; a mapping becomes a dataclass, or what it names.
@@ -150,7 +150,7 @@ def call(target: Callable, keywords: Mapping[str, Any], key: str) -> Any:
 
 
 def look_up(kind: Kind, name: str, key: str, trust: Sequence[str] | None = ()) -> Callable:
-    """The function or class that a name or a dotted path stands for.
+    """Resolves a name or a dotted path to a function or class.
 
     Args:
         kind: what may be named there.

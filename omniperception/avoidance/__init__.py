@@ -1,1 +1,1 @@
-"""What avoiding obstacles asks of the robot: distances by sector, the risk of velocities, the avoidance velocity."""
+"""Obstacle avoidance: distances by sector, the risk of velocities, the avoidance velocity."""

@@ -100,7 +100,7 @@ class Avoidance:
         return None if self.sector_distance is None else (self.sector_distance >= self.config.threshold).all(1)
 
     def targets(self, names: Collection[str]) -> dict[str, torch.Tensor]:
-        """Those of SECTOR_TARGET, AVOIDANCE_TARGET and MOTION_TARGET that are in `names`; (num_envs, ...)."""
+        """Targets among SECTOR_TARGET, AVOIDANCE_TARGET and MOTION_TARGET that are in `names`; (num_envs, ...)."""
         targets: dict[str, torch.Tensor] = {}
         if SECTOR_TARGET in names:
             assert self.sector_distance is not None  # it is supervised, so V_avoid is read
@@ -113,7 +113,7 @@ class Avoidance:
         return targets
 
     def reset(self, env_ids: torch.Tensor) -> None:
-        """Forgets what was near in some environments (n,)."""
+        """Clears avoidance velocity and sector distances of environments (n,)."""
         self.velocity = self.velocity.index_fill(0, env_ids, 0.0)
         if self.sector_distance is not None:
             self.sector_distance[env_ids] = self._max_distance
@@ -123,7 +123,7 @@ class Avoidance:
             self.risk = self.risk.index_fill(0, env_ids, 0.0)
 
     def state_dict(self) -> dict:
-        """What `load_state_dict` needs to go on exactly."""
+        """State that `load_state_dict` needs for an exact resume."""
         kept = {"velocity": self.velocity, "motion": self.motion, "risk": self.risk}
         return {**kept, "sector_distance": None if self.sector_distance is None else self.sector_distance.clone()}
 

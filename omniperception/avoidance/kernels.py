@@ -103,7 +103,7 @@ def worst_sectors(
     sector_out: wp.array2d(dtype=wp.int64),
     time_out: wp.array2d(dtype=wp.float32),
 ):
-    """Of one environment, the sector and the time that make each candidate's risk; see `VelocityRisk`."""
+    """Sector and time that determine each candidate's risk, of one environment; see `VelocityRisk`."""
     env = wp.tid() + env_offset
     for k in range(candidates.shape[0]):
         least[env, k] = wp.inf

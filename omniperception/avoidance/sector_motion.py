@@ -13,7 +13,7 @@ FAINT = 0.05
 """Nearness below which a regressed sector counts as empty."""
 
 VELOCITY_WEIGHT = 1.0
-"""Of a squared velocity error ((m/s)^2) of what is at the robot, against a squared error of nearness."""
+"""Weight of a squared velocity error ((m/s)^2) of an obstacle at the robot, relative to a squared error of nearness."""
 
 
 def sector_bearings(num_sectors: int, device: torch.device | str = "cpu") -> torch.Tensor:

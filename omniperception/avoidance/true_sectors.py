@@ -1,4 +1,4 @@
-"""What stands and moves around the base, by azimuth sector, from the true poses and outlines of all obstacles."""
+"""Nearness and motion of obstacles by azimuth sector, from the true poses and outlines of all obstacles."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> None:
-    """Exports and tells what was written."""
+    """Exports, and prints what was written."""
     run_dir = config.find_run(arguments.run)
     folder = arguments.out or run_dir / FOLDER
     described = export(run_dir, folder, arguments.formats, arguments.trust)

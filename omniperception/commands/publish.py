@@ -26,7 +26,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> None:
-    """Publishes and tells what the run was."""
+    """Publishes, and prints what the run was."""
     record = publish(config.find_run(arguments.run), arguments.to)
     print(f"{arguments.to}: {record['iterations']} iterations, {record['training_hours']} h of training")
 

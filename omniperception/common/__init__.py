@@ -1,1 +1,1 @@
-"""What several packages share: random streams, rotations, kernel launches, timing."""
+"""Code that several packages share: random streams, rotations, kernel launches, timing."""

@@ -13,7 +13,7 @@ class PlotsUnavailable(ImportError):
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """A figure of so many inches that is drawn to a file only.
+    """A figure of a given size in inches that is drawn to a file only.
 
     Raises:
         PlotsUnavailable: matplotlib is not installed.

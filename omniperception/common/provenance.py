@@ -1,4 +1,4 @@
-"""Where a result comes from: commit, command, date, machine, versions and seeds; whatever is written to a file says."""
+"""Provenance of a result: commit, command, date, machine, versions and seeds; part of every file of results."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LIBRARIES = ("omniperception", "torch", "mujoco-core", "warp-lang", "rsl-rl-lib"
 
 
 def provenance(device: object = "cpu", libraries: tuple[str, ...] = LIBRARIES, **facts: object) -> dict:
-    """Commit, command, date, machine and versions of whatever this process has measured.
+    """Commit, command, date, machine and versions of this process.
 
     Args:
         device: where tensors and rays live.

@@ -1,4 +1,4 @@
-"""What an exported policy is: names, scales and rates, as written beside its network in policy.json."""
+"""Description of an exported policy: names, scales and rates, as written beside its network in policy.json."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Lidar:
 
 @dataclass(frozen=True)
 class Perception:
-    """How frames become the network's input.
+    """Preprocessing from frames to the network's input.
 
     Attributes:
         history: frames that the network sees.
@@ -116,7 +116,7 @@ class Perception:
 
 @dataclass(frozen=True)
 class Description:
-    """Everything that a robot has to know besides the network's weights.
+    """All that a robot needs besides the network's weights.
 
     Attributes:
         control_period_s: seconds between two control steps.

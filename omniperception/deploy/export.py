@@ -29,7 +29,7 @@ from omniperception.learning.read_out import MotionReadOut
 from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler
 
 FOLDER = "exported"
-"""Where in a run directory an exported policy goes."""
+"""Folder of a run directory for an exported policy."""
 
 FORMATS = {"onnx": "policy.onnx", "torchscript": "policy.pt"}
 """File of each kind of network."""

@@ -1,4 +1,4 @@
-"""How long an exported policy takes from sensor readings to joint targets."""
+"""Latency of an exported policy from sensor readings to joint targets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PERCENTILES = (50, 95, 99)
 
 @dataclass(frozen=True)
 class Reading:
-    """What a robot senses at a control step: its state, the command (3,), and a frame (n, 3) in m, or None."""
+    """Input of a control step: state, command (3,), and a frame (n, 3) in m, or None."""
 
     state: RobotState
     command: np.ndarray

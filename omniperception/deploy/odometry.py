@@ -1,4 +1,4 @@
-"""How the base has moved since the last LiDAR frame, from its estimated velocity and the IMU's heading."""
+"""Motion of the base since the last LiDAR frame, from its estimated velocity and the IMU's heading."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RobotState:
-    """What a robot senses of itself at a control step.
+    """A robot's own measured state at a control step.
 
     Attributes:
         joint_pos: (num_joints,) rad, in the order of `Description.joints`.
@@ -116,7 +116,7 @@ class ExportedPolicy:
             self._odometry = Odometry(self.description.control_period_s)
 
     def thin(self, points: np.ndarray) -> np.ndarray:
-        """Of a device's whole frame (n, 3), misses as zeros or left out, the points that training would have kept."""
+        """The points of a device's whole frame (n, 3), misses zero or left out, that training would have kept."""
         lidar = self._perception()[0]
         if lidar.keep_every is not None:
             return points[:: lidar.keep_every][: lidar.num_rays]
@@ -213,7 +213,7 @@ class ExportedPolicy:
 
 
 Quantity = Callable[[ExportedPolicy, RobotState, ArrayLike], np.ndarray]
-"""What a policy observes, from the robot's state and the command."""
+"""Observations of a policy, from the robot's state and the command."""
 
 
 def _vector(name: str) -> Quantity:
@@ -258,4 +258,4 @@ QUANTITIES: dict[str, Quantity] = {
     "command": lambda policy, state, command: np.asarray(command, np.float32),
     "previous_action": lambda policy, state, command: policy.action,
 }
-"""What a policy can observe, by the name of training's observation term."""
+"""Quantities that a policy can observe, by the name of training's observation term."""

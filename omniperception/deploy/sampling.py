@@ -21,7 +21,7 @@ _ROUNDING = 1.0 + 1e-6
 
 @dataclass(frozen=True)
 class Attitude:
-    """How the sensor stands.
+    """Mount of the sensor.
 
     Attributes:
         base_quat: (4,) orientation of the base in the world, (w, x, y, z); its heading does not matter.

@@ -1,4 +1,4 @@
-"""Everything that defines the task, checked."""
+"""Configuration of the task, validated."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FROM_LIDAR = frozenset({AVOIDANCE, DISTAL_RANGE, CLOUD})
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Everything that defines the task.
+    """Configuration of the task.
 
     Attributes:
         num_envs: parallel environments.
@@ -98,7 +98,7 @@ class EnvConfig:
                 )
 
     def requirements(self) -> frozenset[str]:
-        """What has to be there before the world is compiled, see `state.requires`."""
+        """Sensors that must exist before the world is compiled, see `state.requires`."""
         needed = set(self.rewards.requirements() | self.observations.requirements())
         if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
             needed.add(AVOIDANCE)

@@ -21,7 +21,7 @@ from omniperception.env.state import CONTACT_SENSORS, EnvState
 from omniperception.scene import ObstacleField, build_world
 
 FOOTING = 0.35
-"""Nothing of the ground within this distance (m) of the base reaches above the feet when a robot starts."""
+"""Distance (m) from the base within which no ground is higher than the feet when a robot starts."""
 
 MAX_ACTION = 100.0
 """Actions beyond this magnitude are clipped and counted; a policy that gets here has diverged."""
@@ -160,7 +160,7 @@ class OmniEnv(VecEnv):
         return obstacles.travel(sim.timestep, sim.decimation, robot_xy_w)
 
     def _follow_sensors(self) -> None:
-        """What the LiDAR and the avoidance velocity take from each control step, and a frame where one is due."""
+        """Updates LiDAR and avoidance velocity in each control step, and casts a frame where one is due."""
         if self.sensing is not None:
             self.sensing.follow(self.state.measured)
             if self.sensing.due(self.step_count):
@@ -171,7 +171,7 @@ class OmniEnv(VecEnv):
             self.avoidance.choose(self.command.value[:, :2])
 
     def _sense(self) -> None:
-        """One frame of the LiDAR and what follows from it."""
+        """Casts a frame of the LiDAR, samples it and updates the avoidance velocity."""
         if self.sensing is None or not self._lidar_is_awake():
             return
         self.sensing.take_frame(self.step_count * self.control_dt, self.state.measured.base_quat_w, self.timer)
@@ -184,7 +184,7 @@ class OmniEnv(VecEnv):
                 self._frame_heights = self.state.heights
 
     def _lidar_is_awake(self) -> bool:
-        """Whether there is a LiDAR; it sleeps while the curriculum has not let the first obstacle in."""
+        """Whether frames are cast: there is a LiDAR, and the curriculum has an obstacle."""
         return self.sensing is not None and (self.obstacles is None or self.obstacles.level > 0.0)
 
     def _follow_terrain(self) -> None:
@@ -276,7 +276,7 @@ class OmniEnv(VecEnv):
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:
-        """What is logged at the end of a log interval."""
+        """Metrics at the end of a log interval."""
         config, log = self.config, {}
         if self.obstacles is not None:
             if config.initial_obstacle_level is None:
@@ -294,7 +294,7 @@ class OmniEnv(VecEnv):
 
     @property
     def curriculum_level(self) -> float:
-        """Share of the obstacles that the curriculum lets in, 0 to 1; 1 where there is none."""
+        """Share of the obstacles that the curriculum has activated, 0 to 1; 1 without obstacles."""
         return 1.0 if self.obstacles is None else self.obstacles.level
 
     @curriculum_level.setter
@@ -307,7 +307,7 @@ class OmniEnv(VecEnv):
         return {term: part.stop - part.start for term, part in self._groups[group].slices.items()}
 
     def terms_not_finite(self, name: str, env_id: int) -> list[str]:
-        """Which terms of "rewards", or of an observation group, are not finite for an environment."""
+        """Terms of "rewards", or of an observation group, that are not finite for an environment."""
         if name == "rewards":
             return [term for term, value in self.rewards.weighted.items() if not torch.isfinite(value[env_id])]
         if name not in self._groups:
@@ -317,7 +317,7 @@ class OmniEnv(VecEnv):
         return [term for term, part in group.slices.items() if not torch.isfinite(history[:, part]).all()]
 
     def state_dict(self) -> dict:
-        """Everything that a resumed run needs to go on exactly."""
+        """State that an exact resume needs."""
         return {
             **{name: part.state_dict() for name, part in self._with_state().items()},
             "random": self.random.counter,
@@ -338,11 +338,11 @@ class OmniEnv(VecEnv):
         self.observations = self._collect(dict(state["observations"]))
 
     def _managers(self) -> dict[str, RewardManager | ObservationManager]:
-        """Those that evaluate terms."""
+        """The managers, by name."""
         return {"rewards": self.rewards, **{f"observations.{name}": group for name, group in self._groups.items()}}
 
     def _with_state(self) -> dict:
-        """Whatever has a state to be saved, by name."""
+        """Components with a state to be saved, by name."""
         names = ("sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing")
         parts = {name: getattr(self, name) for name in (*names, "state", "metrics")} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}

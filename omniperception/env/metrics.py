@@ -9,7 +9,7 @@ import torch
 from omniperception.sim import Failure
 
 OUTCOMES = ("time_out", "fall", "goal", "collision_end", "diverged")
-"""How an episode can end."""
+"""Reasons for which an episode can end."""
 
 
 class EpisodeMetrics:

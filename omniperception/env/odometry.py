@@ -1,4 +1,4 @@
-"""How the base has moved since the last LiDAR frame, as a state estimator tells it."""
+"""Motion of the base since the last LiDAR frame, as a state estimator measures it."""
 
 from __future__ import annotations
 

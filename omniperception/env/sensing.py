@@ -182,7 +182,7 @@ class LidarSensing:
         return self.lidar.frame if self._is_cast else None
 
     def slices_of(self, num_envs: int) -> tuple[slice, ...]:
-        """The slices in which the clouds of a run with so many environments are cast."""
+        """The slices in which the clouds of `num_envs` environments are cast."""
         most = num_envs if self.whole else envs_at_once(self.config, self.lidar.outputs)
         return env_slices(num_envs, most)
 

@@ -1,4 +1,4 @@
-"""What terms read: the robot and what is around it at the end of a control step, computed when it is first read."""
+"""State that terms read, of the robot and its surroundings at the end of a control step, computed at the first read."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:  # parts that not every task has
     from omniperception.sim import Simulator
 
 AVOIDANCE, DISTAL_RANGE, CLOUD = "avoidance", "distal_range", "cloud"
-"""What is taken from the LiDAR where a term requires it: V_avoid and sector distances, mean distal ranges, clouds."""
+"""Outputs of the LiDAR that a term can require: V_avoid and sector distances, mean distal ranges, clouds."""
 CONTACT_SENSORS = frozenset({FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT})
 REQUIREMENTS = (*sorted(CONTACT_SENSORS), AVOIDANCE, DISTAL_RANGE, CLOUD)
-"""What has to be there before the world is compiled."""
+"""Sensors that must exist before the world is compiled."""
 
 CONTACT_FORCE = 1.0
 """Vertical force (N) from which on a foot is in contact."""
@@ -51,7 +51,7 @@ def requires(*names: str) -> Callable[[Marked], Marked]:
 
 
 def requirements(term: Callable) -> frozenset[str]:
-    """What a term (or a partial of one) declared with `requires`."""
+    """Requirements that a term (or a partial of one) declared with `requires`."""
     while isinstance(term, partial):
         term = term.func
     return getattr(term, "requires", frozenset())
@@ -143,7 +143,7 @@ class EnvState:
             self._foot_times.advance(self.foot_contact, self.control_dt)
 
     def reset(self, env_ids: torch.Tensor) -> None:
-        """Forgets earlier steps of environments (n,) whose physics has been reset."""
+        """Clears the history of environments (n,) whose physics has been reset."""
         self.invalidate()
         self.actions = tuple(action.index_fill(0, env_ids, 0.0) for action in self.actions)
         if self._history is not None:
@@ -152,7 +152,7 @@ class EnvState:
             self._foot_times.reset(env_ids)
 
     def invalidate(self) -> None:
-        """Forgets what has been computed, because the simulation has changed."""
+        """Drops the cached quantities, because the simulation has changed."""
         for name in _CACHED & self.__dict__.keys():
             del self.__dict__[name]
 
@@ -161,7 +161,7 @@ class EnvState:
         return name in self.__dict__
 
     def state_dict(self) -> dict:
-        """What earlier steps leave behind."""
+        """State that lasts from step to step."""
         return {
             "actions": list(self.actions),
             "history": self._history and self._history.state_dict(),
@@ -266,7 +266,7 @@ class EnvState:
 
     @property
     def foot_times(self) -> ContactTimes:
-        """How long the feet have been in the air and in contact. Requires "foot_force"."""
+        """Air and contact time of the feet. Requires "foot_force"."""
         if self._foot_times is None:
             self._foot_times = ContactTimes(self.foot_contact)
         return self._foot_times
@@ -275,7 +275,7 @@ class EnvState:
 
     @lazy
     def obstacles(self) -> Obstacles:
-        """Where the obstacles are and how they move."""
+        """Positions and velocities of the obstacles."""
         n, field, yaw = self.num_envs, self._obstacles, self.kinematics.yaw
         if field is None:
             nothing = torch.zeros(n, 0, 2, device=self.device)
@@ -343,7 +343,7 @@ class StateHistory:
 
 
 class ContactTimes:
-    """How long each foot has been in the air or in contact, updated in every control step; all (num_envs, F).
+    """Time that each foot has been in the air or in contact, updated in every control step; all (num_envs, F).
 
     Attributes:
         air, contact: s: of the present phase in the air and in contact; 0 in the other one.
@@ -352,7 +352,7 @@ class ContactTimes:
     """
 
     def __init__(self, contact: torch.Tensor) -> None:
-        """Nothing has lasted yet; `contact` (num_envs, F) bool gives the shape."""
+        """Starts all times at 0; `contact` (num_envs, F) bool gives the shape."""
         self.air, self.contact, self.last_air, self.last_contact = torch.zeros(
             4, *contact.shape, device=contact.device
         ).unbind(0)

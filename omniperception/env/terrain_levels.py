@@ -91,7 +91,7 @@ class TerrainLevels:
         }
 
     def state_dict(self) -> dict:
-        """What `load_state_dict` needs to go on exactly; the levels are the ground's."""
+        """State that `load_state_dict` needs for an exact resume; the levels are the ground's."""
         totals = torch.stack((self.walked, self.commanded, self.reach, self._steps))
         return {"totals": totals, "start": self._start.clone()}
 

@@ -46,7 +46,7 @@ PAPER = {
 
 @dataclass(frozen=True)
 class Ablation:
-    """What to train and how to evaluate it.
+    """Settings of an ablation study.
 
     Attributes:
         out: the study's directory.
@@ -106,7 +106,7 @@ def train(study: Ablation) -> None:
 
 
 def overrides_of(variant: str) -> tuple[str, ...]:
-    """What makes a variant: a preset of `perception`, or one of VARIANTS."""
+    """Overrides of a variant: a preset of `perception`, or one of VARIANTS."""
     return VARIANTS.get(variant, (f"perception={variant}",))
 
 

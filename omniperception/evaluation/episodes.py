@@ -25,7 +25,7 @@ _GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Episodes:
-    """What happened in each episode; tensors are (num_episodes,), ordered by environment and then by time.
+    """Outcomes of episodes; tensors are (num_episodes,), ordered by environment and then by time.
 
     Attributes:
         length_s: duration (s).
@@ -138,7 +138,7 @@ class Episodes:
 
 
 VERDICTS = ("success", "success, touched", "time out", "fall", "collision end", "diverged")
-"""What became of an episode, in words."""
+"""Verdicts on an episode, in words."""
 
 
 def run_episodes(
@@ -291,7 +291,7 @@ _SUMS = (
     "energy",
     "path",
 )
-"""What is added up over the control steps of an episode."""
+"""Sums over the control steps of an episode."""
 
 
 class _StageClock:

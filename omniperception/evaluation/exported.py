@@ -54,7 +54,7 @@ class ExportedPolicies:
 
 
 def robot_states(env: OmniEnv) -> list[RobotState]:
-    """What each robot senses of itself, with the latency that the environment gives it."""
+    """Measured state of each robot, with the latency that the environment gives it."""
     measured = env.state.measured
     tensors = (
         measured.joint_pos,
@@ -74,7 +74,7 @@ def raw_points(frame: LidarFrame) -> np.ndarray:
 
 
 def record(env: OmniEnv, policy: ExportedPolicy, steps: int, whole_frames: bool) -> list[Reading]:
-    """What the first robot senses while the policy drives it.
+    """Readings of the first robot while the policy drives it.
 
     Args:
         env: at the start of its first episodes.

@@ -1,4 +1,4 @@
-"""How well a policy's perception knows the ground around the robot, against predictors that see nothing."""
+"""Errors of perceived heights around the robot, against predictors that see nothing."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from omniperception.scene.obstacles import Obstacle, ObstaclesConfig
 
 COLOURS = dict(zip(VERDICTS, ("#2a9d5c", "#e0a100", "#3b6fb6", "#c0392b", "#8e44ad", "#555555"), strict=True))
 SHOWN = 300
-"""At most so many ways are drawn in one panel."""
+"""Largest number of trajectories in one panel."""
 EXAMPLES = 3
 """Single trials drawn with their obstacles."""
 

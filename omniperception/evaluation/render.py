@@ -50,7 +50,7 @@ class Arrow:
 
 @dataclass(frozen=True)
 class View:
-    """Everything that one picture shows, in the environment's frame.
+    """Content of one picture, in the environment's frame.
 
     Attributes:
         eye_w: (3,) position of the camera, m.
@@ -167,7 +167,7 @@ class Renderer:
         return albedo
 
     def _shadowed(self, points: torch.Tensor, normals: torch.Tensor, lit: torch.Tensor) -> torch.Tensor:
-        """Which of the points that face the sun something else hides from it."""
+        """Whether each of the points that face the sun lies in a shadow."""
         shadowed = torch.zeros_like(lit)
         ids = lit.nonzero().flatten()
         strips = self._scene.num_envs

@@ -1,4 +1,4 @@
-"""What is printed and written of evaluated episodes: a table, and one line per episode."""
+"""Reports on evaluated episodes: a table, and one line per episode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEFINITIONS = {
     "energy_j": "sum over joints and control steps of |torque * joint velocity| * control step",
     "cost_of_transport": "energy / (weight * length of the base's horizontal way), over all trials",
 }
-"""What the entries of a summary mean."""
+"""Meaning of the entries of a summary."""
 
 
 def table(summaries: Mapping[str, dict]) -> str:

@@ -22,7 +22,7 @@ from omniperception.evaluation.plots import draw_tracks
 from omniperception.evaluation.report import DEFINITIONS, table, times_line, write_trials
 
 FOLDER = "evaluation"
-"""Where in a run directory the results go."""
+"""Folder of a run directory for the results."""
 
 POLICIES = {
     "run": "the run's policy",
@@ -32,7 +32,7 @@ POLICIES = {
     "command": "a walking policy that follows V_cmd alone",
     "exported": "the run's exported policy on what a robot measures: onnxruntime",
 }
-"""What can be evaluated; the walking policy is the one of `walker`, or for `scripted` the run's own, LiDAR covered."""
+"""Policies to evaluate; the walking policy is that of `walker`, or for `scripted` the run's own, LiDAR covered."""
 
 ENVS = 256
 """Most environments at a time, unless `num_envs` is given."""
@@ -40,7 +40,7 @@ ENVS = 256
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What to evaluate and how.
+    """Settings of an evaluation.
 
     Attributes:
         run_dir: the run.

@@ -14,7 +14,7 @@ PERIOD_S = 0.1
 
 @dataclass(frozen=True)
 class Tracks:
-    """What a picture of each episode needs; lists are ordered by environment and then by time.
+    """Tracks of the episodes for a picture; lists are ordered by environment and then by time.
 
     Attributes:
         xy: one (T, 2) per episode: the base's position (m, environment frame) every PERIOD_S and at the end.
@@ -61,7 +61,7 @@ class TrackRecorder:
         self._episode += env.done
 
     def tracks(self) -> Tracks:
-        """What has been recorded."""
+        """The recorded tracks."""
         episode = torch.cat([ids for ids, _ in self._points])
         points = torch.cat([xy for _, xy in self._points])
         order = episode.argsort(stable=True)

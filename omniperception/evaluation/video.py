@@ -159,7 +159,7 @@ class Recorder:
         return _rotate(turned, points_b) + at, frame.elevation[self._id, hit] > self._split
 
     def _interest(self) -> float:
-        """How much there is to see: the robot walks ahead, and its LiDAR sees obstacles."""
+        """Score of a picture: the robot walks ahead, and its LiDAR sees obstacles."""
         env = self._env
         speed = float(env.state.kinematics.base_lin_vel_yaw[self._id, 0])
         value = min(max(speed, 0.0), 0.8) + float(env.episode_length_buf[self._id] * env.control_dt > 2.0)

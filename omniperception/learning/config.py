@@ -17,7 +17,7 @@ from omniperception.perception import PerceptionNetwork, Sampler
 
 @dataclass(frozen=True)
 class PerceptionConfig:
-    """How the actor reads the LiDAR.
+    """Configuration of the actor's perception.
 
     Attributes:
         sampler: makes the sampler that reduces one frame to points.
@@ -212,7 +212,7 @@ _RSL_RL = (
 
 @dataclass(frozen=True)
 class LearningConfig:
-    """What learns in an environment, and how.
+    """Configuration of a runner.
 
     Attributes:
         ppo: learning settings.

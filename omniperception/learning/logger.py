@@ -15,7 +15,7 @@ METRICS, ANOMALIES = "Metrics/", "Anomalies/"
 """Keys of ``extras["log"]`` that begin so are shown on the console; anomalies only if there are any."""
 
 CONSOLE_METRICS = ("velocity_error", "yaw_rate_error", "collision_rate", "fall_rate", "obstacle_level")
-"""What the console shows of the metrics, in this order."""
+"""Metrics on the console, in this order."""
 
 
 class Logger:

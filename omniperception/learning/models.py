@@ -111,7 +111,7 @@ class PerceptionActor(MLPModel):
         return torch.cat([latent, features[:, : self._feature_dim]], dim=-1)
 
     def reset(self, dones: torch.Tensor | None = None, hidden_state: HiddenState = None) -> None:
-        """Forget the embedding of the newest frame; with ``dones`` (single environments were reset) it stays valid."""
+        """Drop the embedding of the newest frame; with ``dones`` (single environments were reset) it stays valid."""
         if dones is None:
             self._newest = None
 

@@ -196,7 +196,7 @@ class PerceptiveStorage(RolloutStorage):
         )
 
     def observations_of(self, env_ids: torch.Tensor, steps: Sequence[int] | None = None) -> WindowedObservations:
-        """What some environments saw, flattened in (step, environment) order.
+        """Rollout of some environments, flattened in (step, environment) order.
 
         Args:
             env_ids: (E,).

@@ -39,7 +39,7 @@ MIN_CHUNK_WORK = 65536
 
 
 def default_num_threads() -> int:
-    """How many CPU cores this process may use."""
+    """Number of CPU cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

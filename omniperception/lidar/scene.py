@@ -26,7 +26,7 @@ POSE_TYPES = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 @dataclass(frozen=True)
 class RayHits:
-    """What general rays hit.
+    """Hits of general rays.
 
     Attributes:
         ranges: Distance along each ray, metres, ``inf`` for a miss, (num_envs, R).

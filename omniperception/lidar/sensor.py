@@ -158,7 +158,7 @@ class LidarFrame:
 
 
 OUTPUTS = tuple(field.name for field in fields(LidarFrame))
-"""Everything that a LiDAR can report, by the names of ``LidarFrame``'s fields."""
+"""Outputs that a LiDAR can report, by the names of ``LidarFrame``'s fields."""
 
 _VECTORS = ("points_s", "points_b", "points_w", "normals_w", "directions_s")
 _INTEGERS = ("body_id", "shape_id", "class_id", "row")
@@ -318,7 +318,7 @@ class Lidar:
         return {"frame_count": self.frame_count.clone(), "track": track}
 
     def load_state_dict(self, state: dict) -> None:
-        """Goes on where ``state_dict`` was taken."""
+        """Resumes where ``state_dict`` was taken."""
         self.frame_count.copy_(state["frame_count"])
         if self._track is not None:
             self._track.load_state_dict(state["track"])

@@ -160,7 +160,7 @@ class ObstacleField:
         return bottom if self._ground is None else bottom - self._ground.height(self.pos_w[..., :2])
 
     def restart_approaching(self, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
-        """Lets approaching obstacles that have left the robot behind come again; see `reset` for the arguments."""
+        """Restarts approaching obstacles that have passed the robot; see `reset` for the arguments."""
         distance = (self.pos_w[..., :2] - robot_xy_w.to(self._dtype)[:, None]).norm(dim=-1)
         gone = self.approaches & self.active & (distance > self._start[:, 1] + LOSE_SIGHT)
         env_ids = gone.any(1).nonzero().flatten()

@@ -1,4 +1,4 @@
-"""Obstacles: their shapes, and what says where they are placed and how they move."""
+"""Configuration of obstacles: shapes, placement and motion."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ class FreePathConfig:
 
 @dataclass(frozen=True)
 class ObstaclesConfig:
-    """What stands, hangs and moves around the robot.
+    """Configuration of the obstacles around the robot.
 
     Attributes:
         groups: obstacle groups by name.

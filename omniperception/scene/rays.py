@@ -13,7 +13,7 @@ from omniperception.scene.terrain import GROUND
 
 
 class HitClass(IntEnum):
-    """What a ray has hit."""
+    """Class of the surface that a ray has hit."""
 
     TERRAIN = 0
     OBSTACLE = 1

@@ -115,7 +115,7 @@ class Simulator(Protocol):
         """Goes on from a `state_dict` of the same world and number of environments."""
 
     def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
-        """Marks simulations `which` (num_envs,) bool as failed; the first cause stays."""
+        """Marks simulations `which` (num_envs,) bool as failed, keeping the first cause."""
 
     def detect_failures(self) -> None:
         """Marks simulations whose state is no longer one that a robot can be in."""

@@ -91,7 +91,7 @@ class Capacity:
 
     @classmethod
     def of(cls, world: World, config: MujocoWarpConfig) -> Capacity:
-        """What is configured, else for a robot that lies on all of its geoms, pressed against a few obstacles."""
+        """Configured capacities, or those for a robot that lies on all of its geoms, pressed against some obstacles."""
         model = world.model
         robot = [k for k in range(model.ngeom) if model.geom_conaffinity[k]]
         tiled = world.ground_mocap is not None
@@ -333,7 +333,7 @@ class MujocoWarpSimulator:
 
     @torch.inference_mode(False)  # what is allocated within a rollout is written outside of one, too
     def _allocate_steps(self, num_steps: int) -> None:
-        """Buffers for what goes in and comes out with every physics step of a call."""
+        """Buffers for the inputs and outputs of every physics step of a call."""
         self._num_steps = num_steps
         model, device = self.world.model, self.device
         widths = {"sensordata": model.nsensordata, "qpos": model.nq, "qvel": model.nv}

@@ -1,4 +1,4 @@
-"""What a LiDAR sees: its pattern over time, and one scan of a demonstration scene, as pictures and as a point cloud."""
+"""Pictures of a LiDAR's pattern over time and of one scan of a demonstration scene, and the scan as a point cloud."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def write_scan(scan: Scan, sensor: SensorConfig, demo: DemoScene, out: Path, col
 
 
 def summary(scan: Scan) -> str:
-    """How many points there are, and on what, in one line."""
+    """Number of points by class, in one line."""
     counts = np.bincount(scan.class_id, minlength=len(DemoClass))
     parts = ", ".join(f"{kind.name.lower()} {counts[kind]:,}" for kind in DemoClass if counts[kind])
     hits = len(scan.ranges)

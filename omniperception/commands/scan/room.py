@@ -20,7 +20,7 @@ ROOM = ((-2.6, 4.4), (-2.7, 2.7), 2.6)
 
 
 class DemoClass(IntEnum):
-    """What a ray has hit."""
+    """Class of the surface that a ray has hit."""
 
     FLOOR = 0
     WALL = 1
@@ -49,7 +49,7 @@ REFLECTIVITY = {
     DemoClass.STONE: 0.35,
     DemoClass.ROBOT: 0.1,
 }
-"""Of matt surfaces; rough values by eye."""
+"""Reflectivity of matt surfaces; rough values, chosen by eye."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ def _check_range(key: str, bounds: Sequence[float]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class SpawnConfig:
-    """Where a robot starts, in its environment's frame.
+    """Start pose of a robot, in its environment's frame.
 
     Attributes:
         x: range (m).

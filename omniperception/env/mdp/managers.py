@@ -35,7 +35,7 @@ class RewardManager:
         return total
 
     def reset(self, env_ids: torch.Tensor) -> None:
-        """Tells terms that keep something that some environments (n,) begin an episode."""
+        """Resets the terms with memory for environments (n,) that begin an episode."""
         for term in _stateful(self._terms).values():
             term.reset(env_ids)
 
@@ -85,7 +85,7 @@ class ObservationManager:
         return self._history.flatten(1)
 
     def reset(self, env_ids: torch.Tensor) -> None:
-        """Tells terms that keep something that some environments (n,) begin an episode."""
+        """Resets the terms with memory for environments (n,) that begin an episode."""
         for term in _stateful(self._terms).values():
             term.reset(env_ids)
 

@@ -30,7 +30,7 @@ _DRAWN = (
     "com_y",
     "com_z",
 )
-"""What is drawn at a reset, in this order."""
+"""Parameters that are drawn at a reset, in this order."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class Randomizer:
             )
 
     def _drawn_shapes(self) -> dict[str, tuple[int, ...]]:
-        """What is drawn for one environment, in the order of the draws."""
+        """Parameters and shapes that are drawn for one environment, in the order of the draws."""
         joints, config = self._sim.world.robot.num_joints, self.config
         shapes = {"motor_strength": (self._model.nu, 1), "gravity_offset": (3,), "joint_offset": (joints,)}
         return {name: shapes.get(name, ()) for name in _DRAWN if getattr(config, name) is not None}

@@ -27,7 +27,7 @@ class StatefulTerm:
         raise NotImplementedError
 
     def reset(self, env_ids: torch.Tensor) -> None:
-        """Forgets the episodes of some environments (n,)."""
+        """Begins an episode in environments (n,)."""
 
     def state_dict(self) -> dict:
         return {name: value for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
@@ -90,7 +90,7 @@ class RewardsConfig:
         object.__setattr__(self, "terms", used)
 
     def requirements(self) -> frozenset[str]:
-        """What the terms need before the world is compiled, see `requires`."""
+        """Sensors that the terms need before the world is compiled, see `requires`."""
         return frozenset().union(*(requirements(term.func) for term in self.terms.values()))
 
 
@@ -129,6 +129,6 @@ class ObservationsConfig:
         object.__setattr__(self, "critic", tuple(self.critic))
 
     def requirements(self) -> frozenset[str]:
-        """What the terms need before the world is compiled, see `requires`."""
+        """Sensors that the terms need before the world is compiled, see `requires`."""
         terms = (term for group in self.groups.values() for term in group.terms.values())
         return frozenset().union(*map(requirements, terms))

@@ -61,7 +61,7 @@ class Geometry:
 
 @wp.struct
 class Hit:
-    """Where a ray hits a shape.
+    """Hit of a ray on a shape.
 
     Distance, infinite for a miss; which face of a mesh or height field, -1 for other shapes; sine of the angle between
     ray and surface, 0 where it is not known.

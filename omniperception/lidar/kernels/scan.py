@@ -21,7 +21,7 @@ WINDOW_REACHES = wp.constant(wp.vec4(*map(float, REACHES)))
 
 @wp.struct
 class Rays:
-    """Which rays a frame has; M rows of the table."""
+    """Rays of a frame; M rows of the table."""
 
     directions: wp.array(dtype=wp.vec3)  # (M,) unit vectors in the sensor frame
     origins: wp.array(dtype=wp.vec3)  # (M,) where rays start, if beside the sensor's origin
@@ -46,7 +46,7 @@ class Rays:
 
 @wp.struct
 class Labels:
-    """What is known of classes and environments."""
+    """Tables of classes and environments."""
 
     reflectivity: wp.array(dtype=wp.float32)  # by class, times the square of the reference range, m^2
     frame: wp.array(dtype=wp.int32)  # (num_envs,) frames cast, for the noise

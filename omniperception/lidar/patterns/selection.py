@@ -1,4 +1,4 @@
-"""Which points of a frame are kept when fewer rays are wanted than the device measures."""
+"""Selection of points where fewer rays are kept of a frame than the device measures."""
 
 import math
 from dataclasses import dataclass

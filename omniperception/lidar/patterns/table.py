@@ -104,7 +104,7 @@ class ScanPattern:
         return self.num_rows / self.points_per_second
 
     def points_per_frame(self, period_s: float) -> int:
-        """How many points the device measures in ``period_s``; at least 1."""
+        """Number of points that the device measures in ``period_s``; at least 1."""
         return max(1, math.floor(period_s * self.points_per_second + ROW_SLACK))
 
     def check_num_rays(self, period_s: float, num_rays: int) -> int:
