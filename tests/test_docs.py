@@ -84,6 +84,20 @@ def test_what_a_page_links_to_and_runs_exists(page):
     assert [str(path) for path in (*links, *scripts) if not path.exists()] == []
 
 
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
+def test_files_and_presets_that_a_page_names_exist(page):
+    text = page.read_text()
+    files = {name for name in re.findall(r"`([\w./]*\w+\.(?:py|h))`", text) if not list(ROOT.glob(f"[!.]*/**/{name}"))}
+    assert not {name for name in files if not (ROOT / name).exists()}
+    groups = "|".join(folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir())
+    presets = {tuple(found) for found in re.findall(rf"(?<![\w./])({groups})=([a-z]\w*)", text)}
+    assert not {
+        f"{group}={name}"
+        for group, name in presets
+        if name not in ("mine", "all") and not (ROOT / "conf" / group / f"{name}.yaml").exists()
+    }
+
+
 def test_the_readme_names_every_page():
     text = (ROOT / "README.md").read_text()
     assert [page.name for page in PAGES if page.parent.parent == ROOT / "docs" and page.name not in text] == []
