@@ -7,16 +7,7 @@ import pytest
 import torch
 from lidar_helpers import cast
 
-from omniperception.lidar import (
-    HeightField,
-    Lidar,
-    LidarConfig,
-    RayScene,
-    ScanPattern,
-    Shape,
-    ShapeKind,
-    TriangleMesh,
-)
+from omniperception.lidar import HeightField, Lidar, LidarConfig, RayScene, ScanPattern, Shape, ShapeKind, TriangleMesh
 from omniperception.lidar.kernels.march_block import REACHES
 
 

@@ -59,9 +59,7 @@ CLOSED_FORMS = [
 
 
 @pytest.mark.parametrize(
-    ("shape", "origin", "direction", "expected"),
-    [c[1:] for c in CLOSED_FORMS],
-    ids=[c[0] for c in CLOSED_FORMS],
+    ("shape", "origin", "direction", "expected"), [c[1:] for c in CLOSED_FORMS], ids=[c[0] for c in CLOSED_FORMS]
 )
 def test_closed_forms(shape, origin, direction, expected):
     distance, shape_id = single(shape, origin, direction)

@@ -30,11 +30,7 @@ def test_environments_do_not_see_each_other():
     scene = RayScene([Shape(ShapeKind.SPHERE, (0.5,), body=0)], num_envs=3, num_bodies=1, num_threads=2)
     scene.body_pos[:, 0] = torch.tensor([[2.0, 0.0, 0.0], [0.0, 0.0, -1000.0], [0.0, 5.0, 0.0]])
     assert scene.cast(*rays(3)).ranges.flatten().tolist() == [1.5, math.inf, math.inf]
-    assert scene.cast(*rays(3, direction=(0.0, 1.0, 0.0))).ranges.flatten().tolist() == [
-        math.inf,
-        math.inf,
-        4.5,
-    ]
+    assert scene.cast(*rays(3, direction=(0.0, 1.0, 0.0))).ranges.flatten().tolist() == [math.inf, math.inf, 4.5]
 
 
 def test_a_body_carries_and_turns_its_shape():
@@ -61,11 +57,7 @@ def test_a_miss_after_a_hit_is_infinite():
 @pytest.mark.parametrize("shapes", [[], [Shape(ShapeKind.SPHERE, (0.5,), pos=(2.0, 0.0, 0.0))]], ids=["empty", "one"])
 def test_odd_counts(num_envs, num_rays, num_bodies, shapes):
     scene = RayScene(shapes, num_envs, num_bodies, num_threads=2)
-    assert scene.body_pos.shape == (num_envs, num_bodies, 3) and scene.body_quat.shape == (
-        num_envs,
-        num_bodies,
-        4,
-    )
+    assert scene.body_pos.shape == (num_envs, num_bodies, 3) and scene.body_quat.shape == (num_envs, num_bodies, 4)
     ranges = scene.cast(*rays(num_envs, num_rays)).ranges
     assert ranges.shape == (num_envs, num_rays)
     assert (ranges == (1.5 if shapes else math.inf)).all()

@@ -28,10 +28,7 @@ def test_kernels_compile_for_cuda(module, tmp_path):
     assert files and all(path.stat().st_size > 0 for path in files)
 
 
-SAMPLERS = [
-    PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0),
-    FpsSampler(70, max_range=MAX_RANGE),
-]
+SAMPLERS = [PdSampler(64, 32, max_range=MAX_RANGE, split_deg=10.0), FpsSampler(70, max_range=MAX_RANGE)]
 
 
 @pytest.mark.gpu

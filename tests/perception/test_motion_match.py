@@ -83,8 +83,3 @@ def test_ground_is_not_matched():
 def test_what_makes_no_sense_is_refused(given, message):
     with pytest.raises(ValueError, match=message):
         MotionMatch(**{"speeds": (1.0,), "num_directions": 8, "width": 0.4, "period_s": 0.1} | given)
-
-
-def test_one_frame_shows_no_motion():
-    with pytest.raises(ValueError, match=r"perception\.history=1 shows no motion"):
-        RingPath(2 * SECTORS, 1, match=MATCH)

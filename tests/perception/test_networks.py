@@ -66,13 +66,17 @@ def test_invalid_frames_have_no_influence():
     assert torch.equal(a, b) and (a[0, 0] == 0).all() and (a[0, 1:] != 0).all()
 
 
-def test_pd_risknet_splits_the_points():
-    network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3)
+@pytest.mark.parametrize("encoder", [0, 7])
+def test_pd_risknet_splits_the_points(encoder):
+    """Each half in a GRU of its own; the distal half may pass a layer before."""
+    network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3, distal_encoder=encoder)
     frames, count = sequence(), counts()
-    got = network(frames, count)
-    near = gru_by_window(plain_gru(network.proximal), frames[:, :, :4], count)
-    far = gru_by_window(plain_gru(network.distal), frames[:, :, 4:], count)
-    assert torch.allclose(got, torch.cat([near, far], -1), atol=1e-5)
+    far = frames[:, :, 4:]
+    if encoder:
+        far = torch.nn.functional.elu(network.encoder[0](far.flatten(2))).unsqueeze(-1)
+    halves = (network.proximal, frames[:, :, :4]), (network.distal, far)
+    expected = torch.cat([gru_by_window(plain_gru(gru), points, count) for gru, points in halves], -1)
+    assert torch.allclose(network(frames, count), expected, atol=1e-5)
     assert network.supervised["height_target"] == slice(0, 5)  # the proximal half
 
 
@@ -90,12 +94,12 @@ def test_paper_dimensions():
 def test_windowed_linear_equals_linear_on_each_window():
     frames, count = sequence(), counts()
     layer = WindowedLinear(18, 7, H)
+    got = layer(frames.flatten(2), count)
     for b in range(B):
         for w in range(W):
             window = frames[b, w : w + H].flatten(1).clone()
             window[: H - int(count[b, w])] = 0.0
-            expected = layer.linear(window.flatten())
-            assert torch.allclose(layer(frames.flatten(2), count)[b, w], expected, atol=1e-5)
+            assert torch.allclose(got[b, w], layer.linear(window.flatten()), atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -119,14 +123,6 @@ def test_wrong_counts_are_refused():
         FpsGru(6, H, 9)(sequence(), torch.full((B, W + 1), H))
     with pytest.raises(ValueError, match="at least 1"):
         FpsGru(0, H)
-
-
-def test_the_distal_encoder_is_a_layer_before_the_gru():
-    network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3, distal_encoder=7)
-    frames, count = sequence(), counts()
-    encoded = torch.nn.functional.elu(network.encoder[0](frames[:, :, 4:].flatten(2)))
-    far = gru_by_window(plain_gru(network.distal), encoded.unsqueeze(-1), count)
-    assert torch.allclose(network(frames, count)[..., 5:], far, atol=1e-5)
 
 
 def test_a_path_can_be_left_out():

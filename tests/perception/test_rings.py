@@ -106,10 +106,15 @@ def test_a_turned_world_gives_turned_motion():
     assert torch.allclose(path(turned, moved, count).unflatten(2, (SECTORS, 3)), out.roll(2, 2), atol=1e-4)
 
 
-def test_sizes_that_do_not_fit():
-    with pytest.raises(ValueError, match="num_distal=70 must be a multiple of num_sectors=36"):
-        RingPath(70, 4)
-    with pytest.raises(ValueError, match=r"kernel_sizes=\[4\] must be one odd number for each of the 1 channels"):
-        RingPath(72, 4, channels=(8,), kernel_sizes=(4,))
-    with pytest.raises(ValueError, match="ground_bands=2 must be less than the 2 bands"):
-        RingPath(72, 4, ground_bands=2)
+@pytest.mark.parametrize(
+    ("arguments", "options", "message"),
+    [
+        ((70, 4), {}, "num_distal=70 must be a multiple of num_sectors=36"),
+        ((72, 4), {"channels": (8,), "kernel_sizes": (4,)}, r"kernel_sizes=\[4\] must be one odd number for each of"),
+        ((72, 4), {"ground_bands": 2}, "ground_bands=2 must be less than the 2 bands"),
+        ((72, 1), {"match": MATCH}, r"perception\.history=1 shows no motion"),
+    ],
+)
+def test_sizes_that_do_not_fit(arguments, options, message):
+    with pytest.raises(ValueError, match=message):
+        RingPath(*arguments, **options)

@@ -28,6 +28,9 @@ def order(theta, phi, ring_deg=2.0):
     return np.lexsort((np.asarray(phi, dtype=np.float64), ring))
 
 
+PD = {"num_proximal": 16, "num_distal": 8, "max_range": MAX_RANGE, "split_deg": 10.0}
+
+
 def as_set(points):
     return sorted(map(tuple, np.round(np.asarray(points, dtype=np.float64), 6).tolist()))
 
@@ -98,14 +101,12 @@ class TestDegenerateClouds:
         PdSampler(3, 4, max_range=MAX_RANGE, split_deg=10.0),
     ]
 
+    @pytest.mark.parametrize("empty", [math.inf, math.nan])
     @pytest.mark.parametrize("sampler", SAMPLERS, ids=lambda s: type(s).__name__)
-    def test_empty_cloud_is_zero_even_after_a_full_one(self, sampler):
+    def test_empty_cloud_is_zero_even_after_a_full_one(self, sampler, empty):
         ranges, *rest = random_rays(3, 20, miss=0.0)
-        out = torch.empty(3, sampler.num_points, 3)
-        sampler(ranges, *rest, out)
-        assert (out != 0).any()
-        sampler(torch.full_like(ranges, math.inf), *rest, out)
-        assert (out == 0).all()
+        assert (sample(sampler, (ranges, *rest)) != 0).any()
+        assert (sample(sampler, (torch.full_like(ranges, empty), *rest)) == 0).all()
 
     def test_single_point(self):
         rays = rays_from_points([[2.0, 0.0, 2.0]])  # 45 degrees up
@@ -122,30 +123,20 @@ class TestDegenerateClouds:
         np.testing.assert_allclose(got[:6], expected, atol=1e-6)
         assert (got[6:] == 0).all()
 
-    def test_nan_range_is_no_point(self):
-        ranges, *rest = random_rays(1, 20, miss=0.0)
-        out = sample(RawSampler(20, max_range=MAX_RANGE), (torch.full_like(ranges, math.nan), *rest))
-        assert (out == 0).all()
-
 
 class TestDistal:
     SPLIT = 15.0
-
-    def distal(self, rays, env):
-        """Indices of the distal rays of one environment in (ring, phi) order."""
-        theta, phi = rays[2][env].double().numpy(), rays[3][env].double().numpy()
-        ids = np.flatnonzero(theta <= np.radians(self.SPLIT))
-        return ids[order(theta[ids], phi[ids])]
 
     def test_bins_of_consecutive_points(self):
         rays = random_rays(5, 250, seed=7)
         got = sample(PdSampler(8, 16, max_range=MAX_RANGE, split_deg=self.SPLIT), rays)
         for env in range(5):
-            ids = [i for i in self.distal(rays, env) if torch.isfinite(rays[0][env, i])]
+            theta, phi = (t[env].double().numpy() for t in rays[2:])
+            ids = np.flatnonzero((theta <= np.radians(self.SPLIT)) & rays[0][env].isfinite().numpy())
+            ids = ids[order(theta[ids], phi[ids])]
             cloud = (rays[0][env, ids, None] * rays[1][env, ids] / MAX_RANGE).numpy()
             edges = [b * len(ids) // 16 for b in range(17)]
-            bins = [cloud[a:b] for a, b in itertools.pairwise(edges)]
-            expected = [b.mean(0) for b in bins]
+            expected = [cloud[a:b].mean(0) for a, b in itertools.pairwise(edges)]
             np.testing.assert_allclose(got[env, 8:], expected, atol=1e-5)
 
     def test_partition_by_elevation(self):
@@ -166,24 +157,16 @@ class TestInterface:
         assert torch.allclose(got, expected, atol=1e-6)
 
     @pytest.mark.parametrize("num_envs", [1, 2, 7, 33])
-    def test_threads_do_not_change_the_result(self, num_envs):
+    def test_threads_and_other_environments_do_not_change_the_result(self, num_envs):
         rays = random_rays(num_envs, 120, seed=num_envs)
-        results = []
+        expected = sample(PdSampler(**PD), rays)
         for threads in (1, 2, 3, 5):
-            sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0, num_threads=threads)
-            results.append(sample(sampler, rays))
-        assert all(torch.equal(results[0], other) for other in results[1:])
-
-    def test_environments_are_independent(self):
-        rays = random_rays(6, 120, seed=5)
-        sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
-        full = sample(sampler, rays)
-        alone = sample(sampler, tuple(t[3:4].clone() for t in rays))
-        assert torch.equal(full[3:4], alone)
+            assert torch.equal(sample(PdSampler(**PD, num_threads=threads), rays), expected)
+        alone = sample(PdSampler(**PD), tuple(t[-1:].clone() for t in rays))
+        assert torch.equal(alone, expected[-1:])
 
     def test_writes_into_a_slice_of_a_history(self):
-        rays = random_rays(6, 120, seed=6)
-        sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
+        rays, sampler = random_rays(6, 120, seed=6), PdSampler(**PD)
         history = torch.full((6, 4, 24, 3), 7.0)
         sampler(*rays, history[:, -1])
         assert torch.equal(history[:, -1], sample(sampler, rays)) and (history[:, :-1] == 7.0).all()
@@ -191,12 +174,12 @@ class TestInterface:
     def test_shared_scan_expanded_over_environments(self):
         ranges, directions, theta, phi = random_rays(4, 60, seed=11)
         shared = directions[:1].expand(4, -1, -1), theta[:1].expand(4, -1), phi[:1].expand(4, -1)
-        sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
+        sampler = PdSampler(**PD)
         assert torch.equal(sample(sampler, (ranges, *shared)), sample(sampler, (ranges, *(t.clone() for t in shared))))
 
     def test_azimuth_branch_does_not_matter(self):
         ranges, directions, theta, phi = random_rays(2, 60, seed=12)
-        sampler = PdSampler(16, 8, max_range=MAX_RANGE, split_deg=10.0)
+        sampler = PdSampler(**PD)
         wrapped = torch.where(phi < 0, phi + 2 * math.pi, phi)
         a, b = (sample(sampler, (ranges, directions, theta, azimuth)) for azimuth in (phi, wrapped))
         assert torch.allclose(a, b)

@@ -45,15 +45,6 @@ def test_choice_is_the_weighted_mean_by_hand():
     assert velocity[0].tolist() == pytest.approx([expected, 0.0], abs=1e-6)
 
 
-def test_what_lies_ahead_is_passed_on_the_free_side():
-    controller = VelocityRisk(**GIVEN)
-    risk = torch.zeros(1, 9)
-    risk[0, [0, 1, 5, 2, 6]] = 1.0  # here, ahead and to the left
-    command = torch.tensor([[1.0, 0.0]])
-    velocity = command + controller.avoidance(risk, command, controller.candidates())
-    assert velocity[0, 1] < -0.1 and velocity[0, 0] < 0.3
-
-
 @pytest.mark.parametrize("sideways", [1.0, 0.3])
 def test_a_deviation_counts_by_its_direction(sideways):
     controller, rng = VelocityRisk(**GIVEN, sideways=sideways), np.random.default_rng(3)

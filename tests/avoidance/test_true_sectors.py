@@ -47,36 +47,34 @@ def test_a_circle_by_hand():
 def test_sectors_and_velocities_turn_with_the_robot():
     scene = Scene({"post": POST}, yaw=-math.pi / 2)
     scene.field.pos_w[0, 0] = torch.tensor([3.0, 4.0, 0.5])
-    scene.field.velocity_w[0, 0] = torch.tensor(
-        [0.0, 1.5]
-    )  # north of the world is to the left of a robot facing south...
-    north = scene.measure(4)[0, NORTH]
-    assert north.tolist() == pytest.approx([4.5, -1.5, 0.0], abs=1e-6)  # ...turned by -90 degrees: backwards
+    scene.field.velocity_w[0, 0] = torch.tensor([0.0, 1.5])  # in the world; backwards for a robot turned by -90 degrees
+    assert scene.measure(4)[0, NORTH].tolist() == pytest.approx([4.5, -1.5, 0.0], abs=1e-6)
 
 
 def test_a_wall_is_as_far_as_along_the_sectors_middle_and_its_nearest_point_counts():
     wall = ObstacleGroup("box", 1, [[0.1, 0.1], [3.0, 3.0], [0.5, 0.5]], poses=[[2.1, 0.0, 0.0]])
     distance = Scene({"wall": wall}).measure(8)[0, :, 0]  # its face at x = 2, y from -3 to 3
     along = 2.0 / math.cos(math.radians(22.5))
-    assert distance[3].item() == pytest.approx(along) and distance[4].item() == pytest.approx(
-        2.0
-    )  # nearest at 0 degrees
+    assert distance[3:5].tolist() == pytest.approx([along, 2.0])  # the nearest point is at 0 degrees
     assert distance[[0, 1, 2, 5, 6, 7]].isinf().all()  # middles at 67.5 degrees and more pass it
 
 
-def test_what_reaches_in_from_the_side_alone_does_not_count():
-    scene = Scene({"post": ObstacleGroup("cylinder", 1, [[0.4, 0.4], [0.5, 0.5]])})
-    scene.field.pos_w[0, 0] = torch.tensor([2.0, 0.3, 0.5])  # bearings -3 to 20 degrees, nearest at 9 degrees
-    distance = scene.measure(36)[0, :, 0]
-    assert distance.isfinite().nonzero().flatten().tolist() == [18, 19]  # middles at 5 and 15 degrees, not at -5
-
-
-def test_a_pole_between_two_middles_is_in_its_sector():
-    scene = Scene({"pole": ObstacleGroup("cylinder", 1, [[0.01, 0.01], [0.5, 0.5]])})
-    bearing = math.radians(9.0)
-    scene.field.pos_w[0, 0] = torch.tensor([3 * math.cos(bearing), 3 * math.sin(bearing), 0.5])
-    distance = scene.measure(36)[0, :, 0]
-    assert distance[18].item() == pytest.approx(2.99) and distance.isfinite().sum() == 1
+@pytest.mark.parametrize(
+    ("radius", "distance", "bearing_deg", "sectors"),
+    [
+        (0.4, math.hypot(2.0, 0.3), math.degrees(math.atan2(0.3, 2.0)), [18, 19]),  # reaches beside the middle of 17
+        (0.01, 3.0, 9.0, [18]),  # a pole between two middles is in its sector
+    ],
+)
+def test_an_obstacle_is_in_sectors_whose_middle_it_covers_and_in_that_of_its_nearest_point(
+    radius, distance, bearing_deg, sectors
+):
+    scene = Scene({"post": ObstacleGroup("cylinder", 1, [[radius, radius], [0.5, 0.5]])})
+    bearing = math.radians(bearing_deg)
+    scene.field.pos_w[0, 0] = torch.tensor([distance * math.cos(bearing), distance * math.sin(bearing), 0.5])
+    measured = scene.measure(36)[0, :, 0]
+    assert measured.isfinite().nonzero().flatten().tolist() == sectors
+    assert measured[18].item() == pytest.approx(distance - radius, rel=1e-2)
 
 
 def test_what_hangs_overhead_is_parked_or_unknown_does_not_count():
@@ -196,15 +194,17 @@ def test_only_what_is_read_exists(make_config):
     assert OmniEnv(make_config("experiment=walk", "num_envs=2").env).avoidance is None
 
 
-def test_motion_needs_its_law(make_config):
-    avoid = ("experiment=avoid", "init=unread")
-    with pytest.raises(
-        ValueError, match=r"perception\.motion_weight needs rewards\.avoidance\.risk; use rewards=veloc"
-    ):
-        make_config(*avoid, "rewards=default")
-    with pytest.raises(
-        ValueError, match=r"avoidance_weight=1\.0 and motion_weight=10\.0 would both change the command"
-    ):
-        make_config(*avoid, "perception.avoidance_weight=1.0")
-    with pytest.raises(ValueError, match=r"is learned beside PPO; set perception\.supervised_epochs to at least 1"):
-        make_config(*avoid, "perception.supervised_epochs=0", "ppo.num_learning_epochs=2")
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["rewards=default"], r"perception\.motion_weight needs rewards\.avoidance\.risk; use rewards=veloc"),
+        (["perception.avoidance_weight=1.0"], r"avoidance_weight=1\.0 and motion_weight=10\.0 would both change the"),
+        (
+            ["perception.supervised_epochs=0", "ppo.num_learning_epochs=2"],
+            r"set perception\.supervised_epochs to at le",
+        ),
+    ],
+)
+def test_motion_needs_its_avoidance_controller(make_config, overrides, message):
+    with pytest.raises(ValueError, match=message):
+        make_config("experiment=avoid", "init=unread", *overrides)
