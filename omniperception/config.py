@@ -27,7 +27,7 @@ CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"
 CONFIG_FILE = "config.yaml"
 OUTPUTS = Path("outputs")
 SEARCH_PATH = "search_path"
-"""Key of a configuration: folders of one's own with presets, from `--config-dir` or `hydra.searchpath`."""
+"""Key of a configuration: the user's folders of presets, from `--config-dir` or `hydra.searchpath`."""
 FIXED_BY_SCENARIO = ("seed", "terrain", "obstacles", "commands", "terminations", "randomization")
 """Groups that a scenario replaces in a run's configuration; the run keeps all others."""
 DEFINED_BY_SCENARIO = ("obstacles", "commands")
@@ -235,7 +235,7 @@ def _check_preset(override: Override, known: Sequence[str]) -> None:
 
 
 def search_path(overrides: Sequence[Override | str], config: DictConfig | None = None) -> list[Path]:
-    """Folders of one's own with presets: those that a run remembers, and those that hydra.searchpath names."""
+    """The user's folders of presets: those saved with a run, and those that hydra.searchpath names."""
     remembered = config.get(SEARCH_PATH) or () if config is not None else ()
     found = [Path(name) for name in remembered if Path(name).is_dir()]
     for given in overrides:
@@ -275,7 +275,7 @@ def remember(config: DictConfig, folders: Sequence[Path]) -> None:
 
 
 def presets(group: str, folders: Sequence[Path] = ()) -> tuple[str, ...]:
-    """Names of a group's presets, those in folders of one's own included; none where there is no such group."""
+    """Names of a group's presets, those in the user's folders included; none where there is no such group."""
     found = {path.stem for folder in (CONFIG_DIR, *folders) for path in (folder / group).glob("[!_]*.yaml")}
     return tuple(sorted(found))
 

@@ -6,8 +6,8 @@
 Runs lie in <out>/<variant>/seed<seed>. The same command goes on where it was stopped: finished runs and evaluations are
 left alone. A variant is a preset of `perception`, or a name from `VARIANTS` in omniperception/evaluation/ablation.py
 (such as pd_risknet_rings_no_match), which lists its overrides. On a cluster, with pip install
-'omniperception[train,cluster]', give stage=train and Hydra's launcher; nothing else differs. Writes <out>/ablation.md and
-ablation.json.
+'omniperception[train,cluster]', give stage=train and Hydra's launcher; nothing else differs. Writes
+<out>/ablation.md and ablation.json.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ class ExportedPolicy:
         return ExportedPolicy(self.description, self._session)
 
     def reset(self) -> None:
-        """Forgets everything, as at the start of an episode: the next step's observation fills the histories."""
+        """Clears all histories, as at the start of an episode: the next step's observation fills them."""
         self.action = np.zeros(len(self._default_pos), np.float32)
         for history in self._histories.values():
             history.clear()

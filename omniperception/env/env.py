@@ -328,7 +328,7 @@ class OmniEnv(VecEnv):
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Goes on from the `state_dict` of an environment with the same configuration."""
+        """Resumes from the `state_dict` of an environment with the same configuration."""
         for name, part in self._with_state().items():
             part.load_state_dict(state[name])
         self.random.counter.copy_(state["random"])

@@ -301,7 +301,7 @@ class LidarSensing:
         self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
 
     def reset(self, env_ids: torch.Tensor, measured: Kinematics) -> None:
-        """Forgets what some environments (n,) have seen, and how their bodies moved.
+        """Clears frames, sightings and recorded motion of environments (n,).
 
         Args:
             env_ids: which.

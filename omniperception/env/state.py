@@ -304,7 +304,7 @@ _CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance
 
 
 def _declared(part: Part | None, name: str) -> Part:
-    """What a term reads, which is there if the term has declared it."""
+    """A quantity that exists if a term has declared it."""
     if part is None:
         raise ValueError(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
     return part

@@ -138,7 +138,7 @@ def write_tables(study: Ablation) -> str:
 def pooled(counts: Sequence[tuple[int, int]]) -> dict:
     """Rate over all seeds with Wilson's 95 % interval, and the lowest and the highest of the seeds' rates.
 
-    The interval takes trials for independent; how much seeds differ, the range tells.
+    The interval assumes independent trials; the range shows how much seeds differ.
     """
     happened, trials = (sum(column) for column in zip(*counts, strict=True))
     low, high = wilson(happened, trials)

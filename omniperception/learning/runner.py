@@ -226,7 +226,7 @@ class Runner:
         return state
 
     def _save_checkpoint(self) -> None:
-        """Save to the run directory unless this state is there already."""
+        """Save to the run directory unless this state is saved already."""
         if self.logger.log_dir is None:
             return
         path = checkpoint_path(self.logger.log_dir, self.current_learning_iteration)

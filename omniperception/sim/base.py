@@ -112,7 +112,7 @@ class Simulator(Protocol):
         """Everything that the physics needs to go on exactly."""
 
     def load_state_dict(self, state: dict) -> None:
-        """Goes on from a `state_dict` of the same world and number of environments."""
+        """Resumes from a `state_dict` of the same world and number of environments."""
 
     def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
         """Marks simulations `which` (num_envs,) bool as failed, keeping the first cause."""
