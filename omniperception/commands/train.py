@@ -97,7 +97,7 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
     if distributed.rank() == 0:
         Watch(runner, save)
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
-    report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; play run={run_dir} replays it")
+    report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
     distributed.disconnect()
 
 
