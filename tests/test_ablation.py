@@ -26,7 +26,7 @@ def test_pooled_rates_by_hand():
         ({"overrides": ["seed=4"]}, "seed=4: give experiment=, variants= and seeds= instead"),
     ],
 )
-def test_mistakes_are_told_before_anything_runs(change, message):
+def test_mistakes_are_refused_before_anything_runs(change, message):
     with pytest.raises(ConfigError, match=message):
         Ablation(**GIVEN | change)
 

@@ -84,7 +84,7 @@ def test_only_what_is_randomized_is_a_field_of_its_own():
     assert fields == {"model field actuator_gainprm", "model field actuator_biasprm"}
 
 
-def test_a_lidar_that_nobody_reads_is_not_built(make_env):
+def test_a_lidar_that_is_not_read_is_not_built(make_env):
     env = make_env("perception=none", "rewards=walk", "observations=walk", "obstacles=none")
     assert env.config.lidar is not None and env.sensing is None
 
@@ -175,7 +175,7 @@ def test_what_nothing_carries_is_placed_once(launched):
     assert torch.equal(frames[0], frames[2])
 
 
-def test_shapes_that_can_be_hidden_are_placed_anew(launched):
+def test_shapes_that_can_be_hidden_are_placed_in_each_frame(launched):
     scene = RayScene([Shape(ShapeKind.SPHERE, (0.5,), pos=(2.0, 0.0, 0.0))], 1, 0, num_threads=1)
     ray = torch.zeros(1, 1, 3), torch.tensor([[[1.0, 0.0, 0.0]]])
     assert [scene.cast(*ray).ranges.item() for _ in range(2)] == [1.5, 1.5]

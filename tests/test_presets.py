@@ -118,7 +118,7 @@ class TestSensors:
         assert mount("robot.mounts.head.pos=[0.3,0,0]")[0] == (0.3, 0.0, 0.0)
         assert mount("lidar.mount={pos: [0, 0, 1], exclude_geoms: [trunk]}") == ((0, 0, 1), (0, 0, 0), ("trunk",))
 
-    def test_figures_that_differ_from_the_devices(self, make_config):
+    def test_parameters_that_differ_from_the_devices(self, make_config):
         run = make_config("lidar=os0_32", "lidar.max_range=9.0", "lidar.pattern={type: os0, channels: 64}")
         assert run.env.lidar.max_range == 9.0 and run.env.lidar.pattern().num_lasers == 64
         assert run.perception.sampler().max_range == 9.0

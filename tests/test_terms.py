@@ -235,7 +235,7 @@ def test_a_term_is_an_ordinary_function(make_config):
     )
 
 
-def test_a_reward_of_the_wrong_shape_is_told_in_one_line(tmp_path, monkeypatch):
+def test_a_reward_of_the_wrong_shape_is_refused_in_one_line(tmp_path, monkeypatch):
     (tmp_path / "misshapen_terms.py").write_text("def wide(state):\n    import torch\n    return torch.zeros(2, 3)\n")
     monkeypatch.syspath_prepend(tmp_path)
     overrides = ["experiment=walk", "num_envs=2", "+rewards.terms.wide={func: misshapen_terms.wide, weight: 1}"]

@@ -71,7 +71,7 @@ class TerrainLevels:
     def steps_up(self, env_ids: torch.Tensor, complete: torch.Tensor) -> torch.Tensor:
         """(n,) int64: 1 for environments that move up a level, -1 for those that move down; see `start`."""
         config, curriculum = self._ground.config, self._ground.config.curriculum
-        assert curriculum is not None  # else nobody asks
+        assert curriculum is not None  # levels change with a curriculum only
         walked, commanded, reach, steps = (
             values[env_ids] for values in (self.walked, self.commanded, self.reach, self._steps)
         )

@@ -134,7 +134,7 @@ class PerceptionActor(MLPModel):
         """(B, D) embeddings of the steps of an update, or (B, D + K) those that were acted on; each window is embedded
         once."""
         empty = self.perception.empty(obs.frames)
-        if not obs.has_frames:  # the sensor sleeps: there is nothing to embed
+        if not obs.has_frames:  # no frame has been cast yet: there is nothing to embed
             return empty.expand(obs.batch_size[0], -1)
         windows = obs.window_features
         if windows is None:

@@ -22,7 +22,7 @@ def test_without_a_gpu_it_says_so_in_one_line(tmp_path, capsys):
     assert ended.value.code == 2 and error.startswith("error: device=cuda:0") and error.count("\n") == 1
 
 
-def test_a_part_that_fails_is_told_and_the_others_run(tmp_path, monkeypatch):
+def test_a_part_that_fails_is_reported_and_the_others_run(tmp_path, monkeypatch):
     def fails(options):
         raise RuntimeError("out of order")
 

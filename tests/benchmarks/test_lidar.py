@@ -267,7 +267,7 @@ def test_every_feature_of_the_sensor_is_measured():
 
 
 @pytest.mark.parametrize("argument", ["what=nothing", "speed=3", "repeats=many", "motions=fly", "device=cuda:99"])
-def test_wrong_arguments_are_told_in_one_line(argument, capsys):
+def test_wrong_arguments_are_refused_in_one_line(argument, capsys):
     with pytest.raises(SystemExit) as ended:
         command([argument])
     error = capsys.readouterr().err

@@ -91,7 +91,7 @@ def test_the_command_prints_and_draws(capsys, tmp_path):
 
 
 @pytest.mark.parametrize(("argument", "named"), [("sensors=nose", "sensors=nose must be one of"), ("foo=1", "foo=1")])
-def test_the_command_tells_what_is_wrong_in_one_line(capsys, argument, named):
+def test_wrong_arguments_are_refused_in_one_line(capsys, argument, named):
     with pytest.raises(SystemExit, match="2"):
         command([argument])
     (line,) = capsys.readouterr().err.splitlines()

@@ -61,7 +61,7 @@ def test_every_lidar_case_holds():
     assert [row["case"] for row in rows if not row["good"]] == [] and len(rows) == 41
 
 
-def test_a_wrong_range_is_told():
+def test_a_wrong_range_is_found():
     true = np.array([1.0, 2.0, math.inf])
     assert lidar._row("", true, true, 1e-5)["good"]
     for wrong in ([1.0, 2.1, math.inf], [1.0, math.inf, math.inf], [1.0, 2.0, 3.0], [1.0, math.nan, math.inf]):

@@ -95,7 +95,7 @@ def test_updates_see_both_sides():
         ),
     ],
 )
-def test_what_has_no_image_is_told_in_one_line(overrides, message):
+def test_what_has_no_mirror_image_is_refused_in_one_line(overrides, message):
     with pytest.raises(ConfigError, match=message) as error:
         build_runner(build.assemble(config.compose([*overrides, "num_envs=2"])), None)
     assert "\n" not in str(error.value)

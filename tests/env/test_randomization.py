@@ -237,7 +237,7 @@ class TestLatency:
         assert (env.state.measured.joint_pos[0] != env.state.default_joint_pos).any()
 
 
-def test_a_reset_draws_anew_for_that_environment_only(make_env):
+def test_a_reset_draws_for_that_environment_only(make_env):
     env = make_env("randomization=paper", "obstacles=none", blind=True)
     before = {name: env.sim.model_field(name).clone() for name in MODEL_FIELDS}
     env.sim.qpos[2, 2] = 0.05

@@ -243,7 +243,7 @@ class TestParts:
         if whole.sensing.unseen is not None:
             assert torch.equal(whole.sensing.unseen, parts.sensing.unseen)
 
-    def test_what_reads_whole_clouds_is_told(self, make_env):
+    def test_reading_a_whole_cloud_that_does_not_fit_is_refused(self, make_env):
         env = make_env("obstacles=static", "lidar.cloud_mb=0.1", num_envs=5)
         with pytest.raises(ValueError, match=r"5 environments take more than lidar\.cloud_mb=0\.1"):
             _ = env.sensing.frame

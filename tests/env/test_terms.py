@@ -81,7 +81,7 @@ def test_unknown_requirements_are_refused():
         requires("foot_forces")
 
 
-def test_what_nobody_reads_is_not_computed(make_env):
+def test_a_quantity_that_is_not_read_is_not_computed(make_env):
     env = make_env("obstacles=moving", blind=True)
     computed = set()
     env.step_hooks.append(lambda: computed.update(vars(env.state)))

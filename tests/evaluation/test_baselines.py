@@ -26,7 +26,7 @@ class TestSteered:
         policy(env.get_observations())
         return heard[0]
 
-    def test_is_told_the_sum_within_what_it_has_learned(self, make_env):
+    def test_is_commanded_the_sum_within_its_trained_range(self, make_env):
         env = make_env(*BLIND, "scenario=static", "num_envs=2", "commands.spawn.yaw_deg=[0,0]")
         env.sim.mocap_pos[..., 2] = -100.0
         env.sim.mocap_pos[1, 2] = torch.tensor([50.0, 0.0, 0.3])

@@ -88,8 +88,8 @@ def test_files_and_tables(walker, capsys):
     assert "ending at the first contact" in printed and "scripted" in printed and "time out" in printed
 
 
-def test_only_a_law_that_the_policy_does_not_know_is_clipped(monkeypatch):
-    """To the walker's commands; a run whose own command follows from the law is given all of V_avoid."""
+def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
+    """To the range of the walker's commands; a run that computes V_avoid itself is given all of it."""
     given = []
 
     def spy(env, policy, avoidance, limits):
@@ -119,7 +119,7 @@ def test_environments_default_to_even_rounds(walker):
         ({"overrides": ["scenario=rod"]}, "scenario=rod is not an override here"),
     ],
 )
-def test_mistakes_are_told_before_anything_runs(walker, given, message):
+def test_mistakes_are_refused_before_anything_runs(walker, given, message):
     with pytest.raises(ConfigError, match=message):
         Evaluation(**{"run_dir": walker, "scenarios": ["static"], **given})
 
@@ -129,7 +129,7 @@ def test_a_blind_run_cannot_be_blinded(walker):
         evaluate(Evaluation(walker, ["static"], ["blind"], trials=1, plots=False, overrides=[SHORT]))
 
 
-def test_missing_matplotlib_is_told_first(walker, monkeypatch):
+def test_missing_matplotlib_is_refused_first(walker, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(PlotsUnavailable, match=r"pip install 'omniperception\[plots\]'"):
         evaluate(Evaluation(walker, ["static"], trials=1))

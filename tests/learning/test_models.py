@@ -113,7 +113,7 @@ def test_another_environment_of_the_same_tick_is_embedded():
     assert not torch.allclose(first, second)
 
 
-def test_a_reset_alone_embeds_nothing_anew():
+def test_a_reset_alone_embeds_nothing_again():
     env = ToyEnv(4)
     advance(env, 10)
     actor = actor_for(env)

@@ -264,7 +264,7 @@ def test_a_sensor_that_goes_on_from_a_saved_state_casts_the_same():
     assert torch.equal(first.frame.ranges, second.frame.ranges)
 
 
-def test_moments_that_are_missing_are_told():
+def test_missing_moments_are_refused():
     lidar = Lidar(LidarConfig(NUM_RAYS, PERIOD, motion_segments=3), fan(), wall_scene(), 0)
     lidar.cast(PERIOD)  # the very first frame has none
     lidar.record_poses()

@@ -80,7 +80,7 @@ def test_classes_and_geoms_are_chosen_by_rule(model):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_rays_meet_what_mj_ray_meets(model, seed):
+def test_rays_hit_what_mj_ray_hits(model, seed):
     data, rng = random_data(model, seed)
     scene = MujocoScene(model, num_envs=2)
     scene.copy_data(data)

@@ -106,7 +106,7 @@ def test_phase_shifts_each_environment(pattern):
     assert rows[:, 0].tolist() == [0, 799_999] and rows[1, 1] == 1998
 
 
-def test_first_rows_write_where_they_are_told(pattern):
+def test_first_rows_write_into_the_given_tensor(pattern):
     out, scratch = torch.zeros(3, dtype=torch.int64), torch.zeros(3, dtype=torch.float64)
     times = seconds(0.1, 0.7, 9.3)
     assert pattern.first_rows(times, 0.1, 5, out, scratch) is out
@@ -131,7 +131,7 @@ def test_more_rays_than_points_are_refused(pattern):
         (lambda: tiny(origins_s=torch.full((6, 3), math.inf)), "origins_s must be finite"),
     ],
 )
-def test_wrong_patterns_are_told_in_one_line(make, message):
+def test_wrong_patterns_are_refused_in_one_line(make, message):
     with pytest.raises(ValueError, match=message) as error:
         make()
     assert "\n" not in str(error.value)

@@ -38,7 +38,7 @@ def test_the_pattern_has_the_devices_rate(device):
     assert pattern.points_per_frame(1.0 / spec.frame_hz) == pytest.approx(whole, abs=1.0)
 
 
-def test_figures_make_sense_and_have_a_source(device):
+def test_parameters_are_plausible_and_have_a_source(device):
     _, spec, _ = device
     assert 0.0 <= spec.min_range < spec.max_range and 0.0 < spec.range_sigma < 0.1
     assert spec.angle_sigma_deg is None or 0.0 < spec.angle_sigma_deg <= 0.15

@@ -44,7 +44,7 @@ def test_height_scanner_is_a_grid_of_vertical_rays():
         ((1.6, 1.0, 0.0), "lidar.pattern.spacing=0.0 must be a positive length"),
     ],
 )
-def test_wrong_height_scanners_are_told(arguments, message):
+def test_wrong_height_scanners_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         height_scanner(*arguments)
 
@@ -87,7 +87,7 @@ def test_a_csv_of_one_row(tmp_path):
         ("scan.npy", "no array", "rad", "cannot be read as numbers"),
     ],
 )
-def test_wrong_files_are_told_in_one_line(tmp_path, name, content, unit, message):
+def test_wrong_files_are_refused_in_one_line(tmp_path, name, content, unit, message):
     if content is not None:
         (tmp_path / name).write_text(content)
     with pytest.raises((ValueError, FileNotFoundError), match=message) as error:

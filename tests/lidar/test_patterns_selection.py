@@ -87,7 +87,7 @@ class TestVariants:
         assert long.seen > 2.0 * short.seen
 
     @pytest.mark.parametrize("strategy", STRATEGIES)
-    def test_they_are_written_where_told(self, selections, strategy):
+    def test_they_are_written_into_the_given_tensor(self, selections, strategy):
         selection = selections[strategy]
         first, frame = torch.arange(8) * 4000, torch.tensor([2], dtype=torch.int32)
         out = torch.full((8,), -1)
@@ -195,7 +195,7 @@ class TestCells:
             SphereCells(0.0)
 
 
-def test_wrong_selections_are_told_in_one_line(rosette):
+def test_wrong_selections_are_refused_in_one_line(rosette):
     with pytest.raises(ValueError, match=r"lidar.selection='best' must be one of every_kth, stratified"):
         make_selection(rosette, 0.1, 10, "best")
     for strategy in STRATEGIES:

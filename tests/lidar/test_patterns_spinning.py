@@ -171,7 +171,7 @@ def test_a_ray_looks_where_its_laser_is_at_its_time():
         (lambda: spinning([0.0], 1.0, 10.0), "cycle_s=10.0 must be shorter than a turn"),
     ],
 )
-def test_wrong_devices_are_told_in_one_line(make, message):
+def test_wrong_devices_are_refused_in_one_line(make, message):
     with pytest.raises(ValueError, match=message) as error:
         make()
     assert "\n" not in str(error.value)

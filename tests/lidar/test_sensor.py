@@ -308,7 +308,7 @@ def test_several_sensors_see_one_scene_at_their_own_rates(pattern):
     assert torch.equal(front.frame.ranges, single.ranges) and torch.equal(front.frame.row, single.row)
 
 
-def test_keeping_the_first_part_of_each_frame_is_told():
+def test_keeping_the_first_part_of_each_frame_warns():
     """Every second point would be of two lasers alone, so 10,000 of 20,000 are the first 10,000."""
     angles = torch.linspace(-0.5, 0.5, 20_000).numpy()
     pattern = ScanPattern.from_angles(angles, 2.0 * angles, 200_000.0, num_lasers=4)

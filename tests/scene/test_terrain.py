@@ -161,7 +161,7 @@ class TestSurface:
         assert down == pytest.approx(2.0)
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_heights_are_those_that_mj_ray_meets(self, env, dtype):
+    def test_heights_are_those_that_mj_ray_hits(self, env, dtype):
         generator = torch.Generator().manual_seed(0)
         xy = (torch.rand(20, 200, 2, generator=generator, dtype=dtype) - 0.5) * 12.0
         xy[:, 0] = 0.0
@@ -215,7 +215,7 @@ class TestSurface:
             np.testing.assert_allclose(env.state.heights[i], expected, atol=5e-5)
         assert (env.state.heights.amax(1) - env.state.heights.amin(1)).max() > 0.02
 
-    def test_rays_meet_the_surface_that_mj_ray_meets(self, make_config):
+    def test_rays_hit_the_surface_that_mj_ray_hits(self, make_config):
         run = make_config(*SMALL, "obstacles=mixed", "obstacles.groups.walker.count=1")
         world = build_world(run.env.robot, run.env.terrain, run.env.obstacles)
         shapes = ray_shapes(world)
