@@ -44,6 +44,11 @@ def rotate(quat, vectors):
     return vectors + w * across + torch.linalg.cross(xyz, across)
 
 
+def turn(quat, points):
+    """NumPy points (N, 3) turned by a unit quaternion, in float64."""
+    return rotate(torch.as_tensor(quat, dtype=torch.float64), torch.as_tensor(points, dtype=torch.float64)).numpy()
+
+
 def multiply(a, b):
     """Hamilton product of quaternions (..., 4)."""
     w, v = a[..., :1], a[..., 1:]

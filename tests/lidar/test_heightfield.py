@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from lidar_helpers import cast
+from lidar_helpers import cast, rotate, turn
 
 from omniperception.lidar import HeightField, Lidar, LidarConfig, RayScene, ScanPattern, Shape, ShapeKind, TriangleMesh
 from omniperception.lidar.kernels.march_block import REACHES
@@ -37,8 +37,7 @@ def test_the_surface_is_that_of_its_triangles(rows, cols, scale):
     above = 3.0 * scale  # from there no ray comes to a wall first
     targets = rng.uniform(-1, 1, (3000, 3)) * (1.4 * scale, 0.65 * scale, 0.0)
     origins = targets * 0.3 + rng.normal(size=(3000, 3)) * 0.1 * scale + (0.0, 0.0, above)
-    w, v = shape.quat[0], np.array(shape.quat[1:])
-    origins, targets = (p + 2 * np.cross(v, np.cross(v, p) + w * p) + shape.pos for p in (origins, targets))
+    origins, targets = (turn(shape.quat, points) + shape.pos for points in (origins, targets))
     ours, expected = (cast(RayScene([s], 1, 0), origins, targets - origins, normals=True) for s in (shape, mesh))
     assert expected.ranges.isfinite().float().mean() > 0.95
     both = ours.ranges.isfinite() & expected.ranges.isfinite()
@@ -163,40 +162,21 @@ def test_a_scan_hits_what_single_rays_hit(base, scale):
     field = HeightField(heights, 12.0 * scale, 10.0 * scale, base * scale, scale)
     pos, quat = scale * np.array([30.0, -20.0, 1.0]), np.array([math.cos(0.3), 0.0, 0.0, math.sin(0.3)])
     shapes = [Shape(ShapeKind.HEIGHTFIELD, asset=field, pos=tuple(pos), quat=tuple(quat))]
-    places = [
-        (0, 0, 3.2),
-        (4, 5, 3.0),
-        (11.99, -9.99, 3.1),
-        (-7, 2, 0.1),
-        (1, 1, -0.2),
-        (1, 2, -5),
-        (3, 3, 20),
-        (-14, 0, 1),
-    ]
-    places = scale * np.array(places, np.float64)
-    pairs = np.stack([places, places])  # upright and tilted
-    turn = np.array([[math.cos(0.6), -math.sin(0.6), 0], [math.sin(0.6), math.cos(0.6), 0], [0, 0, 1]])
-    origins = torch.from_numpy(pairs.reshape(-1, 3) @ turn.T + pos)
+    above, below = [(0, 0, 3.2), (4, 5, 3.0), (11.99, -9.99, 3.1), (3, 3, 20)], [(-7, 2, 0.1), (1, 1, -0.2), (1, 2, -5)]
+    places = scale * np.array([*above, *below, (-14, 0, 1)])
+    origins = torch.from_numpy(turn(quat, np.tile(places, (2, 1))) + pos)  # upright and tilted
     scene = RayScene(shapes, len(origins), 1, pose_dtype=torch.float64)
     scene.body_pos[:, 0] = origins
     scene.body_quat[:, 0] = torch.tensor([1.0, 0, 0, 0])
     tilt = torch.from_numpy(rng.normal(size=(len(places), 4)))
-    scene.body_quat[len(places) :, 0] = tilt / tilt.norm(dim=-1, keepdim=True)
+    scene.body_quat[len(places) :, 0] = torch.nn.functional.normalize(tilt, dim=-1)
     pattern = ScanPattern.from_angles(np.arcsin(rng.uniform(-1, 1, 3000)), rng.uniform(0, 2 * np.pi, 3000), 30000.0)
-    lidar = Lidar(
-        LidarConfig(3000, min_range=0.0, max_range=40.0 * scale),
-        pattern,
-        scene,
-        0,
-        outputs=("ranges", "directions_s", "normals_w"),
-    )
+    config = LidarConfig(3000, min_range=0.0, max_range=40.0 * scale)
+    lidar = Lidar(config, pattern, scene, 0, outputs=("ranges", "directions_s", "normals_w"))
     frame = lidar.cast(0.3)
-    directions = frame.directions_s.double()
-    w, v = scene.body_quat[:, :1, :1], scene.body_quat[:, :1, 1:].expand_as(directions)
-    directions = directions + 2 * torch.linalg.cross(v, torch.linalg.cross(v, directions) + w * directions)
-    single = scene.cast(
-        origins[:, None].expand_as(directions).contiguous(), directions, max_range=40.0 * scale, normals=True
-    )
+    directions = rotate(scene.body_quat, frame.directions_s.double())
+    starts = origins[:, None].expand_as(directions).contiguous()
+    single = scene.cast(starts, directions, max_range=40.0 * scale, normals=True)
     assert 0.3 < single.ranges.isfinite().float().mean() < 0.9
     near = (frame.ranges - single.ranges).abs() <= 1e-5 + 1e-5 * single.ranges
     same = near | (frame.ranges == single.ranges)

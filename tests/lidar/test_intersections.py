@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-import torch
+from lidar_helpers import cast, one
 
 from benchmarks.lidar_accuracy import cases, compare
 from omniperception.lidar import RayScene, Shape, ShapeKind
@@ -18,13 +18,6 @@ def test_ranges_are_those_of_mj_ray(case):
     tally = compare(case, num_rays=3000, seed=1, rays_per_scene=500)
     assert tally.unexplained == 0, tally.examples
     assert tally.share_within >= 0.999 and tally.hits > 200
-
-
-def single(shape, origin, direction, **options):
-    scene = RayScene([shape], num_envs=1, num_bodies=0)
-    ray = [torch.tensor([[v]], dtype=torch.float32) for v in (origin, direction)]
-    hits = scene.cast(*ray, **options)
-    return float(hits.ranges), int(hits.shape_id)
 
 
 HALF_ROOT = math.sqrt(0.5)
@@ -62,9 +55,9 @@ CLOSED_FORMS = [
     ("shape", "origin", "direction", "expected"), [c[1:] for c in CLOSED_FORMS], ids=[c[0] for c in CLOSED_FORMS]
 )
 def test_closed_forms(shape, origin, direction, expected):
-    distance, shape_id = single(shape, origin, direction)
-    assert distance == pytest.approx(expected, abs=1e-6)
-    assert shape_id == (0 if math.isfinite(expected) else -1)
+    hits = cast(RayScene([shape], 1, 0), origin, direction)
+    assert float(hits.ranges) == pytest.approx(expected, abs=1e-6)
+    assert int(hits.shape_id) == (0 if math.isfinite(expected) else -1)
 
 
 NORMALS = [
@@ -84,23 +77,24 @@ NORMALS = [
     ("shape", "origin", "direction", "expected"), [c[1:] for c in NORMALS], ids=[c[0] for c in NORMALS]
 )
 def test_normals_point_outwards(shape, origin, direction, expected):
-    scene = RayScene([shape], num_envs=1, num_bodies=0)
-    ray = [torch.tensor([[v]], dtype=torch.float32) for v in (origin, direction)]
-    np.testing.assert_allclose(scene.cast(*ray, normals=True).normals_w[0, 0].numpy(), expected, atol=1e-6)
+    hits = cast(RayScene([shape], 1, 0), origin, direction, normals=True)
+    np.testing.assert_allclose(hits.normals_w[0, 0].numpy(), expected, atol=1e-6)
 
 
-def test_max_range_and_exclusion():
-    sphere = Shape(K.SPHERE, (1.0,))
-    assert single(sphere, (-3, 0, 0), (1, 0, 0), max_range=1.9) == (math.inf, -1)
-    assert single(sphere, (-3, 0, 0), (1, 0, 0), max_range=2.1)[1] == 0
-    assert single(sphere, (-3, 0, 0), (1, 0, 0), exclude_shapes=(0,)) == (math.inf, -1)
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [({"max_range": 1.9}, math.inf), ({"max_range": 2.1}, 2.0), ({"exclude_shapes": (0,)}, math.inf)],
+)
+def test_max_range_and_exclusion(options, expected):
+    hits = cast(RayScene([Shape(K.SPHERE, (1.0,))], 1, 0), (-3, 0, 0), (1, 0, 0), **options)
+    assert float(hits.ranges) == expected and int(hits.shape_id) == (0 if expected == 2.0 else -1)
 
 
 def test_thin_and_far_shapes_keep_their_accuracy():
-    rod = Shape(K.CAPSULE, (0.01, 1.0), pos=(39.0, 0.0, 0.0))
-    assert single(rod, (0, 0, 0), (1, 0, 0))[0] == pytest.approx(38.99, abs=1e-5)
-    assert single(rod, (0, 0.0095, 0), (1, 0, 0))[1] == 0
-    assert single(rod, (0, 0.0105, 0), (1, 0, 0))[1] == -1
+    rod = [Shape(K.CAPSULE, (0.01, 1.0), pos=(39.0, 0.0, 0.0))]
+    assert one(rod, (0, 0, 0), (1, 0, 0)) == pytest.approx(38.99, abs=1e-5)
+    assert one(rod, (0, 0.0095, 0), (1, 0, 0)) < 39.0
+    assert one(rod, (0, 0.0105, 0), (1, 0, 0)) == math.inf
 
 
 @pytest.mark.parametrize("height", [0.3, 3.0])
@@ -111,9 +105,7 @@ def test_grazing_the_ground(height, angle):
     turn = np.array([[1, 0, 0], [0, math.cos(0.4), -math.sin(0.4)], [0, math.sin(0.4), math.cos(0.4)]])
     origin = turn @ np.array([0.0, 0.0, height])
     direction = turn @ np.array([math.cos(1.1) * math.cos(angle), math.sin(1.1) * math.cos(angle), -math.sin(angle)])
-    scene = RayScene([Shape(K.PLANE, quat=tilt)], 1, 0)
-    hits = scene.cast(torch.from_numpy(origin)[None, None], torch.from_numpy(direction)[None, None])
-    assert float(hits.ranges) == pytest.approx(height / math.sin(angle), rel=2e-7)
+    assert one([Shape(K.PLANE, quat=tilt)], origin, direction) == pytest.approx(height / math.sin(angle), rel=2e-7)
 
 
 @pytest.mark.parametrize(

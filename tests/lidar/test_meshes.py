@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from lidar_helpers import CUBE, CUBE_FACES, cast, one
+from lidar_helpers import CUBE, CUBE_FACES, cast, one, turn
 
 from benchmarks.lidar_accuracy import random_mesh
 from omniperception.lidar import RayScene, Shape, ShapeKind, TriangleMesh
@@ -70,8 +70,7 @@ def test_no_ray_leaves_a_closed_room(scale, place):
     scene = RayScene([mesh_shape(vertices, faces, body=0)], 1, 1, pose_dtype=torch.float64)
     scene.body_pos[:] = place
     scene.body_quat[0, 0] = torch.from_numpy(quat)
-    w, v = quat[0], quat[1:]
-    turned = vertices + 2 * np.cross(v, np.cross(v, vertices) + w * vertices) + place
+    turned = turn(quat, vertices) + place
     edges = np.concatenate([turned[faces[:, [k, (k + 1) % 3]]] for k in range(3)])
     along = rng.uniform(0, 1, (len(edges), 1))
     targets = np.concatenate([turned, edges.mean(1), edges[:, 0] * along + edges[:, 1] * (1 - along)])
@@ -227,23 +226,6 @@ def test_vertices_written_in_place_and_refitted():
     scene.vertices(0)[1] *= 2.0
     scene.refit()
     assert cast(scene, *ray).ranges.tolist() == [[4.0], [3.0]]
-
-
-def test_rigid_and_deformable_and_exact_shapes_in_one_scene():
-    mesh = TriangleMesh(CUBE, CUBE_FACES)
-    shapes = [
-        Shape(ShapeKind.DEFORMABLE, asset=mesh, body=0),
-        Shape(ShapeKind.MESH, asset=mesh, body=1),
-        Shape(ShapeKind.SPHERE, (1.0,), pos=(0, 0, 5)),
-        Shape(ShapeKind.DEFORMABLE, asset=mesh, pos=(0, 0, -9)),
-    ]
-    scene = RayScene(shapes, num_envs=2, num_bodies=2)
-    scene.body_pos[:] = torch.tensor([[4.0, 0, 0], [0, 6.0, 0]])
-    scene.update_vertices(0, torch.from_numpy(CUBE) * torch.tensor([1.0, 2.0]).reshape(2, 1, 1))
-    directions = [[(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)]] * 2
-    hits = cast(scene, np.zeros((2, 4, 3)), directions)
-    assert hits.ranges.tolist() == [[3.0, 5.0, 4.0, 8.0], [2.0, 5.0, 4.0, 8.0]]
-    assert hits.shape_id.tolist() == [[0, 1, 2, 3]] * 2
 
 
 def test_a_vertex_that_is_not_finite_takes_its_triangles_away_for_that_frame():
