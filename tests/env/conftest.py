@@ -1,6 +1,11 @@
-"""Fixtures of these tests."""
+"""Fixtures of these tests; helpers beside the tests are importable by name."""
+
+import sys
+from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture(autouse=True)

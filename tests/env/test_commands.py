@@ -14,32 +14,21 @@ N = 4000
 
 
 def velocity_command(**settings):
-    config = VelocityCommandConfig(
-        **{
-            "lin_vel_x": (-0.5, 1.0),
-            "lin_vel_y": (-0.3, 0.3),
-            "ang_vel_z": (0.2, 0.8),
-            "resample_s": 1.0,
-            "standing": 0.0,
-            "spawn": SpawnConfig(),
-            **settings,
-        }
-    )
+    ranges = {"lin_vel_x": (-0.5, 1.0), "lin_vel_y": (-0.3, 0.3), "ang_vel_z": (0.2, 0.8)}
+    times = {"resample_s": 1.0, "standing": 0.0}
+    config = VelocityCommandConfig(**{**ranges, **times, "spawn": SpawnConfig(), **settings})
     command = config.build(N, torch.device("cpu"), EnvRandom(0, N))
     command.reset(torch.arange(N), None)
     return command
 
 
-def test_commands_fill_their_ranges():
+def test_commands_fill_their_ranges_and_some_stand():
     value = velocity_command().value
     low, high = torch.tensor([-0.5, -0.3, 0.2]), torch.tensor([1.0, 0.3, 0.8])
     assert (value >= low).all() and (value <= high).all()
     torch.testing.assert_close(value.amin(0), low, atol=0.01, rtol=0)
     torch.testing.assert_close(value.amax(0), high, atol=0.01, rtol=0)
     torch.testing.assert_close(value.mean(0), (low + high) / 2, atol=0.03, rtol=0)
-
-
-def test_standing_share():
     value = velocity_command(standing=0.3).value
     assert (value == 0).all(1).float().mean().item() == pytest.approx(0.3, abs=0.03)
     assert ((value == 0).all(1) | (value != 0).all(1)).all()
@@ -89,6 +78,7 @@ def robots(positions, yaws):
 
 class TestGoal:
     line = GoalCommandConfig((10.0, 10.0), (0.0, 0.0), None, 0.8, 2.0, 1.0, SpawnConfig())
+    box = GoalCommandConfig([6.0, 7.5], [-1.5, 1.5], 0.5, 0.8, 2.0, 1.0, SpawnConfig())
     point = GoalCommandConfig((3.0, 3.0), (4.0, 4.0), 0.5, 0.8, 2.0, 1.0, SpawnConfig())
 
     def command(self, positions, yaws, config=line):
@@ -109,13 +99,10 @@ class TestGoal:
         value, _ = self.command([[0.0, 0.0]] * 3, [0.1, 3.1, -3.1])
         assert value[:, 2].tolist() == pytest.approx([-0.2, -1.0, 1.0], abs=1e-6)
 
-    def test_reached(self):
-        _, reached = self.command([[9.99, 0.0], [10.01, 3.0]], [0.0, 0.0])
-        assert reached.tolist() == [False, True]
-
-    def test_speed_is_kept_everywhere(self):
-        value, _ = self.command([[9.9, 3.0], [12.0, -1.0], [-20.0, 0.5]], [0.3, -2.0, 1.0])
+    def test_speed_is_kept_everywhere_and_the_line_is_reached_behind_it(self):
+        value, reached = self.command([[9.99, 3.0], [10.01, -1.0], [-20.0, 0.5]], [0.3, -2.0, 1.0])
         torch.testing.assert_close(value[:, :2].norm(dim=1), torch.full((3,), 0.8))
+        assert reached.tolist() == [False, True, False]
 
     def test_a_point_is_aimed_at_and_reached_within_its_radius(self):
         value, reached = self.command(
@@ -126,9 +113,8 @@ class TestGoal:
         assert reached.tolist() == [False, False, True, False]
 
     def test_goals_fill_their_box_and_change_with_the_episode(self):
-        box = GoalCommandConfig([6.0, 7.5], [-1.5, 1.5], 0.5, 0.8, 2.0, 1.0, SpawnConfig())
         kinematics = robots([[0.0, 0.0]] * N, [0.0] * N)
-        command = box.build(N, torch.device("cpu"), EnvRandom(0, N))
+        command = self.box.build(N, torch.device("cpu"), EnvRandom(0, N))
         command.reset(torch.arange(N), kinematics)
         goal = command.goal_w.clone()
         torch.testing.assert_close(goal.amin(0), torch.tensor([6.0, -1.5]), atol=0.01, rtol=0)
@@ -138,9 +124,8 @@ class TestGoal:
         assert (command.goal_w != goal).any(1).nonzero().flatten().tolist() == [2]
 
     def test_a_saved_goal_goes_on(self):
-        box = GoalCommandConfig([6.0, 7.5], [-1.5, 1.5], 0.5, 0.8, 2.0, 1.0, SpawnConfig())
         kinematics = robots([[0.0, 0.0]] * 3, [0.0] * 3)
-        first, second = (box.build(3, torch.device("cpu"), EnvRandom(seed, 3)) for seed in (1, 2))
+        first, second = (self.box.build(3, torch.device("cpu"), EnvRandom(seed, 3)) for seed in (1, 2))
         for command in (first, second):
             command.reset(torch.arange(3), kinematics)
         assert not torch.equal(first.goal_w, second.goal_w)

@@ -1,4 +1,4 @@
-"""The environment's step: determinism, isolation, anomalies, terminations, symmetry, saved states."""
+"""The environment's step: seeds, terminations, symmetry, what a run without LiDAR leaves out, observations."""
 
 import math
 
@@ -6,54 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-
-from omniperception.learning import load_checkpoint, save_checkpoint
-
-FULL = ("obstacles=moving", "randomization=paper", "perception=pd_risknet", "rewards=paper")
-
-
-def random_actions(env, steps, seed=0, scale=1.0):
-    generator = torch.Generator().manual_seed(seed)
-    return scale * torch.randn(steps, env.num_envs, env.num_actions, generator=generator)
-
-
-def rows(observations, env_ids):
-    return {name: observations[name][env_ids].clone() for name in observations.keys()}  # noqa: SIM118
-
-
-def assert_equal(a, b):
-    assert a.keys() == b.keys()
-    for name in a:
-        assert torch.equal(a[name], b[name]), name
-
-
-def trajectory(env, actions, env_ids=slice(None), before_step=None):
-    """Observations, rewards and ends of every step."""
-    record = []
-    for step, action in enumerate(actions):
-        if before_step is not None:
-            before_step(step)
-        observations, reward, done, extras = env.step(action)
-        record.append(
-            {
-                **rows(observations, env_ids),
-                "reward": reward[env_ids].clone(),
-                "done": done[env_ids].clone(),
-                "time_outs": extras["time_outs"][env_ids].clone(),
-            }
-        )
-    return record
-
-
-def test_two_environments_of_one_configuration_are_bit_identical(make_env):
-    short = "terminations.episode_length_s=0.5"
-    first, second = (make_env(*FULL, short) for _ in range(2))
-    actions = random_actions(first, 60)
-    one, other = trajectory(first, actions), trajectory(second, actions)
-    for a, b in zip(one, other, strict=True):
-        assert_equal(a, b)
-    assert sum(int(step["done"].sum()) for step in one) >= 8  # every robot has been reset twice
-    assert (one[-1]["frames"] != 0).any()
+from stepping import FULL, OTHERS, random_actions, still
 
 
 def test_seeds_differ(make_env):
@@ -62,77 +15,7 @@ def test_seeds_differ(make_env):
     assert not torch.equal(first.sim.mocap_pos, second.sim.mocap_pos)
 
 
-def test_a_fall_in_one_environment_changes_nothing_in_the_others(make_env):
-    quiet, disturbed = make_env(*FULL), make_env(*FULL)
-    actions = random_actions(quiet, 30, scale=0.3)
-
-    def knock_over(step):
-        if step in (7, 18):
-            disturbed.sim.qpos[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
-
-    others = torch.tensor([0, 2, 3])
-    expected = trajectory(quiet, actions, others)
-    got = trajectory(disturbed, actions, others, knock_over)
-    for a, b in zip(expected, got, strict=True):
-        assert_equal(a, b)
-    assert disturbed.episode_length_buf.tolist() == [30, 11, 30, 30]
-
-
-@pytest.mark.parametrize("field", ["qpos", "qvel"])
-@pytest.mark.parametrize("step", [7, 9])  # step index 9 ends with a LiDAR frame
-def test_a_diverged_environment_is_reset_counted_and_stays_alone(make_env, field, step):
-    healthy, broken = (make_env(*FULL, "ppo.num_steps_per_env=20") for _ in range(2))
-    actions = random_actions(healthy, 20, scale=0.3)
-    others = torch.tensor([0, 2, 3])
-
-    def poison(now):
-        if now == step:
-            getattr(broken.sim, field)[1, 2] = float("nan")
-
-    expected = trajectory(healthy, actions, others)
-    for now, action in enumerate(actions):
-        poison(now)
-        observations, reward, done, extras = broken.step(action)
-        assert_equal(expected[now], {**rows(observations, others), **ends(reward, done, extras, others)})
-        assert torch.isfinite(reward).all()
-        for name in observations.keys():  # noqa: SIM118
-            assert torch.isfinite(observations[name].float()).all(), (now, name)
-        assert done[1] == (now == step)
-        assert extras["time_outs"][1] == 0
-        if now == step:
-            assert reward[1] == 0 and broken.outcomes["diverged"].tolist() == [False, True, False, False]
-    assert extras["log"]["Anomalies/diverged"] == 1
-    assert all(math.isfinite(value) for value in extras["log"].values())
-
-
-def ends(reward, done, extras, env_ids):
-    return {
-        "reward": reward[env_ids].clone(),
-        "done": done[env_ids].clone(),
-        "time_outs": extras["time_outs"][env_ids].clone(),
-    }
-
-
-def test_a_saved_state_goes_on_bit_for_bit(make_env, tmp_path):
-    short = "terminations.episode_length_s=0.9"
-    whole, resumed = (make_env(*FULL, short, f"seed={seed}") for seed in (1, 1))
-    actions = random_actions(whole, 77)
-    trajectory(whole, actions[:37])
-    trajectory(resumed, actions[:11])  # whatever it did before is forgotten
-    save_checkpoint(tmp_path / "state.pt", whole.state_dict())
-    resumed.load_state_dict(load_checkpoint(tmp_path / "state.pt"))
-    everyone = torch.arange(4)
-    assert_equal(rows(whole.get_observations(), everyone), rows(resumed.get_observations(), everyone))
-    expected, got = trajectory(whole, actions[37:]), trajectory(resumed, actions[37:])
-    for a, b in zip(expected, got, strict=True):
-        assert_equal(a, b)
-    assert sum(int(step["done"].sum()) for step in expected) >= 4
-
-
 class TestTerminations:
-    def still(self, env):
-        return torch.zeros(env.num_envs, env.num_actions)
-
     def outcome(self, env, name):
         return env.outcomes[name].nonzero().flatten().tolist()
 
@@ -143,7 +26,7 @@ class TestTerminations:
         env.sim.qpos[0, 3:7] = torch.tensor([math.cos(half[0]), math.sin(half[0]), 0.0, 0.0])
         env.sim.qpos[1, 3:7] = torch.tensor([math.cos(half[1]), 0.0, math.sin(half[1]), 0.0])
         env.sim.qpos[2, 2] = 0.1
-        _, _, done, extras = env.step(self.still(env))
+        _, _, done, extras = env.step(still(env))
         assert done.tolist() == [0, 1, 1, 0]
         assert self.outcome(env, "fall") == [1, 2]
         assert extras["time_outs"].sum() == 0
@@ -153,7 +36,7 @@ class TestTerminations:
         for step in range(5):
             if step == 4:
                 env.sim.qpos[3, 2] = 0.05  # falls in the very step of the time limit
-            _, _, done, extras = env.step(self.still(env))
+            _, _, done, extras = env.step(still(env))
             assert done.all() == (step == 4)
         assert self.outcome(env, "time_out") == [0, 1, 2]
         assert extras["time_outs"].tolist() == [1, 1, 1, 0]
@@ -166,7 +49,7 @@ class TestTerminations:
         env = make_env(f"terminations={preset}", "obstacles=static", blind=True)
         env.sim.mocap_pos[2, 0, :2] = env.sim.qpos[2, :2]
         env.sim.mocap_pos[2, 0, 2] = 0.3
-        _, _, done, _ = env.step(self.still(env))
+        _, _, done, _ = env.step(still(env))
         assert env.contacts.tolist() == [False, False, True, False]
         assert done.tolist() == [0, 0, int(ends), 0]
         assert self.outcome(env, "collision_end") == ([2] if ends else [])
@@ -179,14 +62,14 @@ class TestTerminations:
         env.obstacles.velocity_w[:] = 0.0
         env.sim.mocap_pos[1, 0] = torch.tensor([-1.0, 0.0, 0.8])
         env.obstacles.velocity_w[1, 0, 0] = 200.0  # 1 m per physics step, 4 m per control step
-        env.step(self.still(env))
+        env.step(still(env))
         assert env.contacts.tolist() == [False, True, False, False]
         assert env.sim.mocap_pos[1, 0, 0] > 1.0
 
     def test_goal(self, make_env):
         env = make_env("commands=corridor", "obstacles=corridor", blind=True)
         env.sim.qpos[2, 0] = 11.6
-        _, _, done, extras = env.step(self.still(env))
+        _, _, done, extras = env.step(still(env))
         assert done.tolist() == [0, 0, 1, 0] and self.outcome(env, "goal") == [2]
         assert extras["time_outs"].sum() == 0
 
@@ -234,7 +117,7 @@ class TestYawEquivariance:
             for action in random_actions(env, 5, scale=0.5):
                 observations, reward, done, _ = env.step(action)
             assert env.sensing.due(env.step_count) and not done.any()
-            outcomes.append({**rows(observations, [0]), "reward": reward})
+            outcomes.append({**dict(observations), "reward": reward})
         straight, turned = outcomes
         assert (envs[0].avoidance.sector_distance < 1).any()
         assert envs[0].avoidance.velocity.norm() > 0.1
@@ -257,11 +140,6 @@ class TestWithoutLidar:
         assert not any("rays" in stage or "sampling" in stage or "sectors" in stage for stage in stages)
         assert "Time/physics_us_per_env_step" in stages
 
-    def test_a_reward_alone_keeps_the_lidar_without_frames(self, make_env):
-        env = make_env("perception=none")
-        assert env.sensing is not None and env.sensing.frames is None
-        assert "frames" not in env.get_observations().keys()  # noqa: SIM118
-
     def test_free_ground_has_no_obstacle_stage(self, make_env):
         env = make_env("obstacles=none", blind=True)
         env.step(torch.zeros(4, 12))
@@ -277,21 +155,13 @@ def test_observations_have_history_and_forget_at_a_reset(make_env):
     actions = random_actions(env, 3)
     env.step(actions[0])
     before = env.step(actions[1])[0]["proprioception"].unflatten(1, (10, 33)).clone()
-    env.sim.qpos[2, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
-    after = env.step(actions[2])[0]["proprioception"].unflatten(1, (10, 33))
-    others = [0, 1, 3]
-    assert torch.equal(after[others, :-1], before[others, 1:])
-    assert (after[2] == after[2, :1]).all()
-    assert after[2, 0, :12].abs().max() < 1e-6 and after[2, 0, -3:].tolist() == [0, 0, -1]
-
-
-def test_previous_action_is_the_applied_one_and_zero_after_a_reset(make_env):
-    env = make_env("obstacles=none", blind=True)
-    action = random_actions(env, 1)[0]
-    env.sim.qpos[1, 2] = 0.05
-    observations = env.step(action)[0]
-    assert torch.equal(observations["action"][[0, 2, 3]], action[[0, 2, 3]])
-    assert (observations["action"][1] == 0).all()
+    env.sim.qpos[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    observations = env.step(actions[2])[0]
+    after = observations["proprioception"].unflatten(1, (10, 33))
+    assert torch.equal(after[OTHERS, :-1], before[OTHERS, 1:])
+    assert (after[1] == after[1, :1]).all()
+    assert after[1, 0, :12].abs().max() < 1e-6 and after[1, 0, -3:].tolist() == [0, 0, -1]
+    assert torch.equal(observations["action"][OTHERS], actions[2][OTHERS]) and (observations["action"][1] == 0).all()
 
 
 def test_nearest_obstacles_by_hand(make_env):

@@ -5,15 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from stepping import OTHERS, assert_equal, outcome, random_actions, still
 
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import RewardTerm
 from omniperception.env.state import requires
 from omniperception.lidar import OUTPUTS, Lidar
-
-
-def still(env):
-    return torch.zeros(env.num_envs, env.num_actions)
 
 
 def test_frames_come_at_tick_times_only(make_env):
@@ -31,11 +28,14 @@ def test_frames_come_at_tick_times_only(make_env):
             assert torch.equal(observations["frames"][:, :-1], before[:, 1:])
 
 
-def test_frame_count_stops_at_the_history(make_env):
+def test_frame_count_stops_at_the_history_and_points_lie_within_the_range(make_env):
+    """Points are in units of the range, 6 m; the sensor begins at 0.1 m."""
     env = make_env("obstacles=static", "perception.history=3", "lidar.period_s=0.02")
     counts = [int(env.step(still(env))[0]["frame_count"][0]) for _ in range(5)]
     assert counts == [2, 3, 3, 3, 3]
     assert env.sensing.frames.shape[:2] == (4, 3)
+    distance = env.sensing.frames.norm(dim=-1)
+    assert distance.max() <= 1.0 + 1e-6 and distance[distance > 0].min() >= 0.1 / 6.0 - 1e-6
 
 
 def test_a_reset_clears_that_environments_frames_only(make_env):
@@ -49,9 +49,8 @@ def test_a_reset_clears_that_environments_frames_only(make_env):
     assert done.tolist() == [0, 1, 0, 0]
     assert observations["frame_count"].flatten().tolist() == [2, 0, 2, 2]
     assert (observations["frames"][1] == 0).all()
-    others = [0, 2, 3]
-    assert torch.equal(observations["frames"][others], before[others])
-    assert torch.equal(env.avoidance.sector_distance[others], sectors[others])
+    assert torch.equal(observations["frames"][OTHERS], before[OTHERS])
+    assert torch.equal(env.avoidance.sector_distance[OTHERS], sectors[OTHERS])
     assert (env.avoidance.sector_distance[1] == 6.0).all()
     assert env.sensing.mean_distal_range(6.0)[1] == 6.0  # the last episode's distances are forgotten, too
     for _ in range(3):
@@ -59,13 +58,6 @@ def test_a_reset_clears_that_environments_frames_only(make_env):
     assert observations["frame_count"].flatten().tolist() == [3, 1, 3, 3]
     assert (observations["frames"][1, :-1] == 0).all() and (observations["frames"][1, -1] != 0).any()
     assert env.sensing.mean_distal_range(6.0)[1] < 6.0
-
-
-def test_points_lie_within_the_range_in_units_of_it(make_env):
-    env = make_env("obstacles=static")
-    distance = env.sensing.frames[:, -1].norm(dim=-1)
-    assert distance.max() <= 1.0 + 1e-6
-    assert distance[distance > 0].min() >= 0.1 / 6.0 - 1e-6
 
 
 def test_sector_distance_of_a_pillar_by_hand(make_env):
@@ -99,14 +91,11 @@ def test_distal_range_is_the_mean_of_capped_distances(make_env):
     for _ in range(5):
         env.step(still(env))
     frame = env.sensing.frame
-    for i in range(env.num_envs):
-        distances = [
-            min(range_, 2.5)
-            for range_, theta in zip(frame.true_ranges[i].tolist(), frame.elevation[i].tolist(), strict=True)
-            if theta < math.radians(20)
-        ]
-        mean = sum(distances) / len(distances)
-        assert env.sensing.mean_distal_range(2.5)[i].item() == pytest.approx(mean, rel=1e-4)
+    for ranges, elevation, mean in zip(
+        frame.true_ranges.double(), frame.elevation, env.sensing.mean_distal_range(2.5), strict=True
+    ):
+        expected = ranges[elevation < math.radians(20)].clamp(max=2.5).mean()
+        assert mean.item() == pytest.approx(expected.item(), rel=1e-4)
 
 
 def test_noise_reaches_the_points_and_not_the_reward(make_env):
@@ -125,22 +114,29 @@ def test_sector_target_is_the_nearness_of_obstacles(make_env):
     assert "sector_target" not in make_env("obstacles=static").get_observations().keys()  # noqa: SIM118
 
 
-@pytest.mark.parametrize("period", ["0.03", "0.005"])
-def test_a_period_between_control_steps_is_refused(make_env, period):
-    with pytest.raises(ValueError, match=rf"lidar\.period_s={period} must be a multiple"):
-        make_env(f"lidar.period_s={period}")
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("lidar.period_s=0.03", r"lidar\.period_s=0\.03 must be a multiple"),
+        ("lidar.period_s=0.005", r"lidar\.period_s=0\.005 must be a multiple"),
+        ("lidar.motion_segments=2", r"motion_segments=2 must be 0 or divide the 5 control steps"),
+        ("lidar.cloud_mb=0.0", r"lidar\.cloud_mb"),
+    ],
+)
+def test_wrong_settings_are_refused(make_env, override, message):
+    with pytest.raises(ValueError, match=message):
+        make_env("obstacles=static", override)
 
 
-def test_the_lidar_sleeps_until_the_curriculum_lets_obstacles_in(make_env):
+def test_no_frames_until_the_curriculum_has_obstacles(make_env):
     env = make_env("experiment=quickstart", "perception.sampler.num_proximal=8")
-    actions = torch.zeros(env.num_envs, env.num_actions)
     for _ in range(6):
-        env.step(actions)
+        env.step(still(env))
     assert env.obstacles.level == 0.0 and env.sensing.tick == 0 and not env.sensing.frame_count.any()
     assert "rays" not in env.timer.seconds
     env.obstacles.level = 0.5
     for _ in range(5):
-        observations = env.step(actions)[0]
+        observations = env.step(still(env))[0]
     assert env.sensing.tick == 1 and (observations["frame_count"] == 1).all()
 
 
@@ -159,33 +155,21 @@ def take_frame(env, time_s):
     env.sensing.take_frame(time_s, env.state.measured.base_quat_w, env.timer)
 
 
-def test_motion_distortion_forgets_the_last_episode(make_env):
-    """A robot that is placed again has not swept there; a robot that turns has."""
-    env = make_env("obstacles=static", "lidar.motion_segments=1", "lidar.motion_jump=100.0", num_envs=2)
-    still_env = make_env("obstacles=static", num_envs=2)
-    for each in (env, still_env):
-        each.sim.qpos[:, :2] += 3.0
-        each.sensing.reset(torch.tensor([0]), each.state.measured)
-        take_frame(each, 0.1)
-    moving, still = env.sensing.frame.true_ranges, still_env.sensing.frame.true_ranges
-    torch.testing.assert_close(moving[0], still[0], rtol=1e-6, atol=1e-6)
-    assert not torch.allclose(moving[1], still[1], rtol=1e-3)
-
-
-def test_a_saved_state_goes_on_with_its_motion(make_env):
-    """The frame after a resumption starts where the frame before it ended."""
-    whole, resumed = (make_env("obstacles=static", "lidar.motion_segments=1", num_envs=2) for _ in range(2))
+def test_motion_distortion_starts_where_the_last_frame_ended_and_forgets_the_last_episode(make_env):
+    """A robot that is placed again has not swept there; a robot that turns has, also after a saved state is loaded."""
+    moving = ("obstacles=static", "lidar.motion_segments=1", "lidar.motion_jump=100.0")
+    whole, resumed, instant = (make_env(*given, num_envs=2) for given in (moving, moving, ("obstacles=static",)))
     whole.sim.qpos[:, :2] += 0.3
     take_frame(whole, 0.1)
     resumed.sensing.load_state_dict(whole.sensing.state_dict())
-    for env in (whole, resumed):
-        env.sim.qpos[:, :2] = 0.5
+    for env in (whole, resumed, instant):
+        env.sim.qpos[:, :2] = 3.0
+        env.sensing.reset(torch.tensor([0]), env.state.measured)
         take_frame(env, 0.2)
-    assert torch.equal(whole.sensing.frame.true_ranges, resumed.sensing.frame.true_ranges)
-    still = make_env("obstacles=static", num_envs=2)
-    still.sim.qpos[:, :2] = 0.5
-    take_frame(still, 0.2)
-    assert not torch.allclose(whole.sensing.frame.true_ranges, still.sensing.frame.true_ranges, rtol=1e-3)
+    found, again, expected = (env.sensing.frame.true_ranges for env in (whole, resumed, instant))
+    assert torch.equal(found, again)
+    torch.testing.assert_close(found[0], expected[0], rtol=1e-6, atol=1e-6)
+    assert not torch.allclose(found[1], expected[1], rtol=1e-3)
 
 
 def test_rays_within_a_frame_follow_the_robot_by_control_steps(make_env):
@@ -195,27 +179,23 @@ def test_rays_within_a_frame_follow_the_robot_by_control_steps(make_env):
     lidar = Lidar(sensing.config, sensing.config.pattern(), sensing.scene, sensing.base, outputs=outputs)
     lidar.phase_rows.copy_(sensing.lidar.phase_rows)
     lidar.load_state_dict(sensing.lidar.state_dict())
-    for step in range(1, 6):
-        env.step(0.5 * torch.randn(2, 12, generator=torch.Generator().manual_seed(step)))
+    actions = random_actions(env, 5, scale=0.5)
+    for step, action in enumerate(actions):
+        env.step(action)
         pos, quat = env.sim.body_poses(sensing._bodies)
         sensing.scene.body_pos.copy_(pos)
         sensing.scene.body_quat.copy_(quat)
-        if step < 5:
+        if step < 4:
             lidar.record_poses()
     expected = lidar.cast(5 * env.control_dt).true_ranges
     assert torch.equal(sensing.frame.true_ranges, expected)
     straight = make_env("obstacles=static", "lidar.motion_segments=1", "perception=none", num_envs=2)
-    for step in range(1, 6):
-        straight.step(0.5 * torch.randn(2, 12, generator=torch.Generator().manual_seed(step)))
+    for action in actions:
+        straight.step(action)
     assert not torch.allclose(straight.sensing.frame.true_ranges, expected, rtol=1e-3)
 
 
-def test_segments_that_do_not_divide_a_frame_are_refused(make_env):
-    with pytest.raises(ValueError, match=r"motion_segments=2 must be 0 or divide the 5 control steps"):
-        make_env("lidar.motion_segments=2")
-
-
-class TestParts:
+class TestSlices:
     """Clouds of some environments after those of others give what all at once give."""
 
     TASKS = (
@@ -226,29 +206,24 @@ class TestParts:
 
     @pytest.mark.parametrize("task", TASKS)
     def test_bit_for_bit(self, make_env, task):
-        whole, parts = (make_env(*task, f"lidar.cloud_mb={mb}", num_envs=5) for mb in ("1000.0", "0.1"))
-        sizes = [part.stop - part.start for part in parts.sensing.lidar.env_slices]
+        whole, sliced = (make_env(*task, f"lidar.cloud_mb={mb}", num_envs=5) for mb in ("1000.0", "0.1"))
+        sizes = [each.stop - each.start for each in sliced.sensing.lidar.env_slices]
         assert (
             len(whole.sensing.lidar.env_slices) == 1 < len(sizes) and sum(sizes) == 5 and max(sizes) - min(sizes) <= 1
         )
-        assert len(parts.sensing.lidar.frame.ranges) == max(sizes)
+        assert len(sliced.sensing.lidar.frame.ranges) == max(sizes)
         for step in range(23):
-            for env in (whole, parts):
+            for env in (whole, sliced):
                 env.episode_length_buf[step % 5] = env.max_episode_length - 1 if step % 4 == 1 else 5
             actions = 0.3 * torch.sin(torch.arange(60.0).reshape(5, 12) + step)
-            expected, found = whole.step(actions), parts.step(actions)
-            assert torch.equal(expected[1], found[1])
-            for key, value in expected[0].items():
-                assert torch.equal(value, found[0][key]), (step, key)
+            assert_equal(outcome(whole, actions)[0], outcome(sliced, actions)[0])
         if whole.sensing.unseen is not None:
-            assert torch.equal(whole.sensing.unseen, parts.sensing.unseen)
+            assert torch.equal(whole.sensing.unseen, sliced.sensing.unseen)
 
     def test_reading_a_whole_cloud_that_does_not_fit_is_refused(self, make_env):
         env = make_env("obstacles=static", "lidar.cloud_mb=0.1", num_envs=5)
         with pytest.raises(ValueError, match=r"5 environments take more than lidar\.cloud_mb=0\.1"):
             _ = env.sensing.frame
-        with pytest.raises(ValueError, match=r"lidar\.cloud_mb"):
-            make_env("obstacles=static", "lidar.cloud_mb=0.0")
 
     def test_a_term_of_ones_own_that_reads_rays_gets_whole_clouds(self, make_env):
         @requires("cloud")
