@@ -32,30 +32,26 @@ def ring(radius=lambda j: 1.0 + j / 36.0):
     return [(radius(j) * math.cos(a), radius(j) * math.sin(a), 0.3) for j, a in enumerate(angles)]
 
 
-def test_no_hit_gives_the_maximum_everywhere():
-    assert sectors([(1.0, 0.0, 0.0)], [-1]).tolist() == [5.0] * 36
-    assert sectors([(1.0, 0.0, 0.0)], [0]).tolist() == [5.0] * 36
-    assert sectors([], []).tolist() == [5.0] * 36
-
-
-def test_one_hit_fills_one_sector_with_its_horizontal_distance():
-    distances = sectors([(3.0, 0.1, 4.0)], [OBSTACLE])
-    assert distances[18] == pytest.approx(math.hypot(3.0, 0.1), rel=1e-5)  # azimuth 1.9 deg: [0, 10)
-    assert (distances == 5.0).sum() == 35
-
-
-def test_the_nearest_hit_of_a_sector_counts_and_other_classes_do_not():
-    points = [(2.0, 0.1, 0.0), (1.5, 0.1, 0.0), (0.5, 0.1, 0.0), (1.8, 0.1, 0.0)]
-    assert sectors(points, [OBSTACLE, OBSTACLE, 0, OBSTACLE])[18] == pytest.approx(math.hypot(1.5, 0.1), rel=1e-5)
+@pytest.mark.parametrize(
+    ("points", "classes", "expected"),
+    [
+        ([], [], 5.0),
+        ([(1.0, 0.1, 0.0)], [-1], 5.0),
+        ([(1.0, 0.1, 0.0)], [0], 5.0),
+        ([(9.0, 0.1, 0.0)], [OBSTACLE], 5.0),
+        ([(3.0, 0.1, 4.0)], [OBSTACLE], math.hypot(3.0, 0.1)),  # horizontal; azimuth 1.9 deg is in [0, 10)
+        ([(2.0, 0.1, 0.0), (1.5, 0.1, 0.0), (0.5, 0.1, 0.0)], [OBSTACLE, OBSTACLE, 0], math.hypot(1.5, 0.1)),
+    ],
+)
+def test_the_nearest_obstacle_of_a_sector_counts(points, classes, expected):
+    distances = sectors(points, classes)
+    assert distances[18].item() == pytest.approx(expected, rel=1e-5)
+    assert (distances == 5.0).sum() == (36 if expected == 5.0 else 35)
 
 
 def test_all_sectors():
     expected = torch.tensor([1.0 + j / 36.0 for j in range(36)])
     assert torch.allclose(sectors(ring(), [OBSTACLE] * 36), expected, atol=1e-5)
-
-
-def test_a_hit_beyond_the_maximum_is_the_maximum():
-    assert sectors([(9.0, 0.1, 0.0)], [OBSTACLE])[18] == 5.0
 
 
 @pytest.mark.parametrize(
@@ -67,15 +63,11 @@ def test_sector_borders(azimuth_deg, sector):
     assert [d < 5.0 for d in distances.tolist()] == [j == sector for j in range(4)]
 
 
-def test_yaw_of_the_base_changes_nothing():
-    for yaw in (0.3, 2.0, -3.1):
-        turned = sectors(ring(), [OBSTACLE] * 36, base_quat=quat_from_rpy(0.0, 0.0, yaw))
-        assert torch.allclose(turned, sectors(ring(), [OBSTACLE] * 36), atol=1e-5)
-
-
-def test_turning_the_sensor_on_its_mount_shifts_the_sectors():
-    turned = sectors(ring(), [OBSTACLE] * 36, mount_quat=quat_from_rpy(0.0, 0.0, math.radians(30.0)))
-    assert torch.allclose(turned, sectors(ring(), [OBSTACLE] * 36).roll(3), atol=1e-5)
+@pytest.mark.parametrize(("base_yaw", "mount_yaw", "shift"), [(0.3, 0.0, 0), (2.0, 0.0, 0), (-3.1, math.pi / 6, 3)])
+def test_yaw_of_the_base_changes_nothing_and_that_of_the_mount_shifts_the_sectors(base_yaw, mount_yaw, shift):
+    base, mount = (quat_from_rpy(0.0, 0.0, yaw) for yaw in (base_yaw, mount_yaw))
+    turned = sectors(ring(), [OBSTACLE] * 36, base_quat=base, mount_quat=mount)
+    assert torch.allclose(turned, sectors(ring(), [OBSTACLE] * 36).roll(shift), atol=1e-5)
 
 
 def test_pitch_is_levelled_and_the_mount_offset_counts():
@@ -84,8 +76,7 @@ def test_pitch_is_levelled_and_the_mount_offset_counts():
     assert distances[18] == pytest.approx(math.hypot(0.5 + 2.0 * math.cos(pitch), 0.01), rel=1e-5)
 
 
-def test_wrong_arguments_are_refused():
-    with pytest.raises(ValueError, match="num_sectors=0"):
-        sectors([(1.0, 0.0, 0.0)], [OBSTACLE], num_sectors=0)
-    with pytest.raises(ValueError, match="max_distance=0"):
-        sectors([(1.0, 0.0, 0.0)], [OBSTACLE], max_distance=0.0)
+@pytest.mark.parametrize(("option", "value"), [("num_sectors", 0), ("max_distance", 0.0)])
+def test_wrong_arguments_are_refused(option, value):
+    with pytest.raises(ValueError, match=f"{option}=0"):
+        sectors([(1.0, 0.0, 0.0)], [OBSTACLE], **{option: value})
