@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from rsl_rl.env import VecEnv
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
+from omniperception.env.env import OmniEnv
 from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
     CheckpointError,
@@ -50,7 +50,7 @@ class Runner:
         stop_reason: why the last :meth:`learn` ended: "completed" or "time budget".
     """
 
-    def __init__(self, env: VecEnv, config: LearningConfig, log_dir: Path | None = None, device: str = "cpu") -> None:
+    def __init__(self, env: OmniEnv, config: LearningConfig, log_dir: Path | None = None, device: str = "cpu") -> None:
         """Build models, algorithm and log.
 
         Args:
@@ -186,7 +186,7 @@ class Runner:
 
     def _share_curriculum(self) -> None:
         """Obstacles come in all processes at once, so that all see LiDAR frames in the same steps."""
-        if self.alg.is_multi_gpu and hasattr(self.env, "curriculum_level"):
+        if self.alg.is_multi_gpu:
             self.env.curriculum_level = distributed.mean(self.env.curriculum_level, self.device)
 
     def _check_step(self, obs: TensorDict, rewards: torch.Tensor) -> None:
@@ -196,7 +196,7 @@ class Runner:
         for (name, tensor), good in zip(checked.items(), finite.tolist(), strict=True):  # one host synchronisation
             if not good:
                 env = int((~torch.isfinite(tensor)).reshape(len(tensor), -1).any(1).nonzero()[0])
-                terms = self.env.terms_not_finite(name, env) if hasattr(self.env, "terms_not_finite") else []
+                terms = self.env.terms_not_finite(name, env)
                 blamed = f" ({', '.join(terms)})" if terms else ""
                 raise TrainingDiverged(
                     f"iteration {self.current_learning_iteration}: the environment returned"

@@ -11,10 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from .kernels.noise import NoiseParameters
 
 MAX_SIGMAS = 5.0
 """Jitter ends here, so that a ray stays within known bounds; exp(-12.5), or 4 in a million, would go beyond."""
@@ -162,30 +158,6 @@ def noise_by_name(noise: Sequence[Noise]) -> dict[str, Noise]:
             raise ValueError(f"lidar.noise holds more than one {type(model).__name__}; give at most one of each kind")
         named[name] = model
     return named
-
-
-def noise_parameters(named: dict[str, Noise], seed: int, min_range: float, max_range: float) -> NoiseParameters:
-    """The models as the kernels read them, angles as their tangents."""
-    from .kernels.noise import NoiseParameters
-
-    parameters = NoiseParameters()
-    parameters.seed, parameters.min_range, parameters.max_range = seed & 0x7FFFFFFF, min_range, max_range
-    for model in named.values():
-        if isinstance(model, AngularJitter):
-            parameters.jitter_sigma = math.tan(math.radians(model.sigma_deg))
-        elif isinstance(model, MixedPixels):
-            parameters.mixed_radius = math.tan(math.radians(model.divergence_deg) / 2.0)
-            parameters.mixed_min_gap, parameters.mixed_max_gap = model.min_gap, model.max_gap
-            parameters.mixed_weight = model.foreground
-        elif isinstance(model, GaussianNoise):
-            parameters.gaussian_sigma, parameters.gaussian_sigma_per_metre = model.sigma, model.sigma_per_metre
-        elif isinstance(model, DistanceNoise):
-            parameters.distance_ratio = model.ratio
-        elif isinstance(model, Dropout):
-            parameters.dropout_ratio, parameters.dropout_ratio_per_metre = model.ratio, model.ratio_per_metre
-        else:
-            parameters.mask_ratio, parameters.mask_low, parameters.mask_high = model.ratio, model.low, model.high
-    return parameters
 
 
 def max_deviation(noise: Sequence[Noise]) -> float:

@@ -13,10 +13,11 @@ import warp as wp
 
 from .kernels.march_block import BLOCK
 from .kernels.motion import Track
+from .kernels.noise import noise_parameters
 from .kernels.scan import Labels, Rays, ScanOutputs, scan_kernel
 from .launch import SplitLaunch
 from .motion import PoseTrack, SweptShapes
-from .noise import Noise, max_deviation, noise_by_name, noise_parameters
+from .noise import Noise, max_deviation, noise_by_name
 from .patterns import ROW_SLACK, ScanPattern, make_selection
 from .patterns.selection import Strategy
 from .scan_table import ScanTable

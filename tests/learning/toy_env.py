@@ -34,6 +34,11 @@ class ToyEnv(VecEnv):
         self.frames = torch.zeros(num_envs, history, POINTS, 3)
         self.frame_count = torch.zeros(num_envs, 1, dtype=torch.long)
 
+    curriculum_level = 1.0
+
+    def terms_not_finite(self, name, env_id):
+        return []
+
     def get_observations(self):
         groups = {
             "policy": torch.cat([self.position, self.episode_length_buf.unsqueeze(1) / 10.0], -1),

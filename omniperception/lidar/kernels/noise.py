@@ -3,11 +3,12 @@
 The random numbers are a function of seed, environment, frame, ray and model: none depends on what else is configured.
 """
 
+import math
 from functools import cache
 
 import warp as wp
 
-from ..noise import MAX_SIGMAS
+from ..noise import MAX_SIGMAS, AngularJitter, DistanceNoise, Dropout, GaussianNoise, MixedPixels, Noise
 from .geometry import INF, PI
 
 wp.set_module_options({"enable_backward": False})
@@ -37,6 +38,28 @@ class NoiseParameters:
     mask_ratio: float
     mask_low: float
     mask_high: float
+
+
+def noise_parameters(named: dict[str, Noise], seed: int, min_range: float, max_range: float) -> NoiseParameters:
+    """The models as the kernels read them, angles as their tangents."""
+    parameters = NoiseParameters()
+    parameters.seed, parameters.min_range, parameters.max_range = seed & 0x7FFFFFFF, min_range, max_range
+    for model in named.values():
+        if isinstance(model, AngularJitter):
+            parameters.jitter_sigma = math.tan(math.radians(model.sigma_deg))
+        elif isinstance(model, MixedPixels):
+            parameters.mixed_radius = math.tan(math.radians(model.divergence_deg) / 2.0)
+            parameters.mixed_min_gap, parameters.mixed_max_gap = model.min_gap, model.max_gap
+            parameters.mixed_weight = model.foreground
+        elif isinstance(model, GaussianNoise):
+            parameters.gaussian_sigma, parameters.gaussian_sigma_per_metre = model.sigma, model.sigma_per_metre
+        elif isinstance(model, DistanceNoise):
+            parameters.distance_ratio = model.ratio
+        elif isinstance(model, Dropout):
+            parameters.dropout_ratio, parameters.dropout_ratio_per_metre = model.ratio, model.ratio_per_metre
+        else:
+            parameters.mask_ratio, parameters.mask_low, parameters.mask_high = model.ratio, model.low, model.high
+    return parameters
 
 
 @wp.func
