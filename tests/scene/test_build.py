@@ -37,31 +37,24 @@ def contact_pairs(world, data):
     return {"".join(sorted(map(kind, pair))) for pair in data.contact.geom}
 
 
-def test_only_the_robot_touches_ground_and_obstacles(mixed):
-    data = mujoco.MjData(mixed.model)
-    data.qpos[2] = 0.1  # belly on the ground, legs folded through one another and the trunk
-    rng = np.random.default_rng(0)
+def shaken(model):
+    """20 states with legs inside one another and the trunk, and obstacles inside the robot."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    data.qpos[2] = 0.1
     for _ in range(20):
         data.qpos[7:] = rng.uniform(-1.5, 1.5, 12)
-        data.mocap_pos[:] = rng.uniform([-0.3, -0.3, -0.2], [0.3, 0.3, 0.4], (mixed.model.nmocap, 3))
-        mujoco.mj_forward(mixed.model, data)
-        assert contact_pairs(mixed, data) == {"GR", "OR"}
+        data.mocap_pos[:] = rng.uniform([-0.3, -0.3, -0.2], [0.3, 0.3, 0.4], (model.nmocap, 3))
+        mujoco.mj_forward(model, data)
+        yield data
 
 
-def test_the_robot_would_touch_itself_without_the_filter(mixed):
-    """The test above can fail: these states have legs inside legs."""
+def test_only_the_robot_touches_ground_and_obstacles(mixed):
+    """It would touch itself without the filter."""
+    assert all(contact_pairs(mixed, data) == {"GR", "OR"} for data in shaken(mixed.model))
     spec = mixed.robot.spec()
     for geom in spec.geoms:
         geom.contype, geom.conaffinity = 1, 1
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    rng = np.random.default_rng(0)
-    touched = 0
-    for _ in range(20):
-        data.qpos[7:] = rng.uniform(-1.5, 1.5, 12)
-        mujoco.mj_forward(model, data)
-        touched += data.ncon
-    assert touched > 0
+    assert sum(data.ncon for data in shaken(spec.compile())) > 0
 
 
 def test_fixed_poses_are_geoms_of_the_world(make_config):
@@ -75,27 +68,19 @@ def test_fixed_poses_are_geoms_of_the_world(make_config):
     assert world.model.nmocap == 6
 
 
-def test_no_obstacles_leave_nothing_behind(make_config):
-    model = world_of(make_config("obstacles=none")).model
-    assert model.nmocap == 0 and model.nsensor == 0 and model.ngeom == len(model.geom_bodyid) == 20
-
-
 def test_sensor_columns_are_those_of_the_named_geoms(make_config):
     world = world_of(make_config("obstacles=moving"), {"foot_force", "link_force", "obstacle_contact"})
-    widths = {kind: world.sensor_slice(kind) for kind in ("foot_force", "link_force", "obstacle_contact")}
-    assert {kind: s.stop - s.start for kind, s in widths.items()} == {
-        "foot_force": 12,
-        "link_force": 45,
-        "obstacle_contact": 8,
-    }
-    assert sum(s.stop - s.start for s in widths.values()) == world.model.nsensordata
+    expected = {"foot_force": 12, "link_force": 45, "obstacle_contact": 8}
+    columns = {kind: world.sensor_slice(kind) for kind in expected}
+    assert {kind: s.stop - s.start for kind, s in columns.items()} == expected
+    assert sum(expected.values()) == world.model.nsensordata
     first = world.model.sensor("foot_force:FL_foot")
-    assert first.adr[0] == widths["foot_force"].start
+    assert first.adr[0] == columns["foot_force"].start
     with pytest.raises(ValueError, match="unknown contact sensors"):
         world_of(make_config("obstacles=moving"), {"smell"})
 
 
-def test_actuators_are_a_pd_law_with_torque_limits(mixed):
+def test_actuators_are_pd_controllers_with_torque_limits(mixed):
     """tau = kp (target - q) - kv qdot, clipped; kp 25, kv 0.6, calf limit 45.43 N m."""
     data = mujoco.MjData(mixed.model)
     mixed_default = list(mixed.robot.default_joint_pos.values())
