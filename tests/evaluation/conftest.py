@@ -4,21 +4,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-import torch
 
 from omniperception import build, config
 from omniperception.env.env import OmniEnv
 
 MakeEnv = Callable[..., OmniEnv]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Tiny tensors: one thread is faster."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

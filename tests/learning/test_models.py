@@ -28,15 +28,13 @@ def advance(env, steps):
         env.step(torch.randn(env.num_envs, 2))
 
 
-class Counter:
-    """Counts calls of a module."""
-
-    def __init__(self, module):
-        self.calls = 0
-        module.register_forward_hook(self.count)
-
-    def count(self, *_):
-        self.calls += 1
+def assert_update_equals_rollout(actor, storage, seen, num_mini_batches):
+    with torch.no_grad():
+        by_step = torch.stack([actor(obs) for obs in seen])
+        for batch in storage.mini_batch_generator(num_mini_batches, 1):
+            for got, action in zip(actor(batch.observations), batch.actions, strict=True):
+                step, env_id = (storage.actions == action).all(-1).nonzero()[0].tolist()
+                assert torch.allclose(got, by_step[step, env_id], atol=1e-5)
 
 
 @pytest.mark.parametrize("network", ["pd", "mlp"])
@@ -51,35 +49,30 @@ def test_update_equals_rollout(network, normalize):
     seen = rollout(env, storage, 12)
     if normalize:
         actor.update_normalization(storage.observations.flatten(0, 1))
-    with torch.no_grad():
-        by_step = torch.stack([actor(obs) for obs in seen])
-    for batch in storage.mini_batch_generator(2, 1):
-        got = actor(batch.observations)
-        for row, action in enumerate(batch.actions):
-            step, env_id = (storage.actions == action).all(-1).nonzero()[0].tolist()
-            assert torch.allclose(got[row], by_step[step, env_id], atol=1e-5)
+    assert_update_equals_rollout(actor, storage, seen, 2)
 
 
 def test_features_once_per_tick_until_the_actor_is_reset():
     env = ToyEnv(4)
     actor = actor_for(env)
-    counter = Counter(actor.perception)
+    calls = []
+    actor.perception.register_forward_hook(lambda *_: calls.append(1))
     with torch.inference_mode():
         for _ in range(5):
             actor(env.get_observations())
             advance(env, 1)
-        first = counter.calls
-        actor(env.get_observations())
-        assert counter.calls == 2 * first
-        actor(env.get_observations())
-        assert counter.calls == 2 * first
+        first = len(calls)
+        for _ in range(3):
+            actor(env.get_observations())
+            assert len(calls) == 2 * first
+            env.frame_count[2], env.frames[2] = 0, 0.0  # a reset alone embeds nothing
     with torch.no_grad():
         next(actor.perception.parameters()).add_(0.1)
     with torch.inference_mode():
         before = actor.embed_newest(env.get_observations())
         actor.reset()
         assert not torch.equal(actor.embed_newest(env.get_observations()), before)
-    assert counter.calls == 3 * first
+    assert len(calls) == 3 * first
 
 
 def test_weights_that_learn_or_are_loaded_are_used_at_once():
@@ -111,19 +104,6 @@ def test_another_environment_of_the_same_tick_is_embedded():
     with torch.no_grad():
         first, second = actor.embed_newest(a.get_observations()), actor.embed_newest(b.get_observations())
     assert not torch.allclose(first, second)
-
-
-def test_a_reset_alone_embeds_nothing_again():
-    env = ToyEnv(4)
-    advance(env, 10)
-    actor = actor_for(env)
-    counter = Counter(actor.perception)
-    with torch.inference_mode():
-        actor(env.get_observations())
-        first = counter.calls
-        env.frame_count[2], env.frames[2] = 0, 0.0
-        actor(env.get_observations())
-    assert counter.calls == first
 
 
 @pytest.mark.parametrize("network", ["pd", "mlp"])
@@ -169,18 +149,6 @@ def test_height_loss_joins_the_backward_pass_at_unit_scale(weight):
         assert torch.allclose(a, b, rtol=1e-4, atol=1e-7)
     assert actor.pop_supervised_losses() == {"height_target": pytest.approx(height.item(), rel=1e-5)}
     assert actor.pop_supervised_losses() == {}
-
-
-def test_height_loss_learns_the_heights():
-    actor, obs = height_case(1.0)
-    optimizer = torch.optim.Adam(actor.perception.parameters(), 0.02)
-    losses = []
-    for _ in range(80):
-        optimizer.zero_grad()
-        (0.0 * actor(obs).sum()).backward()
-        optimizer.step()
-        losses.append(actor.pop_supervised_losses()["height_target"])
-    assert losses[-1] < 0.2 * losses[0]
 
 
 def test_no_step_with_a_frame_gives_zero_height_loss():
@@ -247,11 +215,7 @@ def test_avoidance_velocity_of_an_update_equals_that_of_the_rollout_and_is_learn
     storage = PerceptiveStorage(5, 9, env.get_observations(), ["policy", "avoidance_target"], 2, frames=True)
     seen = rollout(env, storage, 9)
     [batch] = storage.mini_batch_generator(1, 1)
-    with torch.no_grad():
-        by_step = torch.stack([actor(obs) for obs in seen])
-        for row, action in zip(actor(batch.observations), batch.actions, strict=True):
-            step, env_id = (storage.actions == action).all(-1).nonzero()[0].tolist()
-            assert torch.allclose(row, by_step[step, env_id], atol=1e-5)
+    assert_update_equals_rollout(actor, storage, seen, 1)
     optimizer = torch.optim.Adam(actor.parameters(), 0.02)
     losses = []
     for _ in range(150):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tensordict import TensorDict
 from toy_env import ToyEnv, config
 
 from omniperception.learning import PerceptivePpo, TrainingDiverged
@@ -24,9 +23,16 @@ def collect(alg, env, steps):
         alg.compute_returns(obs)
 
 
+def collected(num_envs=4, frames=True, num_steps=8, **options):
+    """An algorithm, with one rollout in its storage."""
+    env = ToyEnv(num_envs, frames=frames)
+    alg = algorithm(env, num_steps, frames, **options)
+    collect(alg, env, num_steps)
+    return alg
+
+
 def test_returns_by_hand_with_termination_and_time_out():
-    """gamma = lambda = 0.5, V = 2 everywhere, reward 1; environment 0 runs on, 1 falls, 2 times out at step
-    1.
+    """gamma = lambda = 0.5, V = 2 everywhere, reward 1; of the environments 0 runs on, 1 falls, 2 times out.
 
     Step 2 bootstraps: delta = 1 + 0.5 * 2 - 2 = 0 for all, so its return is 2.
     Step 1: running on, delta 0; falling, 1 - 2 = -1, return 1; time-out, the reward becomes 1 + 0.5 * 2 = 2
@@ -60,8 +66,7 @@ def test_update_with_frames(num_envs):
 
 
 def test_first_ratio_is_one():
-    """Before any step the update sees the log-probabilities of the rollout: windows and caching agree with
-    it."""
+    """Before any step the update sees the log-probabilities of the rollout: windows and caching agree with it."""
     env = ToyEnv(6, episode=9)
     alg = algorithm(env)
     collect(alg, env, 8)
@@ -72,16 +77,13 @@ def test_first_ratio_is_one():
 
 
 def test_storage_holds_only_what_is_read():
-    env = ToyEnv(4)
-    assert set(algorithm(env).storage.observations.keys()) == {"policy", "height_target"}
+    assert set(algorithm(ToyEnv(4)).storage.observations.keys()) == {"policy", "height_target"}
     assert set(algorithm(ToyEnv(4, frames=False), frames=False).storage.observations.keys()) == {"policy"}
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_a_non_finite_return_stops_before_it_reaches_the_weights(value):
-    env = ToyEnv(4)
-    alg = algorithm(env)
-    collect(alg, env, 8)
+    alg = collected()
     alg.storage.returns[3, 1] = value
     with pytest.raises(TrainingDiverged, match="gradient of the critic.*returns") as error:
         alg.update()
@@ -91,8 +93,7 @@ def test_a_non_finite_return_stops_before_it_reaches_the_weights(value):
 
 
 def test_non_finite_parameters_are_named():
-    env = ToyEnv(4)
-    alg = algorithm(env)
+    alg = algorithm(ToyEnv(4))
     with torch.no_grad():
         alg.actor.perception.distal.bias_hh_l0[0] = float("nan")
     with pytest.raises(TrainingDiverged, match="perception.distal.bias_hh_l0"):
@@ -113,11 +114,3 @@ def test_symmetry_and_frames_are_refused():
         PerceptivePpo.build(ToyEnv(4), replace(config(), mirror=lambda **_: None), "cpu")
     with pytest.raises(ValueError, match="observations.actor is empty"):
         PerceptivePpo.build(ToyEnv(4), replace(config(), actor_groups=()), "cpu")
-
-
-def test_groups_are_a_tensordict():
-    env = ToyEnv(4)
-    alg = algorithm(env)
-    collect(alg, env, 8)
-    [batch] = alg.storage.mini_batch_generator(1, 1)
-    assert isinstance(batch.observations.groups, TensorDict) and "policy" in batch.observations

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from test_ppo import algorithm, collect
+from test_ppo import algorithm, collect, collected
 from toy_env import ToyEnv, config
 
 from omniperception.learning import PerceptivePpo, RolloutTooSmall, Runner, TrainingDiverged
@@ -42,18 +42,14 @@ def test_gradients_whose_norm_overflows_are_not_passed_over(model):
 
 
 def test_nothing_to_learn_for_the_actor_is_no_reason_to_stop():
-    env = ToyEnv(4, frames=False)
-    alg = algorithm(env, frames=False, entropy_coef=0.0)
-    collect(alg, env, 8)
+    alg = collected(frames=False, entropy_coef=0.0)
     alg.storage.advantages = torch.zeros_like(alg.storage.advantages)
     alg.update()
     assert finite_weights(alg)
 
 
 def test_a_likelihood_ratio_that_overflows_is_the_cause():
-    env = ToyEnv(4, frames=False)
-    alg = algorithm(env, frames=False)
-    collect(alg, env, 8)
+    alg = collected(frames=False)
     alg.storage.actions.copy_(alg.storage.distribution_params[0])
     alg.storage.actions_log_prob.fill_(-100.0)
     with torch.no_grad():
@@ -63,29 +59,22 @@ def test_a_likelihood_ratio_that_overflows_is_the_cause():
 
 
 def test_an_observation_whose_square_overflows_is_the_cause():
-    env = ToyEnv(4, frames=False)
-    alg = algorithm(env, frames=False)
-    collect(alg, env, 8)
+    alg = collected(frames=False)
     alg.storage.observations["policy"][3, 2, 0] = 1e30
     assert "observation 'policy' reach 1e+30, whose square overflows" in stopped_by(alg)
 
 
 @pytest.mark.parametrize(
-    ("num_envs", "frames", "steps", "message"),
+    ("num_mini_batches", "frames", "steps", "message"),
     [
-        (1, True, 8, r"num_mini_batches=2 must not exceed the 1 environments"),
-        (1, False, 1, r"num_mini_batches=2 must not exceed the 1 steps"),
+        (2, True, 8, "num_mini_batches=2 must not exceed the 1 environments"),
+        (2, False, 1, "num_mini_batches=2 must not exceed the 1 steps"),
+        (1, False, 1, "no spread"),
     ],
 )
-def test_empty_mini_batches_are_refused_before_a_rollout(num_envs, frames, steps, message):
-    alg = algorithm(ToyEnv(num_envs, frames=frames), num_steps=steps, frames=frames)
+def test_rollouts_that_are_too_small_are_refused_before_they_are_collected(num_mini_batches, frames, steps, message):
+    alg = algorithm(ToyEnv(1, frames=frames), steps, frames, num_mini_batches=num_mini_batches)
     with pytest.raises(RolloutTooSmall, match=message):
-        alg.check_rollout()
-
-
-def test_a_single_step_has_no_spread_of_advantages():
-    alg = algorithm(ToyEnv(1, frames=False), num_steps=1, frames=False, num_mini_batches=1)
-    with pytest.raises(RolloutTooSmall, match="no spread"):
         alg.check_rollout()
 
 

@@ -9,15 +9,8 @@ from omniperception.learning.storage import max_windows
 
 
 def storage_for(env, num_steps, steps_per_frame=PERIOD):
-    return PerceptiveStorage(
-        env.num_envs,
-        num_steps,
-        env.get_observations(),
-        ["policy"],
-        2,
-        frames=env.has_frames,
-        steps_per_frame=steps_per_frame,
-    )
+    given = {"frames": env.has_frames, "steps_per_frame": steps_per_frame}
+    return PerceptiveStorage(env.num_envs, num_steps, env.get_observations(), ["policy"], 2, **given)
 
 
 @pytest.mark.parametrize(("num_envs", "num_batches"), [(1, 1), (5, 2), (7, 3), (6, 6)])

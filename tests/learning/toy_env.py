@@ -1,5 +1,4 @@
-"""A tiny deterministic environment with LiDAR frames, resets and time-outs, and configurations to train on
-it."""
+"""A tiny deterministic environment with LiDAR frames, resets and time-outs, and configurations to train on it."""
 
 import functools
 
@@ -13,6 +12,7 @@ from omniperception.learning.config import LearningConfig, PerceptionConfig, PPO
 from omniperception.perception import PdRiskNet, PdSampler
 
 HISTORY, POINTS, PERIOD = 4, 3, 5
+STATE = ("step_count", "tick", "position", "episode_length_buf", "frames", "frame_count")
 
 
 class ToyEnv(VecEnv):
@@ -77,17 +77,12 @@ class ToyEnv(VecEnv):
         self.frame_count[ids] = 0
 
     def state_dict(self):
-        names = ("step_count", "tick", "position", "episode_length_buf", "frames", "frame_count")
-        return {
-            "rng": self.rng.bit_generator.state,
-            "array": np.arange(3),
-            **{n: getattr(self, n) for n in names},
-        }
+        return {"rng": self.rng.bit_generator.state, "array": np.arange(3), **{n: getattr(self, n) for n in STATE}}
 
     def load_state_dict(self, state):
         assert torch.equal(state["array"], torch.arange(3))
         self.rng.bit_generator.state = state["rng"]
-        for name in ("step_count", "tick", "position", "episode_length_buf", "frames", "frame_count"):
+        for name in STATE:
             setattr(self, name, state[name])
 
 
