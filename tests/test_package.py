@@ -81,13 +81,6 @@ def test_the_console_command_lists_and_explains_all_commands(capsys):
     assert "trian is unknown; known: train, play" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("door", ["train.py", "play.py", "scripts/evaluate.py", "scripts/view_scan.py"])
-def test_doors_of_a_checkout_run_the_commands(door):
-    text = (ROOT / door).read_text()
-    names = [name for name in COMMANDS if f'main(["{name}", *sys.argv[1:]])' in text]
-    assert len(names) == 1
-
-
 @pytest.mark.slow
 def test_the_wheel_trains_and_plays_in_an_empty_folder(tmp_path):
     source, site, empty = tmp_path / "source", tmp_path / "site", tmp_path / "empty"

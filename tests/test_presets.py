@@ -90,12 +90,9 @@ class TestPaper:
         assert run.env.randomization.noise and run.env.observations.actor == ("proprioception", "command")
 
 
-class TestRates:
-    def test_defaults(self, make_config):
-        env = make_config().env
-        assert env.sim.timestep == 0.005 and env.sim.control_dt == pytest.approx(0.02)
-        assert env.lidar.period_s == 0.1
-        assert env.lidar.mount_pos == (0.28945, 0.0, -0.046825)
+def test_default_rates(make_config):
+    env = make_config().env
+    assert (env.sim.timestep, env.sim.control_dt, env.lidar.period_s) == (0.005, pytest.approx(0.02), 0.1)
 
 
 class TestSensors:

@@ -46,22 +46,6 @@ def test_pictures_and_a_cloud_are_written(command, capsys, tmp_path, preset):
     assert len({tuple(row) for row in table[["red", "green", "blue"]].tolist()}) == len(set(table["class_id"]))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (("lidar=none",), "lidar=none has nothing to view"),
-        (("colour=pink",), "colour=pink must be one of class, height"),
-        (("lidar=avia", "rays=0"), "rays=0 must be a whole number >= 1"),
-        (("seed=-1",), "seed=-1 must be a whole number >= 0"),
-    ],
-)
-def test_wrong_arguments_end_with_one_line(command, capsys, arguments, expected):
-    with pytest.raises(SystemExit, match="2"):
-        command(*arguments)
-    error = capsys.readouterr().err
-    assert expected in error and error.count("\n") == 1
-
-
 def test_a_scan_has_every_class_and_the_robot_sees_itself(make_config):
     run = make_config("perception=none", "observations=walk", "rewards=walk", "lidar=mid360")
     demo = demo_scene(run.env.robot)

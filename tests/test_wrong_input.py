@@ -12,6 +12,7 @@ import torch
 from omniperception import build, config
 from omniperception.commands import COMMANDS, main
 from omniperception.learning import Runner
+from omniperception.lidar.sensor import Lidar  # noqa: F401  Warp asks for the processor in a process of its own
 
 ROOT = Path(__file__).resolve().parents[1]
 GROUPS = sorted(path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir())
@@ -40,11 +41,13 @@ LINES = [
     ("train hydra.searchpath=[nowhere]", "nowhere"),
     ("train hydra/launcher=rocket", "rocket"),
     ("train hydra.run.dri=x", "hydra.run.dri"),
-    ("train run=nowhere", "run=nowhere"),
+    ("train run=nowhere", "run=latest"),
+    ("train run=latest", "train one first"),
     ("train run=", "run="),
     ("train run=RUN -m", "-m"),
     ("train run=RUN experiment=paper", "experiment=paper"),
     ("train run=RUN episodes=3", "episodes=3"),
+    ("train run=RUN ppo.foo=1", "max_iterations"),
     # keys that nothing takes
     ("train num_env=64", "did you mean num_envs?"),
     ("train +num_env=64", "did you mean num_envs?"),
@@ -124,7 +127,7 @@ LINES = [
     ("train init=nowhere", "init=nowhere"),
     ("train experiment=gait", "init=<run of experiment=walk> does not exist; give a run directory or init=latest"),
     ("train experiment=walk ppo.num_learning_epochs=0", "ppo.num_learning_epochs=0 keeps the policy as it is"),
-    ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape,weight:1.0}", "rewards.terms.mine"),
+    ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape,weight:1.0}", "has shape (3, 5), expected (2,)"),
     ("train +rewards.terms.mine={func:wrong_input_terms.not_a_tensor,weight:1.0}", "rewards.terms.mine"),
     ("train +rewards.terms.mine={func:wrong_input_terms.missing,weight:1.0}", "rewards.terms.mine"),
     ("train +rewards.terms.mine={func:nowhere.at_all,weight:1.0}", "nowhere"),
@@ -149,21 +152,21 @@ LINES = [
     ("evaluate run=RUN obstacles=moving plots=false", "scenario=corridor defines the obstacles"),
     ("evaluate run=RUN num_envs=0", "num_envs=0"),
     ("ablate stage=dance", "stage=dance"),
-    ("ablate variants=fps_mlpp", "did you mean fps_mlp?"),
+    ("ablate variants=fps_gruu", "variants=fps_gruu is unknown; did you mean fps_gru?"),
     ("ablate seeds=a", "seeds=a"),
     ("ablate scenarios=statik", "scenarios=statik"),
-    ("ablate seed=3", "seed=3"),
-    ("ablate stage=table out=EMPTY variants=fps_mlp seeds=1", "has not been evaluated"),
+    ("ablate seed=3", "seed=3: give experiment=, variants= and seeds= instead"),
+    ("ablate stage=table out=EMPTY variants=fps_mlp seeds=1", "seed1 has not been evaluated; use stage=eval"),
     ("export run=RUN formats=tarball", "formats=tarball"),
     ("export run=RUN num_envs=3", "num_envs=3"),
     ("export run=EMPTY", "is not a run directory"),
     ("publish run=RUN", "to=... must be given"),
     ("publish run=RUN to=EMPTY precision=float8", "precision=float8"),
-    ("scan lidar=none", "lidar=none"),
+    ("scan lidar=none", "lidar=none has nothing to view"),
     ("scan lidar=sonar", "lidar=sonar"),
-    ("scan colour=pink", "colour=pink"),
-    ("scan rays=0", "rays=0"),
-    ("scan seed=-1", "seed=-1"),
+    ("scan colour=pink", "colour=pink must be one of class, height"),
+    ("scan rays=0", "rays=0 must be a whole number >= 1"),
+    ("scan seed=-1", "seed=-1 must be a whole number >= 0"),
     ("plan num_envs=x", "num_envs=x"),
     *((f"train {group}=dragons", f"{group}=dragons is unknown") for group in GROUPS),
     *((f"{command} --wrong", "--wrong is unknown") for command in COMMANDS),

@@ -3,7 +3,11 @@
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+
+import pytest
+import torch
 
 ROOT = Path(__file__).resolve().parents[2]
 STUDIES = sorted(path for path in (ROOT / "scripts").glob("*.py") if "import command" in path.read_text())
@@ -35,3 +39,41 @@ def test_a_script_and_a_module_refuse_nonsense(tmp_path):
     module = run(["-m", "benchmarks.lidar_accuracy", "rays=no"], ROOT)
     for done in (script, module):
         assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith("error: rays=no must be a whole number")
+
+
+@pytest.mark.parametrize(
+    ("study", "arguments", "expected"),
+    [
+        ("lidar.__main__", "what=nothing", "what=nothing"),
+        ("lidar.__main__", "speed=3", "speed=3"),
+        ("lidar.__main__", "repeats=many", "repeats=many"),
+        ("lidar.__main__", "motions=fly", "motions=fly"),
+        ("lidar.__main__", "device=cuda:99", "cuda:99"),
+        ("pattern_coverage", "sensors=nose", "sensors=nose must be one of"),
+        ("pattern_coverage", "foo=1", "foo=1"),
+        ("stability.__main__", "subject=weather", "subject=weather must be one of physics, lidar, learning"),
+        ("stability.__main__", "subject=lidar sim.timestep=0.1", "sim.timestep=0.1 is unknown for subject=lidar"),
+        ("stability.__main__", "subject=lidar rays=0", "rays=0 must be"),
+        ("work_precision.__main__", "subject=lidr", "lidar, physics, perception, policy"),
+        ("work_precision.__main__", "subject=lidar only=shape", "only=shape"),
+        (
+            "work_precision.__main__",
+            "subject=lidar lidar=none observations=walk rewards=walk perception=none",
+            "lidar=none",
+        ),
+        ("work_precision.__main__", "subject=policy runs=/nowhere", "/nowhere"),
+        ("work_precision.__main__", "subject=policy num_envs=4", "num_envs=4: policies are taken as they were trained"),
+        pytest.param(
+            "gpu_check",
+            "",
+            "device=cuda:0",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
+        ),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_line(study, arguments, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        import_module(f"benchmarks.{study}").command(arguments.split())
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and expected in error and error.count("\n") == 1

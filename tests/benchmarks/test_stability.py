@@ -87,20 +87,6 @@ def test_float32_is_precise_enough_in_every_layer():
     assert all(row["output"] < 1e-4 and row["gradient"] < 1e-4 for row in rows)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["subject=weather"], "subject=weather must be one of physics, lidar, learning"),
-        (["subject=lidar", "sim.timestep=0.1"], "sim.timestep=0.1 is unknown for subject=lidar"),
-        (["subject=lidar", "rays=0"], "rays=0 must be"),
-    ],
-)
-def test_wrong_arguments_are_refused(arguments, expected, capsys):
-    with pytest.raises(SystemExit) as ended:
-        command(arguments)
-    assert ended.value.code == 2 and expected in capsys.readouterr().err
-
-
 def test_the_exit_status_says_whether_all_is_well(tmp_path, monkeypatch, capsys):
     arguments = ["subject=lidar", f"out={tmp_path}", "rays=50", "many=100"]
     monkeypatch.setattr(lidar, "run", lambda rays, many: [{"case": "a", "good": True}])

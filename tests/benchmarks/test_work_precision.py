@@ -195,9 +195,8 @@ def test_trained_policies_are_timed_as_they_were_exported(tmp_path, capsys):
     run = tmp_path / "gait"
     shutil.copytree(ROOT / "pretrained" / "gait", run)
     export([f"run={run}", "formats=onnx"])
-    rates = {
-        name: {"rate": 0.5, "low": 0.1, "high": 0.9} for name in ("success", "success_untouched", "collision", "fall")
-    }
+    names = ("success", "success_untouched", "collision", "fall")
+    rates = {name: {"rate": 0.5, "low": 0.1, "high": 0.9} for name in names}
     report = {"scenario": "static", "policies": {"run": {"rates": rates, "episodes": 4}}}
     (run / "evaluation").mkdir()
     (run / "evaluation" / "static.json").write_text(json.dumps(report))
@@ -214,20 +213,3 @@ def test_the_command_writes_tables_and_plot(tmp_path, capsys):
     assert written >= {"fronts.png", "shapes.csv", "shapes.json", "precision.csv", "precision.json"}
     content = json.loads((tmp_path / "lidar" / "shapes.json").read_text())
     assert {row["choice"] for row in content["rows"]} >= {"exact", "4096 triangles"}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["subject=lidr"], "lidar, physics, perception, policy"),
-        (["subject=lidar", "only=shape"], "only=shape"),
-        (["subject=lidar", "lidar=none", "observations=walk", "rewards=walk", "perception=none"], "lidar=none"),
-        (["subject=policy", "runs=/nowhere"], "/nowhere"),
-        (["subject=policy", "num_envs=4"], "num_envs=4: policies are taken as they were trained"),
-    ],
-)
-def test_wrong_arguments_end_with_one_line(arguments, expected, capsys):
-    with pytest.raises(SystemExit) as ended:
-        command(arguments)
-    error = capsys.readouterr().err
-    assert ended.value.code == 2 and expected in error and error.count("\n") == 1

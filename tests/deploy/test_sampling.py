@@ -31,19 +31,16 @@ SAMPLERS = {
 }
 
 
-def directions(count, rng, low=-7.0, high=52.0):
+def directions(count, rng, low, high):
     theta, phi = np.radians(rng.uniform(low, high, count)), rng.uniform(0.0, 2 * math.pi, count)
     return np.stack((np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.sin(theta)), 1)
 
 
 def cloud(name, rng):
     """(RAYS, 3) points, misses as zeros."""
-    if name == "all near":
-        return (directions(RAYS, rng, 21.0) * rng.uniform(0.05, 6.0, (RAYS, 1))).astype(np.float32)
-    points = directions(RAYS, rng) * rng.uniform(0.05, 6.0, (RAYS, 1))
-    if name == "all far":
-        points = directions(RAYS, rng, high=19.0) * rng.uniform(0.05, 6.0, (RAYS, 1))
-    elif name == "duplicates":
+    low, high = {"all near": (21.0, 52.0), "all far": (-7.0, 19.0)}.get(name, (-7.0, 52.0))
+    points = directions(RAYS, rng, low, high) * rng.uniform(0.05, 6.0, (RAYS, 1))
+    if name == "duplicates":
         points = points[rng.integers(0, 20, RAYS)]
     elif name == "few":
         points[rng.permutation(RAYS)[7:]] = 0.0
@@ -51,7 +48,7 @@ def cloud(name, rng):
         points[1:] = 0.0
     elif name == "empty":
         points[:] = 0.0
-    else:
+    elif name == "random":
         points[rng.uniform(size=RAYS) < 0.3] = 0.0
     return points.astype(np.float32)
 
@@ -73,7 +70,7 @@ def by_training(sampler, points, base_quat):
     return out[0].numpy()
 
 
-def by_robot(sampler, points, base_quat):
+def by_robot(sampler, points, base_quat=(1.0, 0.0, 0.0, 0.0)):
     return make_sampler(sampler_parameters(sampler))(points, Attitude(np.array(base_quat), MOUNT_POS, MOUNT_QUAT))
 
 
@@ -118,16 +115,13 @@ def test_what_is_no_point():
     """Rows that are not finite, zero or beyond the range."""
     rng, sampler = np.random.default_rng(5), SAMPLERS["pd"]()
     points = cloud("all near", rng)
-    expected = by_robot(sampler, points, (1.0, 0.0, 0.0, 0.0))
+    expected = by_robot(sampler, points)
     noisy = np.insert(points, [3, 50, 100, 200], [[math.nan] * 3, [math.inf] * 3, [0.0] * 3, [0.0, 0.0, 6.01]], axis=0)
-    np.testing.assert_array_equal(by_robot(sampler, noisy.astype(np.float32), (1.0, 0.0, 0.0, 0.0)), expected)
+    np.testing.assert_array_equal(by_robot(sampler, noisy.astype(np.float32)), expected)
 
 
-def test_the_raw_sampler_wants_every_ray():
-    with pytest.raises(DeployError, match=r"\(301, 3\) was expected, \(300, 3\) given"):
-        by_robot(SAMPLERS["raw"](), np.ones((300, 3), np.float32), (1.0, 0.0, 0.0, 0.0))
-
-
-def test_an_unknown_sampler_is_named():
+def test_wrong_clouds_and_samplers_are_named():
     with pytest.raises(DeployError, match="sampler 'voxels' is unknown; known: raw, pd, proximity"):
         make_sampler({"kind": "voxels"})
+    with pytest.raises(DeployError, match=r"\(301, 3\) was expected, \(300, 3\) given"):
+        by_robot(SAMPLERS["raw"](), np.ones((300, 3), np.float32))

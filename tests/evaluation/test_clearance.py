@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.evaluation.clearance import BOX, CAPSULE, CYLINDER, TOLERANCE, Clearance, convex_distance, support
+from omniperception.evaluation.clearance import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    TOLERANCE,
+    Clearance,
+    Geoms,
+    convex_distance,
+    support,
+)
 
 BLIND = ("experiment=walk", "rewards=walk")
 
@@ -107,9 +116,7 @@ def test_a_diverged_environment_measures_nothing(make_env):
     assert Clearance(env).measure(torch.full((2,), 50.0)).isfinite().all()
 
 
-def test_shapes_beyond_the_primitives_are_their_bounding_boxes(make_env):
-    from omniperception.evaluation.clearance import Geoms
-
+def test_shapes_beyond_the_primitives_are_their_bounding_boxes():
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=[0.1, 0.2, 0.3])
     model = spec.compile()

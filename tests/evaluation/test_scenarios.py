@@ -56,10 +56,6 @@ class TestOverlay:
             with pytest.raises(ConfigError, match=f"scenario=static defines the {group.split('=')[0]}"):
                 compose(["scenario=static", group])
 
-    def test_unknown_scenarios_are_named_with_the_known(self, run_dir):
-        with pytest.raises(ConfigError, match="known: abs_hard, aerial, corridor"):
-            config.load(run_dir, ["scenario=dragons"])
-
     @pytest.mark.parametrize("scenario", config.presets("scenario"))
     def test_an_experiment_leaves_no_trace_in_the_scene(self, scenario):
         alone, mixed = (config.compose([*given, f"scenario={scenario}"]) for given in ([], ["experiment=quickstart"]))
