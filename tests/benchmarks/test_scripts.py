@@ -11,6 +11,8 @@ import torch
 
 ROOT = Path(__file__).resolve().parents[2]
 STUDIES = sorted(path for path in (ROOT / "scripts").glob("*.py") if "import command" in path.read_text())
+WALK = "observations=walk rewards=walk perception=none"
+NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 HELP_OF_ALL = """
 import runpy, sys
 scripts, sys.argv, path = sys.argv[1:], ["", "--help"], list(sys.path)
@@ -56,19 +58,10 @@ def test_a_script_and_a_module_refuse_nonsense(tmp_path):
         ("stability.__main__", "subject=lidar rays=0", "rays=0 must be"),
         ("work_precision.__main__", "subject=lidr", "lidar, physics, perception, policy"),
         ("work_precision.__main__", "subject=lidar only=shape", "only=shape"),
-        (
-            "work_precision.__main__",
-            "subject=lidar lidar=none observations=walk rewards=walk perception=none",
-            "lidar=none",
-        ),
+        ("work_precision.__main__", f"subject=lidar lidar=none {WALK}", "lidar=none"),
         ("work_precision.__main__", "subject=policy runs=/nowhere", "/nowhere"),
         ("work_precision.__main__", "subject=policy num_envs=4", "num_envs=4: policies are taken as they were trained"),
-        pytest.param(
-            "gpu_check",
-            "",
-            "device=cuda:0",
-            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
-        ),
+        pytest.param("gpu_check", "", "device=cuda:0", marks=NO_GPU),
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(study, arguments, expected, tmp_path, monkeypatch, capsys):
