@@ -139,16 +139,8 @@ class TestOnesOwn:
             terms(f"+rewards.terms.steady={{func: {own_project}.Steady, weight: 1}}")
 
     def test_networks_and_tiles(self, own_project):
-        run = build.assemble(
-            config.compose(
-                [
-                    "perception=fps_gru",
-                    f"perception.network.type={own_project}.Wide",
-                    "terrain=rough",
-                    f"terrain.tiles.rough.type={own_project}.Waves",
-                ]
-            )
-        )
+        network, tile = f"perception.network.type={own_project}.Wide", f"terrain.tiles.rough.type={own_project}.Waves"
+        run = build.assemble(config.compose(["perception=fps_gru", network, "terrain=rough", tile]))
         assert type(run.perception.build_network()).__name__ == "Wide"
         assert type(run.env.terrain.tiles["rough"]).__name__ == "Waves"
 
@@ -230,20 +222,5 @@ def test_a_term_is_an_ordinary_function(make_config):
     env = make_config("experiment=quickstart").env
     found = [term.func for term in env.rewards.terms.values()]
     found += [term for group in env.observations.groups.values() for term in group.terms.values()]
-    assert all(
-        (term.func if isinstance(term, partial) else term).__module__.startswith("omniperception") for term in found
-    )
-
-
-def test_a_reward_of_the_wrong_shape_is_refused_in_one_line(tmp_path, monkeypatch):
-    (tmp_path / "misshapen_terms.py").write_text("def wide(state):\n    import torch\n    return torch.zeros(2, 3)\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    overrides = ["experiment=walk", "num_envs=2", "+rewards.terms.wide={func: misshapen_terms.wide, weight: 1}"]
-    with pytest.raises(ConfigError, match=r"rewards\.terms\.wide has shape \(2, 3\), expected \(2,\)"):
-        build.build_runner(build.assemble(config.compose(overrides)), None)
-
-
-def test_a_base_that_the_robot_does_not_have(make_config):
-    with pytest.raises(ConfigError, match="robot.base=trunk") as error:
-        build.build_runner(make_config("experiment=walk", "num_envs=2", "robot.base=trunk"), None)
-    assert "\n" not in str(error.value)
+    found = [term.func if isinstance(term, partial) else term for term in found]
+    assert all(term.__module__.startswith("omniperception") for term in found)

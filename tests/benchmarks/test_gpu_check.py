@@ -4,22 +4,13 @@ import json
 from dataclasses import replace
 
 import pytest
-import torch
 
 from benchmarks import memory
-from benchmarks.gpu_check import Arguments, command, execute
+from benchmarks.gpu_check import Arguments, execute
 from benchmarks.harness.table import Table
 from omniperception.build import build_runner
 
 TINY = ("experiment=walk", "ppo.num_steps_per_env=4", "ppo.hidden_dims=[32,16]", "ppo.num_mini_batches=2")
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_it_says_so_in_one_line(tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        command([f"out={tmp_path}"])
-    error = capsys.readouterr().err
-    assert ended.value.code == 2 and error.startswith("error: device=cuda:0") and error.count("\n") == 1
 
 
 def test_a_part_that_fails_is_reported_and_the_others_run(tmp_path, monkeypatch):

@@ -88,11 +88,3 @@ def test_the_command_prints_and_draws(capsys, tmp_path):
     printed = capsys.readouterr().out
     assert "100 rays every 0.1 s" in printed and printed.count("stratified") == 3
     assert (tmp_path / "patterns.png").stat().st_size > 10_000 and (tmp_path / "pattern_coverage.csv").is_file()
-
-
-@pytest.mark.parametrize(("argument", "named"), [("sensors=nose", "sensors=nose must be one of"), ("foo=1", "foo=1")])
-def test_wrong_arguments_are_refused_in_one_line(capsys, argument, named):
-    with pytest.raises(SystemExit, match="2"):
-        command([argument])
-    (line,) = capsys.readouterr().err.splitlines()
-    assert named in line
