@@ -12,3 +12,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 def own_folder(tmp_path, monkeypatch):
     """MuJoCo logs a diverged simulation to the working directory."""
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def run(make_config):
+    return make_config("obstacles=static")

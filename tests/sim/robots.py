@@ -2,6 +2,13 @@
 
 import torch
 
+from omniperception.scene import build_world
+
+
+def simulator(run, engine, num_envs=4):
+    world = build_world(run.env.robot, run.env.terrain, run.env.obstacles, ("foot_force", "obstacle_contact"))
+    return engine.build(world, num_envs)
+
 
 def default_joints(sim):
     return torch.tensor(list(sim.world.robot.default_joint_pos.values()), dtype=torch.float64)

@@ -1,30 +1,21 @@
 """Both simulators behave alike: the same tests for `sim=mujoco` and `sim=mujoco_warp`."""
 
 import copy
+import math
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from robots import default_joints, stand, targets
+from robots import default_joints, simulator, stand, targets
 
-from omniperception.scene import build_world
 from omniperception.sim import SimConfig
 from omniperception.sim.mujoco_warp import MujocoWarpConfig
 
-SENSORS = ("foot_force", "obstacle_contact")
 
-
-@pytest.fixture(scope="module", params=["mujoco", "mujoco_warp"])
+@pytest.fixture(scope="module", params=[SimConfig(), MujocoWarpConfig(device="cpu")], ids=["mujoco", "mujoco_warp"])
 def engine(request):
-    if request.param == "mujoco":
-        return SimConfig()
-    return MujocoWarpConfig(device="cpu")
-
-
-@pytest.fixture(scope="module")
-def run(make_config):
-    return make_config("obstacles=static")
+    return request.param
 
 
 @pytest.fixture
@@ -32,10 +23,6 @@ def sim(run, engine):
     sim = simulator(run, engine)
     stand(sim)
     return sim
-
-
-def simulator(run, engine, num_envs=4):
-    return engine.build(build_world(run.env.robot, run.env.terrain, run.env.obstacles, SENSORS), num_envs)
 
 
 def test_body_poses_are_those_of_the_current_state(sim):
@@ -114,10 +101,36 @@ def test_a_reset_forgets_the_past(run, engine):
     assert torch.equal(fresh.qpos, used.qpos)
 
 
-def test_gravity_of_one_environment(sim):
-    """Free fall for one step: v = g dt, and only where gravity was changed."""
+@pytest.mark.parametrize("field", ["qpos", "qvel"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e12])
+def test_a_broken_state_is_detected_and_stays_alone(run, engine, field, value):
+    healthy, broken = simulator(run, engine), simulator(run, engine)
+    for sim in (healthy, broken):
+        stand(sim)
+    getattr(broken, field)[1, 7] = value
+    steps = targets(healthy, 5, 4)
+    for sim in (healthy, broken):
+        for target in steps:
+            sim.step(target)
+        sim.detect_failures()
+    assert not healthy.failed.any() and broken.failed.tolist() == [False, True, False, False]
+    others = [0, 2, 3]
+    assert torch.equal(healthy.qpos[others], broken.qpos[others])
+    for sim in (healthy, broken):
+        stand(sim)
+        assert not sim.failed.any()
+        sim.step(steps[0])
+    assert torch.equal(healthy.qpos, broken.qpos)
+
+
+def test_a_field_is_per_environment_once_it_is_asked_for(sim):
+    """Free fall for one step, v = g dt, and friction that is doubled in one environment alone."""
     sim.qpos[:, 2] = 5.0
     sim.model_field("opt.gravity")[3] = torch.tensor([1.0, 0.0, -8.81], dtype=sim.qpos.dtype)
+    friction = sim.model_field("geom_friction")
+    friction[1] *= 2
+    nominal = torch.tensor(sim.world.model.geom_friction, dtype=friction.dtype)
+    torch.testing.assert_close(friction[[0, 1, 3]], torch.stack((nominal, 2 * nominal, nominal)))
     sim.step(default_joints(sim).expand(4, -1))
     assert sim.qvel[3, :3].tolist() == pytest.approx([0.005, 0.0, -8.81 * 0.005], abs=1e-6)
     assert sim.qvel[0, :3].tolist() == pytest.approx([0.0, 0.0, -9.81 * 0.005], abs=1e-6)
