@@ -120,22 +120,25 @@ def test_a_direction_of_any_other_length_is_one(length):
         assert float(scene.cast(*rays).ranges) == 2.0
 
 
-@pytest.mark.parametrize("field", ["body_pos", "body_quat"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(
+            (field, [0.0, value, 0.0, 0.0])
+            for field in ("body_pos", "body_quat")
+            for value in (math.nan, math.inf, -math.inf)
+        ),
+        *(("body_quat", [norm, 0.0, 0.0, 0.0]) for norm in (0.0, 1e-9)),
+    ],
+)
 @every_shape
 def test_a_body_without_a_pose_is_not_there(shape, field, value):
     scene = RayScene([carried(shape), Shape(K.SPHERE, (0.5,), pos=(0, 0, -50))], num_envs=2, num_bodies=1)
-    getattr(scene, field)[1, 0, 1] = value
+    pose = getattr(scene, field)
+    pose[1, 0] = torch.tensor(value)[: pose.shape[-1]]
     hits = cast(scene, [[(0.1, 0, 3)]] * 2, [[(0, 0, -1)]] * 2)
     assert hits.shape_id.flatten().tolist() == [0, 1]
     assert scene.broken_poses().tolist() == [[False], [True]]
-
-
-@pytest.mark.parametrize("norm", [0.0, 1e-9])
-def test_a_quaternion_of_norm_0_is_no_pose(norm):
-    scene = RayScene([Shape(K.SPHERE, (0.5,), body=0)], 1, 1)
-    scene.body_quat[:] = torch.tensor([norm, 0, 0, 0])
-    assert cast(scene, (0, 0, 3), (0, 0, -1)).ranges.isinf() and scene.broken_poses().all()
 
 
 @pytest.mark.parametrize("norm", [1e-3, 1 - 1e-3, 1 + 1e-3, 1e3])
@@ -190,7 +193,7 @@ def test_all_misses_and_all_hits_at_the_minimum_range():
     assert (nearest.cast(time_s).ranges[1] == math.inf).all()  # the sensor's own body has no pose
 
 
-@pytest.mark.parametrize("num_bodies", [0, 1, 10_000])
+@pytest.mark.parametrize("num_bodies", [1, 10_000])
 def test_many_bodies(num_bodies):
     rng = np.random.default_rng(0)
     shapes = [Shape(K.SPHERE, (0.05,), body=k) for k in range(num_bodies)]
@@ -200,9 +203,6 @@ def test_many_bodies(num_bodies):
     directions = rng.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     hits = cast(scene, np.zeros((300, 3)), directions)
-    if num_bodies == 0:
-        assert hits.ranges.isinf().all()
-        return
     ahead = directions @ centres.T.astype(np.float64)
     half = np.sqrt(np.maximum(0.05**2 - ((centres**2).sum(1) - ahead**2), -1e-30 + 0j)).real
     met = ((centres.astype(np.float64) ** 2).sum(1) - ahead**2 < 0.05**2) & (ahead + half > 0)

@@ -17,11 +17,6 @@ def seconds(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def expected_first(time: float, period: Fraction, rate: Fraction, num_rows: int) -> int:
-    """First point not before time - period, in exact arithmetic."""
-    return math.ceil((Fraction(time) - period) * rate) % num_rows
-
-
 def tiny(points_per_second=10.0, **fields):
     return ScanPattern.from_angles(np.zeros(6), np.arange(6.0), points_per_second, **fields)
 
@@ -72,16 +67,10 @@ def test_rows_are_exact_also_late(pattern, late):
     assert select_rows(pattern, times, 0.1, 100)[:, 0].tolist() == expected
 
 
-def test_rows_between_ticks_are_those_of_exact_arithmetic(pattern):
-    times = [0.123456, 17.00000251, 3.14159265]
-    expected = [expected_first(t, Fraction(1, 10), Fraction(RATE), 800_000) for t in times]
-    assert pattern.first_rows(seconds(*times), 0.1).tolist() == expected
-
-
 @pytest.mark.parametrize("make", [vlp16, xt32], ids=["vlp16", "xt32"])
 @pytest.mark.parametrize("step_s", [Fraction(1, 50), Fraction(7, 1000), Fraction(1, 3)])
 def test_a_rate_that_is_no_multiple_of_the_step_loses_and_repeats_no_point(make, step_s):
-    """289,352 points/s are 5787.04 per 20 ms: frames of 5787 and 5788 points that follow one another."""
+    """In exact arithmetic: 289,352 points/s are 5787.04 per 20 ms, frames of 5787 and 5788 points one after another."""
     pattern = make()
     rate = Fraction(16, 55_296) * 10**9 if make is vlp16 else Fraction(640_000)
     steps = range(1, 400)
@@ -93,17 +82,13 @@ def test_a_rate_that_is_no_multiple_of_the_step_loses_and_repeats_no_point(make,
 
 
 def test_a_pause_a_reset_and_a_replay_see_what_belongs_to_their_time(pattern):
-    phase = torch.tensor([0, 123_457])
+    phase = torch.tensor([0, 799_999])
+    assert select_rows(pattern, seconds(0.1, 0.1), 0.1, 10, phase)[:, :2].tolist() == [[0, 1999], [799_999, 1998]]
     straight = {t: select_rows(pattern, seconds(t, t), 0.1, 50, phase) for t in (0.1, 0.2, 0.3, 0.4)}
     for t in (0.4, 0.1, 0.1, 0.3):  # backwards, twice, after a gap: nothing is remembered
         assert torch.equal(select_rows(pattern, seconds(t, t), 0.1, 50, phase), straight[t])
     mixed = select_rows(pattern, seconds(0.1, 0.3), 0.1, 50, phase)  # environment 0 was reset
     assert torch.equal(mixed[0], straight[0.1][0]) and torch.equal(mixed[1], straight[0.3][1])
-
-
-def test_phase_shifts_each_environment(pattern):
-    rows = select_rows(pattern, seconds(0.1, 0.1), 0.1, 10, phase_rows=torch.tensor([0, 799_999]))
-    assert rows[:, 0].tolist() == [0, 799_999] and rows[1, 1] == 1998
 
 
 def test_first_rows_write_into_the_given_tensor(pattern):
@@ -113,11 +98,6 @@ def test_first_rows_write_into_the_given_tensor(pattern):
     assert torch.equal(out, pattern.first_rows(times, 0.1, 5)) and times.tolist() == [0.1, 0.7, 9.3]
 
 
-def test_more_rays_than_points_are_refused(pattern):
-    with pytest.raises(ValueError, match=r"lidar.num_rays=20001 must be in 1..20000"):
-        select_rows(pattern, seconds(0.1), 0.1, 20_001)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -125,6 +105,7 @@ def test_more_rays_than_points_are_refused(pattern):
         (lambda: ScanPattern(torch.eye(3), torch.zeros(3), torch.zeros(3), 0.0), "points_per_second"),
         (lambda: ScanPattern(torch.eye(3), torch.zeros(2), torch.zeros(3), 1.0), r"directions_s \(M, 3\)"),
         (lambda: ScanPattern(torch.eye(3) * math.nan, torch.zeros(3), torch.zeros(3), 1.0), "finite"),
+        (lambda: select_rows(tiny(), seconds(0.1), 0.1, 2), r"lidar.num_rays=2 must be in 1..1"),
         (lambda: tiny(num_lasers=0), "num_lasers=0 must be at least 1"),
         (lambda: tiny(rows_per_shot=4), "rows_per_shot=4 must divide the 6 rows"),
         (lambda: tiny(origins_s=torch.zeros(5, 3)), r"origins_s must be finite \(6, 3\), got \(5, 3\)"),

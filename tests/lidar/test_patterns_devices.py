@@ -48,9 +48,5 @@ def test_parameters_are_plausible_and_have_a_source(device):
 
 def test_every_livox_scanner_is_a_device():
     assert set(LIVOX) <= set(DEVICES)
-    assert {p.stem for p in PRESETS.glob("[!_]*.yaml")} - set(DEVICES) == {
-        "none",
-        "custom",
-        "depth_camera",
-        "height_scanner",
-    }
+    others = {"none", "custom", "depth_camera", "height_scanner"}
+    assert {p.stem for p in PRESETS.glob("[!_]*.yaml")} - set(DEVICES) == others

@@ -96,14 +96,12 @@ def test_incidence_and_intensity_by_hand():
     assert white.intensity[0].item() == pytest.approx(1.0, rel=1e-5)
 
 
-def test_intensity_falls_with_the_square_of_the_true_range():
-    intensity = []
-    for distance in (2.0, 4.0, 8.0):
-        scene = RayScene([Shape(K.BOX, (0.1, 9.0, 9.0), pos=(distance + 0.1, 0.0, 0.0))], 3, 0)
-        noise = (GaussianNoise(0.2),)
-        lidar = Lidar(LidarConfig(1, 1 / 30), grid(1, 1, 10.0), scene, -1, noise=noise, outputs=("intensity",))
-        intensity.append(lidar.cast(NOW).intensity[0].item())
-    assert intensity == pytest.approx([25.0, 6.25, 1.5625], rel=1e-5)
+@pytest.mark.parametrize(("distance", "expected"), [(2.0, 25.0), (4.0, 6.25), (8.0, 1.5625)])
+def test_intensity_falls_with_the_square_of_the_true_range(distance, expected):
+    scene = RayScene([Shape(K.BOX, (0.1, 9.0, 9.0), pos=(distance + 0.1, 0.0, 0.0))], 3, 0)
+    noise = (GaussianNoise(0.2),)
+    lidar = Lidar(LidarConfig(1, 1 / 30), grid(1, 1, 10.0), scene, -1, noise=noise, outputs=("intensity",))
+    assert lidar.cast(NOW).intensity[0].item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_an_inside_wall_is_as_bright_as_an_outside_one():
