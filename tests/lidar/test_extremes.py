@@ -156,9 +156,8 @@ def test_grazing_rays():
     """1e-6 rad towards and away from flat faces: a hit far away, a miss, and nothing in between."""
     angle = 1e-6
     towards, away = (math.cos(angle), 0, -math.sin(angle)), (math.cos(angle), 0, math.sin(angle))
-    ground = [Shape(K.PLANE)]
-    assert one(ground, (0, 0, 1), towards) == pytest.approx(1 / angle, rel=1e-5)
-    assert one(ground, (0, 0, 1), away) == math.inf
+    assert one([Shape(K.PLANE)], (0, 0, 1), towards) == pytest.approx(1 / angle, rel=1e-5)
+    assert one([Shape(K.PLANE)], (0, 0, 1), away) == math.inf
     slab = [Shape(K.BOX, (50, 50, 1), pos=(0, 0, -1)), Shape(K.CYLINDER, (50, 1), pos=(0, 0, -1))]
     slab += [Shape(K.HEIGHTFIELD, asset=HeightField(np.ones((6, 6)), 50, 50), pos=(0, 0, -1))]
     slab += [Shape(K.MESH, asset=TriangleMesh(CUBE_MESH.vertices * (50, 50, 1), CUBE_MESH.triangles), pos=(0, 0, -1))]
