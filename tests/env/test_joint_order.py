@@ -97,17 +97,13 @@ def test_training_is_that_of_the_same_robot(monkeypatch):
     torch.testing.assert_close(weights[0]["mlp.2.weight"][ORDER], weights[1]["mlp.2.weight"], atol=1e-4, rtol=0)
 
 
-def test_the_exported_description_has_the_listed_order(make_config, make_env):
-    described = [describe(make_config(*o), make_env(*o)) for o in (("experiment=walk",), ("experiment=walk", PERMUTED))]
-    plain, permuted = (d.joints for d in described)
+def test_the_exported_description_and_the_mirror_have_the_listed_order(make_config, make_env):
+    both = [("experiment=walk",), ("experiment=walk", PERMUTED)]
+    plain, permuted = (describe(make_config(*o), make_env(*o)).joints for o in both)
     assert permuted.names == tuple(JOINTS[k] for k in ORDER)
     for key in ("default_pos", "torque_limits", "lower", "upper"):
         values = getattr(plain, key)
         assert getattr(permuted, key) == [values[k] for k in ORDER], key
-
-
-def test_mirror_images_pair_the_same_joints(make_config):
-    index, sign = mirrored_joints(make_config("experiment=walk", PERMUTED).env.robot)
-    plain_index, plain_sign = mirrored_joints(make_config("experiment=walk").env.robot)
+    (plain_index, plain_sign), (index, sign) = (mirrored_joints(make_config(*o).env.robot) for o in both)
     assert [ORDER[k] for k in index] == plain_index[ORDER].tolist()
     assert np.array_equal(sign, plain_sign[ORDER])

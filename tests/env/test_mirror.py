@@ -37,7 +37,6 @@ def test_mirrored_physics_gives_mirrored_observations(make_env):
         env.sim.qvel[i, 3:6] = turning if side > 0 else -turning * flip
         env.sim.qvel[i, 6:18] = 0.0
         env.command.value[i] = torch.tensor([0.7, 0.3 * side, -0.5 * side])
-    compared = 0
     for _ in range(8):
         action = torch.randn(1, 12)
         obs = env.step(torch.cat((action, action[:, index] * sign)))[0]
@@ -49,8 +48,7 @@ def test_mirrored_physics_gives_mirrored_observations(make_env):
             torch.testing.assert_close(
                 both[name][1], obs[name][1], atol=2e-2, rtol=1e-2, msg=lambda m, n=name: f"{n}: {m}"
             )
-            compared += 1
-    assert compared == 8 * 4
+        assert len(names) == 4
 
 
 def test_twice_mirrored_is_itself(make_env):
@@ -86,11 +84,7 @@ def test_updates_see_both_sides():
             "default_joint_pos is not its own mirror image",
         ),
         (
-            (
-                "experiment=walk",
-                "ppo.symmetry=true",
-                "+observations.groups.privileged.terms.heights={}",
-            ),
+            ("experiment=walk", "ppo.symmetry=true", "+observations.groups.privileged.terms.heights={}"),
             "privileged.terms.heights does not say how it looks in the mirror",
         ),
     ],

@@ -74,9 +74,6 @@ def test_wrong_terms_are_refused_when_the_environment_is_built(make_env, term, m
     with pytest.raises(ValueError, match=message) as error:
         with_terms(make_env("obstacles=none", blind=True), mine=RewardTerm(1.0, term))
     assert "\n" not in str(error.value)
-
-
-def test_unknown_requirements_are_refused():
     with pytest.raises(ValueError, match=r"@requires\(foot_forces\) is unknown; known: foot_force"):
         requires("foot_forces")
 
