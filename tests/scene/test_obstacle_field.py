@@ -144,7 +144,7 @@ class TestApproach:
         field.advance(0.1, torch.zeros(20, 2))
         torch.testing.assert_close(field.pos_w[..., :2], before + velocity * 0.1)
 
-    def test_what_does_not_take_part_stays_away(self):
+    def test_parked_obstacles_stay_parked(self):
         field = self.approaching(50)
         field.level = 0.0
         reset(field)
