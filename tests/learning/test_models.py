@@ -45,6 +45,7 @@ def test_update_equals_rollout(network, normalize):
     env = ToyEnv(5, episode=11)
     advance(env, 13)
     actor = actor_for(env, network, obs_normalization=normalize)
+    torch.nn.init.normal_(actor.mlp[0].weight)  # an untrained actor ignores its features
     storage = PerceptiveStorage(5, 12, env.get_observations(), ["policy"], 2, frames=True, steps_per_frame=5)
     seen = rollout(env, storage, 12)
     if normalize:
