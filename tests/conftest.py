@@ -39,3 +39,19 @@ def one_thread(request):
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+INTEGRATION = (
+    *("benchmarks", "evaluation", "learning/test_runner.py", "test_*.py"),
+    *(f"env/test_{name}.py" for name in ("devices", "isolation", "joint_order", "sensing")),
+)
+"""Tests of whole runs and commands, which `make test-fast` leaves out; of the top folder all but UNITS."""
+UNITS = ("test_cli.py", "test_config.py")
+
+
+def pytest_collection_modifyitems(items):
+    here = Path(__file__).parent
+    whole = {path for pattern in INTEGRATION for path in here.glob(pattern)} - {here / name for name in UNITS}
+    for item in items:
+        if whole & {item.path, *item.path.parents}:
+            item.add_marker("integration")
