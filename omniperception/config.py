@@ -104,7 +104,7 @@ _COMPOSED = "composed"
 
 
 def is_composed(config: DictConfig) -> bool:
-    """Whether a configuration is from `compose`: of presets and overrides, not from a run's file."""
+    """Tell whether a configuration is from `compose`: of presets and overrides, not from a run's file."""
     return bool(config._get_flag(_COMPOSED))
 
 
@@ -183,7 +183,7 @@ def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
 
 
 def _exists(config: DictConfig, override: Override) -> bool:
-    """Whether the key of an override exists; raises ConfigError where it cannot."""
+    """Tell whether the key of an override exists; raises ConfigError where it cannot."""
     node: Any = config
     text, names = str(override.input_line), override.key_or_group.split(".")
     for depth, name in enumerate(names):
@@ -306,7 +306,7 @@ def read(run_dir: Path) -> DictConfig:
 
 
 def is_begun(run_dir: Path, composed: dict) -> bool:
-    """Whether `run_dir` holds a run of exactly this configuration; one of another is a ConfigError."""
+    """Tell whether `run_dir` holds a run of exactly this configuration; one of another is a ConfigError."""
     path = run_dir / CONFIG_FILE
     if not path.is_file():
         return False

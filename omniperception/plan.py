@@ -1,4 +1,4 @@
-"""What a run consists of, read off the objects that exist after a few control steps."""
+"""Parts of a run, read off the objects that exist after a few control steps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ENTERED = ("omniperception.", "mujoco.batch", "mujoco_warp.", "rsl_rl.storage")
 
 @dataclass(frozen=True)
 class Plan:
-    """What exists, by section and name, with a size or an empty text.
+    """Things that exist, by section and name, with a size or an empty text.
 
     Attributes:
         num_envs: environments of which this was seen.

@@ -30,7 +30,7 @@ ANYTHING = None
 
 @dataclass(frozen=True)
 class Kind:
-    """What may be named at one place of a configuration.
+    """Names allowed at one place of a configuration.
 
     Attributes:
         names: path of a function or class by name; or the path of a module, whose public functions and classes are
@@ -76,7 +76,7 @@ NAMES: dict[str, Kind] = {
     ),
     "perception.network.rings": Kind(_members("perception", rings="RingPath"), built=False, given=None),
 }
-"""What may be named, by key; `*` is any one name."""
+"""Names allowed, by key; `*` is any one name."""
 
 
 def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -> Any:
@@ -175,7 +175,7 @@ def look_up(kind: Kind, name: str, key: str, trust: Sequence[str] | None = ()) -
 
 
 def _named(kind: Kind, hint: Any, values: dict[str, object], key: str, trust: Sequence[str] | None) -> Any:
-    """What a mapping names, with its parameters: called, or left to be called."""
+    """Object that a mapping names, with its parameters: called, or left to be called."""
     names, own = _names(kind), key.rpartition(".")[2]
     if len(names) == 1:
         own = next(iter(names))
@@ -261,7 +261,7 @@ def _options(hint: Any) -> Sequence[Any]:
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Whether plain data that is no mapping may stand for a type."""
+    """Tell whether plain data that is no mapping may stand for a type."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any or isinstance(hint, typing.TypeVar):
         return not isinstance(value, Mapping)

@@ -7,7 +7,7 @@ import warp as wp
 
 @wp.func
 def slab(start: float, direction: float, half: float):
-    """Where a line enters and leaves |x| <= half."""
+    """Points at which a line enters and leaves |x| <= half."""
     step = direction
     if wp.abs(step) < 1.0e-9:
         step = wp.float32(1.0e-9)

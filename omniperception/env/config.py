@@ -120,5 +120,5 @@ class EnvConfig:
 
     @property
     def uses_lidar(self) -> bool:
-        """Whether anything reads the LiDAR; otherwise it is not built."""
+        """Tell whether anything reads the LiDAR; otherwise it is not built."""
         return self.lidar is not None and (self.sampler is not None or bool(self.requirements() & FROM_LIDAR))

@@ -184,7 +184,7 @@ class OmniEnv(VecEnv):
                 self._frame_heights = self.state.heights
 
     def _lidar_is_awake(self) -> bool:
-        """Whether frames are cast: there is a LiDAR, and the curriculum has an obstacle."""
+        """Tell whether frames are cast: there is a LiDAR, and the curriculum has an obstacle."""
         return self.sensing is not None and (self.obstacles is None or self.obstacles.level > 0.0)
 
     def _follow_terrain(self) -> None:
@@ -193,7 +193,7 @@ class OmniEnv(VecEnv):
                 self.terrain_levels.record(self.state.kinematics, self.command.value, self.healthy)
 
     def _terminate(self) -> None:
-        """Whether environments end, and why, each for the first reason that applies."""
+        """Tell whether environments end, and why, each for the first reason that applies."""
         state, config = self.state, self.config.terminations
         never = torch.zeros_like(self.healthy)
         reached = self.command.reached(state.kinematics)

@@ -196,7 +196,7 @@ class LidarSensing:
         return None if self.unseen is None else self.unseen < frames
 
     def due(self, step: int) -> bool:
-        """Whether a frame ends with control step number `step`."""
+        """Tell whether a frame ends with control step number `step`."""
         return step % self.period_steps == 0
 
     def record_motion(self, step: int) -> None:

@@ -157,7 +157,7 @@ class EnvState:
             del self.__dict__[name]
 
     def has_computed(self, name: str) -> bool:
-        """Whether a quantity has been read since the last `invalidate`."""
+        """Tell whether a quantity has been read since the last `invalidate`."""
         return name in self.__dict__
 
     def state_dict(self) -> dict:

@@ -125,7 +125,7 @@ def _examples(episodes: Episodes) -> list[int]:
 
 
 def _bounds(all_episodes: list[Episodes]) -> tuple[float, float, float, float]:
-    """What the panels show (m): all ways and goals with a margin."""
+    """Area that the panels show (m): all ways and goals with a margin."""
 
     def points(tracks: Tracks) -> torch.Tensor:
         return torch.cat([*tracks.xy, *([tracks.goal] if tracks.goal is not None else [])])

@@ -167,7 +167,7 @@ class Renderer:
         return albedo
 
     def _shadowed(self, points: torch.Tensor, normals: torch.Tensor, lit: torch.Tensor) -> torch.Tensor:
-        """Whether each of the points that face the sun lies in a shadow."""
+        """Tell whether each of the points that face the sun lies in a shadow."""
         shadowed = torch.zeros_like(lit)
         ids = lit.nonzero().flatten()
         strips = self._scene.num_envs

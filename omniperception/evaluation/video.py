@@ -18,9 +18,9 @@ from omniperception.scene.rays import HitClass, ray_shapes
 
 FPS = 25
 BEHIND_M, ABOVE_M, AHEAD_M = 2.4, 1.45, 1.0
-"""Where the camera is with respect to the robot, and how far ahead of the robot it looks."""
+"""Place of the camera with respect to the robot, and how far ahead of the robot it looks."""
 OVER_GROUND_M = 0.4
-"""How far above the ground below it the camera stays at least, where the ground is not flat."""
+"""Least height of the camera above the ground below it, where the ground is not flat."""
 FOLLOW_S, TURN_S = 0.25, 0.9
 """Time constants with which the camera follows the robot's position and heading."""
 MIN_ARROW = 0.1

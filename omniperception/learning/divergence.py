@@ -71,7 +71,7 @@ class DivergenceGuard:
             self._has_gradient[name] = self._has_gradient.get(name, False) or has_gradient
 
     def _diagnosis(self) -> str:
-        """Which stored quantity is not finite, or advice if all are."""
+        """Name of the stored quantity that is not finite, or advice if all are."""
         algorithm, storage = self._algorithm, self._algorithm.storage
         rollout: dict[str, torch.Tensor] = {f"observation '{k}'": v for k, v in storage.observations.items()}
         if storage.has_frames:
@@ -106,7 +106,7 @@ class DivergenceGuard:
 
 
 def _finite_and_largest(tensors: list[torch.Tensor]) -> tuple[bool, float]:
-    """Whether every element is finite, and the largest norm of a tensor, with one host synchronisation.
+    """Tell whether every element is finite, and the largest norm of a tensor, with one host synchronisation.
 
     Euclidean norms take a twentieth of the time of maximum norms; they may overflow, so a bad one is looked into.
     """

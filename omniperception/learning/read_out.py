@@ -18,7 +18,7 @@ class VelocityReadOut(nn.Module):
         self.layers = zero_mlp(feature_dim, 64, 2)
 
     def extend(self, embedding: torch.Tensor) -> torch.Tensor:
-        """What is computed once per embedding (..., D): nothing."""
+        """Tensors that are computed once per embedding (..., D): nothing."""
         return embedding
 
     def velocity(self, features: torch.Tensor, command: torch.Tensor) -> torch.Tensor:

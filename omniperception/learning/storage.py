@@ -36,7 +36,7 @@ class WindowedObservations:
 
     @property
     def has_frames(self) -> bool:
-        """Whether any step has seen a frame since its environment's reset."""
+        """Tell whether any step has seen a frame since its environment's reset."""
         return bool(self.window_count.any())
 
     @property

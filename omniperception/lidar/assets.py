@@ -16,7 +16,7 @@ from .shapes import Shape, ShapeKind
 
 @dataclass
 class _Arrays:
-    """What has been laid out so far; ``num_nodes`` and ``num_leaves`` include the copies of deformables.
+    """Arrays laid out so far; ``num_nodes`` and ``num_leaves`` include the copies of deformables.
 
     ``windowed``: whether blocks of rays march through height fields.
     """

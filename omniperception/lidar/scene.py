@@ -61,7 +61,7 @@ class View:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """Where the sensor is, as the kernels read it."""
+        """Pose of the sensor, as the kernels read it."""
         viewpoint = Viewpoint()
         viewpoint.body, viewpoint.pose = self.body, wp_pose(self.pos, self.quat)
         return viewpoint
@@ -228,7 +228,7 @@ class RayScene:
 
     @property
     def visible(self) -> torch.Tensor:
-        """Which shapes there are in which environment, (num_envs, num_shapes) bool, all at first; write in place.
+        """Shapes that exist, by environment, (num_envs, num_shapes) bool, all at first; write in place.
 
         Allocated, and looked at, from the first use on.
         """
@@ -278,7 +278,7 @@ class RayScene:
             self.body_quat[..., 1:].copy_(quat[..., :3])
 
     def broken_poses(self) -> torch.Tensor:
-        """Which bodies have a pose that is not finite or a quaternion of norm 0, (num_envs, num_bodies) bool."""
+        """Bodies that have a pose that is not finite or a quaternion of norm 0, (num_envs, num_bodies) bool."""
         norm = torch.linalg.vector_norm(self.body_quat.double(), dim=-1)
         finite = self.body_pos.isfinite().all(-1) & norm.isfinite()
         return ~finite | (norm <= 1e-6)
@@ -324,12 +324,12 @@ class RayScene:
 
     @property
     def has_mesh(self) -> bool:
-        """Whether any shape is a mesh or a deformable."""
+        """Tell whether any shape is a mesh or a deformable."""
         return any(shape.kind in (ShapeKind.MESH, ShapeKind.DEFORMABLE) for shape in self.shapes)
 
     @property
     def has_heightfield(self) -> bool:
-        """Whether any shape is a height field."""
+        """Tell whether any shape is a height field."""
         return any(shape.kind == ShapeKind.HEIGHTFIELD for shape in self.shapes)
 
     def launch(self, kernel: wp.Kernel, inner: Sequence[int], args: Sequence, work_per_env: int = 1) -> SplitLaunch:

@@ -44,7 +44,7 @@ def quat_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, 
 
 @dataclass(frozen=True)
 class LidarConfig:
-    """How a LiDAR is mounted and what of its scan is kept.
+    """Mount of a LiDAR, and what of its scan is kept.
 
     Attributes:
         num_rays: Points kept per frame.
@@ -314,7 +314,7 @@ class Lidar:
             self._track.forget(env_ids)
 
     def state_dict(self) -> dict:
-        """What the next frames depend on beside the scene's poses and the time."""
+        """State that the next frames depend on beside the scene's poses and the time."""
         track = None if self._track is None else self._track.state_dict()
         return {"frame_count": self.frame_count.clone(), "track": track}
 
@@ -357,7 +357,7 @@ class Lidar:
         return LidarFrame(**{name: getattr(self.frame, name)[:count] for name in self.outputs})
 
     def _place(self, mount_body: int, exclude_shapes: Sequence[int]) -> tuple[View, PlacedShapes | SweptShapes]:
-        """Where the sensor looks from, and what places the shapes that it may see."""
+        """Pose from which the sensor looks, and what places the shapes that it may see."""
         config, reach = self.config, self._reach()
         elevation = None
         if reach == 0.0:
@@ -371,12 +371,12 @@ class Lidar:
         return view, SweptShapes(self.scene, exclude_shapes, view, self._track)
 
     def _reach(self) -> float:
-        """How far from the sensor's origin its rays start, metres."""
+        """Distance from the sensor's origin at which its rays start, metres."""
         origins = self.pattern.origins_s
         return 0.0 if origins is None else float(torch.linalg.vector_norm(origins.double(), dim=1).max())
 
     def _marches_blocks(self, exclude_shapes: Sequence[int]) -> bool:
-        """Whether a block's rays march through the height field all at once: on a CPU, from one place, along rows."""
+        """Tell whether a block's rays march through the height field at once: on a CPU, from one place, along rows."""
         scene = self.scene
         viewed = (shape for k, shape in enumerate(scene.shapes) if k not in exclude_shapes)
         return (

@@ -99,7 +99,7 @@ class Shape:
 
     @property
     def extents(self) -> tuple[float, float, float]:
-        """What the kernels call the size: for a mesh or a height field, half of a box around ``pos`` that holds it."""
+        """Size as the kernels read it: for a mesh or a height field, half of a box around ``pos`` that holds it."""
         if self.kind in (ShapeKind.MESH, ShapeKind.HEIGHTFIELD):
             assert self.asset is not None
             return self.asset.half_extents

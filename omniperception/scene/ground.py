@@ -22,7 +22,7 @@ _REAL = {torch.float32: (wp.float32, wp.vec2), torch.float64: (wp.float64, wp.ve
 
 
 class Ground:
-    """Which tile each environment starts on, and how high the ground is in that environment's frame.
+    """Tile on which each environment starts, and height of the ground in that environment's frame.
 
     The origin of an environment's frame is the middle of its tile, at the height of the ground there. The surface is
     the one that MuJoCo collides and rays hit: two triangles to a cell, divided from (row, col) to (row + 1, col + 1).
@@ -139,7 +139,7 @@ class Ground:
         return {kind: level / count for kind, (count, level) in sums.items() if count}
 
     def state_dict(self) -> dict:
-        """What `load_state_dict` needs; the ground's position belongs to the simulator's state."""
+        """State that `load_state_dict` needs; the ground's position belongs to the simulator's state."""
         return {"level": self.level.clone()}
 
     def load_state_dict(self, state: dict) -> None:

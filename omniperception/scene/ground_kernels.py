@@ -87,7 +87,7 @@ def base_heights(
     # out
     height_out: wp.array(dtype=wp.float32),
 ):
-    """How high the base of one environment is above the mean of the ground at some points around it."""
+    """Height of the base of one environment above the mean of the ground at some points around it."""
     env = wp.tid() + env_offset
     turn = wp.vec2d(wp.float64(wp.cos(yaw[env])), wp.float64(wp.sin(yaw[env])))
     total = wp.float64(0.0)
@@ -108,7 +108,7 @@ def heights_around(
     # out
     height_out: wp.array2d(dtype=wp.float32),
 ):
-    """How high the base of one environment is above the ground at each of some points around it, within +-bound."""
+    """Height of the base of one environment above the ground at each of some points around it, within +-bound."""
     env = wp.tid() + env_offset
     turn = wp.vec2d(wp.float64(wp.cos(yaw[env])), wp.float64(wp.sin(yaw[env])))
     for k in range(offsets.shape[0]):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 PARKED_HEIGHT = -100.0
 """Height (m) at which an inactive obstacle is parked, below the ground where no ray and no contact finds it."""
 LOSE_SIGHT = 1.0
-"""How far (m) beyond its farthest start an approaching obstacle gets before it starts again."""
+"""Distance (m) beyond its farthest start at which an approaching obstacle starts again."""
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PUSH_OFF_TURNS = 16
 _CANDIDATES = 48
@@ -178,7 +178,7 @@ class ObstacleField:
             self.level = min(1.0, self.level + curriculum.rise * seconds)
 
     def state_dict(self) -> dict:
-        """What `load_state_dict` needs to go on; positions belong to the simulator's state."""
+        """State that `load_state_dict` needs to go on; positions belong to the simulator's state."""
         state = {"velocity_w": self.velocity_w.clone(), "active": self.active.clone(), "level": self.level}
         return state if self._ground is None else {**state, "above_ground": self._above_ground.clone()}
 

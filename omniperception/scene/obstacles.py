@@ -19,7 +19,7 @@ _NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
 
 @dataclass(frozen=True)
 class ApproachConfig:
-    """How obstacles come at the robot: each walks straight on, on a course that leads past the robot.
+    """Approach of obstacles to the robot: each walks straight on, on a course that leads past the robot.
 
     One starts at a random bearing, all sides alike. Its course is such that its centre would pass within `within` of
     the robot's base if the robot kept the velocity that it is commanded at that moment; where no course does because

@@ -170,7 +170,7 @@ def _at(bounds: Sequence[float], difficulty: float) -> float:
 
 
 def _check_tile(tile: Tile, key: str) -> None:
-    """What gets harder must be a range from easy to hard, and the share positive."""
+    """Check a tile: what gets harder must be a range from easy to hard, and the share positive."""
     bounds = tuple(float(value) for value in getattr(tile, key))
     object.__setattr__(tile, key, bounds)
     if len(bounds) != 2 or not 0 <= bounds[0] <= bounds[1]:

@@ -1,4 +1,4 @@
-"""What the task needs from a physics engine."""
+"""Protocol of a physics engine, as the task needs it."""
 
 from __future__ import annotations
 

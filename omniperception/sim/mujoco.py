@@ -65,7 +65,7 @@ class SimConfig:
 
     @property
     def torch_device(self) -> torch.device:
-        """Where the simulations and everything that they feed live."""
+        """Device of the simulations and of everything that they feed."""
         return torch.device("cpu")
 
     def build(self, world: World, num_envs: int, record_states: bool = False) -> Simulator:

@@ -256,7 +256,7 @@ class MujocoWarpSimulator:
         return {"constraint_overflow": row_count, "contact_overflow": contact_count}
 
     def state_dict(self) -> dict:
-        """What the next step depends on, and the model fields that differ between the worlds."""
+        """State that the next step depends on, and the model fields that differ between the worlds."""
         return {
             "state": {name: wp.to_torch(getattr(self.data, name)).clone() for name in _STATE},
             "fields": {name: value.clone() for name, value in self._fields.items()},

@@ -131,7 +131,7 @@ def summary(scan: Scan) -> str:
 
 
 def draw_pattern(name: str, pattern: ScanPattern, path: Path) -> None:
-    """Where the sensor looks after each of ``DURATIONS_S``; where its parallel rays start, for a height scanner."""
+    """Directions of the sensor after each of ``DURATIONS_S``; where its parallel rays start, for a height scanner."""
     across, along, labels = _coordinates(pattern)
     shape = np.ptp(across) / max(np.ptp(along), 1e-6)
     figure = new_figure(float(np.clip(3.9 * shape, 3.6, 5.2)) * len(DURATIONS_S) + 1.2, 4.6)

@@ -77,7 +77,7 @@ def obstacle_contact(state: EnvState) -> torch.Tensor:
 
 
 def closing_speed(state: EnvState, horizon: float, margin: float) -> torch.Tensor:
-    """How imminent the worst collision course is, 0 to 1.
+    """Imminence of the worst collision course is, 0 to 1.
 
     For each obstacle, its distance from the robot at the closest approach within `horizon` (s) if both keep their
     velocities; the term is the largest (1 - clearance / margin) (1 - time / horizon) with clearance (m) to the

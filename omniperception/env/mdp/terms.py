@@ -37,7 +37,7 @@ class StatefulTerm:
 
 
 def is_class(term: Term) -> bool:
-    """Whether a term is a class or a partial of one."""
+    """Tell whether a term is a class or a partial of one."""
     return isinstance(term.func if isinstance(term, partial) else term, type)
 
 

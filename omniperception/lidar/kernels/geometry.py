@@ -31,7 +31,7 @@ REFINE = wp.constant(wp.float32(50.0))
 
 @wp.struct
 class Geometry:
-    """What the shapes of a scene are, indexed by shape; the data of meshes and height fields follow one another.
+    """Shapes of a scene, indexed by shape; the data of meshes and height fields follow one another.
 
     ``body`` carries the shape at ``pose``, -1 being the environment. ``part`` is a shape's place in ``mesh_part`` or
     ``field_part``. The tree of a mesh has boxes ``mesh_bounds`` (node, axis of lows then highs) of four children
@@ -136,7 +136,7 @@ exact_plane, exact_sphere, exact_box, exact_cylinder, exact_capsule, exact_ellip
 
 @wp.func
 def uncertain(hit: Hit, c: wp.vec3):
-    """Whether rounding may have moved a hit on a shape centred at c by more than 1e-5 of its range plus 1e-5 m."""
+    """Tell whether rounding may have moved a hit on a shape centred at c by more than 1e-5 of its range plus 1e-5 m."""
     return hit.sin_incidence * (1.0 + hit.t) * REFINE < hit.t + wp.abs(c[0]) + wp.abs(c[1]) + wp.abs(c[2])
 
 

@@ -39,5 +39,5 @@ def march_block(
     face_out: wp.array2d(dtype=wp.int32),
     uncertain_out: wp.array2d(dtype=wp.bool),
 ):
-    """What ``intersect_heightfield`` finds for rays ``first`` to ``last`` of an environment, all from ``o``."""
+    """Hits that ``intersect_heightfield`` finds for rays ``first`` to ``last`` of an environment, all from ``o``."""
     ...

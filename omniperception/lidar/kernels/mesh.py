@@ -15,7 +15,7 @@ STACK_SIZE = constant(HEADER, "stack_size")
 
 @wp.struct
 class MeshPart:
-    """Where the tree of one shape's mesh lies in the arrays of its scene; strides are those of environments."""
+    """Place of the tree of one shape's mesh in the arrays of its scene; strides are those of environments."""
 
     first_child: int
     first_node: int
@@ -64,7 +64,7 @@ def corner_of(triangles: wp.array2d(dtype=wp.vec4), first_leaf: int, face: int, 
 
 @wp.func
 def plane_through(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, o: wp.vec3d, d: wp.vec3d, t: wp.float64):
-    """Where the ray crosses the plane of a triangle that float32 hit near ``t``; no farther off than its corners."""
+    """Distance at which the ray crosses the plane of a triangle that float32 hit near ``t``, within its corners."""
     n = wp.normalize(wp.cross(b - a, c - a))
     sine = wp.dot(n, d)
     if wp.abs(sine) < wp.float64(1.0e-9):

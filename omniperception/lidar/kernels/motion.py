@@ -133,7 +133,7 @@ def shape_at(track: Track, env: int, shape: int, segment: int, fraction: float):
 
 @wp.func
 def view_at(track: Track, env: int, viewpoint: Viewpoint, segment: int, fraction: float):
-    """Where the sensor is."""
+    """Pose of the sensor."""
     pose = viewpoint.pose
     if viewpoint.body >= 0:
         pose = body_at(track, env, viewpoint.body, segment, fraction) * pose
@@ -154,7 +154,7 @@ def moment_at(track: Track, env: int, viewpoint: Viewpoint, time: float):
 
 @wp.func
 def is_there(track: Track, env: int, body: int):
-    """Whether a body has a pose all along."""
+    """Tell whether a body has a pose all along."""
     there = bool(True)
     if body >= 0:
         for segment in range(track.segments):
@@ -165,7 +165,7 @@ def is_there(track: Track, env: int, body: int):
 
 @wp.func
 def chord_error(track: Track, env: int, body: int, pose: wp.transformd):
-    """How far a point fixed at ``pose`` on a turning body strays from even motion along a line.
+    """Distance by which a point fixed at ``pose`` on a turning body strays from even motion along a line.
 
     A function whose second derivative is at most arm * angle^2 differs by an eighth of that from its chord.
     """

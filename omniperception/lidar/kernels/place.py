@@ -27,7 +27,7 @@ HALF_PI = wp.constant(wp.float32(0.5 * math.pi))
 
 @wp.struct
 class Limits:
-    """Which shapes a viewer may see at all."""
+    """Shapes that a viewer may see at all."""
 
     viewed: wp.array(dtype=wp.int32)  # indices of shapes
     num_viewed: int
@@ -171,7 +171,7 @@ def bound_groups(
 
 @wp.func
 def _is_between(c: wp.vec3, distance: float, radius: float, sin_low: float, sin_high: float):
-    """Whether a sphere around c, which does not hold the origin, reaches between two elevations given by their sines.
+    """Tell whether a sphere around c, without the origin in it, reaches between two elevations given by their sines.
 
     Its lowest and highest elevation are that of c minus and plus the angle that its radius fills; where the sum is
     beyond the zenith or the nadir, its cosine is negative, and the sphere holds the pole.

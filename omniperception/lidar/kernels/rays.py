@@ -14,7 +14,7 @@ from .slots import Slots
 
 @wp.func
 def may_hit(d: wp.vec3, c: wp.vec3, radius: float, best: float):
-    """Whether a ray from the origin comes into a sphere before ``best``, with room for rounding."""
+    """Tell whether a ray from the origin comes into a sphere before ``best``, with room for rounding."""
     ahead = wp.dot(d, c)
     square = wp.dot(c, c)
     outside = square - radius * radius * (1.0 + SLACK)

@@ -19,7 +19,7 @@ def to_quatd(wxyz: wp.vec4d):
 
 @wp.func
 def is_pose(p: wp.vec3d, q: wp.vec4d):
-    """Whether a position and an orientation are finite and the orientation is one."""
+    """Tell whether a position and an orientation are finite and the orientation is one."""
     norm = wp.dot(q, q)
     away = wp.dot(p, p)
     return norm > wp.float64(1.0e-12) and norm < wp.float64(1.0e12) and away < wp.float64(1.0e30)

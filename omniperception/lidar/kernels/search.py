@@ -27,7 +27,7 @@ FEW = wp.constant(2)
 
 @wp.struct
 class Located:
-    """Where a shape is for a ray that starts at the origin: its centre, and its axes in rows."""
+    """Pose of a shape for a ray that starts at the origin: its centre, and its axes in rows."""
 
     c: wp.vec3
     axes: wp.mat33
@@ -44,7 +44,7 @@ class SlotHit:
 
 @wp.struct
 class NearestHit:
-    """What a ray hits first: its distance, the slot, -1 for nothing, and the face of a mesh."""
+    """First hit of a ray: its distance, the slot, -1 for nothing, and the face of a mesh."""
 
     t: wp.float32
     slot: wp.int32
@@ -55,7 +55,7 @@ class NearestHit:
 def slots_ahead(
     words: wp.array3d(dtype=wp.float32), env: int, word: int, count: int, dx: float, dy: float, dz: float
 ) -> int:
-    """Which of the first ``count`` of a word's slots a ray along (dx, dy, dz) may hit, one bit each."""
+    """Those of the first ``count`` of a word's slots that a ray along (dx, dy, dz) may hit, one bit each."""
     ...
 
 
@@ -75,7 +75,7 @@ def lowest_bit(bits: int) -> int:
 
 @wp.func
 def passes_sphere(d: wp.vec3, c: wp.vec3, radius: float):
-    """Whether a ray from the origin misses a sphere around c, with room for rounding."""
+    """Tell whether a ray from the origin misses a sphere around c, with room for rounding."""
     along = wp.dot(d, c)
     square = wp.dot(c, c)
     outside = square - radius * radius * (1.0 + SLACK)

@@ -15,7 +15,7 @@ WORD = wp.constant(constant(SLOTS_AHEAD, "word_size"))
 
 @wp.struct
 class Viewpoint:
-    """Where the viewer is on which body; -1: in the environment."""
+    """Pose of the viewer and its body; -1: in the environment."""
 
     body: int
     pose: wp.transformd

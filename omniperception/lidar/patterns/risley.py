@@ -40,7 +40,7 @@ class RisleyScanner:
     fan_deg: float = 0.0
 
     def directions(self, time: np.ndarray, laser: np.ndarray) -> np.ndarray:
-        """Where lasers point.
+        """Directions of lasers.
 
         Args:
             time: s; any shape that broadcasts with ``laser``.

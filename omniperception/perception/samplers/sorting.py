@@ -44,7 +44,7 @@ def sort_rays(
 
 
 def memory_of_order(items: torch.Tensor) -> torch.Tensor:
-    """Where :func:`sort_rays` leaves the order (N, R): of all rays, in the first half of what is sorted (2, N, R)."""
+    """Buffer of the order (N, R) that :func:`sort_rays` leaves: all rays, the first half of the sorted (2, N, R)."""
     return items[0] if items.device.type in SORT_ALL_RAYS_ON else torch.empty_like(items[0])
 
 
@@ -61,5 +61,5 @@ def sort_segments(keys: torch.Tensor, items: torch.Tensor, num_envs: int) -> Non
 
 @lru_cache(64)
 def _starts(num_envs: int, length: int, device: torch.device) -> torch.Tensor:
-    """Where the rows begin, and where the last one ends."""
+    """Begin of each row, and the end of the last one."""
     return torch.arange(num_envs + 1, dtype=torch.int32, device=device) * length

@@ -89,7 +89,7 @@ def key_rays(
     num_lanes: int,
     work: Work,
 ):
-    """What each ray is sorted by: misses, and distal hits that are not used, come first."""
+    """Key by which each ray is sorted: misses, and distal hits that are not used, come first."""
     thread, lane = wp.tid()
     env = env_offset + thread
     for ray in range(lane, ranges.shape[1], num_lanes):
@@ -106,7 +106,7 @@ def key_rays(
 
 @wp.kernel
 def find_parts(env_offset: int, work: Work):
-    """Where each sorted row's proximal and distal hits begin."""
+    """Begin of each sorted row's proximal and distal hits."""
     env = env_offset + wp.tid()
     num_rays = work.rays.shape[1]
     proximal = first_from(work.keys, env, 0, num_rays, _PROXIMAL)
