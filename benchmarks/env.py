@@ -9,7 +9,7 @@ iteration  a whole PPO iteration, beside the bare physics of its rollout
 update     the update of a PPO iteration alone, on the same rollout again and again
 gain       what it would cost to have what a scene leaves out: each thing forced in, with no effect on the task
 inference  an exported policy on one core, from sensor readings to joint targets, preprocessing included: the points
-           that training kept, the device's whole frame thinned to them, and the whole frame; latency.json beside it
+           that training kept, the device's whole frame thinned to them, and the whole frame
 
 Everything is timed in turn, wall time and CPU time of all threads; ratios are those of the same round. `against`,
 overrides with commas between them, times the task in turn with the one to which they lead, instead of bare physics.
@@ -256,7 +256,7 @@ def main(given: Arguments, overrides: list[str]) -> None:
         if overrides:
             raise ConfigError(f"{overrides[0]}: what=inference takes a run as it was trained; leave overrides out")
         run_dir = config.find_run(given.run)
-        report([latency(run_dir, given.steps)], about(1), run_dir / FOLDER)
+        report([latency(run_dir, given.steps)], about(1), given.out)
         return
     if given.what == "gain":
         report([gains(given.repeats, overrides)], about(1), given.out)

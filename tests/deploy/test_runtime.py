@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -289,12 +290,14 @@ def test_the_commands(exported_run, tmp_path):
     done = call("export.py", f"run={run_dir}", f"out={tmp_path / 'there'}", "formats=torchscript")
     assert done.returncode == 0 and "wrote" in done.stdout, done.stderr
     assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["policy.json", "policy.pt"]
-    done = call("benchmark_inference.py", f"run={run_dir}", f"out={tmp_path / 'there'}")
+    shutil.copytree(tmp_path / "there", tmp_path / "run" / "exported")
+    shutil.copy(run_dir / "config.yaml", tmp_path / "run")
+    done = call("benchmark_env.py", "what=inference", f"run={tmp_path / 'run'}")
     assert done.returncode == 2 and "has no ONNX file" in done.stderr and "Traceback" not in done.stderr
-    done = call("benchmark_inference.py", f"run={run_dir}", "steps=20")
-    assert done.returncode == 0 and "without frame" in done.stdout and "p99" in done.stdout, done.stderr
-    timed = json.loads((run_dir / "exported" / "latency.json").read_text())["cases"]["as trained"]
-    assert timed["without_frame"]["steps"] == 20 and 0 < timed["without_frame"]["p50_ms"] < 1000
+    done = call("benchmark_env.py", "what=inference", f"run={run_dir}", "steps=20", f"out={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "latency.json").read_text())["rows"]
+    assert row["case"] == "as trained" and row["step"] == "without frame" and 0 < row["p50_ms"] < 1000
 
 
 def test_what_cannot_be_exported_is_named(exported_run, tmp_path):
