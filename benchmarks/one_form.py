@@ -25,7 +25,7 @@ HALVES = {"max_range": 6.0, "split_deg": 20.0, "ring_deg": 9.0, "num_threads": 1
 CELLS = {"band_edges": (-0.34, -0.25, -0.15, -0.05, 0.15, 0.5, 3.0), "decay": 0.5, "blind": 0.3, "body": (0.5, 0.28)}
 SAMPLERS: dict[str, Callable[[], Sampler]] = {
     "pd_risknet: 256 + 128": lambda: PdSampler(256, 128, **HALVES),
-    "pd_risknet_small: 64 + 36 x 6": lambda: ProximitySampler(64, 36, **HALVES, **CELLS),
+    "proximity_gru: 64 + 36 x 6": lambda: ProximitySampler(64, 36, **HALVES, **CELLS),
     "fps_gru_small: 280": lambda: FpsSampler(280, max_range=6.0, ring_deg=9.0, num_threads=1),
 }
 

@@ -70,7 +70,8 @@ NAMES: dict[str, Kind] = {
         built=False,
     ),
     "perception.network": Kind(
-        _members("perception", direct_mlp="DirectMlp", fps_mlp="FpsMlp", fps_gru="FpsGru", pd_risknet="PdRiskNet"),
+        _members("perception", direct_mlp="DirectMlp", fps_mlp="FpsMlp", fps_gru="FpsGru", pd_risknet="PdRiskNet")
+        | _members("perception", proximity_gru="ProximityGru", polar_rings="PolarRings"),
         built=False,
         given=None,
     ),

@@ -36,7 +36,7 @@ def test_a_pretrained_policy_follows_its_command(run_dir):
 @pytest.mark.slow
 def test_what_it_sees_keeps_the_published_policy_from_touching():
     """Of 12 trials among standing obstacles it touches in at least 6 fewer than with its LiDAR covered (0 and 12)."""
-    run_dir, touched = RUNS[-1].with_name("pd_risknet"), []
+    run_dir, touched = RUNS[-1].with_name("avoider"), []
     overrides = ["scenario=static", "num_envs=12", "terminations.episode_length_s=10.0"]
     for look in (lambda env, policy: policy, covered):
         trained = load_policy(build.assemble(config.load(run_dir, overrides)), run_dir)

@@ -172,7 +172,7 @@ class TestStrangers:
             ("rewards/terms/x", {"weight": 1.0, "func": "omniperception.lidar.os.system"}),
             ("observations/groups/command/terms/x", {"func": "os.mkdir", "path": "touched"}),
             ("perception/network", {"type": "os.system", "command": "touch touched"}),
-            ("perception/network/rings", {"type": "os.system"}),
+            ("perception/network", {"type": "polar_rings", "rings": {"type": "os.system"}}),
             ("perception/sampler/type", "os.mkdir"),
             ("lidar/pattern", {"type": "os.mkdir", "path": "touched"}),
             ("terrain/type", "logging.FileHandler"),

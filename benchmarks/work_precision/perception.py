@@ -22,7 +22,7 @@ from omniperception.env.config import HEIGHT_TARGET
 from omniperception.env.env import OmniEnv
 from omniperception.env.heights import height_grid
 from omniperception.lidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
-from omniperception.perception import Attitude, PdRiskNet, PdSampler, ProximitySampler, Sampler
+from omniperception.perception import Attitude, PdSampler, PerceptionNetwork, ProximitySampler, Sampler
 from omniperception.scene.rays import HitClass, ray_shapes
 
 from .scene import dense_directions
@@ -300,9 +300,8 @@ def history_study(overrides: Sequence[str], sizes: Sizes, histories: Sequence[in
     targets = torch.stack([cloud.true_sectors for cloud in clouds], 1).unflatten(1, (sizes.episodes, per_episode))
     targets = (1.0 - targets.flatten(0, 1)[:, -2] / NEARNESS_RANGE).clamp(min=0.0)
     held_out = torch.arange(len(frames)) >= len(frames) * 3 // 4  # other environments
-    options = {key: value for key, value in perception.network.keywords.items() if key != "history"}
-    networks: dict[str, Callable[[], PdRiskNet]] = {
-        f"window of {n}": partial(PdRiskNet, **sampler.sizes, history=n, **options)
+    networks: dict[str, Callable[[], PerceptionNetwork]] = {
+        f"window of {n}": partial(perception.network, **sampler.sizes, history=n)
         for n in sorted({*histories, perception.history} & set(range(1, per_episode)))
     }
     default = f"window of {perception.history}"
@@ -320,7 +319,7 @@ def history_study(overrides: Sequence[str], sizes: Sizes, histories: Sequence[in
         facts = {"bytes per environment": frames[0, 0].numel() * 4 * network.history}
         choices.append(Choice(name, costs[name], {SECTOR: errors[name]}, name == default, facts=facts))
     notes = (
-        f"PD-RiskNet as configured, {sizes.steps} steps of Adam (1e-3) on {int((~held_out).sum())} scenes of"
+        f"The network as configured, {sizes.steps} steps of Adam (1e-3) on {int((~held_out).sum())} scenes of"
         f" {per_episode - 1} frames, tested on {int(held_out.sum())} others; robots stand among obstacles=mixed. Short"
         " training: it compares what is easily learnt. Reference: rays all over the field of view at the newest frame."
         " Cost: one newest embedding for 64 environments.",
@@ -379,12 +378,12 @@ def _sampled(
     return {name: 1e6 * t.least_cpu_s / len(clouds[name].ranges) for name, t in timings.items()}, outs
 
 
-def _embedding_costs(networks: Mapping[str, PdRiskNet], frames: torch.Tensor, sizes: Sizes) -> dict[str, float]:
+def _embedding_costs(networks: Mapping[str, PerceptionNetwork], frames: torch.Tensor, sizes: Sizes) -> dict[str, float]:
     """CPU time of the newest embedding, us per environment."""
     num_envs = 64
     some = frames[torch.arange(num_envs) % len(frames)]
 
-    def embed(network: PdRiskNet) -> None:
+    def embed(network: PerceptionNetwork) -> None:
         count = torch.full((num_envs, 1), network.history)
         with torch.inference_mode():
             network(some[:, -network.history :], count)
@@ -394,7 +393,7 @@ def _embedding_costs(networks: Mapping[str, PdRiskNet], frames: torch.Tensor, si
     return {name: 1e6 * t.least_cpu_s / num_envs for name, t in timings.items()}
 
 
-def _fit(network: PdRiskNet, frames: torch.Tensor, targets: torch.Tensor, sizes: Sizes) -> None:
+def _fit(network: PerceptionNetwork, frames: torch.Tensor, targets: torch.Tensor, sizes: Sizes) -> None:
     """Regresses the sector part of the newest embedding on the nearness (B, 36)."""
     adam, generator = torch.optim.Adam(network.parameters(), lr=1e-3), torch.Generator().manual_seed(0)
     for _ in range(sizes.steps):
@@ -405,7 +404,7 @@ def _fit(network: PdRiskNet, frames: torch.Tensor, targets: torch.Tensor, sizes:
         adam.step()
 
 
-def _embed(network: PdRiskNet, frames: torch.Tensor) -> torch.Tensor:
+def _embed(network: PerceptionNetwork, frames: torch.Tensor) -> torch.Tensor:
     """The sector part (B, 36) of the newest embedding of sequences (B, F, P, 3)."""
     count = torch.full((len(frames), 1), network.history)
     embedding = network(frames[:, -network.history :], count)[:, 0]

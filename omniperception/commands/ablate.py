@@ -1,11 +1,11 @@
 """Trains perception variants over seeds, evaluates them in scenarios, and writes the paper's table beside ours.
 
-    ablate variants=fps_mlp_small,fps_gru_small,pd_risknet_rings seeds=1,2,3
+    ablate variants=fps_mlp_small,fps_gru_small,polar_rings seeds=1,2,3
     ablate stage=train hydra/launcher=submitit_slurm hydra.launcher.partition=cpu
 
 Runs lie in <out>/<variant>/seed<seed>. The same command goes on where it was stopped: finished runs and evaluations are
 left alone. A variant is a preset of `perception`, or a name from `VARIANTS` in omniperception/evaluation/ablation.py
-(such as pd_risknet_rings_no_match), which lists its overrides. On a cluster, with pip install
+(such as polar_rings_no_match), which lists its overrides. On a cluster, with pip install
 'omniperception[train,cluster]', give stage=train and Hydra's launcher; nothing else differs. Writes
 <out>/ablation.md and ablation.json.
 """
@@ -30,7 +30,7 @@ class Arguments:
     stage: str = argument("all", "what is done", choices=STAGES)
     out: Path = argument(Path("outputs/ablation"), "folder of the study")
     experiment: str = argument("avoid", "recipe that all variants share")
-    variants: tuple[str, ...] = argument(("fps_mlp_small", "fps_gru_small", "pd_risknet_rings"), "perception variants")
+    variants: tuple[str, ...] = argument(("fps_mlp_small", "fps_gru_small", "polar_rings"), "perception variants")
     seeds: tuple[int, ...] = argument((1, 2, 3), "seeds; each variant is trained with each", least=0)
     scenarios: tuple[str, ...] = argument(("all",), "where they are evaluated")
     trials: int = argument(1000, "trials of each run in each scenario, at least", least=1)

@@ -1,7 +1,7 @@
 """Evaluates a run in fixed scenarios: rates with 95 % intervals, clearance, time, energy, beside baselines.
 
     evaluate run=latest scenario=all policy=run,blind
-    evaluate run=pretrained/pd_risknet scenario=corridor trials=250 commands.speed=0.8
+    evaluate run=pretrained/avoider scenario=corridor trials=250 commands.speed=0.8
 
 A scenario from conf/scenario replaces the run's obstacles, commands, terminations, terrain, randomization and seed; the
 run keeps its robot, LiDAR, observations, rewards and networks. Overrides go on top. The same seed, number of trials and

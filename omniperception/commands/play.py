@@ -1,7 +1,7 @@
 """Replays a run: counts what its policy does in whole episodes and films it.
 
     play run=latest obstacles=static num_envs=64 seed=3
-    play run=pretrained/pd_risknet scenario=moving viewer=none
+    play run=pretrained/avoider scenario=moving viewer=none
 
 All obstacles are present from the first step. Writes replay.json and, with viewer=video, replay.mp4 and replay.png into
 the run directory.

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from omniperception.perception.networks.base import DirectMlp, FpsGru, FpsMlp, PerceptionNetwork
 from omniperception.perception.networks.motion_match import MotionMatch
-from omniperception.perception.networks.pd_risknet import PdRiskNet
+from omniperception.perception.networks.pd_risknet import PdRiskNet, ProximityGru
+from omniperception.perception.networks.polar_rings import PolarRings
 from omniperception.perception.samplers.base import Attitude, Sampler
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ __all__ = [
     "PdRiskNet",
     "PdSampler",
     "PerceptionNetwork",
+    "PolarRings",
+    "ProximityGru",
     "ProximitySampler",
     "RawSampler",
     "RingPath",

@@ -35,10 +35,10 @@ RECIPES = {
     "fps_gru": ("perception=fps_gru", "perception.sampler.num_points=64"),
     "direct_mlp": ("perception=direct_mlp", "perception.history=3"),
     "pd_risknet": ("perception=pd_risknet", "obstacles=static"),
-    "pd_risknet_small": ("perception=pd_risknet_small", "randomization=paper"),
+    "proximity_gru": ("perception=proximity_gru", "randomization=paper"),
     "pd_risknet_no_distal": overrides_of("pd_risknet_no_distal"),
-    "pd_risknet_small_no_proximal": overrides_of("pd_risknet_small_no_proximal"),
-    "pd_risknet_rings": ("experiment=avoid", "init=unread"),
+    "proximity_gru_no_proximal": overrides_of("proximity_gru_no_proximal"),
+    "polar_rings": ("experiment=avoid", "init=unread"),
     "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
     "motion_by_proximal": ("experiment=avoid", "init=unread", *overrides_of("pd_risknet_no_distal")),
 }
@@ -46,10 +46,10 @@ ALIKE = {
     "fps_mlp_small": "fps_mlp",
     "fps_gru_small": "fps_gru",
     "direct_mlp_small": "direct_mlp",
-    "pd_risknet_no_proximal": "pd_risknet_small_no_proximal",
-    "pd_risknet_rings_no_height": "pd_risknet_rings",
-    "pd_risknet_rings_no_match": "pd_risknet_rings",
-    "pd_risknet_rings_no_proximal": "pd_risknet_rings",
+    "pd_risknet_no_proximal": "proximity_gru_no_proximal",
+    "polar_rings_no_height": "polar_rings",
+    "polar_rings_no_match": "polar_rings",
+    "polar_rings_no_proximal": "polar_rings",
 }
 """Presets that differ from a recipe's in sizes, or lack a part."""
 STAND = RobotState([0.0] * 12, [0.0] * 12, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3)
@@ -127,7 +127,7 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
 @pytest.mark.slow
 def test_the_evaluation_result_is_that_of_torch(exported_run):
     """Two environments go their own ways, one driven by torch, the other by the exported policy."""
-    run_dir = exported_run("pd_risknet_small")
+    run_dir = exported_run("proximity_gru")
     overrides = ("num_envs=4", "terminations.episode_length_s=0.8", "seed=5")
     expected = trained(run_dir, *overrides)
     expected = run_episodes(expected.env, expected.policy, 8)
@@ -206,7 +206,7 @@ def test_thinning_keeps_what_training_kept(exported_run):
 
 
 def test_the_description_says_what_was_trained(exported_run):
-    described = Description.read(exported_run("pd_risknet_small") / "exported")
+    described = Description.read(exported_run("proximity_gru") / "exported")
     assert described.control_period_s == 0.02 and described.lidar.period_s == 0.1
     assert described.joints.names[0] == "FL_hip_joint" and described.joints.default_pos[:3] == [0.1, 0.8, -1.5]
     assert (described.joints.kp, described.joints.kd, described.joints.action_scale) == (25.0, 0.6, 0.25)

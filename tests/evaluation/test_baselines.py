@@ -43,8 +43,8 @@ class TestSteered:
         assert torch.equal(env.get_observations()["command"], given)  # the task's command is what it was
 
     def test_what_the_policy_perceives_itself_does_not_matter(self):
-        run = config.load(ROOT / "pretrained/pd_risknet", ["scenario=corridor", "num_envs=4"])
-        trained = load_policy(build.assemble(run), ROOT / "pretrained/pd_risknet")
+        run = config.load(ROOT / "pretrained/avoider", ["scenario=corridor", "num_envs=4"])
+        trained = load_policy(build.assemble(run), ROOT / "pretrained/avoider")
         env, controller = trained.env, trained.env.config.rewards.avoidance
         commanded = steered(env, trained.policy, controller, None)
         with torch.no_grad():

@@ -93,7 +93,7 @@ def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
         return steered(env, policy, avoidance, limits)
 
     monkeypatch.setattr(suite, "steered", spy)
-    run, walker = ROOT / "pretrained/pd_risknet", ROOT / "pretrained/gait"
+    run, walker = ROOT / "pretrained/avoider", ROOT / "pretrained/gait"
     for walks in (None, walker):
         suite._contender("scripted", Evaluation(run, ["static"], ["scripted"], trials=2, walker=walks), "static")
     assert given == [None, ((-1.0, 1.5), (-1.0, 1.0))]

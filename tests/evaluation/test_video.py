@@ -113,7 +113,7 @@ def test_a_video_of_the_real_environment_plays(make_env, tmp_path):
 
 
 def test_lidar_points_lie_on_what_was_hit(make_env, tmp_path):
-    env = make_env("obstacles=static", "num_envs=2", "perception=pd_risknet_small")
+    env = make_env("obstacles=static", "num_envs=2", "perception=proximity_gru")
     recorder = Recorder(env, tmp_path / "a.mp4", duration_s=1.0, width=WIDTH, height=HEIGHT, env_id=1)
     for _ in range(5):
         env.step(torch.zeros(2, 12))
@@ -127,7 +127,7 @@ def test_lidar_points_lie_on_what_was_hit(make_env, tmp_path):
 
 def test_points_of_an_ended_episode_are_not_shown(make_env, tmp_path):
     short = "terminations.episode_length_s=0.14"  # 7 steps, a frame every 5
-    env = make_env("obstacles=static", "num_envs=2", short, "perception=pd_risknet_small")
+    env = make_env("obstacles=static", "num_envs=2", short, "perception=proximity_gru")
     recorder = Recorder(env, tmp_path / "a.mp4", duration_s=1.0, width=WIDTH, height=HEIGHT)
     shown = []
     for _ in range(10):

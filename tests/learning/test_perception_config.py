@@ -6,7 +6,7 @@ import pytest
 
 from omniperception.evaluation.ablation import VARIANTS
 from omniperception.learning.config import PerceptionConfig
-from omniperception.perception import FpsMlp, FpsSampler, PdRiskNet, PdSampler, ProximitySampler
+from omniperception.perception import FpsMlp, FpsSampler, PdRiskNet, PdSampler, ProximityGru, ProximitySampler
 
 CELLS = {"band_edges": [-1.0, 0.0, 0.5, 2.0], "decay": 0.5, "blind": 0.3, "body": [0.5, 0.3], "split_deg": 20.0}
 
@@ -17,7 +17,7 @@ def perception(sampler, network, history=3):
 
 @pytest.mark.parametrize("num_proximal", [0, 6])
 def test_cells_of_the_distal_half_are_counted_for_the_network(num_proximal):
-    network = partial(PdRiskNet, proximal_dim=5 if num_proximal else 0, distal_dim=3, distal_encoder=4)
+    network = partial(ProximityGru, proximal_dim=5 if num_proximal else 0, distal_dim=3, distal_encoder=4)
     sampler = partial(ProximitySampler, num_proximal, 7, **CELLS)
     built = perception(sampler, network).build_network()
     assert (built.num_points, built.history) == (num_proximal + 3 * 7, 3)

@@ -1,10 +1,21 @@
 """Windowed layers against the plain network run on each window by itself."""
 
+import functools
+
 import pytest
 import torch
 from torch import nn
 
-from omniperception.perception import DirectMlp, FpsGru, FpsMlp, PdRiskNet
+from omniperception.perception import (
+    DirectMlp,
+    FpsGru,
+    FpsMlp,
+    MotionMatch,
+    PdRiskNet,
+    PolarRings,
+    ProximityGru,
+    RingPath,
+)
 from omniperception.perception.networks.windows import WindowedGru, WindowedLinear
 
 H, W, B = 5, 4, 3
@@ -69,7 +80,9 @@ def test_invalid_frames_have_no_influence():
 @pytest.mark.parametrize("encoder", [0, 7])
 def test_pd_risknet_splits_the_points(encoder):
     """Each half in a GRU of its own; the distal half may pass a layer before."""
-    network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3, distal_encoder=encoder)
+    network = PdRiskNet(4, 2, history=H, proximal_dim=5, distal_dim=3)
+    if encoder:
+        network = ProximityGru(4, 2, history=H, proximal_dim=5, distal_dim=3, distal_encoder=encoder)
     frames, count = sequence(), counts()
     far = frames[:, :, 4:]
     if encoder:
@@ -89,6 +102,24 @@ def test_paper_dimensions():
     assert features[..., network.supervised["height_target"]].shape == (2, 1, 187)
     assert network.supervised["sector_target"] == slice(187, 223)  # within the distal half
     assert (features[0] == 0).all()
+
+
+@pytest.mark.parametrize("proximal_dim", [0, 5])
+def test_rings_stand_beside_the_proximal_gru(proximal_dim):
+    """The last row of a frame is the motion of the base; what a path embeds, it embeds alone."""
+    match = MotionMatch(speeds=(1.0,), num_directions=4, width=0.4, period_s=0.1)
+    rings = functools.partial(RingPath, num_sectors=9, channels=(8,), kernel_sizes=(3,), match=match)
+    near = 4 if proximal_dim else 0
+    network = PolarRings(near, 2 * 9 + 1, H, rings, proximal_dim)
+    nn.init.normal_(network.rings.layers[-1].weight)
+    frames, count = sequence(near + 19).sigmoid(), counts()
+    around = network.rings(frames[:, :, near:-1], frames[:, :, -1], count)
+    below = [network.proximal(frames[:, :, :near].flatten(2), count)] if proximal_dim else []
+    got = network(frames, count)
+    assert around.abs().max() > 0 and torch.equal(got, torch.cat((*below, around), -1))
+    assert torch.equal(got[..., network.supervised["motion_target"]], around)
+    assert network.feature_dim == proximal_dim + 3 * 9
+    assert ("height_target" in network.supervised) == bool(proximal_dim)
 
 
 def test_windowed_linear_equals_linear_on_each_window():

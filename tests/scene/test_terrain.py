@@ -265,7 +265,7 @@ class TestSupervision:
     def test_heights_are_those_of_the_newest_frame(self, make_env):
         """The base's height at the LiDAR's ticks, held until the next; where a term reads them, of the moment."""
         for terms, fresh in (((), False), ((HEIGHTS,), True)):
-            env = make_env(*SMALL, "obstacles=mixed", "perception=pd_risknet_small", *terms, num_envs=3)
+            env = make_env(*SMALL, "obstacles=mixed", "perception=proximity_gru", *terms, num_envs=3)
             env.obstacles.level = 1.0
             at_tick = None
             for step in range(1, 13):
