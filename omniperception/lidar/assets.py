@@ -107,6 +107,10 @@ def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[
     def upload(values: list, dtype: type) -> wp.array:
         return wp.array(values if len(values) else [dtype()], dtype=dtype, device=device)
 
+    def by_env(values: np.ndarray, dtype: type) -> wp.array:
+        row = values if len(values) else np.zeros((1, *values.shape[1:]))
+        return wp.array(np.repeat(row[None], num_envs, 0), dtype=dtype, device=device)
+
     def concatenated(chunks: list[np.ndarray], dtype: type, ndim: int = 1) -> wp.array:
         if not chunks:
             return wp.empty((0,) * ndim, dtype=dtype, device=device)
@@ -116,9 +120,9 @@ def lay_out(shapes: Sequence[Shape], num_envs: int, device: wp.Device) -> tuple[
     geometry.kind = upload([int(shape.kind) for shape in shapes], wp.int32)
     geometry.body = upload([shape.body for shape in shapes], wp.int32)
     geometry.pose = upload([wp_pose(shape.pos, shape.quat) for shape in shapes], wp.transformd)
-    geometry.size = upload([shape.extents for shape in shapes], wp.vec3)
-    geometry.exact_size = upload([shape.extents for shape in shapes], wp.vec3d)
-    geometry.radius = upload([shape.bounding_radius for shape in shapes], wp.float32)
+    extents = np.array([shape.extents for shape in shapes], np.float64).reshape(-1, 3)
+    geometry.size, geometry.exact_size = by_env(extents, wp.vec3), by_env(extents, wp.vec3d)
+    geometry.radius = by_env(np.array([shape.bounding_radius for shape in shapes], np.float64), wp.float32)
     geometry.class_id = upload([shape.class_id for shape in shapes], wp.int32)
     geometry.part = upload(parts, wp.int32)
     geometry.mesh_part = wp.array(arrays.mesh_parts, dtype=MeshPart, device=device)

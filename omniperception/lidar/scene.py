@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from .kernels.slots import WORD, Slots, Viewpoint
 from .launch import SplitLaunch, default_num_threads, wp_device
 from .meshes import TriangleMesh
 from .shapes import Shape, ShapeKind
+from .sizes import ShapeSizes
 
 Array = torch.Tensor | np.ndarray
 QuatOrder = Literal["wxyz", "xyzw"]
@@ -98,17 +100,23 @@ class PlacedShapes:
         self._moves = carriers != {-1}
         self._launches: list[SplitLaunch] = []
         self._visible: torch.Tensor | None = None
+        if not self._moves:
+            scene.placed_once.add(self)
 
     def refresh(self) -> None:
         """Places the shapes where their bodies are now.
 
-        What no body carries is placed once, unless ``visible`` is in use.
+        What no body carries is placed once, and by ``place_again``, unless ``visible`` is in use.
         """
         if not self._launches or self._visible is not self._scene.visible_if_used:
             self._visible = self._scene.visible_if_used
             self._launches = self._record()
         elif not self._moves and self._visible is None:
             return
+        self.place_again()
+
+    def place_again(self) -> None:
+        """Places what has been placed before, though no body may have moved: sizes have changed."""
         for launch in self._launches:
             launch()
 
@@ -143,7 +151,8 @@ class RayScene:
     """Shapes in ``num_envs`` environments, carried by bodies whose poses are each environment's own.
 
     Every environment has its own origin, and a ray hits only the shapes of its own environment. Write ``body_pos`` and
-    ``body_quat`` in place before a cast, and ``visible`` to hide shapes or to have them in some environments only.
+    ``body_quat`` in place before a cast, and ``visible`` to hide shapes or to have them in some environments only;
+    ``set_sizes`` gives environments sizes of their own.
 
     Attributes:
         shapes: The shapes; a shape id is an index into this tuple.
@@ -213,6 +222,10 @@ class RayScene:
             mesh = self.shapes[k].asset
             assert isinstance(mesh, TriangleMesh)  # of a deformable
             self._deformables[k] = Deformable(mesh, part, self.geometry, num_envs, self.device, self.num_threads)
+        self._sizes = tuple(wp.to_torch(array) for array in (self.geometry.size, self.geometry.exact_size))
+        self._radius = wp.to_torch(self.geometry.radius)
+        self._sized: dict[tuple[int, ...], tuple[torch.Tensor, ShapeSizes]] = {}
+        self.placed_once: WeakSet[PlacedShapes] = WeakSet()
         self._visible: torch.Tensor | None = None
         self._placed: dict[frozenset[int], PlacedShapes] = {}
 
@@ -277,6 +290,53 @@ class RayScene:
             self.body_quat[..., 0].copy_(quat[..., 3])
             self.body_quat[..., 1:].copy_(quat[..., :3])
 
+    def sizes(self, shape_ids: Sequence[int]) -> torch.Tensor:
+        """A copy of the present sizes of shapes, metres, as in ``set_sizes``, (num_envs, k, 3) float64."""
+        return self._sizes[1][:, list(shape_ids)]
+
+    def set_sizes(
+        self, shape_ids: Sequence[int], sizes: Array, env_ids: torch.Tensor | None = None, check: bool = True
+    ) -> None:
+        """Gives boxes, spheres, cylinders, capsules and ellipsoids sizes of their own in some environments.
+
+        It writes into memory that casts read: those that are recorded, in graphs too, go on with the new sizes.
+
+        Args:
+            shape_ids: The k shapes.
+            sizes: Metres, as ``Shape.size`` with the unused of three values ignored, (n, k, 3), or (k, 3) for all n
+                environments.
+            env_ids: Which environments, (n,) int64; None for all.
+            check: Whether the values are looked at, for which the host waits for a GPU. Without it they have to be
+                positive and finite.
+
+        Raises:
+            ValueError: A shape has no such size, ``sizes`` has the wrong shape, or a value is not positive and finite.
+        """
+        index, shapes = self._sized_shapes(shape_ids)
+        num_envs, count = self.num_envs if env_ids is None else len(env_ids), len(index)
+        sizes = torch.as_tensor(sizes, device=self.device).double()
+        if sizes.shape not in ((num_envs, count, 3), (count, 3)):
+            raise ValueError(f"sizes {tuple(sizes.shape)} must be {(num_envs, count, 3)} or {(count, 3)}")
+        if check and not bool(shapes.are_valid(sizes)):
+            raise ValueError("sizes must be positive and finite where the kind of their shape reads them")
+        sizes = shapes.read(sizes).expand(num_envs, count, 3)
+        rows = slice(None) if env_ids is None else env_ids.to(self.device)[:, None]
+        for own in self._sizes:
+            own[rows, index] = sizes.to(own.dtype)
+        self._radius[rows, index] = shapes.bounding_radii(sizes).float()
+        for placed in self.placed_once:
+            placed.place_again()
+
+    def _sized_shapes(self, shape_ids: Sequence[int]) -> tuple[torch.Tensor, ShapeSizes]:
+        """Indices (k,) of primitives, and how they read their sizes."""
+        key = tuple(int(k) for k in shape_ids)
+        if key not in self._sized:
+            self._check_known("shape_ids", key)
+            names, kinds = [f"shapes[{k}]" for k in key], [self.shapes[k].kind for k in key]
+            index = torch.tensor(key, dtype=torch.int64, device=self.device)
+            self._sized[key] = index, ShapeSizes(names, kinds, self.device)
+        return self._sized[key]
+
     def broken_poses(self) -> torch.Tensor:
         """Bodies that have a pose that is not finite or a quaternion of norm 0, (num_envs, num_bodies) bool."""
         norm = torch.linalg.vector_norm(self.body_quat.double(), dim=-1)
@@ -338,10 +398,13 @@ class RayScene:
 
     def check_shape_ids(self, shape_ids: Sequence[int]) -> frozenset[int]:
         """``shape_ids`` as a set, or a ValueError if one of them is no shape of this scene."""
+        self._check_known("exclude_shapes", shape_ids)
+        return frozenset(int(k) for k in shape_ids)
+
+    def _check_known(self, name: str, shape_ids: Sequence[int]) -> None:
         unknown = [k for k in shape_ids if not 0 <= k < len(self.shapes)]
         if unknown:
-            raise ValueError(f"exclude_shapes={unknown} must be shape indices in 0..{len(self.shapes) - 1}")
-        return frozenset(int(k) for k in shape_ids)
+            raise ValueError(f"{name}={unknown} must be shape indices in 0..{len(self.shapes) - 1}")
 
     def cast(
         self,

@@ -49,7 +49,7 @@ class Shape:
         kind: What the shape is.
         size: Metres. Sphere ``(radius,)``; cylinder and capsule ``(radius, half_length)`` along the local z
             axis; box and ellipsoid half extents; plane ``()`` or ``(half_x, half_y)``, of which 0 is infinite, with its
-            normal along the local +z axis; the others ``()``.
+            normal along the local +z axis; the others ``()``. ``RayScene.set_sizes`` changes it by environment.
         body: Index of the moving body that carries the shape; -1 is fixed in the environment's frame.
         pos: Position in that body's frame, metres.
         quat: Orientation in that body's frame, (w, x, y, z), unit length.

@@ -33,7 +33,8 @@ REFINE = wp.constant(wp.float32(50.0))
 class Geometry:
     """Shapes of a scene, indexed by shape; the data of meshes and height fields follow one another.
 
-    ``body`` carries the shape at ``pose``, -1 being the environment. ``part`` is a shape's place in ``mesh_part`` or
+    ``size``, the same in float64 and the bounding ``radius`` are each environment's own, (num_envs, S). ``body``
+    carries the shape at ``pose``, -1 being the environment. ``part`` is a shape's place in ``mesh_part`` or
     ``field_part``. The tree of a mesh has boxes ``mesh_bounds`` (node, axis of lows then highs) of four children
     ``mesh_child``: a node if > 0, none if 0, leaf -1 - child if < 0. A leaf is four triangles ``mesh_triangle`` (leaf,
     3 * corner + axis). A height field's level is (first, columns) in ``field_extreme``, which holds lowest and highest
@@ -43,9 +44,9 @@ class Geometry:
     kind: wp.array(dtype=wp.int32)
     body: wp.array(dtype=wp.int32)
     pose: wp.array(dtype=wp.transformd)
-    size: wp.array(dtype=wp.vec3)
-    exact_size: wp.array(dtype=wp.vec3d)
-    radius: wp.array(dtype=wp.float32)
+    size: wp.array2d(dtype=wp.vec3)
+    exact_size: wp.array2d(dtype=wp.vec3d)
+    radius: wp.array2d(dtype=wp.float32)
     class_id: wp.array(dtype=wp.int32)
     part: wp.array(dtype=wp.int32)
     mesh_part: wp.array(dtype=MeshPart)
@@ -154,17 +155,17 @@ def shape_functions(mesh: bool, heightfield: bool) -> tuple[wp.Function, wp.Func
         found = wp.vec2(INF, 0.0)
         face = wp.int32(-1)
         if kind == PLANE:
-            found = hit_plane(d, c, axes, geometry.size[shape])
+            found = hit_plane(d, c, axes, geometry.size[env, shape])
         elif kind == CAPSULE:
-            found = hit_capsule(d, c, axes, geometry.size[shape])
+            found = hit_capsule(d, c, axes, geometry.size[env, shape])
         elif kind == SPHERE:
-            found = hit_sphere(d, c, geometry.size[shape])
+            found = hit_sphere(d, c, geometry.size[env, shape])
         elif kind == BOX:
-            found = hit_box(d, c, axes, geometry.size[shape])
+            found = hit_box(d, c, axes, geometry.size[env, shape])
         elif kind == CYLINDER:
-            found = hit_cylinder(d, c, axes, geometry.size[shape])
+            found = hit_cylinder(d, c, axes, geometry.size[env, shape])
         elif kind == ELLIPSOID:
-            found = hit_ellipsoid(d, c, axes, geometry.size[shape])
+            found = hit_ellipsoid(d, c, axes, geometry.size[env, shape])
         if wp.static(heightfield):
             if kind == HEIGHTFIELD:
                 on_field = intersect_heightfield(
@@ -207,7 +208,7 @@ def shape_functions(mesh: bool, heightfield: bool) -> tuple[wp.Function, wp.Func
         centre = wp.quat_rotate_inv(q, wp.transform_get_translation(pose))
         exact = wp.float64(t)
         own = wp.identity(n=3, dtype=wp.float64)
-        size = geometry.exact_size[shape]
+        size = geometry.exact_size[env, shape]
         if kind == PLANE:
             exact = exact_plane(direction, centre, own, size)[0]
         elif kind == CAPSULE:
@@ -246,7 +247,7 @@ def shape_functions(mesh: bool, heightfield: bool) -> tuple[wp.Function, wp.Func
         kind = geometry.kind[shape]
         n = wp.vec3(0.0, 0.0, 1.0)
         if kind < MESH:
-            n = outward_normal(kind, point, geometry.size[shape])
+            n = outward_normal(kind, point, geometry.size[env, shape])
         if wp.static(heightfield):
             if kind == HEIGHTFIELD:
                 n = heightfield_normal(geometry.field_part[geometry.part[shape]], geometry.field_height, face, point)

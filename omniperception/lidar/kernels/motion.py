@@ -187,7 +187,7 @@ def angle_between(a: wp.transformd, b: wp.transformd):
 def bound_swept_shapes(
     env_offset: int,
     track: Track,
-    shape_radius: wp.array(dtype=wp.float32),
+    shape_radius: wp.array2d(dtype=wp.float32),
     visible: wp.array2d(dtype=wp.bool),
     viewed: wp.array(dtype=wp.int32),
     num_viewed: int,
@@ -219,7 +219,7 @@ def bound_swept_shapes(
             there = there and visible[env, shape]
         bound = wp.vec4(0.0, 0.0, 0.0, -INF)
         near = float(0.0)
-        if there and shape_radius[shape] < INF:
+        if there and shape_radius[env, shape] < INF:
             low = wp.vec3(INF, INF, INF)
             high = wp.vec3(-INF, -INF, -INF)
             for end in range(2 * track.segments):
@@ -230,7 +230,7 @@ def bound_swept_shapes(
                 high = wp.max(high, offset)
             centre = 0.5 * (low + high)
             chord_errors = view_error + chord_error(track, env, track.shape_body[shape], track.shape_pose[shape])
-            radius = (shape_radius[shape] + 0.5 * wp.length(high - low) + chord_errors) * (1.0 + ANGLE_SLACK)
+            radius = (shape_radius[env, shape] + 0.5 * wp.length(high - low) + chord_errors) * (1.0 + ANGLE_SLACK)
             distance = wp.length(centre)
             near = wp.max(distance - radius, 0.0)
             if distance > radius:

@@ -118,7 +118,7 @@ def _curve_position(p: wp.vec3):
 def _order_along_curve(
     env: int,
     count: int,
-    radius: wp.array(dtype=wp.float32),
+    radius: wp.array2d(dtype=wp.float32),
     shape: wp.array2d(dtype=wp.int32),
     bound: wp.array2d(dtype=wp.vec4),
     # out
@@ -128,7 +128,7 @@ def _order_along_curve(
     low = wp.vec3(INF, INF, INF)
     high = wp.vec3(-INF, -INF, -INF)
     for slot in range(count):
-        if radius[shape[env, slot]] < INF:
+        if radius[env, shape[env, slot]] < INF:
             c = wp.vec3(bound[env, slot][0], bound[env, slot][1], bound[env, slot][2])
             low = wp.min(low, c)
             high = wp.max(high, c)
@@ -136,7 +136,7 @@ def _order_along_curve(
     scale = 1.0 / wp.max(wp.max(extent[0], wp.max(extent[1], extent[2])), NOTHING)
     for slot in range(count):
         key[env, slot] = -1.0
-        if radius[shape[env, slot]] < INF:
+        if radius[env, shape[env, slot]] < INF:
             c = wp.vec3(bound[env, slot][0], bound[env, slot][1], bound[env, slot][2])
             key[env, slot] = _curve_position(scale * (c - low))
     return 0
@@ -145,7 +145,7 @@ def _order_along_curve(
 @wp.kernel(module="unique", enable_backward=False)
 def bound_groups(
     env_offset: int,
-    radius: wp.array(dtype=wp.float32),
+    radius: wp.array2d(dtype=wp.float32),
     slots: Slots,
     # out
     group_out: wp.array2d(dtype=wp.vec4d),
@@ -165,7 +165,7 @@ def bound_groups(
         reach = wp.float64(0.0)
         for slot in range(first, last):
             away = wp.length(wp.transform_get_translation(slots.pose[env, slot]) - centre)
-            reach = wp.max(reach, away + wp.float64(radius[slots.shape[env, slot]]))
+            reach = wp.max(reach, away + wp.float64(radius[env, slots.shape[env, slot]]))
         group_out[env, group] = wp.vec4d(centre[0], centre[1], centre[2], reach)
 
 
@@ -262,8 +262,8 @@ def place_shapes(
         pose = to_view * pose
         if there:
             kind = geometry.kind[shape]
-            size = geometry.size[shape]
-            radius = geometry.radius[shape]
+            size = geometry.size[env, shape]
+            radius = geometry.radius[env, shape]
             c = flush_denormals(wp.vec3(wp.transform_get_translation(pose)))
             axes = axes_of(pose)
             z_axis = wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2])

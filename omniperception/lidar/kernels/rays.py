@@ -69,7 +69,7 @@ def rays_kernel(mesh: bool, heightfield: bool) -> wp.Kernel:
             if may_hit(d, middle, float(bound[3]), best):
                 for s in range(group * GROUP, wp.min(group * GROUP + GROUP, count)):
                     shape = slots.shape[env, s]
-                    radius = geometry.radius[shape]
+                    radius = geometry.radius[env, shape]
                     away = wp.transform_get_translation(slots.pose[env, s]) - origin
                     if may_hit(d, wp.vec3(away), radius, best):
                         skipped = wp.max(wp.dot(direction, away) - wp.float64(1.01 * radius), wp.float64(0.0))

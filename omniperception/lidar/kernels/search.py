@@ -146,7 +146,7 @@ def search_functions(has: frozenset[str]) -> tuple[wp.Function, wp.Function]:
                     return SlotHit(slots.marched_t[env, ray], face, slots.marched_uncertain[env, ray])
         at = locate(slots, track, moment, env, slot)
         if wp.static(displaced):
-            if passes_sphere(d, at.c, geometry.radius[shape]):
+            if passes_sphere(d, at.c, geometry.radius[env, shape]):
                 return SlotHit(INF, -1, False)
         hit = intersect(geometry, shape, env, d, at.c, at.axes, limit)
         return SlotHit(hit.t, hit.face, uncertain(hit, at.c))
