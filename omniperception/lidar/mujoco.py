@@ -62,7 +62,7 @@ def geom_shapes(
     assets: Assets = {}
     shapes = []
     for k in geom_ids:
-        kind = _kind(model, k)
+        kind = geom_kind(model, k)
         body = int(model.geom_bodyid[k])
         moves = body in body_ids
         quat = np.empty(4)
@@ -137,7 +137,8 @@ def _moves(model: mujoco.MjModel, body: int) -> bool:
     return bool(model.body_mocapid[model.body_rootid[body]] >= 0 or model.body_weldid[body] != 0)
 
 
-def _kind(model: mujoco.MjModel, geom: int) -> ShapeKind:
+def geom_kind(model: mujoco.MjModel, geom: int) -> ShapeKind:
+    """Kind of the shape that rays hit for a geom."""
     import mujoco
 
     name = mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_")

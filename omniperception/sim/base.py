@@ -5,8 +5,11 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Protocol
 
+import mujoco
 import torch
 
+from omniperception.lidar.mujoco import geom_kind
+from omniperception.lidar.sizes import ShapeSizes
 from omniperception.scene import World
 
 MAX_SPEED = 1e3
@@ -102,6 +105,18 @@ class Simulator(Protocol):
     def geom_velocities(self, geoms: tuple[int, ...]) -> torch.Tensor:
         """Linear velocities (num_envs, n, 3) (m/s, world) of the centres of geoms at the current state, float32."""
 
+    def resize(self, geoms: tuple[int, ...], env_ids: torch.Tensor, sizes: torch.Tensor) -> None:
+        """Gives geoms, k of them, sizes of their own in environments `env_ids` (n,), and contacts follow.
+
+        Args:
+            geoms: boxes, spheres, cylinders, capsules or ellipsoids, each the only geom of its body.
+            env_ids: (n,) which environments.
+            sizes: (n, k, 3) m, as MuJoCo has them; numbers that a kind does not read are ignored.
+
+        Raises:
+            ValueError: a geom is of another kind or shares its body.
+        """
+
     def model_field(self, name: str) -> torch.Tensor:
         """(num_envs, ...) per-environment values of a model field, made per-environment on the first call."""
 
@@ -122,6 +137,28 @@ class Simulator(Protocol):
 
     def update_model(self, env_ids: torch.Tensor) -> None:
         """Recomputes what the engine derives from model fields that were written for environments `env_ids` (n,)."""
+
+
+class SizedGeoms:
+    """Geoms of a model that are resized together.
+
+    Attributes:
+        index: (k,) int64, their ids.
+        shapes: how their kinds read sizes.
+    """
+
+    def __init__(self, model: mujoco.MjModel, geoms: tuple[int, ...], device: torch.device) -> None:
+        names = [f"geom {model.geom(k).name}" for k in geoms]
+        for name, k in zip(names, geoms, strict=True):
+            if model.body_geomnum[model.geom_bodyid[k]] != 1:
+                raise ValueError(f"{name} shares its body with other geoms; only one alone can be resized")
+        self.index = torch.tensor(geoms, dtype=torch.int64, device=device)
+        self.shapes = ShapeSizes(names, [geom_kind(model, k) for k in geoms], device)
+
+    def read(self, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Sizes (n, k, 3) as the engine stores them, and half extents (n, k, 3) of the boxes that hold the geoms."""
+        sizes = self.shapes.read(sizes)
+        return sizes, self.shapes.half_extents(sizes)
 
 
 class JointOrder:

@@ -10,7 +10,7 @@ import torch
 from mujoco.batch import Batch, SimulationError
 
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, Simulator
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, Simulator, SizedGeoms
 
 _INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -101,6 +101,7 @@ class MujocoSimulator:
         self._record = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
         self._records: dict[str, np.ndarray] = self._allocate_records(1)
         self._fields: dict[str, torch.Tensor] = {}
+        self._sized: dict[tuple[int, ...], SizedGeoms] = {}
         self._actuator_force: np.ndarray | None = None
         self._torque: torch.Tensor | None = None
         self._poses: tuple[np.ndarray, np.ndarray] | None = None
@@ -244,6 +245,16 @@ class MujocoSimulator:
         linear = velocity[:, body, 3:] + np.cross(velocity[:, body, :3], offset)
         return torch.from_numpy(linear.astype(np.float32))
 
+    def resize(self, geoms: tuple[int, ...], env_ids: torch.Tensor, sizes: torch.Tensor) -> None:
+        """The engine derives from size and box what else bounds a geom and its body."""
+        if geoms not in self._sized:
+            self._sized[geoms] = SizedGeoms(self.world.model, geoms, self.device)
+        sized, rows = self._sized[geoms], env_ids[:, None]
+        sizes, half_extents = sized.read(sizes.double())
+        self.model_field("geom_size")[rows, sized.index] = sizes
+        self.model_field("geom_aabb")[rows, sized.index, 3:] = half_extents
+        self.update_model(env_ids)
+
     def model_field(self, name: str) -> torch.Tensor:
         if name not in self._fields:
             self._fields[name] = torch.from_numpy(self.batch.expand(name))
@@ -267,7 +278,7 @@ class MujocoSimulator:
         self.failure.zero_()
         for name, value in state["fields"].items():
             self.model_field(name).copy_(value)
-        if "body_mass" in state["fields"]:
+        if state["fields"].keys() & {"body_mass", "geom_size"}:
             self.update_model(torch.arange(self.num_envs))
 
 

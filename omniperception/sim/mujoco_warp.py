@@ -15,7 +15,7 @@ import warp as wp
 
 from omniperception.lidar.launch import wp_device
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, SizedGeoms
 from omniperception.sim.kernels import move_kinematic, record
 from omniperception.sim.mujoco import SimConfig, apply_options
 
@@ -153,6 +153,7 @@ class MujocoWarpSimulator:
         recorded = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
         self._recorded: tuple[str, ...] = recorded
         self._fields: dict[str, torch.Tensor] = {}
+        self._sized: dict[tuple[int, ...], SizedGeoms] = {}
         self._indices: dict[tuple[int, ...], torch.Tensor] = {}
         self._graphs: dict[str, wp.Graph | None] = {}
         self._allocate_steps(config.decimation)
@@ -224,6 +225,15 @@ class MujocoWarpSimulator:
         velocity, centre = wp.to_torch(self.data.cvel)[:, body], wp.to_torch(self.data.subtree_com)[:, root]
         offset = self._geom_pos[:, index] - centre  # velocities are those at the tree's centre of mass
         return velocity[..., 3:] + torch.linalg.cross(velocity[..., :3], offset)
+
+    def resize(self, geoms: tuple[int, ...], env_ids: torch.Tensor, sizes: torch.Tensor) -> None:
+        if geoms not in self._sized:
+            self._sized[geoms] = SizedGeoms(self.world.model, geoms, self.device)
+        sized, rows = self._sized[geoms], env_ids[:, None]
+        sizes, half_extents = sized.read(sizes.float())
+        self.model_field("geom_size")[rows, sized.index] = sizes
+        self.model_field("geom_aabb")[rows, sized.index, 1] = half_extents
+        self.model_field("geom_rbound")[rows, sized.index] = sized.shapes.bounding_radii(sizes)
 
     def model_field(self, name: str) -> torch.Tensor:
         if name not in self._fields:
