@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,7 @@ from .shapes import SIZE_NAMES, Shape, ShapeKind
 if TYPE_CHECKING:
     import mujoco
 
-Assets = dict[tuple[ShapeKind, int], TriangleMesh | HeightField]
+Assets = dict[tuple[ShapeKind, int, bool], TriangleMesh | HeightField]
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ def geom_shapes(
     model: mujoco.MjModel,
     class_of: Callable[[int], int] | None = None,
     geoms: Sequence[int] | None = None,
+    hulls: Collection[int] = (),
 ) -> GeomShapes:
     """Every geom of a model as the exact shape that ``mj_ray`` intersects.
 
@@ -49,6 +50,7 @@ def geom_shapes(
         model: The compiled model.
         class_of: Class id (>= 0) of a geom by its id; 0 for all if None.
         geoms: Ids of the geoms to take; all that ``mj_ray`` hits if None, which leaves out the fully transparent.
+        hulls: Ids of geoms of which a mesh is taken as its convex hull, which is what MuJoCo collides.
 
     Raises:
         ValueError: A geom is a signed distance field, which has no surface that rays could be cast at.
@@ -75,7 +77,7 @@ def geom_shapes(
                 pos=tuple(model.geom_pos[k] if moves else data.geom_xpos[k]),
                 quat=tuple(model.geom_quat[k] if moves else quat),
                 class_id=class_of(k) if class_of is not None else 0,
-                asset=_asset(model, kind, int(model.geom_dataid[k]), assets),
+                asset=_asset(model, kind, int(model.geom_dataid[k]), k in hulls, assets),
             )
         )
     return GeomShapes(tuple(shapes), tuple(geom_ids), body_ids)
@@ -128,6 +130,29 @@ class MujocoScene(RayScene):
         self.copy_poses(data.xpos, data.xquat)
 
 
+def convex_hull(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
+    """The convex hull with which MuJoCo collides a mesh.
+
+    Returns:
+        Vertices (V, 3) in the frame of the mesh's geoms, metres, and triangles (T, 3) that turn counter-clockwise
+        seen from outside.
+
+    Raises:
+        ValueError: The model has no hull of it, because no geom with that mesh collides.
+    """
+    first = int(model.mesh_graphadr[mesh])
+    if first < 0:
+        raise ValueError(f"mesh {mesh} ({model.mesh(mesh).name!r}) has no convex hull: none of its geoms collides")
+    num_vertices, num_faces = (int(n) for n in model.mesh_graph[first : first + 2])
+    vertex_ids = first + 2 + num_vertices  # after the addresses of the vertices' edges
+    ids = model.mesh_graph[vertex_ids : vertex_ids + num_vertices]
+    faces = first + 2 + 3 * num_vertices + 3 * num_faces  # after the edges
+    corners = model.mesh_graph[faces : faces + 3 * num_faces].reshape(-1, 3)
+    vertices = model.mesh_vert[int(model.mesh_vertadr[mesh]) + ids]
+    place = {int(k): row for row, k in enumerate(ids)}
+    return vertices, np.array([[place[int(k)] for k in corner] for corner in corners], np.int32)
+
+
 def _is_seen(model: mujoco.MjModel, geom: int) -> bool:
     material = int(model.geom_matid[geom])
     return bool((model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[3] != 0.0)
@@ -155,15 +180,19 @@ def _asset(
     model: mujoco.MjModel,
     kind: ShapeKind,
     data_id: int,
-    assets: dict[tuple[ShapeKind, int], TriangleMesh | HeightField],
+    as_hull: bool,
+    assets: Assets,
 ) -> TriangleMesh | HeightField | None:
     """The mesh or the height field of a geom, one object for all geoms that share it."""
     if kind not in (ShapeKind.MESH, ShapeKind.HEIGHTFIELD):
         return None
-    if (kind, data_id) not in assets:
-        if kind == ShapeKind.MESH:
+    key = kind, data_id, as_hull
+    if key not in assets:
+        if kind == ShapeKind.MESH and as_hull:
+            assets[key] = TriangleMesh(*convex_hull(model, data_id))
+        elif kind == ShapeKind.MESH:
             vertices, faces = int(model.mesh_vertadr[data_id]), int(model.mesh_faceadr[data_id])
-            assets[kind, data_id] = TriangleMesh(
+            assets[key] = TriangleMesh(
                 model.mesh_vert[vertices : vertices + model.mesh_vertnum[data_id]],
                 model.mesh_face[faces : faces + model.mesh_facenum[data_id]],
             )
@@ -172,5 +201,5 @@ def _asset(
             first = int(model.hfield_adr[data_id])
             half_x, half_y, scale, base = (float(x) for x in model.hfield_size[data_id])
             heights = np.array(model.hfield_data[first : first + rows * cols]).reshape(rows, cols)
-            assets[kind, data_id] = HeightField(heights, half_x, half_y, base, scale)
-    return assets[kind, data_id]
+            assets[key] = HeightField(heights, half_x, half_y, base, scale)
+    return assets[key]

@@ -44,6 +44,8 @@ class RayShapes:
 def ray_shapes(world: World, exclude_geoms: Collection[str] = ()) -> RayShapes:
     """Exact shapes of all geoms of the environment but `exclude_geoms`; what cannot move has no pose.
 
+    Of an obstacle that is a mesh the convex hull is taken, which is what the robot touches.
+
     Raises:
         ValueError: `exclude_geoms` names a geom that does not exist.
     """
@@ -54,7 +56,7 @@ def ray_shapes(world: World, exclude_geoms: Collection[str] = ()) -> RayShapes:
         raise ValueError(f"robot.mounts: exclude_geoms names {', '.join(unknown)}; known: {', '.join(known)}")
     kept = [k for k, name in enumerate(known) if name not in exclude_geoms]
     obstacles = set(world.obstacles.geom_names())
-    found = geom_shapes(model, geoms=kept)
+    found = geom_shapes(model, geoms=kept, hulls=[k for k in kept if known[k] in obstacles])
     bodies = tuple(dict.fromkeys((*found.body_ids, world.base_body)))
 
     def hit_class(name: str, shape: Shape) -> HitClass:

@@ -111,3 +111,41 @@ def test_a_signed_distance_field_is_refused(model):
     copy.geom_type[copy.geom("ball").id] = mujoco.mjtGeom.mjGEOM_SDF
     with pytest.raises(ValueError, match=r"\('ball'\) is of type sdf, which rays cannot hit: make it a mesh"):
         MujocoScene(copy)
+
+
+def rock(points, faces, collides=True):
+    """A model of one mesh; without faces MuJoCo makes it the convex hull of its points."""
+    spec, shell = mujoco.MjSpec(), mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    mesh = spec.add_mesh(name="rock", uservert=points.ravel(), userface=np.ravel(faces).astype(int))
+    mesh.inertia = shell if len(faces) else mesh.inertia
+    geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="rock", quat=(0.9, 0.3, 0.1, 0.3))
+    geom.contype = geom.conaffinity = int(collides)
+    return spec.compile()
+
+
+def test_a_hull_is_what_mj_ray_hits_of_the_convex_mesh_of_the_same_points():
+    """Of a mesh that is open and has points in its inside."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(25, 3)) * (0.5, 0.3, 0.4)
+    crumpled, convex = rock(points, rng.permutation(24).reshape(8, 3)), rock(points, [])
+    origins = rng.uniform(-2, 2, (1500, 3))
+    directions = rng.normal(size=(1500, 3)) * 0.6 - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    data = mujoco.MjData(convex)
+    mujoco.mj_kinematics(convex, data)
+    expected, _ = mujoco_ranges(convex, data, origins, directions)
+    rays = [torch.from_numpy(v)[None] for v in (origins, directions)]
+    hits = RayScene(geom_shapes(crumpled, hulls=[0]).shapes, 1, 0).cast(*rays, normals=True)
+    ranges = hits.ranges[0].numpy()
+    grazing = np.isinf(ranges) != np.isinf(expected)
+    assert grazing.mean() < 0.003 and 0.2 < np.isfinite(expected).mean() < 0.9
+    np.testing.assert_allclose(ranges[~grazing], expected[~grazing], rtol=1e-5, atol=1e-5)
+    seen = np.isfinite(ranges) & (np.linalg.norm(origins, axis=1) > 1.5)  # from outside, where it turns to the ray
+    assert ((hits.normals_w[0].numpy() * directions).sum(1)[seen] < 0).all()
+    assert not np.allclose(RayScene(geom_shapes(crumpled).shapes, 1, 0).cast(*rays).ranges[0].numpy(), ranges)
+
+
+def test_a_mesh_that_nothing_can_touch_has_no_hull():
+    crumpled = rock(np.random.default_rng(0).normal(size=(9, 3)), np.arange(9).reshape(3, 3), collides=False)
+    with pytest.raises(ValueError, match=r"mesh 0 \('rock'\) has no convex hull"):
+        geom_shapes(crumpled, hulls=[0])
