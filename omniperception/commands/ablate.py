@@ -1,4 +1,4 @@
-"""Trains perception variants over seeds, evaluates them in scenarios, and writes the paper's table beside ours.
+"""Trains perception variants over seeds, evaluates them in scenarios, and writes tables with intervals.
 
     ablate variants=fps_mlp_small,fps_gru_small,polar_rings seeds=1,2,3
     ablate stage=train hydra/launcher=submitit_slurm hydra.launcher.partition=cpu
