@@ -1,4 +1,4 @@
-"""OmniPerception: learn collision avoidance for legged robots from raw LiDAR point clouds."""
+"""OmniPerception: learn collision avoidance for legged robots from LiDAR point clouds."""
 
 import os
 

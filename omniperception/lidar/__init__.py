@@ -1,4 +1,4 @@
-"""A stand-alone LiDAR toolkit: scan patterns, scenes, sensors and noise, for thousands of environments.
+"""A stand-alone LiDAR toolkit: scan patterns, scenes, sensors and noise, for many environments at once.
 
 Descriptions (patterns, devices, noise) are loaded at once; what needs Warp is loaded when it is first used.
 """
