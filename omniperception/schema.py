@@ -61,6 +61,9 @@ NAMES: dict[str, Kind] = {
         _members("scene.terrain", flat="TerrainConfig") | _members("scene.tiled_terrain", tiled="TiledTerrainConfig")
     ),
     "terrain.tiles.*": Kind(_members("scene.tiles", rough="Rough", slope="Slope", stairs="Stairs", stones="Stones")),
+    "obstacles.groups.*.layout": Kind(
+        _members("scene.layouts", maze="MazeLayout", blocks="BlocksLayout", barn="BarnLayout")
+    ),
     "sim": Kind(
         _members("sim.mujoco", mujoco="SimConfig") | _members("sim.mujoco_warp", mujoco_warp="MujocoWarpConfig")
     ),

@@ -1,0 +1,283 @@
+"""Layouts: passable by an independent search, exact covers, and BARN's measures by hand."""
+
+import numpy as np
+import pytest
+
+from omniperception.scene.layouts import (
+    BarnLayout,
+    BlocksLayout,
+    MazeLayout,
+    barn_scores,
+    inflated,
+    passable,
+    rectangles,
+    shortest_way,
+    smoothed,
+)
+
+_MAZE, _SPARSE = MazeLayout(), BlocksLayout()
+_HOLD = BlocksLayout(area=(-4.5, 4.5, -3.75, 3.75), stagger=0.0, jitter=1.0, free=3.0)
+_BARN = BarnLayout(boxes=120, worlds=24)
+
+
+def distance_to_boxes(points: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """Distances (m) of points (n, 2) to the nearest box of a world (K, 6)."""
+    distances = []
+    for x, y, yaw, half_x, half_y, _ in world[~np.isnan(world[:, 0])]:
+        away = points - [x, y]
+        along = np.abs(away @ [np.cos(yaw), np.sin(yaw)]) - half_x
+        aside = np.abs(away @ [-np.sin(yaw), np.cos(yaw)]) - half_y
+        distances.append(np.hypot(along.clip(0), aside.clip(0)))
+    return np.min(distances, 0)
+
+
+def leads_through(world: np.ndarray, goal: tuple[float, float], y: float, radius: float, step: float = 0.1) -> bool:
+    """Whether a disc gets from the origin to the goal between -y and y, by flooding a grid of its centres."""
+    xs, ys = np.arange(-0.5, goal[0] + 0.5, step), np.arange(-y, y + step / 2, step)
+    places = np.stack(np.meshgrid(xs, ys, indexing="ij"), -1).reshape(-1, 2)
+    free = (distance_to_boxes(places, world) > radius).reshape(len(xs), len(ys))
+    cell = {
+        name: (round((p[0] - xs[0]) / step), round((p[1] - ys[0]) / step))
+        for name, p in (("start", (0.0, 0.0)), ("goal", goal))
+    }
+    reached, front = {cell["start"]}, [cell["start"]]
+    while front:
+        i, j = front.pop()
+        for near in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+            if 0 <= near[0] < len(xs) and 0 <= near[1] < len(ys) and free[near] and near not in reached:
+                reached.add(near)
+                front.append(near)
+    return free[cell["start"]] and cell["goal"] in reached
+
+
+@pytest.mark.parametrize(
+    ("layout", "goal", "y"),
+    [
+        (_MAZE, _MAZE.goal, 4.5),
+        (MazeLayout(walls=32, lanes=(2, 5, 7)), _MAZE.goal, 4.5),
+        (_SPARSE, (11.0, 0.0), 3.3),
+        (BlocksLayout(grid=(4, 4)), (11.0, 0.0), 3.3),
+    ],
+)
+def test_a_go2_gets_to_the_goal(layout, goal, y):
+    for world in layout.table(3, 20):
+        assert leads_through(world, goal, y, radius=0.4)
+
+
+def test_a_barn_world_can_be_passed_between_its_walls():
+    layout = BarnLayout(worlds=12)
+    for world in layout.table(3, 12):
+        assert leads_through(world, (layout.lead + 6.0 + 1.0, 0.0), 2.6, radius=0.35)
+
+
+@pytest.mark.parametrize(
+    ("layout", "goal"), [(_MAZE, _MAZE.goal), (_SPARSE, (11.0, 0.0)), (_BARN, (9.0, 0.0)), (_HOLD, (0.0, 0.0))]
+)
+def test_start_and_goal_are_free(layout, goal):
+    ends = np.array([(0.0, 0.0), goal])
+    assert min(distance_to_boxes(ends, world).min() for world in layout.table(0, 24)) > 0.5
+
+
+@pytest.mark.parametrize("layout", [_MAZE, _SPARSE, _HOLD, _BARN])
+def test_tables_repeat_by_seed(layout):
+    table = layout.table(5, 24)
+    assert table.shape == (24, layout.count, 6)
+    np.testing.assert_array_equal(table, layout.table(5, 24))
+    assert not np.array_equal(table, layout.table(6, 24), equal_nan=True)
+    assert len({world.tobytes() for world in table}) == 24
+    absent = np.isnan(table).any(-1)
+    np.testing.assert_array_equal(absent, np.isnan(table).all(-1))
+    assert (table[~absent][:, 3:] > 0).all()
+
+
+# ---- maze ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_maze_has_its_walls_and_a_closed_border():
+    layout = MazeLayout(columns=4, rows=3, cell=2.0, walls=5, thickness=(0.2, 0.2), height=(0.5, 1.5), depth=1.0)
+    table = layout.table(0, 50)
+    assert layout.count == 5 + 4 + 4  # border: 8 m in two pieces, 6 m in two, twice each
+    np.testing.assert_allclose(table[:, :5, 3], 1.1)  # an edge and half a thickness
+    np.testing.assert_allclose(table[:, :, 4], 0.1)
+    height = 2 * table[..., 5] - layout.depth
+    assert height.min() >= 0.5
+    assert height.max() <= 1.5
+    assert {tuple(wall[:3].round(6)) for world in table for wall in world[:5]} <= {
+        *((2.0 * i + 1.0, 2.0 * j, round(np.pi / 2, 6)) for i in range(3) for j in (-1, 0, 1)),
+        *((2.0 * i, 2.0 * j + 1.0, 0.0) for i in range(4) for j in (-1, 0)),
+    }
+    around = np.array(
+        [(x, side * 3.0) for x in np.arange(-1, 7, 0.05) for side in (-1, 1)]
+        + [(x, y) for y in np.arange(-3, 3, 0.05) for x in (-1.0, 7.0)]
+    )
+    assert distance_to_boxes(around, table[0, 5:]).max() == 0.0
+
+
+def test_no_wall_stands_across_a_lane():
+    layout = MazeLayout(walls=30, lanes=(4,))
+    ys = np.arange(-4.0, 4.0, 0.1)
+    lane = np.column_stack((np.full(len(ys), 8.0), ys))
+    for world in layout.table(1, 30):
+        assert distance_to_boxes(lane, world).min() > 0.7
+
+
+# ---- blocks ----------------------------------------------------------------------------------------------------------
+
+
+def test_clusters_are_two_boxes_that_touch():
+    table = BlocksLayout(jitter=0.0, stagger=0.0).table(2, 40).reshape(40, 9, 2, 6)
+    first, second = table[:, :, 0], table[:, :, 1]
+    np.testing.assert_array_equal(first[..., 2], second[..., 2])
+    aside = np.stack((-np.sin(first[..., 2]), np.cos(first[..., 2])), -1)
+    apart = ((second[..., :2] - first[..., :2]) * aside).sum(-1)
+    np.testing.assert_allclose(apart, first[..., 4] + second[..., 4], atol=1e-12)
+    sides = 2 * table[..., 4]
+    assert 0.08 <= sides.min() < 0.12
+    assert 0.3 < sides.max() <= 0.36
+    pillars = table[..., 3] / table[..., 4]
+    np.testing.assert_allclose(pillars[:, :, 0], 2.0)  # two square pillars, and one or two beside them
+    assert set(pillars[:, :, 1].round(9).ravel()) == {1.0, 2.0}
+    np.testing.assert_allclose(first[0, :, 0] - first[0, 0, 0], np.repeat([0, 3, 6], 3), atol=0.4)
+
+
+def test_clusters_near_the_origin_are_left_out():
+    table = _HOLD.table(0, 50)
+    present = ~np.isnan(table[..., 0])
+    assert np.hypot(table[..., 0], table[..., 1])[present].min() > 3.0 - 0.5  # centres of boxes, not of clusters
+    np.testing.assert_array_equal(present[:, ::2], present[:, 1::2])
+    assert 0 < present.mean() < 1
+
+
+# ---- barn ------------------------------------------------------------------------------------------------------------
+
+
+def _drawn(*lines: str) -> np.ndarray:
+    """Grid (nx, ny) of a picture: x to the right, the first line is y = 0."""
+    return np.array([[character == "#" for character in line] for line in lines]).T
+
+
+def test_smoothing_counts_neighbours():
+    rng = np.random.default_rng(0)
+    grid = rng.random((7, 9)) < 0.4
+    expected = np.zeros_like(grid)
+    for x in range(7):
+        for y in range(9):
+            around = [(x + i, y + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+            filled = sum(not 0 <= b < 9 or (0 <= a < 7 and grid[a, b]) for a, b in around)
+            expected[x, y] = filled >= 5 or (grid[x, y] and filled > 1)
+    np.testing.assert_array_equal(smoothed(grid), expected)
+    np.testing.assert_array_equal(smoothed(np.stack((grid, ~grid)))[0], expected)
+
+
+def test_inflated_is_where_a_square_would_overlap():
+    grid = np.zeros((9, 9), dtype=bool)
+    grid[4, 6] = True
+    expected = np.zeros_like(grid)
+    expected[3:6, 5:8] = True
+    expected[:, [0, -1]] = True  # beyond the sides counts as filled
+    np.testing.assert_array_equal(inflated(grid, 1), expected)
+
+
+def test_passable_only_where_the_square_fits():
+    gap = _drawn("#####", ".....", ".....", ".....", "#####")
+    narrow = _drawn("#####", "..#..", ".....", ".....", "#####")
+    np.testing.assert_array_equal(passable(np.stack((gap, narrow)), 1), [True, False])
+    np.testing.assert_array_equal(passable(np.stack((gap, narrow)), 0), [True, True])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rectangles_cover_exactly_the_filled_cells(seed):
+    grid = smoothed(np.random.default_rng(seed).random((12, 17)) < 0.35)
+    covered = np.zeros_like(grid)
+    for x, y, x_end, y_end in rectangles(grid):
+        covered[x:x_end, y:y_end] = True
+    np.testing.assert_array_equal(covered, grid)
+
+
+def test_few_rectangles():
+    assert len(rectangles(_drawn("####", "####", "##..", "##.."))) == 2
+    assert len(rectangles(_drawn(".#.", "###", ".#."))) == 2  # a cross: they may overlap
+    assert len(rectangles(np.zeros((3, 3), dtype=bool))) == 0
+
+
+def test_boxes_cover_exactly_the_automatons_cells():
+    table, grids = _BARN.table(4, 24), _BARN.grids(4, 24)
+    middles = (np.stack(np.mgrid[:30, :30], -1) + 0.5) * 0.2 + [1.5, -3.0]
+    for world, grid in zip(table, grids, strict=True):
+        inside = distance_to_boxes(middles.reshape(-1, 2), world) == 0.0
+        np.testing.assert_array_equal(inside.reshape(30, 30), grid)
+
+
+def test_each_setting_of_the_automaton_has_its_share_of_the_worlds():
+    thin, thick = BarnLayout(fill=(0.1, 0.3), smoothing=(2,), boxes=120).grids(0, 40).reshape(2, 20, -1).mean(-1)
+    assert thin.max() < thick.min()
+
+
+def test_measures_of_a_narrow_way_by_hand():
+    wall, way = "#" * 11, "." * 11
+    scores = barn_scores(_drawn(wall, wall, wall, way, wall, wall, wall), robot=0, cell=0.5)
+    assert scores == {
+        "closest": pytest.approx(0.5),
+        "visibility": pytest.approx(10 / 8 * 0.5),  # ahead and back 10 cells in all, nothing elsewhere
+        "dispersion": 4.0,  # free ahead and behind, blocked on both sides
+        "dimension": 0.0,
+        "tortuosity": pytest.approx(1.0),
+    }
+
+
+def test_the_shortest_chord_by_hand():
+    wall, way = "#" * 9, "." * 9
+    scores = barn_scores(_drawn(wall, way, way, way, wall), robot=0, cell=1.0)
+    # along y = 1, the first of equally long ways: across 2 cells; slanted at most 2 * sqrt(2), less at the field's ends
+    assert scores["dimension"] == pytest.approx((0 + 2**0.5 + 5 * 2 + 2**0.5 + 0) / 9)
+    assert scores["closest"] == pytest.approx(1.0)
+
+
+def test_what_is_seen_by_hand():
+    world = _drawn("#####", "..#..", "..#..", ".....", "#####")
+    way = shortest_way(world)
+    assert way.tolist() == [[0, 3], [1, 3], [2, 3], [3, 3], [4, 3]]
+    scores = barn_scores(world, robot=0, cell=1.0)
+    # ahead and back 4 in all; upwards 2 but under the pillar; slanted up to the pillar or the field's edge sqrt(2)
+    ends, beside, under = 4 + 2 + 2**0.5, 4 + 2 + 2**0.5, 4 + 2 * 2 * 2**0.5
+    assert scores["visibility"] == pytest.approx((2 * ends + 2 * beside + under) / 5 / 8)
+
+
+def test_a_longer_way_is_more_tortuous():
+    world = _drawn("######", "..#...", "..#.#.", "....#.", "######")
+    scores = barn_scores(world, robot=0, cell=0.3)
+    assert scores["tortuosity"] > 1.05
+
+
+def test_no_way_is_an_error():
+    with pytest.raises(ValueError, match="no way"):
+        shortest_way(_drawn("###", ".#.", "###"))
+
+
+def test_thick_worlds_are_harder():
+    scores = BarnLayout(fill=(0.15, 0.3), smoothing=(3,), boxes=120).scores(0, 24)
+    assert abs(scores["difficulty"].mean()) < 1e-9
+    assert scores["difficulty"][12:].mean() > scores["difficulty"][:12].mean() + 0.5
+
+
+# ---- wrong input -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: MazeLayout(rows=4), "odd number of rows"),
+        (lambda: MazeLayout(walls=80), "in 0 to 36"),
+        (lambda: MazeLayout(lanes=(10,)), "lanes"),
+        (lambda: MazeLayout(thickness=(0.0, 0.1)), "thickness"),
+        (lambda: BlocksLayout(grid=(0, 3)), "grid"),
+        (lambda: BlocksLayout(area=(1.0, 0.0, 0.0, 1.0)), "area"),
+        (lambda: BlocksLayout(jitter=-0.1), "jitter"),
+        (lambda: BarnLayout(fill=(0.8,)), "fill"),
+        (lambda: BarnLayout(worlds=0), "worlds=0"),
+        (lambda: BarnLayout(robot=15), "robot=15"),
+    ],
+)
+def test_wrong_layouts_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
