@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.randomization import Condition
 from omniperception.env.mirror import Mirror
 from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
@@ -37,6 +38,7 @@ class RunConfig:
         perception: the actor's view of the LiDAR, or None.
         ppo: the learning settings.
         init: the runs whose weights this one starts from; where two have the same, the later one's.
+        condition: under which the robot walks, where its randomization is one of conf/condition as it stands.
         composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
     """
 
@@ -44,6 +46,7 @@ class RunConfig:
     perception: PerceptionConfig | None
     ppo: PPOConfig
     init: tuple[str, ...]
+    condition: Condition | None
     composed: dict
 
     def __post_init__(self) -> None:
@@ -89,7 +92,8 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     try:
         lidar = _sensor(composed["lidar"], task["robot"], trusted) if composed["lidar"] else None
         env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, **seen)
-        return RunConfig(env, perception, ppo, _names(composed.get("init")), composed)
+        condition = make(Condition | None, composed.get("condition"), "condition")
+        return RunConfig(env, perception, ppo, _names(composed.get("init")), condition, composed)
     except ValueError as error:
         raise ConfigError(one_line(error)) from None
 

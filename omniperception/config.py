@@ -28,11 +28,13 @@ CONFIG_FILE = "config.yaml"
 OUTPUTS = Path("outputs")
 SEARCH_PATH = "search_path"
 """Key of a configuration: the user's folders of presets, from `--config-dir` or `hydra.searchpath`."""
-FIXED_BY_SCENARIO = ("seed", "terrain", "obstacles", "commands", "terminations", "randomization")
+FIXED_BY_SCENARIO = ("seed", "terrain", "obstacles", "commands", "terminations")
 """Groups that a scenario replaces in a run's configuration; the run keeps all others."""
+FIXED_BY_CONDITION = ("randomization", "condition")
+"""Groups that a condition replaces, its own name and version among them."""
 DEFINED_BY_SCENARIO = ("obstacles", "commands")
 """Groups that a scenario writes out in full, so that another preset would be mixed with it."""
-OPTIONAL_GROUPS = ("experiment", "scenario")
+OPTIONAL_GROUPS = ("experiment", "scenario", "condition")
 """Groups of which none may be chosen."""
 _EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
 
@@ -118,8 +120,9 @@ def without_hydra(config: DictConfig) -> DictConfig:
 def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
     """The configuration of a run, changed by overrides in Hydra's grammar.
 
-    obstacles=static replaces a whole group, dotted overrides single values, and scenario=corridor replaces what
-    FIXED_BY_SCENARIO names.
+    obstacles=static replaces a whole group, dotted overrides single values; scenario=corridor replaces what
+    FIXED_BY_SCENARIO names, condition=robot what FIXED_BY_CONDITION names. A run whose randomization is changed, or
+    that is given condition=null, is under no condition.
     """
     config = read(run_dir)
     parsed = parse(overrides)
@@ -130,8 +133,13 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
         group = override.key_or_group
         if group == "experiment" or override.is_hydra_override():
             raise ConfigError(f"{override.input_line}: a run keeps its {group}; override the groups that should differ")
-        for key in FIXED_BY_SCENARIO if group == "scenario" else (group,):
+        if group == "condition" and override.value() is None:
+            config["condition"] = None
+            continue
+        for key in {"scenario": FIXED_BY_SCENARIO, "condition": FIXED_BY_CONDITION}.get(group, (group,)):
             config[key] = fresh[key]
+    if config.get("condition") and any(_group_of(override) == "randomization" for override in parsed):
+        config["condition"] = None
     OmegaConf.set_struct(config, True)
     apply(config, values)
     _check_keys(config)
@@ -219,7 +227,24 @@ def _split(overrides: Sequence[Override], folders: Sequence[Path]) -> tuple[list
                 f"{by_group['scenario'].input_line} defines the {group}; leave {by_group[group].input_line} out, or"
                 f" override single values such as {group}.{_EXAMPLES[group]}"
             )
+    _check_condition(by_group.get("condition"), overrides)
     return chosen, values
+
+
+def _check_condition(condition: Override | None, overrides: Sequence[Override]) -> None:
+    """Refuses changes to a condition, which is the same wherever its name and version stand."""
+    fixed_by = None if condition is None else condition.value()
+    for override in overrides:
+        if override.key_or_group.startswith("condition."):
+            raise ConfigError(f"{override.input_line}: a condition is chosen as a whole, such as condition=robot")
+        if fixed_by and _group_of(override) == "randomization":
+            given = override.input_line
+            raise ConfigError(f"condition={fixed_by} fixes the randomization; leave {given} out, or condition")
+
+
+def _group_of(override: Override) -> str:
+    """The key at the top of the configuration that an override changes."""
+    return override.key_or_group.partition(".")[0]
 
 
 def _check_preset(override: Override, known: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Sequence
 
 import torch
@@ -23,6 +24,12 @@ class EnvRandom:
     def __init__(self, seed: int, num_envs: int, device: torch.device | str = "cpu") -> None:
         self._key = _mix(torch.arange(num_envs, device=device) + (seed + 1) * 1_000_003)
         self.counter = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self._branches: dict[str, Branch] = {}
+
+    def branch(self, name: str) -> Branch:
+        """Streams of their own beside these, one for each environment."""
+        self._branches[name] = Branch(self, name)
+        return self._branches[name]
 
     def start_episode(self, env_ids: torch.Tensor) -> None:
         """Moves on to the part of the stream that the next episode of environments `env_ids` (n,) draws from.
@@ -30,6 +37,15 @@ class EnvRandom:
         What an environment draws in its k-th episode then depends on k, not on how much it drew before.
         """
         self.counter[env_ids] = (self.counter[env_ids] // _DRAWS_PER_EPISODE + 1) * _DRAWS_PER_EPISODE
+
+    def state_dict(self) -> dict:
+        """How often each environment has drawn, here and in the branches."""
+        return {"counter": self.counter.clone(), "branches": {k: b.state_dict() for k, b in self._branches.items()}}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.counter.copy_(state["counter"])
+        for name, branch in self._branches.items():
+            branch.load_state_dict(state["branches"][name])
 
     def uniform(self, env_ids: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
         """Draws from [0, 1) for environments `env_ids` (n,); the others' streams stay where they are.
@@ -44,6 +60,24 @@ class EnvRandom:
         self.counter[env_ids] = drawn[:, 0] + size
         bits = _shift(_mix(state), 40)
         return (bits.float() * 2.0**-24).reshape(-1, *shape)
+
+
+class Branch(EnvRandom):
+    """Streams beside others: whoever draws from them changes nothing for those who draw from the others.
+
+    An episode's draws follow from the other stream's episode and the branch's name. Call `start_episode` after the
+    other streams'.
+    """
+
+    def __init__(self, trunk: EnvRandom, name: str) -> None:
+        self._trunk, self._salt, self._branches = trunk, zlib.crc32(name.encode()), {}
+        self._key, self.counter = torch.empty_like(trunk._key), torch.empty_like(trunk.counter)
+        self.start_episode(torch.arange(len(self._key), device=self._key.device))
+
+    def start_episode(self, env_ids: torch.Tensor) -> None:
+        """Moves on to the episode in which the other streams of environments `env_ids` (n,) are."""
+        self._key[env_ids] = _mix(self._trunk._key[env_ids] + self._salt)
+        self.counter[env_ids] = self._trunk.counter[env_ids] // _DRAWS_PER_EPISODE * _DRAWS_PER_EPISODE
 
 
 def _shift(x: torch.Tensor, bits: int) -> torch.Tensor:

@@ -12,6 +12,21 @@ def rotate_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
     return vec - w * t + torch.linalg.cross(q, t)
 
 
+def rotate(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Expresses in the world a vector (n, 3) given in the frame whose orientation in the world is `quat` (n, 4)."""
+    w, q = quat[:, :1], quat[:, 1:]
+    t = 2.0 * torch.linalg.cross(q, vec)
+    return vec + w * t + torch.linalg.cross(q, t)
+
+
+def multiply(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Quaternions (n, 4) of the rotations by `second` and then by `first`, each (n, 4)."""
+    w, q = first[:, :1], first[:, 1:]
+    v, r = second[:, :1], second[:, 1:]
+    real = w * v - (q * r).sum(1, keepdim=True)
+    return torch.cat((real, w * r + v * q + torch.linalg.cross(q, r)), 1)
+
+
 def yaw_of(quat: torch.Tensor) -> torch.Tensor:
     """Heading (rad) of the body's x axis in the world's horizontal plane, (n,)."""
     w, x, y, z = quat.unbind(-1)

@@ -15,7 +15,10 @@ from omniperception.sim import Simulator
 
 if TYPE_CHECKING:
     from omniperception.avoidance.avoidance import Avoidance
+    from omniperception.env.frame_delivery import FrameDelivery
     from omniperception.env.height_lookup import HeightLookup
+    from omniperception.env.mdp.pushes import Pushes
+    from omniperception.env.measurement import MeasurementErrors
     from omniperception.env.sensing import LidarSensing
     from omniperception.env.terrain_levels import TerrainLevels
     from omniperception.scene.ground import Ground
@@ -36,6 +39,25 @@ def build_ground(
     max_steps = round(config.terminations.episode_length_s / config.sim.control_dt)
     levels = TerrainLevels(ground, random, config.sim.control_dt, max_steps)
     return ground, levels, HeightLookup(ground, sim.num_envs, sim.device)
+
+
+def build_errors(config: EnvConfig, random: EnvRandom) -> MeasurementErrors | None:
+    """Errors of what the robot measures of itself."""
+    if config.randomization.measures_exactly:
+        return None
+    from omniperception.env.measurement import MeasurementErrors
+
+    branch, joints = random.branch("measurement"), config.robot.num_joints
+    return MeasurementErrors(config.randomization, config.num_envs, joints, config.sim.control_dt, branch)
+
+
+def build_pushes(config: EnvConfig, sim: Simulator, random: EnvRandom) -> Pushes | None:
+    """Pushes of the robot."""
+    if config.randomization.pushes is None:
+        return None
+    from omniperception.env.mdp.pushes import Pushes
+
+    return Pushes(config.randomization.pushes, sim, config.sim.control_dt, random.branch("pushes"))
 
 
 def build_obstacles(
@@ -68,7 +90,20 @@ def build_avoidance(config: EnvConfig, field: ObstacleField | None, device: torc
     )
 
 
-def build_sensing(config: EnvConfig, sim: Simulator, avoidance: Avoidance | None) -> LidarSensing | None:
+def build_delivery(config: EnvConfig, random: EnvRandom) -> FrameDelivery | None:
+    """How LiDAR frames come, where they are lost or late."""
+    rows = config.randomization
+    if rows.frames_lost is None and rows.frames_late_s is None:
+        return None
+    from omniperception.env.frame_delivery import FrameDelivery
+
+    late_s = None if rows.frames_late_s is None else (rows.frames_late_s[0], rows.frames_late_s[1])
+    return FrameDelivery(rows.frames_lost, late_s, config.sim.control_dt, config.num_envs, random.branch("frames"))
+
+
+def build_sensing(
+    config: EnvConfig, sim: Simulator, random: EnvRandom, avoidance: Avoidance | None
+) -> LidarSensing | None:
     """The LiDAR, where something reads it."""
     if config.lidar is None or not config.uses_lidar:
         return None
@@ -89,4 +124,5 @@ def build_sensing(config: EnvConfig, sim: Simulator, avoidance: Avoidance | None
         obstacles=avoidance.obstacle_names if avoidance is not None else (),
         distal=DISTAL_RANGE in needed,
         whole=CLOUD in needed,
+        delivery=build_delivery(config, random),
     )

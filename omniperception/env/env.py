@@ -12,7 +12,14 @@ from tensordict import TensorDict
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
-from omniperception.env.build import build_avoidance, build_ground, build_obstacles, build_sensing
+from omniperception.env.build import (
+    build_avoidance,
+    build_errors,
+    build_ground,
+    build_obstacles,
+    build_pushes,
+    build_sensing,
+)
 from omniperception.env.config import HEIGHT_TARGET, EnvConfig
 from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
@@ -30,13 +37,13 @@ MAX_ACTION = 100.0
 class OmniEnv(VecEnv):
     """`num_envs` robots among obstacles behind rsl_rl's VecEnv contract.
 
-    One control step: `decimation` physics steps, before each of which the obstacles move -> at the LiDAR's rate a frame
-    is cast, given noise and sampled -> terminations and rewards -> finished environments are reset -> observations.
-    `EnvState` says how old each quantity is.
+    One control step: pushes -> `decimation` physics steps, before each of which the obstacles move -> at the LiDAR's
+    rate a frame is cast, given noise and sampled -> terminations and rewards -> finished environments are reset ->
+    observations. `EnvState` says how old each quantity is.
 
     Attributes:
         state: what terms read.
-        ground, terrain_levels, obstacles, avoidance, sensing: None where the task has none.
+        ground, terrain_levels, obstacles, avoidance, sensing, pushes: None where the task has none.
         step_hooks: called at the end of each step, before finished environments are reset.
         healthy: (num_envs,) bool: whose physics was sound in the last step.
         done: (num_envs,) bool: which environments ended in the last step.
@@ -67,7 +74,8 @@ class OmniEnv(VecEnv):
         self.ground, self.terrain_levels, lookup = build_ground(config, self.sim, self.random)
         self.obstacles = build_obstacles(config, self.sim, self.random, self.ground)
         self.avoidance = build_avoidance(config, self.obstacles, self.device)
-        self.sensing = build_sensing(config, self.sim, self.avoidance)
+        self.sensing = build_sensing(config, self.sim, self.random, self.avoidance)
+        self.pushes = build_pushes(config, self.sim, self.random)
         self.state = EnvState(
             self.sim,
             self.control_dt,
@@ -77,6 +85,7 @@ class OmniEnv(VecEnv):
             lookup,
             self.avoidance,
             self.sensing,
+            build_errors(config, self.random),
         )
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
@@ -148,6 +157,8 @@ class OmniEnv(VecEnv):
             with self.timer.stage("obstacles"):
                 path = self._move(self.obstacles)
         with self.timer.stage("physics"):
+            if self.pushes is not None:
+                self.pushes.advance()
             self.sim.step(target, self.config.sim.decimation, path)
             self.sim.detect_failures()
 
@@ -239,6 +250,8 @@ class OmniEnv(VecEnv):
         qvel = torch.zeros(len(env_ids), self.sim.qvel.shape[1], device=self.device)
         self.sim.reset(env_ids, qpos, qvel)
         self.randomizer.reset(env_ids)
+        if self.pushes is not None:
+            self.pushes.reset(env_ids)
         self.state.reset(env_ids)
         self.command.reset(env_ids, self.state.kinematics)
         if self.obstacles is not None:
@@ -320,7 +333,7 @@ class OmniEnv(VecEnv):
         """State that an exact resume needs."""
         return {
             **{name: part.state_dict() for name, part in self._with_state().items()},
-            "random": self.random.counter,
+            "random": self.random.state_dict(),
             "step_count": self.step_count,
             "episode_length": self.episode_length_buf,
             "frame_heights": self._frame_heights,
@@ -331,7 +344,7 @@ class OmniEnv(VecEnv):
         """Resumes from the `state_dict` of an environment with the same configuration."""
         for name, part in self._with_state().items():
             part.load_state_dict(state[name])
-        self.random.counter.copy_(state["random"])
+        self.random.load_state_dict(state["random"])
         self.step_count = state["step_count"]
         self.episode_length_buf.copy_(state["episode_length"])
         self._frame_heights = state["frame_heights"]
@@ -343,8 +356,9 @@ class OmniEnv(VecEnv):
 
     def _with_state(self) -> dict:
         """Components with a state to be saved, by name."""
-        names = ("sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing")
-        parts = {name: getattr(self, name) for name in (*names, "state", "metrics")} | self._managers()
+        names = ["sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing"]
+        names += ["pushes", "state", "metrics"]
+        parts = {name: getattr(self, name) for name in names} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}
 
     def _spawn_bounds(self) -> torch.Tensor:

@@ -14,6 +14,7 @@ class Kinematics:
     Attributes:
         base_pos_w: (n, 3) m, environment frame.
         base_quat_w: (n, 4) wxyz.
+        base_lin_vel_w: (n, 3) m/s, environment frame.
         base_ang_vel_b: (n, 3) rad/s, base frame.
         joint_pos: (n, num_joints) rad.
         joint_vel: (n, num_joints) rad/s.
@@ -21,9 +22,9 @@ class Kinematics:
 
     def __init__(self, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         """From `Simulator.robot_state`: (n, 7 + joints) and (n, 6 + joints)."""
-        qpos, self._qvel = qpos.float(), qvel.float()
+        qpos, qvel = qpos.float(), qvel.float()
         self.base_pos_w, self.base_quat_w, self.joint_pos = qpos[:, :3], qpos[:, 3:7], qpos[:, 7:]
-        self.base_ang_vel_b, self.joint_vel = self._qvel[:, 3:6], self._qvel[:, 6:]
+        self.base_lin_vel_w, self.base_ang_vel_b, self.joint_vel = qvel[:, :3], qvel[:, 3:6], qvel[:, 6:]
 
     @lazy
     def yaw(self) -> torch.Tensor:
@@ -33,7 +34,7 @@ class Kinematics:
     @lazy
     def base_lin_vel_yaw(self) -> torch.Tensor:
         """(n, 2) m/s: horizontal velocity in the yaw-aligned frame."""
-        return rotate_yaw(-self.yaw, self._qvel[:, :2])
+        return rotate_yaw(-self.yaw, self.base_lin_vel_w[:, :2])
 
     @property
     def base_lin_vel_b(self) -> torch.Tensor:
@@ -48,7 +49,7 @@ class Kinematics:
     @lazy
     def _in_base_frame(self) -> torch.Tensor:
         """(2, n, 3) linear velocity and gravity, in one rotation."""
-        down = torch.zeros_like(self._qvel[:, :3])
+        down = torch.zeros_like(self.base_lin_vel_w)
         down[:, 2] = -1.0
-        vectors = torch.cat((self._qvel[:, :3], down))
+        vectors = torch.cat((self.base_lin_vel_w, down))
         return rotate_inverse(self.base_quat_w.repeat(2, 1), vectors).unflatten(0, (2, -1))

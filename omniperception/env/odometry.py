@@ -29,13 +29,24 @@ class Odometry:
         self._yaw = measured.yaw
         self._travelled_w = self._travelled_w + rotate_yaw(measured.yaw, measured.base_lin_vel_yaw) * self._dt
 
-    def since_last_frame(self) -> torch.Tensor:
-        """(num_envs, 3) x, y (m) and yaw (rad) since the call before, in the levelled base of then."""
+    def since_last_frame(self, came: torch.Tensor | None = None) -> torch.Tensor:
+        """Motion up to now since the last frame that came, in the levelled base of then.
+
+        Args:
+            came: (num_envs, 1) bool: whose frame comes now; None: all.
+
+        Returns:
+            (num_envs, 3) x, y (m) and yaw (rad); 0 where no frame comes, and the sum goes on.
+        """
         turned = torch.remainder(self._yaw - self._yaw_before + torch.pi, 2 * torch.pi) - torch.pi
         moved = torch.cat((rotate_yaw(-self._yaw_before, self._travelled_w), turned[:, None]), 1)
-        self._yaw_before = self._yaw
-        self._travelled_w = torch.zeros_like(self._travelled_w)
-        return moved
+        if came is None:
+            self._yaw_before = self._yaw
+            self._travelled_w = torch.zeros_like(self._travelled_w)
+            return moved
+        self._yaw_before = torch.where(came[:, 0], self._yaw, self._yaw_before)
+        self._travelled_w = torch.where(came, 0.0, self._travelled_w)
+        return torch.where(came, moved, 0.0)
 
     def state_dict(self) -> dict:
         return {"travelled": self._travelled_w, "yaw": self._yaw, "yaw_before": self._yaw_before}

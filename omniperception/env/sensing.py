@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from omniperception.common.timing import StageTimer
+from omniperception.env.frame_delivery import FrameDelivery, PastPoses
 from omniperception.env.kinematics import Kinematics
 from omniperception.env.odometry import Odometry
 from omniperception.lidar import (
@@ -74,6 +75,15 @@ class LidarSensing:
     `cloud_mb` asks for: those of all environments never have to exist at the same time. A reset empties an
     environment's history; its next frame comes with the sensor's next tick.
 
+    With a `FrameDelivery`, frames are lost and late. All environments tick together nevertheless:
+    - Where a frame is lost, the history repeats the last one that came, with no motion of the base; the motion of the
+      next one that comes is that since the last one that came. Before any has come `frame_count` stays 0.
+    - A late frame is cast from where base and obstacles were when it was taken. It is levelled with the attitude of the
+      moment at which it comes, and so does the odometry count, as on a robot whose frames bear no time. What rays say
+      without noise (sector distances, distal ranges, sightings) is of the moment at which they were cast, lost or not;
+      what is known of poses (true sectors, heights, targets of supervision by these) is of the moment of the tick, so
+      that a network learns what is there now.
+
     Attributes:
         base: index of the robot's base among the bodies of the ray scene.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
@@ -81,7 +91,8 @@ class LidarSensing:
             sampler.
         frame_count: (num_envs, 1) int64 how many of the newest frames are valid.
         frame_tick: (num_envs, 1) int64 number of the newest frame, the same for all environments.
-        unseen: (num_envs, O) int64 frames since a ray last hit each of `obstacles`; None without any.
+        fresh: (num_envs,) bool whose frame came at the newest tick; clouds of the others are not to be looked at.
+        unseen: (num_envs, O) int64 frames of the history since a ray last hit each of `obstacles`; None without any.
     """
 
     def __init__(
@@ -99,6 +110,7 @@ class LidarSensing:
         obstacles: Sequence[str] = (),
         distal: bool = False,
         whole: bool = False,
+        delivery: FrameDelivery | None = None,
     ) -> None:
         """
         Args:
@@ -116,6 +128,7 @@ class LidarSensing:
             obstacles: geoms whose sightings are noted.
             distal: whether `mean_distal_range` is read.
             whole: whether `frame` is read, the clouds of all environments.
+            delivery: which frames are lost and late; None: none.
         """
         ratio = config.period_s / control_dt
         self.period_steps = round(ratio)
@@ -128,6 +141,12 @@ class LidarSensing:
                 " of a frame evenly"
             )
         self._steps_per_segment = self.period_steps // segments
+        late = 0 if delivery is None else delivery.max_late_steps
+        if late and config.motion_segments:
+            raise ValueError(
+                f"lidar.motion_segments={config.motion_segments} casts along the way to the present, but"
+                " randomization.frames_late_s asks for the past; use lidar.motion_segments=0"
+            )
         self._sim, self.sampler, self.whole = sim, sampler, whole
         self.config, pattern = config, config.scan_pattern()
         shapes = ray_shapes(sim.world, config.exclude_geoms)
@@ -148,6 +167,9 @@ class LidarSensing:
         )
         n, device = sim.num_envs, sim.device
         self._time = torch.zeros(n, dtype=torch.float64, device=device)
+        self._delivery = delivery
+        self._past = PastPoses(late + 1, n, len(self._bodies), device) if late else None
+        self.fresh = torch.ones(n, dtype=torch.bool, device=device) if delivery is None else delivery.fresh
         self.tick, self._is_cast = 0, False
         self.frame_count, self.frame_tick = torch.zeros(2, n, 1, dtype=torch.int64, device=device).unbind(0)
         self.frames: torch.Tensor | None = None
@@ -187,9 +209,11 @@ class LidarSensing:
         return env_slices(num_envs, most)
 
     def follow(self, measured: Kinematics) -> None:
-        """Notes how the base moves, as measured; call at every control step."""
+        """Notes how the base moves, as measured, and where everything is; call at every control step."""
         if self.odometry is not None:
             self.odometry.advance(measured)
+        if self._past is not None:
+            self._past.record(*self._sim.body_poses(self._bodies))
 
     def seen_within(self, frames: int) -> torch.Tensor | None:
         """(num_envs, O) bool: which obstacles a ray has hit in the last `frames` frames; None without any."""
@@ -206,7 +230,7 @@ class LidarSensing:
             self.lidar.record_poses()
 
     def take_frame(self, time_s: float, base_quat: torch.Tensor, timer: StageTimer) -> None:
-        """Casts the frame that ends at simulation time `time_s` from the current poses, and takes what is read from it.
+        """Casts the frame of simulation time `time_s`, from the current poses or late, and takes what is read from it.
 
         Args:
             time_s: of all environments.
@@ -214,6 +238,8 @@ class LidarSensing:
             timer: of the stages "rays", "sampling" and "sectors".
         """
         with timer.stage("rays"):
+            if self._delivery is not None:
+                self._delivery.draw()
             self._place_bodies()
         slices = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
@@ -236,7 +262,11 @@ class LidarSensing:
             self._append_newest()
 
     def _place_bodies(self) -> None:
-        pos, quat = self._sim.body_poses(self._bodies)
+        """Where they are now, or where they were when a late frame was taken."""
+        if self._past is None or self._delivery is None:
+            pos, quat = self._sim.body_poses(self._bodies)
+        else:
+            pos, quat = self._past.at(self._delivery.late_steps)
         self.scene.body_pos.copy_(pos)
         self.scene.body_quat.copy_(quat)
 
@@ -245,7 +275,10 @@ class LidarSensing:
         hit = self._obstacle_of[frame.shape_id.long() + 1]
         seen = torch.zeros(len(hit), self.unseen.shape[1] + 1, dtype=torch.bool, device=hit.device)
         seen.scatter_(1, hit, True)
-        self.unseen[envs] = torch.where(seen[:, :-1], 0, self.unseen[envs] + 1)
+        seen, unseen = seen[:, :-1], self.unseen[envs]
+        if self._delivery is not None:  # a frame that is repeated shows again what it has shown
+            seen = torch.where(self.fresh[envs, None], seen, unseen == 0)
+        self.unseen[envs] = torch.where(seen, 0, unseen + 1)
 
     def _sample(self, envs: slice, frame: LidarFrame, base_quat: torch.Tensor) -> None:
         assert self.sampler is not None and frame.ranges is not None and frame.directions_s is not None
@@ -255,12 +288,16 @@ class LidarSensing:
         self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
 
     def _append_newest(self) -> None:
-        """Appends the sampled points to the history."""
+        """Appends the sampled points to the history, or the last frame again where this one is lost."""
         assert self.frames is not None
+        fresh = None if self._delivery is None else self.fresh[:, None]
+        newest, came = self._newest, 1 if fresh is None else fresh | (self.frame_count > 0)
+        if fresh is not None:
+            newest = torch.where(fresh[..., None], newest, self.frames[:, -1])
         if self.odometry is not None:
-            self._newest[:, -1] = self.odometry.since_last_frame()
-        self.frames = torch.cat((self.frames[:, 1:], self._newest[:, None]), 1)
-        self.frame_count.add_(1).clamp_(max=self.frames.shape[1])
+            newest[:, -1] = self.odometry.since_last_frame(fresh)
+        self.frames = torch.cat((self.frames[:, 1:], newest[:, None]), 1)
+        self.frame_count.add_(came).clamp_(max=self.frames.shape[1])
 
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
         """(num_envs,) mean of the noise-free distal ranges (m) of the newest frame, each capped at `max_distance`; the
@@ -285,6 +322,8 @@ class LidarSensing:
             "distal_range": {str(key): value.clone() for key, value in self._distal_range.items()},
             "unseen": None if self.unseen is None else self.unseen.clone(),
             "odometry": self.odometry.state_dict() if self.odometry is not None else None,
+            "delivery": self._delivery.state_dict() if self._delivery is not None else None,
+            "past": self._past.state_dict() if self._past is not None else None,
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -298,6 +337,10 @@ class LidarSensing:
             self.unseen = state["unseen"].clone()
         if self.odometry is not None:
             self.odometry.load_state_dict(state["odometry"])
+        if self._delivery is not None:
+            self._delivery.load_state_dict(state["delivery"])
+        if self._past is not None:
+            self._past.load_state_dict(state["past"])
         self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
 
     def reset(self, env_ids: torch.Tensor, measured: Kinematics) -> None:
@@ -309,6 +352,10 @@ class LidarSensing:
         """
         if self.odometry is not None:
             self.odometry.start(env_ids, measured)
+        if self._delivery is not None:
+            self._delivery.reset(env_ids)
+        if self._past is not None:
+            self._past.reset(env_ids, *self._sim.body_poses(self._bodies))
         self.lidar.forget_motion(env_ids)
         self.frame_count[env_ids] = 0
         if self.frames is not None:

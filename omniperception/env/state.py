@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # parts that not every task has
     from omniperception.env.height_lookup import HeightLookup
     from omniperception.env.mdp.commands import Command
     from omniperception.env.mdp.randomization import Randomizer
+    from omniperception.env.measurement import MeasurementErrors
     from omniperception.env.sensing import LidarSensing
     from omniperception.lidar import LidarFrame
     from omniperception.scene import ObstacleField
@@ -79,8 +80,8 @@ class EnvState:
     Quantities are computed at first use and hold until the environment calls `invalidate`, after the physics steps of a
     control step and again after resets. They describe the newest moment but for these: contact forces and torques are
     those of the last physics step, which describes the state before it (one physics step old); `measured` is as old
-    as the randomized latency; `before` is the start of the control step; V_avoid, sector distances and clouds are those
-    of the newest LiDAR frame.
+    as the randomized latency, with the randomized errors; `before` is the start of the control step; V_avoid, sector
+    distances and clouds are those of the newest LiDAR frame.
 
     What a term keeps of earlier steps belongs to the term, but for the times of the feet's contacts: they are followed
     from the first read on, at every control step.
@@ -102,6 +103,7 @@ class EnvState:
         height_lookup: HeightLookup | None = None,
         avoidance: Avoidance | None = None,
         sensing: LidarSensing | None = None,
+        errors: MeasurementErrors | None = None,
     ) -> None:
         """
         Args:
@@ -113,7 +115,9 @@ class EnvState:
             height_lookup: heights above ground that is not flat; None on a plane at 0.
             avoidance: source of V_avoid.
             sensing: the LiDAR.
+            errors: of what is measured.
         """
+        self._errors = errors
         self._sim, self._command, self._obstacles, self._height_lookup = sim, command, obstacles, height_lookup
         self.num_envs, self.device, self.control_dt = sim.num_envs, sim.device, control_dt
         self._avoidance, self._sensing = avoidance, sensing
@@ -139,6 +143,8 @@ class EnvState:
         self.invalidate()
         if self._history is not None:
             self._history.record()
+        if self._errors is not None:
+            self._errors.advance()
         if self._foot_times is not None:
             self._foot_times.advance(self.foot_contact, self.control_dt)
 
@@ -148,6 +154,8 @@ class EnvState:
         self.actions = tuple(action.index_fill(0, env_ids, 0.0) for action in self.actions)
         if self._history is not None:
             self._history.reset(env_ids)
+        if self._errors is not None:
+            self._errors.reset(env_ids)
         if self._foot_times is not None:
             self._foot_times.reset(env_ids)
 
@@ -165,6 +173,7 @@ class EnvState:
         return {
             "actions": list(self.actions),
             "history": self._history and self._history.state_dict(),
+            "errors": self._errors and self._errors.state_dict(),
             "foot_times": self._foot_times and self._foot_times.state_dict(),
         }
 
@@ -173,6 +182,8 @@ class EnvState:
         self.actions = tuple(state["actions"])
         if self._history is not None:
             self._history.load_state_dict(state["history"])
+        if self._errors is not None:
+            self._errors.load_state_dict(state["errors"])
         if self._foot_times is not None:
             self._foot_times.load_state_dict(state["foot_times"])
 
@@ -185,8 +196,9 @@ class EnvState:
 
     @lazy
     def measured(self) -> Kinematics:
-        """Base and joints as the robot's sensors give them, with latency where it is randomized."""
-        return self.kinematics if self._history is None else self._history.delayed()
+        """Base and joints as the robot's sensors give them, with latency and errors where they are randomized."""
+        exact = self.kinematics if self._history is None else self._history.delayed()
+        return exact if self._errors is None else self._errors.added_to(exact)
 
     @property
     def command(self) -> torch.Tensor:

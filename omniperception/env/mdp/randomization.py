@@ -1,4 +1,4 @@
-"""Domain randomization: the thirteen ranges of the paper's table and the LiDAR's own noise, each absent when null."""
+"""Domain randomization: the paper's table, and errors and disturbances that a real robot meets, each absent if null."""
 
 from __future__ import annotations
 
@@ -30,12 +30,93 @@ _DRAWN = (
     "com_y",
     "com_z",
 )
-"""Parameters that are drawn at a reset, in this order."""
+"""Parameters of the physics and the actuation that are drawn at a reset, in this order."""
+_MEASURED = (
+    "velocity_scale",
+    "velocity_drift",
+    "gyro_bias",
+    "gyro_noise",
+    "attitude_bias_deg",
+    "attitude_noise_deg",
+    "joint_pos_noise",
+    "joint_vel_noise",
+)
+"""Errors of what the robot measures of itself."""
+_NEVER_NEGATIVE = (
+    "ground_friction",
+    "ground_restitution",
+    "motor_strength",
+    "latency_s",
+    "velocity_scale",
+    "frames_late_s",
+)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Name of a fixed randomization (conf/condition), as a run or a result records it.
+
+    Attributes:
+        name: of the condition.
+        version: raised whenever one of its values changes: results under different versions are not comparable.
+    """
+
+    name: str
+    version: int
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("condition.name must not be empty; give it the name of its file")
+        if self.version < 1:
+            raise ValueError(f"condition.version={self.version} must be at least 1")
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A slowly wandering error: an Ornstein-Uhlenbeck process, stationary from the first step of an episode on.
+
+    Attributes:
+        sd: standard deviation of each axis.
+        time_s: time (s) after which a fraction 1/e of an error is left.
+    """
+
+    sd: float
+    time_s: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sd < math.inf:
+            raise ValueError(f"randomization: a drift's sd={self.sd} must be 0 or more, and finite")
+        if not 0 < self.time_s < math.inf:
+            raise ValueError(f"randomization: a drift's time_s={self.time_s} must be positive and finite")
+
+
+@dataclass(frozen=True)
+class PushesConfig:
+    """Sudden changes of the base's horizontal velocity.
+
+    Attributes:
+        every_s: (low, high) s between two pushes, drawn uniformly; the first comes after a random part of it.
+        speed: largest change (m/s), drawn uniformly from 0 on, in a direction drawn uniformly.
+    """
+
+    every_s: Sequence[float]
+    speed: float
+
+    def __post_init__(self) -> None:
+        if len(self.every_s) != 2 or not 0 < self.every_s[0] <= self.every_s[1] < math.inf:
+            raise ValueError(f"randomization.pushes.every_s={list(self.every_s)} must be [low, high], positive")
+        if not 0 <= self.speed < math.inf:
+            raise ValueError(f"randomization.pushes.speed={self.speed} must be 0 or more, and finite")
 
 
 @dataclass(frozen=True)
 class RandomizationConfig:
-    """Ranges (low, high) drawn uniformly per environment at every reset; null leaves a parameter as it is.
+    """Ranges (low, high) drawn uniformly per environment; null leaves a row out.
+
+    The rows up to `latency_s` are drawn at every reset, and so are scale errors and biases; noise is drawn anew in
+    every control step. Errors of what is measured change `EnvState.measured` and what is computed of it (the actor's
+    observations, the odometry of LiDAR frames, the levelling of clouds), never the truth that rewards, terminations
+    and the critic see. What is drawn for several axes or joints is drawn for each.
 
     Attributes:
         lidar_device: whether ranges and directions have the noise that the maker of the LiDAR in use states.
@@ -55,6 +136,18 @@ class RandomizationConfig:
         gravity_offset: acceleration (m/s^2) added to each axis of gravity.
         latency_s: age (s) of the proprioception that the actor sees.
         payload_position: where the payload sits in the base frame (m).
+        velocity_scale: factor on the base's measured linear velocity: leg odometry misjudges lengths and slip.
+        velocity_drift: error (m/s) of each axis of it, base frame: an estimator's bias wanders.
+        gyro_bias: error (rad/s) of each axis of the measured angular velocity.
+        gyro_noise: likewise, anew in every control step.
+        attitude_bias_deg: error (deg) of measured roll and pitch each, as of an IMU that is mounted askew.
+        attitude_noise_deg: likewise, anew in every control step.
+        joint_pos_noise: error (rad) of every measured joint position, anew in every control step.
+        joint_vel_noise: error (rad/s) of every measured joint velocity, likewise.
+        frames_lost: share of the LiDAR frames that never come, in each environment on its own.
+        frames_late_s: age (s) of the scene that a LiDAR frame shows when it comes, drawn for every frame, rounded to
+            control steps.
+        pushes: of the base.
     """
 
     lidar_device: bool = False
@@ -76,21 +169,41 @@ class RandomizationConfig:
     gravity_offset: Range = None
     latency_s: Range = None
     payload_position: Sequence[float] = (0.0, 0.0, 0.1)
+    velocity_scale: Range = None
+    velocity_drift: Drift | None = None
+    gyro_bias: Range = None
+    gyro_noise: Range = None
+    attitude_bias_deg: Range = None
+    attitude_noise_deg: Range = None
+    joint_pos_noise: Range = None
+    joint_vel_noise: Range = None
+    frames_lost: float | None = None
+    frames_late_s: Range = None
+    pushes: PushesConfig | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
-            if item.name.startswith("lidar_") or item.name == "payload_position" or value is None:
+            if item.name == "payload_position" or not isinstance(value, Sequence):
                 continue
             if len(value) != 2 or not -math.inf < value[0] <= value[1] < math.inf:
                 raise ValueError(f"randomization.{item.name}={list(value)} must be [low, high] or null")
             object.__setattr__(self, item.name, (float(value[0]), float(value[1])))
-        for name in ("ground_friction", "ground_restitution", "motor_strength", "latency_s"):
+        for name in _NEVER_NEGATIVE:
             value = getattr(self, name)
             if value is not None and value[0] < 0:
                 raise ValueError(f"randomization.{name}={list(value)} must not be negative")
         if self.ground_restitution is not None and self.ground_restitution[1] > 1:
             raise ValueError(f"randomization.ground_restitution={list(self.ground_restitution)} must not exceed 1")
+        if self.frames_lost is not None and not 0 <= self.frames_lost < 1:
+            raise ValueError(
+                f"randomization.frames_lost={self.frames_lost} must be a share: at least 0 and less than 1"
+            )
+
+    @property
+    def measures_exactly(self) -> bool:
+        """Tell whether what the robot measures of itself has no errors."""
+        return all(getattr(self, name) is None for name in _MEASURED)
 
     @property
     def noise(self) -> tuple[Noise, ...]:

@@ -1,0 +1,93 @@
+"""How LiDAR frames come: some are lost, and what the others show is some time ago."""
+
+from __future__ import annotations
+
+import torch
+
+from omniperception.common.random import Branch
+
+
+class FrameDelivery:
+    """Draws for every frame of every environment whether it comes, and how late.
+
+    Attributes:
+        fresh: (num_envs,) bool: whose newest frame came.
+        late_steps: (num_envs,) int64 control steps by which the scene that it shows is older than the moment it comes.
+        max_late_steps: the largest of them.
+    """
+
+    def __init__(
+        self,
+        lost: float | None,
+        late_s: tuple[float, float] | None,
+        control_dt: float,
+        num_envs: int,
+        random: Branch,
+    ) -> None:
+        """
+        Args:
+            lost: share of the frames; None for none.
+            late_s: range of the age (s), rounded to control steps; None for none.
+            control_dt: s.
+            num_envs: environments.
+            random: streams to draw from, and nobody else.
+        """
+        self._lost, (self._low, high) = lost or 0.0, late_s or (0.0, 0.0)
+        self._span, self._dt, self._random = high - self._low, control_dt, random
+        device = random.counter.device
+        self._all_envs = torch.arange(num_envs, device=device)
+        self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.late_steps = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.max_late_steps = round(high / control_dt)
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Episodes begin in environments (n,)."""
+        self._random.start_episode(env_ids)
+
+    def draw(self) -> None:
+        """Draws for the next frame."""
+        lost, late = self._random.uniform(self._all_envs, (2,)).unbind(1)
+        torch.ge(lost, self._lost, out=self.fresh)
+        self.late_steps.copy_(((self._low + self._span * late) / self._dt).round())
+
+    def state_dict(self) -> dict:
+        return {"fresh": self.fresh.clone(), "late_steps": self.late_steps.clone()}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.fresh.copy_(state["fresh"])
+        self.late_steps.copy_(state["late_steps"])
+
+
+class PastPoses:
+    """Poses of bodies at the newest control steps, in a ring."""
+
+    def __init__(self, num_steps: int, num_envs: int, num_bodies: int, device: torch.device) -> None:
+        """Args: num_steps: control steps kept, the present one included; num_envs; num_bodies; device."""
+        self._pos = torch.zeros(num_steps, num_envs, num_bodies, 3, device=device)
+        self._quat = torch.zeros(num_steps, num_envs, num_bodies, 4, device=device)
+        self._newest = 0
+        self._all_envs = torch.arange(num_envs, device=device)
+
+    def record(self, pos: torch.Tensor, quat: torch.Tensor) -> None:
+        """Takes in the poses (num_envs, num_bodies, 3 and 4) at the end of a control step."""
+        self._newest = (self._newest + 1) % len(self._pos)
+        self._pos[self._newest].copy_(pos)
+        self._quat[self._newest].copy_(quat)
+
+    def reset(self, env_ids: torch.Tensor, pos: torch.Tensor, quat: torch.Tensor) -> None:
+        """Makes the present poses of environments (n,), out of those of all, those that they have had all along."""
+        self._pos.index_copy_(1, env_ids, pos[env_ids].expand(len(self._pos), -1, -1, -1))
+        self._quat.index_copy_(1, env_ids, quat[env_ids].expand(len(self._quat), -1, -1, -1))
+
+    def at(self, steps_ago: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Poses of each environment as many control steps ago, (num_envs,) int64."""
+        index = torch.remainder(self._newest - steps_ago, len(self._pos))
+        return self._pos[index, self._all_envs], self._quat[index, self._all_envs]
+
+    def state_dict(self) -> dict:
+        return {"pos": self._pos.clone(), "quat": self._quat.clone(), "newest": self._newest}
+
+    def load_state_dict(self, state: dict) -> None:
+        self._pos.copy_(state["pos"])
+        self._quat.copy_(state["quat"])
+        self._newest = state["newest"]
