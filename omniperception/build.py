@@ -157,7 +157,7 @@ class TrainedPolicy:
     """A run's newest policy and the environment to try it in.
 
     Attributes:
-        env: at the start of its first episodes, with all obstacles.
+        env: at the start of its first trials, with all obstacles.
         policy: from observations to actions, without exploration noise.
         checkpoint: where the weights came from.
     """
@@ -174,7 +174,7 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
         CheckpointError: there is none, or it does not fit.
     """
     checkpoint = latest_checkpoint(run_dir)
-    runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0)), None)
+    runner = build_runner(replace(run, env=replace(run.env, initial_obstacle_level=1.0, trials=True)), None)
     runner.load_policy(checkpoint)
     return TrainedPolicy(runner.env, runner.policy, checkpoint)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +16,10 @@ from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.exported import record
-from omniperception.evaluation.suite import FOLDER as EVALUATION
+from omniperception.evaluation.outcomes import Episodes
+from omniperception.evaluation.records import FOLDER as EVALUATION
+from omniperception.evaluation.records import of_run
+from omniperception.evaluation.statistics import rate
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
 
@@ -55,13 +57,10 @@ class TrainedRun:
     path: Path
     name: str
 
-    def scenarios(self) -> dict[str, dict]:
-        """What scripts/evaluate.py measured of the run's own policy, by scenario."""
-        found = {}
-        for file in sorted((self.path / EVALUATION).glob("*.json")):
-            report = json.loads(file.read_text())
-            if "run" in report.get("policies", {}):
-                found[report["scenario"]] = report["policies"]["run"]
+    def scenarios(self) -> dict[str, Episodes]:
+        """What scripts/evaluate.py measured last of the run's own policy, by world."""
+        records = sorted(of_run(self.path), key=lambda record: record.facts["date"])
+        found = {record.place: record.episodes for record in records if record.policy == "run"}
         if not found:
             raise config.ConfigError(
                 f"runs: {self.path} has not been evaluated; python scripts/evaluate.py run={self.path} scenario=all"
@@ -137,7 +136,7 @@ def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> Iterator[S
                 1e6 * timings[run.name].least_cpu_s,
                 rates_of(reports[run.name][scenario]),
                 run.path.resolve() == chosen,
-                facts={**facts[run.name], "trials": reports[run.name][scenario]["episodes"]},
+                facts={**facts[run.name], "trials": len(reports[run.name][scenario])},
             )
             for run in runs
             if scenario in reports[run.name]
@@ -150,10 +149,10 @@ def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> Iterator[S
         yield Study(f"policy_{scenario}", title, COST, FAILED, choices, 0.1, notes)
 
 
-def rates_of(summary: dict) -> dict[str, float]:
-    """Errors, in percent, of an evaluation's summary of one policy."""
-    rates = summary["rates"]
-    untouched = rates["success_untouched"]
+def rates_of(episodes: Episodes) -> dict[str, float]:
+    """Errors, in percent, of a policy."""
+    rates = {name: rate(happened) for name, happened in episodes.happened().items()}
+    untouched = rates["untouched"]
     return {
         FAILED: 100.0 * (1.0 - untouched["rate"]),
         "low (%)": 100.0 * (1.0 - untouched["high"]),

@@ -33,7 +33,7 @@ class Arguments:
     variants: tuple[str, ...] = argument(("fps_mlp_small", "fps_gru_small", "polar_rings"), "perception variants")
     seeds: tuple[int, ...] = argument((1, 2, 3), "seeds; each variant is trained with each", least=0)
     scenarios: tuple[str, ...] = argument(("all",), "where they are evaluated")
-    trials: int = argument(1000, "trials of each run in each scenario, at least", least=1)
+    trials: int = argument(250, "trials of each run in each scenario", least=1)
     trust: tuple[str, ...] = trust()
 
 

@@ -1,30 +1,36 @@
-"""Evaluates a run in fixed scenarios: rates with 95 % intervals, clearance, time, energy, beside baselines.
+"""Evaluates runs in fixed worlds: how often they arrive untouched, beside baselines, and all that goes with it.
 
-    evaluate run=latest scenario=all policy=run,blind
-    evaluate run=pretrained/avoider scenario=corridor trials=250 commands.speed=0.8
+    evaluate run=latest scenario=corridor,static policy=run,blind trials=100
+    evaluate run=pretrained/avoider suite=held_out split=test condition=robot policy=run,blind,oracle
+    evaluate run=outputs/a,outputs/b,outputs/c suite=held_out    # the same training with three seeds
 
-A scenario from conf/scenario replaces the run's obstacles, commands, terminations, terrain, randomization and seed; the
-run keeps its robot, LiDAR, observations, rewards and networks. Overrides go on top. The same seed, number of trials and
-of environments give the same result. Policies:
+A scenario from conf/scenario replaces the run's obstacles, commands, terminations, terrain and seed, a condition from
+conf/condition its randomization; the run keeps its robot, LiDAR, observations, rewards and networks. Overrides go on
+top. `suite` is a file of conf/suite: scenarios and the terrains that each is run on. Trial k is the same scene for
+every policy and any number of environments. On split=dev the seed is the scenario's; use it to choose anything. On
+split=test the obstacles are of kinds and sizes that no training scene has, the seed follows from the hash of the run's
+weights, and each result is noted in `log`. Policies:
 
     run        the run's
     blind      the same, its LiDAR covered
-    scripted   follows V_cmd + V_avoid, computed by the run's avoidance controller from ground-truth distances: the
-               walker's policy, or without one the run's own, which sees no frame
-    command    the walker's, which follows V_cmd alone
+    oracle     follows V_cmd + V_avoid, computed by the run's avoidance controller from ground truth: the walker's
+               policy, or without one the run's own, which sees no frame
     exported   the run's as the export command wrote it, on raw points, joint states and IMU
 
-Writes evaluation/<scenario>.json (summary), .csv (every trial) and .png (trajectories) into the run directory.
+Prints one table. Each policy and world becomes a JSON file with every trial in the run's evaluation folder at once; the
+same command goes on where it was stopped. `out` adds all of them to one file, which the tables command renders.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from omniperception import config
 from omniperception.cli import Command, argument, trust
 from omniperception.common.figures import PlotsUnavailable
-from omniperception.evaluation.suite import POLICIES, Evaluation, evaluate
+from omniperception.config import ConfigError
+from omniperception.evaluation.suite import POLICIES, SPLITS, Evaluation, World, evaluate, suite_worlds
 from omniperception.learning import CheckpointError
 
 
@@ -32,33 +38,60 @@ from omniperception.learning import CheckpointError
 class Arguments:
     """The command's own arguments."""
 
-    run: str = argument("latest", "run directory, or latest for the newest under outputs/")
-    scenario: tuple[str, ...] = argument(("corridor",), "scenarios, or all")
-    trials: int = argument(1000, "trials of each policy in each scenario, at least", least=1)
+    run: tuple[str, ...] = argument(("latest",), "run directories, or latest for the newest under outputs/")
+    suite: str | None = argument(None, "file of conf/suite, such as held_out: many worlds")
+    scenario: tuple[str, ...] = argument((), "scenarios in place of a suite, or all; corridor without either")
+    split: str = argument("dev", "obstacles and seeds for choosing, or for reporting", choices=SPLITS)
+    condition: str | None = argument(None, "preset of conf/condition; null: the run's own randomization")
     policy: tuple[str, ...] = argument(("run",), "policies", choices=tuple(POLICIES))
-    num_envs: int | None = argument(None, "environments at a time; null: even rounds of at most 256", least=1)
-    walker: str | None = argument(None, "run directory of experiment=walk, for policies that only walk")
-    plots: bool = argument(True, "whether trajectories are drawn")
+    trials: int = argument(250, "trials of each policy in each world", least=1)
+    num_envs: int = argument(64, "environments at a time in each process", least=1)
+    jobs: int | None = argument(
+        None, "worlds at a time, in a process of one thread each; null: as many as cores", least=1
+    )
+    walker: str | None = argument(None, "run directory of experiment=walk, whose gait the oracle steers")
+    plots: bool = argument(False, "whether the worlds are drawn from above, with the ways")
+    again: bool = argument(False, "whether to measure again what has been measured before")
+    out: Path | None = argument(None, "file (.json or .json.gz) that the results are added to, for tables")
+    log: Path | None = argument(None, "where split=test is noted; null: docs/lab/evaluations.jsonl of the checkout")
     trust: tuple[str, ...] = trust()
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
-    """Evaluates, prints tables and writes the run's evaluation folder."""
-    run_dir = config.find_run(arguments.run)
-    known = config.presets("scenario", config.search_path(overrides, config.read(run_dir)))
+    """Evaluates, prints the table and writes the runs' evaluation folders."""
+    runs = [config.find_run(name) for name in arguments.run]
+    folders = config.search_path(overrides, config.read(runs[0]))
     evaluate(
         Evaluation(
-            run_dir=run_dir,
-            scenarios=known if arguments.scenario == ("all",) else arguments.scenario,
+            runs=runs,
+            worlds=_worlds(arguments, folders, any(o.split("=", 1)[0] == "terrain" for o in overrides)),
             policies=arguments.policy,
+            split=arguments.split,
+            condition=arguments.condition,
             trials=arguments.trials,
             num_envs=arguments.num_envs,
+            jobs=arguments.jobs,
             walker=config.find_run(arguments.walker, "walker") if arguments.walker else None,
             plots=arguments.plots,
+            again=arguments.again,
+            out=arguments.out,
+            log=arguments.log,
             overrides=tuple(overrides),
             trust=arguments.trust,
         )
     )
 
 
-command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError, PlotsUnavailable))
+def _worlds(arguments: Arguments, folders: list[Path], terrain_given: bool) -> list[World]:
+    """The worlds of a suite, or the scenarios on their own terrain."""
+    if arguments.suite is None:
+        names = arguments.scenario or ("corridor",)
+        return [World(name) for name in (config.presets("scenario", folders) if names == ("all",) else names)]
+    if arguments.scenario:
+        raise ConfigError(f"suite={arguments.suite} has its own worlds; leave scenario= out, or suite=")
+    if terrain_given:
+        raise ConfigError(f"suite={arguments.suite} says on which terrains; use scenario= with terrain=")
+    return suite_worlds(arguments.suite, folders)
+
+
+command = Command(main, Arguments, __doc__, "of the runs' configuration", (CheckpointError, PlotsUnavailable))

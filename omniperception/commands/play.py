@@ -17,8 +17,9 @@ from omniperception import build, config
 from omniperception.cli import Command, argument, trust
 from omniperception.common.provenance import provenance
 from omniperception.env.env import OmniEnv
-from omniperception.evaluation.episodes import Episodes, Policy, run_episodes
-from omniperception.evaluation.report import table, times_line
+from omniperception.evaluation.episodes import Policy, run_episodes
+from omniperception.evaluation.outcomes import Episodes
+from omniperception.evaluation.report import summary_table, times_line
 from omniperception.learning import CheckpointError
 
 
@@ -28,7 +29,7 @@ class Arguments:
 
     run: str = argument("latest", "run directory, or latest for the newest under outputs/")
     viewer: str = argument("video", "how it is shown", choices=("video", "none"))
-    trials: int = argument(200, "episodes, at least", least=1)
+    trials: int = argument(200, "trials", least=1)
     video_s: float = argument(20.0, "length of the video (s)", positive=True)
     trust: tuple[str, ...] = trust()
 
@@ -47,7 +48,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         episodes = run_episodes(trained.env, trained.policy, arguments.trials)
     summary = episodes.summary()
     print(f"{trained.checkpoint} in {run.env.num_envs} environments, seed {run.env.seed}")
-    print(table({"run": summary}))
+    print(summary_table(summary))
     print(times_line(summary))
     report = {
         "checkpoint": trained.checkpoint.name,

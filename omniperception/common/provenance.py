@@ -45,12 +45,13 @@ def provenance(device: object = "cpu", libraries: tuple[str, ...] = LIBRARIES, *
 
 @cache
 def commit(root: Path = ROOT) -> str | None:
-    """Hash of the commit that the code was run at, with "+changes" if files differed; None outside of a checkout."""
+    """Hash of the commit that the code was run at, with "+changes" if files beside docs/ differed; None outside of a
+    checkout."""
     if not (root / ".git").exists():
         return None
     try:
         found = _git(root, "rev-parse", "HEAD")
-        changed = _git(root, "status", "--porcelain", "--untracked-files=no")
+        changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs")
     except (OSError, subprocess.CalledProcessError):
         return None
     return f"{found}+changes" if changed else found

@@ -22,7 +22,8 @@ class EnvRandom:
     """
 
     def __init__(self, seed: int, num_envs: int, device: torch.device | str = "cpu") -> None:
-        self._key = _mix(torch.arange(num_envs, device=device) + (seed + 1) * 1_000_003)
+        self._seed = seed
+        self._key = self._keys(torch.arange(num_envs, device=device))
         self.counter = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self._branches: dict[str, Branch] = {}
 
@@ -46,6 +47,10 @@ class EnvRandom:
         self.counter.copy_(state["counter"])
         for name, branch in self._branches.items():
             branch.load_state_dict(state["branches"][name])
+
+    def _keys(self, numbers: torch.Tensor) -> torch.Tensor:
+        """Keys (n,) int64 of the streams with these numbers (n,)."""
+        return _mix(numbers + (self._seed + 1) * 1_000_003)
 
     def uniform(self, env_ids: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
         """Draws from [0, 1) for environments `env_ids` (n,); the others' streams stay where they are.
@@ -78,6 +83,30 @@ class Branch(EnvRandom):
         """Moves on to the episode in which the other streams of environments `env_ids` (n,) are."""
         self._key[env_ids] = _mix(self._trunk._key[env_ids] + self._salt)
         self.counter[env_ids] = self._trunk.counter[env_ids] // _DRAWS_PER_EPISODE * _DRAWS_PER_EPISODE
+
+
+class TrialRandom(EnvRandom):
+    """Streams by trial: the k-th episode to begin, counted over all environments, draws from stream k.
+
+    What a trial draws thus depends on its number alone, not on how many environments there are or which of them runs
+    it. Episodes that begin at the same moment are counted in the order of their environments.
+
+    Attributes:
+        trial: (num_envs,) int64: the number of the trial that each environment is in; -1 before its first.
+    """
+
+    def __init__(self, seed: int, num_envs: int, device: torch.device | str = "cpu") -> None:
+        super().__init__(seed, num_envs, device)
+        self.trial = torch.full_like(self.counter, -1)
+        self._begun = 0
+
+    def start_episode(self, env_ids: torch.Tensor) -> None:
+        """Gives environments `env_ids` (n,) the next n trials."""
+        numbers = torch.arange(self._begun, self._begun + len(env_ids), device=env_ids.device)
+        self._begun += len(env_ids)
+        self.trial[env_ids] = numbers
+        self._key[env_ids] = self._keys(numbers)
+        self.counter[env_ids] = 0
 
 
 def _shift(x: torch.Tensor, bits: int) -> torch.Tensor:

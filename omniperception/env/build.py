@@ -37,7 +37,7 @@ def build_ground(
     assert sim.ground_pos is not None  # tiles move
     ground = Ground(config.terrain, sim.world.model, sim.ground_pos, config.sim.num_threads or None)
     max_steps = round(config.terminations.episode_length_s / config.sim.control_dt)
-    levels = TerrainLevels(ground, random, config.sim.control_dt, max_steps)
+    levels = TerrainLevels(ground, random, config.sim.control_dt, max_steps, config.trials)
     return ground, levels, HeightLookup(ground, sim.num_envs, sim.device)
 
 

@@ -42,6 +42,8 @@ class EnvConfig:
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
         log_interval: control steps between two reports of the metrics.
         initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
+        trials: whether episodes are trials of an evaluation: the k-th to begin is the same scene whatever the number of
+            environments, on a tile that it draws; see `TrialRandom`.
     """
 
     num_envs: int
@@ -62,6 +64,7 @@ class EnvConfig:
     targets: Sequence[str] = ()
     log_interval: int = 24
     initial_obstacle_level: float | None = None
+    trials: bool = False
 
     def __post_init__(self) -> None:
         if self.num_envs < 1:

@@ -9,7 +9,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from omniperception.common.random import EnvRandom
+from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
 from omniperception.env.build import (
@@ -68,7 +68,8 @@ class OmniEnv(VecEnv):
         late = config.randomization.latency_s is not None
         self.sim = config.sim.build(self.world, self.num_envs, record_states=late)
         self.device = self.sim.device
-        self.random = EnvRandom(config.seed, self.num_envs, self.device)
+        streams = TrialRandom if config.trials else EnvRandom
+        self.random: EnvRandom = streams(config.seed, self.num_envs, self.device)
         self.command = config.commands.build(self.num_envs, self.device, self.random)
         self.randomizer = Randomizer(config.randomization, self.sim, self.random)
         self.ground, self.terrain_levels, lookup = build_ground(config, self.sim, self.random)

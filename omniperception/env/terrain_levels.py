@@ -21,9 +21,18 @@ class TerrainLevels:
         reach: (num_envs,) largest horizontal distance (m) from where the episode started.
     """
 
-    def __init__(self, ground: Ground, random: EnvRandom, control_dt: float, max_episode_length: int) -> None:
-        """`control_dt` (s) and `max_episode_length` (control steps) are those of the environment."""
-        self._ground, self._random = ground, random
+    def __init__(
+        self, ground: Ground, random: EnvRandom, control_dt: float, max_episode_length: int, any_tile: bool = False
+    ) -> None:
+        """
+        Args:
+            ground: the tiles.
+            random: draws of the environments.
+            control_dt: s.
+            max_episode_length: control steps.
+            any_tile: whether each episode draws its tile among all, without a curriculum.
+        """
+        self._ground, self._random, self._any_tile = ground, random, any_tile
         self._dt, self._max_steps = control_dt, max_episode_length
         num_envs, device = len(ground.level), ground.level.device
         self.walked, self.commanded, self.reach, self._steps = torch.zeros(4, num_envs, device=device).unbind(0)
@@ -56,7 +65,9 @@ class TerrainLevels:
         """
         config, ground = self._ground.config, self._ground
         draw = self._random.uniform(env_ids)
-        if config.curriculum is None:
+        if self._any_tile:
+            ground.column[env_ids] = (self._random.uniform(env_ids) * config.columns).long()
+        if self._any_tile or config.curriculum is None:
             level = (draw * config.levels).long()
         elif complete is None:
             level = (draw * (config.curriculum.start_level + 1)).long()

@@ -13,9 +13,9 @@ from omniperception import config
 from omniperception.common.provenance import provenance
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.statistics import wilson
-from omniperception.evaluation.suite import FOLDER, Evaluation, evaluate
-from omniperception.learning import latest_checkpoint
+from omniperception.evaluation.records import Record, of_run
+from omniperception.evaluation.statistics import pooled
+from omniperception.evaluation.suite import Evaluation, World, evaluate
 
 _FEWER = ("perception.history=5", "perception.sampler.num_points=280")
 _NO_PROXIMAL = ("perception.height_weight=0", "perception.sampler.num_proximal=0", "perception.network.proximal_dim=0")
@@ -34,7 +34,14 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 """Overrides of the variants that are no presets of `perception` themselves. `_small` has as many frames and points as
 proximity_gru; what the perception is supervised with is the experiment's."""
 
-RATES = ("success", "success_untouched", "collision", "fall", "time_out")
+RATES = {
+    "untouched": "reached, untouched",
+    "success": "reached",
+    "collision": "touched",
+    "fall": "falls",
+    "time_out": "time-outs",
+}
+"""Rates in a row, and what the table calls them; the first decides."""
 PAPER = {
     "direct_mlp": "out of memory (24 GB)",
     "fps_mlp": "33.3 | 93.3",
@@ -120,13 +127,11 @@ def _wait(process: subprocess.Popen) -> None:
 
 
 def evaluate_all(study: Ablation) -> None:
-    """Evaluates every run in every scenario, but for what has been evaluated at the same checkpoint before."""
+    """Evaluates every run in every scenario, but for what the same code has evaluated at the same checkpoint before."""
     for variant in study.variants:
         for seed in study.seeds:
-            run_dir = study.run_dir(variant, seed)
-            missing = [name for name in study.scenarios if not _evaluated(run_dir, name, study.trials)]
-            if missing:
-                evaluate(Evaluation(run_dir, missing, trials=study.trials, plots=False, trust=study.trust))
+            worlds = [World(name) for name in study.scenarios]
+            evaluate(Evaluation([study.run_dir(variant, seed)], worlds, trials=study.trials, trust=study.trust))
 
 
 def write_tables(study: Ablation) -> str:
@@ -139,35 +144,26 @@ def write_tables(study: Ablation) -> str:
     return text
 
 
-def pooled(counts: Sequence[tuple[int, int]]) -> dict:
-    """Rate over all seeds with Wilson's 95 % interval, and the lowest and the highest of the seeds' rates.
-
-    The interval assumes independent trials; the range shows how much seeds differ.
-    """
-    happened, trials = (sum(column) for column in zip(*counts, strict=True))
-    low, high = wilson(happened, trials)
-    rates = [count / number for count, number in counts]
-    return {"rate": happened / trials, "low": low, "high": high, "least": min(rates), "most": max(rates), "n": trials}
-
-
 def _row(study: Ablation, variant: str) -> dict:
-    """Rates of one variant by scenario."""
+    """Rates of one variant by scenario, over all seeds."""
     row = {}
     for scenario in study.scenarios:
-        summaries = [_report(study.run_dir(variant, seed), scenario)["policies"]["run"] for seed in study.seeds]
-        row[scenario] = {
-            name: pooled([(s["rates"][name]["count"], s["episodes"]) for s in summaries]) for name in RATES
-        }
+        happened = [_record(study.run_dir(variant, seed), scenario).episodes.happened() for seed in study.seeds]
+        row[scenario] = {name: pooled([by_name[name] for by_name in happened]) for name in RATES if name in happened[0]}
     return row
 
 
 def _table(scenario: str, rows: dict, study: Ablation) -> str:
-    columns = ["variant", *(name.replace("_", " ") + ", %" for name in RATES)]
-    cells = [[variant, *(_cell(row[scenario][name]) for name in RATES)] for variant, row in rows.items()]
+    columns = ["variant", *(f"{label}, %" for label in RATES.values())]
+    cells = [[variant, *(_cell(row[scenario].get(name)) for name in RATES)] for variant, row in rows.items()]
     if scenario == "corridor":
         columns.append("paper (30 trials of its own scene and training): success | collision, %")
         for variant, row in zip(rows, cells, strict=True):
+<<<<<<< HEAD
             row.append(PAPER.get(variant, ""))
+=======
+            row.append(PAPER.get(variant.removesuffix("_small"), ""))
+>>>>>>> a32a11a (Evaluation by trials: a queue whose scenes depend on the trial's number alone, one file format, suites in parallel processes)
     title = (
         f"**{scenario}**, {study.trials} trials of each of {len(study.seeds)} seeds: rate [95 % interval]"
         " (least to most of the seeds)"
@@ -175,23 +171,16 @@ def _table(scenario: str, rows: dict, study: Ablation) -> str:
     return f"{title}\n\n{markdown(columns, cells)}"
 
 
-def _cell(rate: dict) -> str:
+def _cell(rate: dict | None) -> str:
+    if rate is None:
+        return "–"
     low, high, least, most = (100 * rate[key] for key in ("low", "high", "least", "most"))
     return f"{100 * rate['rate']:.1f} [{low:.1f}, {high:.1f}] ({least:.1f} to {most:.1f})"
 
 
-def _report(run_dir: Path, scenario: str) -> dict:
-    path = run_dir / FOLDER / f"{scenario}.json"
-    if not path.is_file():
-        raise ConfigError(f"{path} does not exist: {run_dir} has not been evaluated; use stage=evaluate or stage=all")
-    return json.loads(path.read_text())
-
-
-def _evaluated(run_dir: Path, scenario: str, trials: int) -> bool:
-    path = run_dir / FOLDER / f"{scenario}.json"
-    if not path.is_file():
-        return False
-    policies = _report(run_dir, scenario)["policies"]
-    if "run" not in policies or policies["run"]["episodes"] < trials:
-        return False
-    return Path(policies["run"]["checkpoint"]).name == latest_checkpoint(run_dir).name
+def _record(run_dir: Path, scenario: str) -> Record:
+    """The newest result of a run in a scenario."""
+    found = [record for record in of_run(run_dir) if record.world == scenario and record.policy == "run"]
+    if not found:
+        raise ConfigError(f"{run_dir} has not been evaluated in {scenario}; use stage=evaluate or stage=all")
+    return max(found, key=lambda record: record.facts["date"])

@@ -1,135 +1,119 @@
-"""Draws the robots' paths through a scenario, coloured by outcome."""
+"""Draws worlds from above: the ways of the robots, touched ones in red, and the obstacles of one trial."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from omniperception.common.figures import new_figure
-from omniperception.evaluation.episodes import VERDICTS, Episodes
+from omniperception.evaluation.records import Record
+from omniperception.evaluation.report import rate_cell
 from omniperception.evaluation.tracks import Tracks
-from omniperception.scene.obstacle_field import PARKED_HEIGHT
-from omniperception.scene.obstacles import Obstacle, ObstaclesConfig
 
-COLOURS = dict(zip(VERDICTS, ("#2a9d5c", "#e0a100", "#3b6fb6", "#c0392b", "#8e44ad", "#555555"), strict=True))
-SHOWN = 300
-"""Largest number of trajectories in one panel."""
-EXAMPLES = 3
-"""Single trials drawn with their obstacles."""
+UNTOUCHED, TOUCHED, FAILED = "#1b7f4d", "#d62728", "#3b6fb6"
+"""Colours of ways: reached and untouched; touched, wherever they end; neither touched nor at the goal."""
+SHOWN = 25
+"""Ways drawn of each world, the first ones."""
+COLUMNS = 2
+OVERHEAD = 0.45
+"""Obstacles whose lower edge is higher (m) are drawn as outlines: the robot passes below."""
+_MARGIN = 0.6
+_PANEL = 6.2
+"""Width of a panel (inches)."""
 
 
-def draw_tracks(path: Path, scenario: str, by_policy: Mapping[str, Episodes], obstacles: ObstaclesConfig) -> None:
-    """A row per policy: all ways with the places of the first touches, then single trials with their obstacles.
+def draw_worlds(path: Path, records: Sequence[Record]) -> None:
+    """A panel for each world: the first trial with its obstacles where they were at the start, and more ways.
 
-    The single trials are of the outcomes that are not a clean success, as far as there are such, and show the obstacles
-    where they were at the start; dashed ones move.
+    Args:
+        path: the picture.
+        records: with tracks.
     """
-    bounds = _bounds(list(by_policy.values()))
-    width, height = bounds[1] - bounds[0], bounds[3] - bounds[2]
-    columns, rows = 1 + EXAMPLES, len(by_policy)
-    figure = new_figure(4.2 * columns, rows * (4.2 * height / width + 0.9))
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    for row, (policy, episodes) in zip(axes, by_policy.items(), strict=True):
-        _draw_all(row[0], policy, episodes, obstacles)
-        shown = _examples(episodes)
-        for axis, index in zip(row[1:], shown, strict=False):
-            _draw_one(axis, episodes, index, obstacles)
-        for axis in row[1 + len(shown) :]:
-            axis.set_axis_off()
-        row[0].set_ylabel("y (m)")
-    for axis in axes[-1]:
-        axis.set_xlabel("x (m)")
-    axes[0, 0].set(xlim=bounds[:2], ylim=bounds[2:])
-    figure.suptitle(f"{scenario}: ways of the base by outcome")
-    figure.savefig(path, dpi=120)
+    bounds = [_bounds(_tracks(record)) for record in records]
+    rows = math.ceil(len(records) / COLUMNS)
+    shapes = [(high_y - low_y) / (high_x - low_x) for low_x, high_x, low_y, high_y in bounds]
+    heights = [max(shapes[row * COLUMNS : (row + 1) * COLUMNS]) for row in range(rows)]
+    figure = new_figure(COLUMNS * _PANEL, sum(_PANEL * height + 0.55 for height in heights) + 0.7)
+    axes = figure.subplots(rows, COLUMNS, squeeze=False, gridspec_kw={"height_ratios": heights}).flatten()
+    for axis, record, area in zip(axes, records, bounds, strict=False):
+        _draw(axis, record)
+        axis.set(xlim=area[:2], ylim=area[2:])
+    for axis in axes[len(records) :]:
+        axis.set_axis_off()
+    first = records[0]
+    title = f"{first.policy} of {first.run}, split {first.split}, condition {first.condition}"
+    figure.suptitle(title, fontsize=11)
+    figure.legend(handles=_legend(), loc="outside lower center", ncols=5, fontsize=9, frameon=False)
+    figure.savefig(path, dpi=110)
 
 
-def _draw_all(axis, policy: str, episodes: Episodes, obstacles: ObstaclesConfig) -> None:
+def _draw(axis, record: Record) -> None:
     from matplotlib.collections import LineCollection
 
-    tracks, verdicts = _tracks(episodes), episodes.verdict
-    _draw_walls(axis, obstacles)
-    every = math.ceil(len(episodes) / SHOWN)
-    for verdict in VERDICTS:
-        count = verdicts.count(verdict)
-        if not count:
-            continue
-        ways = [tracks.xy[i].numpy() for i in range(0, len(episodes), every) if verdicts[i] == verdict]
-        label = f"{verdict}: {count}"
-        axis.add_collection(LineCollection(ways, colors=COLOURS[verdict], linewidths=0.7, alpha=0.5))
-        axis.plot([], [], color=COLOURS[verdict], label=label)
-    touched = tracks.contact[::every]
-    axis.plot(touched[:, 0], touched[:, 1], "x", color="black", markersize=3, alpha=0.6, label="first touch")
-    axis.set_title(f"{policy}: {len(range(0, len(episodes), every))} of {len(episodes)} trials", fontsize=9)
-    axis.legend(fontsize=7, loc="upper left", framealpha=0.7)
-    axis.set_aspect("equal")
-
-
-def _draw_one(axis, episodes: Episodes, index: int, obstacles: ObstaclesConfig) -> None:
-    tracks, verdict = _tracks(episodes), episodes.verdict[index]
-    _draw_walls(axis, obstacles)
-    for slot, (x, y, z, yaw) in zip(obstacles.placed_slots(), tracks.obstacles[index].tolist(), strict=True):
-        if z > PARKED_HEIGHT / 2:
-            axis.add_patch(_outline(slot, x, y, yaw, lifted=z - slot.half_height > 0.45))
-    way = tracks.xy[index]
-    axis.plot(way[:, 0], way[:, 1], color=COLOURS[verdict], linewidth=1.5)
-    axis.plot(*tracks.contact[index].tolist(), "x", color="black", markersize=5)
+    episodes, tracks = record.episodes, _tracks(record)
+    for part in tracks.parts[0].tolist():
+        if not math.isnan(part[0]):
+            axis.add_patch(_footprint(*part))
+    colours = [
+        TOUCHED if touched else UNTOUCHED if clean else FAILED
+        for touched, clean in zip(episodes.collided.tolist(), episodes.clean.tolist(), strict=True)
+    ]
+    ways = [way.numpy() for way in tracks.xy[:SHOWN]]
+    axis.add_collection(LineCollection(ways[1:], colors=colours[1 : len(ways)], linewidths=0.6, alpha=0.4))
+    axis.plot(ways[0][:, 0], ways[0][:, 1], color=colours[0], linewidth=2.2)
+    axis.plot(*ways[0][0].tolist(), "o", color="black", markersize=4)
+    axis.plot(*tracks.contact[0].tolist(), "x", color="black", markersize=7, markeredgewidth=1.6)
     if tracks.goal is not None:
-        axis.plot(*tracks.goal[index].tolist(), "*", color="black", markersize=7)
-    env, trial = divmod(index, episodes.per_env)
-    axis.set_title(f"environment {env}, trial {trial}: {verdict}", fontsize=9)
+        axis.plot(*tracks.goal[0].tolist(), "*", color="black", markersize=9)
+    axis.set_title(f"{record.place}: untouched {rate_cell([episodes.clean])} % of {len(episodes)}", fontsize=9)
+    axis.tick_params(labelsize=7)
     axis.set_aspect("equal")
 
 
-def _tracks(episodes: Episodes) -> Tracks:
-    assert episodes.tracks is not None  # recorded for pictures
-    return episodes.tracks
-
-
-def _draw_walls(axis, obstacles: ObstaclesConfig) -> None:
-    for slot in obstacles.slots():
-        if slot.pose is not None:
-            x, y, yaw_deg = slot.pose
-            axis.add_patch(_outline(slot, x, y, math.radians(yaw_deg), lifted=False))
-
-
-def _outline(slot: Obstacle, x: float, y: float, yaw: float, lifted: bool):
-    """The obstacle seen from above; what hangs over the robot is transparent."""
+def _footprint(x: float, y: float, yaw: float, half_x: float, half_y: float, bottom: float, speed: float):
+    """A part from above; one that the robot passes below is an outline, one that moves has a dashed edge."""
     from matplotlib.patches import Circle, Rectangle
 
     style = {
-        "facecolor": "none" if lifted else "#d9d4cc",
-        "edgecolor": "#6b6459",
-        "linestyle": "--" if slot.group.speed[1] > 0 else "-",
-        "linewidth": 0.8,
-        "zorder": 0,
+        "facecolor": "none" if bottom > OVERHEAD else "#cfc8bc",
+        "edgecolor": "#5a544a",
+        "linestyle": "--" if speed > 0.0 else "-",
+        "linewidth": 0.9,
+        "zorder": 0.5,
     }
-    if slot.kind != "box":
-        return Circle((x, y), max(slot.size[0], 0.03), **style)
-    half_x, half_y = slot.size[:2]
+    if half_y < 0.0:
+        return Circle((x, y), max(half_x, 0.03), **style)
     return Rectangle(
         (x - half_x, y - half_y), 2 * half_x, 2 * half_y, angle=math.degrees(yaw), rotation_point="center", **style
     )
 
 
-def _examples(episodes: Episodes) -> list[int]:
-    """Trials to look at: one of each failure in turn, then successes."""
-    verdicts = episodes.verdict
-    order = ("fall", "time out", "success, touched", "collision end", "diverged", "success")
-    by_verdict = [[i for i, v in enumerate(verdicts) if v == verdict] for verdict in order]
-    rounds = max(len(indices) for indices in by_verdict)
-    return [indices[k] for k in range(rounds) for indices in by_verdict if k < len(indices)][:EXAMPLES]
+def _legend() -> list:
+    from matplotlib.lines import Line2D
+
+    ways = ((UNTOUCHED, "reached, untouched"), (TOUCHED, "touched"), (FAILED, "untouched, not reached"))
+    lines = [Line2D([], [], color=colour, label=label) for colour, label in ways]
+    marks = (("x", "first touch"), ("*", "goal"))
+    thick = f"thick: the first trial, with its obstacles at its start (dashed: moving); thin: {SHOWN - 1} more"
+    return [
+        *lines,
+        *(Line2D([], [], color="black", marker=mark, linestyle="", label=label) for mark, label in marks),
+        Line2D([], [], color="none", label=thick),
+    ]
 
 
-def _bounds(all_episodes: list[Episodes]) -> tuple[float, float, float, float]:
-    """Area that the panels show (m): all ways and goals with a margin."""
+def _tracks(record: Record) -> Tracks:
+    assert record.episodes.tracks is not None  # recorded for pictures
+    return record.episodes.tracks
 
-    def points(tracks: Tracks) -> torch.Tensor:
-        return torch.cat([*tracks.xy, *([tracks.goal] if tracks.goal is not None else [])])
 
-    xy = torch.cat([points(_tracks(episodes)) for episodes in all_episodes])
-    low, high = xy.amin(0) - 0.8, xy.amax(0) + 0.8
-    return float(low[0]), float(high[0]), min(float(low[1]), -2.2), max(float(high[1]), 2.2)
+def _bounds(tracks: Tracks) -> tuple[float, float, float, float]:
+    """Area that a panel shows (m): ways, goals and the obstacles of the first trial with a margin."""
+    points = [*tracks.xy[:SHOWN], *([tracks.goal[:SHOWN]] if tracks.goal is not None else [])]
+    here = tracks.parts[0, :, :2]
+    xy = torch.cat([*points, here[~here.isnan().any(1)]])
+    low, high = xy.amin(0) - _MARGIN, xy.amax(0) + _MARGIN
+    return float(low[0]), float(high[0]), min(float(low[1]), -2.0), max(float(high[1]), 2.0)

@@ -1,106 +1,186 @@
-"""Reports on evaluated episodes: a table, and one line per episode."""
+"""Tables of evaluated trials."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 
 from omniperception.common.tables import markdown
-from omniperception.evaluation.episodes import CLEARANCE_CAP, Episodes
+from omniperception.evaluation.outcomes import Episodes
+from omniperception.evaluation.records import Record
+from omniperception.evaluation.statistics import paired_difference, pooled, quantiles
 
-DEFINITIONS = {
-    "success": "goal reached without a fall within the time (without a goal: time limit reached); touches allowed",
-    "success_untouched": "success without any contact between robot and obstacle",
-    "collision": "share of trials with at least one contact; the trial goes on (counting convention)",
-    "rates_to_first_contact": "as if each trial ended at its first contact: exclusive outcomes that add up to one",
-    "interval": "low and high are the ends of Wilson's 95 % interval",
-    "clearance_m": "smallest distance in space between any robot link and any obstacle in a trial, by true geometry, "
-    f"at the end of every control step; 0 with a contact, at most {CLEARANCE_CAP:g}",
-    "velocity_error_m_s": "mean over time of |horizontal velocity - commanded velocity|, avoiding included",
-    "energy_j": "sum over joints and control steps of |torque * joint velocity| * control step",
-    "cost_of_transport": "energy / (weight * length of the base's horizontal way), over all trials",
+REFERENCE = "histogram"
+"""Policy that the others' differences are taken to: the best known without learning."""
+COLUMNS = {
+    "untouched": "reached, untouched, %",
+    "success": "reached, %",
+    "touches": "touches / 100 m",
+    "impulse": "impulse, N s",
+    "time": "time / free time",
+    "clearance": "least clearance, m",
+    "fall": "falls, %",
+    "time_out": "time-outs, %",
+    "diverged": "diverged, %",
 }
-"""Meaning of the entries of a summary."""
+"""Figures of a policy and their headings."""
 
 
-def table(summaries: Mapping[str, dict]) -> str:
-    """Summaries side by side, one column each."""
-    first = next(iter(summaries.values()))
+def grouped(records: Iterable[Record], *names: str) -> dict[tuple, list[Record]]:
+    """Records by some of their attributes, in the order of their first appearance."""
+    groups: dict[tuple, list[Record]] = {}
+    for record in records:
+        groups.setdefault(tuple(getattr(record, name) for name in names), []).append(record)
+    return groups
+
+
+def table(records: Sequence[Record]) -> str:
+    """All figures: a row for each world and policy, runs of several training seeds together.
+
+    With REFERENCE among the policies, each other one has a row with the difference in the first column, trial by trial;
+    the last rows are means over the worlds.
+    """
+    conditions, several = {record.condition for record in records}, len({record.terrain for record in records}) > 1
     rows = []
-    for group, when in (("rates", ""), ("rates_to_first_contact", ", ending at the first contact")):
-        for name in first[group]:
-            rows.append(
-                (name.replace("_", " ") + when, *(_rate(summary[group][name]) for summary in summaries.values()))
-            )
-    for parameters, shown in ((_QUANTILES, _spread), (_FIGURES, _figure)):
-        for key, label, unit in parameters:
-            values = [summary[key] for summary in summaries.values()]
-            if any(value is not None for value in values):
-                rows.append((f"{label} ({unit})" if unit else label, *map(shown, values)))
-    title = f"{first['episodes']} episodes, success: {first['success_means']}"
-    return f"{title}\n\n{markdown(['', *summaries], rows)}\n"
+    for (world, terrain, condition), here in grouped(records, "world", "terrain", "condition").items():
+        by_policy = {policy: of_one for (policy,), of_one in grouped(here, "policy").items()}
+        where = [world, *([terrain] if several else []), *([condition] if len(conditions) > 1 else [])]
+        for policy, seeds in by_policy.items():
+            rows.append([*where, policy, *figures([record.episodes for record in seeds]).values()])
+            if REFERENCE in by_policy and policy != REFERENCE:
+                rows.append([*where, f"{policy}: difference to {REFERENCE}", difference(seeds, by_policy[REFERENCE])])
+    places = len({(record.world, record.terrain) for record in records})
+    if places > 1:
+        for (condition, policy), theirs in grouped(records, "condition", "policy").items():
+            where = [f"mean of {places}", *([""] if several else []), *([condition] if len(conditions) > 1 else [])]
+            rows.append([*where, policy, *mean_figures(theirs)])
+    heads = ["world", *(["terrain"] if several else []), *(["condition"] if len(conditions) > 1 else [])]
+    columns = [*heads, "policy", *COLUMNS.values()]
+    return f"{headline(records)}\n\n{markdown(columns, [row + [''] * (len(columns) - len(row)) for row in rows])}\n"
 
 
-def times_line(summary: dict) -> str:
+def headline(records: Sequence[Record]) -> str:
+    """What all rows of a table share."""
+    trials = sorted({len(record.episodes) for record in records})
+    conditions = sorted({f"{r.condition} (version {r.condition_version})" for r in records if r.condition_version})
+    seeds = len({record.run for record in records})
+    parts = [
+        f"split {', '.join(sorted({record.split for record in records}))}",
+        f"condition {', '.join(conditions) or 'none'}",
+        f"{' or '.join(map(str, trials))} trials" + (f" of each of {seeds} runs" if seeds > 1 else ""),
+        "rates with 95 % intervals" + (" (least to most of the runs)" if seeds > 1 else ""),
+    ]
+    return "; ".join(parts)
+
+
+def figures(seeds: Sequence[Episodes]) -> dict[str, str]:
+    """The cells of COLUMNS for a policy; `seeds` are the trials of each training seed."""
+    happened = [episodes.happened() for episodes in seeds]
+
+    def share(name: str) -> str:
+        return rate_cell([by_name[name] for by_name in happened]) if name in happened[0] else "–"
+
+    first = seeds[0]
+    return {
+        "untouched": share("untouched"),
+        "success": share("success"),
+        "touches": f"{_mean([episodes.touches_per_100_m for episodes in seeds]):.2f}",
+        "impulse": "–" if first.impulse is None else f"{_mean([float(e.impulse.mean()) for e in seeds]):.2f}",  # type: ignore[union-attr]
+        "time": _spread([episodes.time_ratio for episodes in seeds]),
+        "clearance": _spread([episodes.clearance for episodes in seeds]),
+        **{name: share(name) for name in ("fall", "time_out", "diverged")},
+    }
+
+
+def mean_figures(records: Sequence[Record]) -> list[str]:
+    """Means over worlds of the cells of COLUMNS; no interval, because worlds are no sample of anything."""
+    by_world = list(grouped(records, "world", "terrain").values())
+
+    def mean(name: str) -> str:
+        rates = [
+            _mean([float(r.episodes.happened()[name].double().mean()) for r in here if name in r.episodes.happened()])
+            for here in by_world
+        ]
+        return f"{100 * _mean(rates):.1f}"
+
+    touches = _mean([_mean([record.episodes.touches_per_100_m for record in here]) for here in by_world])
+    impulses = [r.episodes.impulse for r in records if r.episodes.impulse is not None]
+    impulse = f"{_mean([float(values.mean()) for values in impulses]):.2f}" if impulses else "–"
+    rest = [mean(name) for name in ("fall", "time_out", "diverged")]
+    return [mean("untouched"), mean("success"), f"{touches:.2f}", impulse, "", "", *rest]
+
+
+def difference(ours: Sequence[Record], theirs: Sequence[Record]) -> str:
+    """Difference of the first column between two policies on the same trials, in percentage points."""
+    pairs = {record.run: record for record in theirs}
+    matched = [(record, pairs[record.run]) for record in ours if record.run in pairs]
+    matched = [(a, b) for a, b in matched if a.seed == b.seed and len(a.episodes) == len(b.episodes)]
+    if not matched:
+        return "not the same trials"
+    clean, reference = (torch.cat([pair[k].episodes.clean for pair in matched]) for k in (0, 1))
+    found = paired_difference(clean, reference)
+    return f"{100 * found['difference']:+.1f} [{100 * found['low']:+.1f}, {100 * found['high']:+.1f}]"
+
+
+def rate_cell(by_seed: Sequence[torch.Tensor]) -> str:
+    """A rate in percent with its interval, and the range of several seeds."""
+    rate = pooled(by_seed)
+    spread = f" ({100 * rate['least']:.1f} to {100 * rate['most']:.1f})" if rate["seeds"] > 1 else ""
+    return f"{100 * rate['rate']:.1f} [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]{spread}"
+
+
+def progress_line(record: Record) -> str:
+    """One line about what has just been measured."""
+    us = record.episodes.us_per_env_step
+    return (
+        f"{record.place}, {record.policy}, {record.run}: untouched {rate_cell([record.episodes.clean])} %,"
+        f" {sum(us.values()):.0f} us per environment step"
+    )
+
+
+def summary_table(summary: Mapping) -> str:
+    """The figures of `Episodes.summary` below each other."""
+    rows: list[tuple] = [(name.replace("_", " "), _percent(rate)) for name, rate in summary["rates"].items()]
+    for key, label in _QUANTILES.items():
+        if summary[key] is not None:
+            rows.append((label, f"{summary[key]['median']:.2f} [{summary[key]['p05']:.2f}, {summary[key]['p95']:.2f}]"))
+    rows += [(label, f"{summary[key]:.3f}") for key, label in _MEANS.items() if summary[key] is not None]
+    return f"{summary['trials']} trials, success: {summary['success_means']}\n\n{markdown(['', 'run'], rows)}\n"
+
+
+def times_line(summary: Mapping) -> str:
     """Wall time of one control step of one environment, by stage."""
     times = sorted(summary["us_per_env_step"].items(), key=lambda item: -item[1])
     return "  time per environment step: " + ", ".join(f"{name} {spent:.1f}" for name, spent in times) + " us"
 
 
-def write_trials(path: Path, by_policy: Mapping[str, Episodes]) -> None:
-    """One line per trial and policy as CSV; trial k of environment i is the same scene for every policy."""
-    with open(path, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["policy", "environment", "trial", "outcome", *_COLUMNS])
-        for policy, episodes in by_policy.items():
-            columns = [_plain(getattr(episodes, name), len(episodes)) for name in _COLUMNS.values()]
-            for k, (outcome, *values) in enumerate(zip(episodes.verdict, *columns, strict=True)):
-                writer.writerow([policy, *divmod(k, episodes.per_env), outcome, *values])
-
-
-_QUANTILES = (
-    ("time_to_goal_s", "time to goal", "s"),
-    ("clearance_m", "least clearance", "m"),
-    ("energy_j", "energy", "J"),
-)
-_FIGURES = (
-    ("cost_of_transport", "cost of transport", ""),
-    ("velocity_error_m_s", "velocity error", "m/s"),
-    ("free_velocity_error_m_s", "velocity error, nothing near", "m/s"),
-    ("yaw_rate_error_rad_s", "yaw rate error", "rad/s"),
-    ("contacts_per_minute", "contacts per minute", ""),
-    ("mean_length_s", "episode length", "s"),
-)
-_COLUMNS = {
-    "length_s": "length_s",
-    "contacts": "contacts",
-    "first_contact_s": "first_contact_s",
-    "clearance_m": "clearance",
-    "energy_j": "energy",
-    "path_m": "path",
-    "velocity_error_m_s": "velocity_error",
-    "yaw_rate_error_rad_s": "yaw_rate_error",
+_QUANTILES = {
+    "time_over_free_time": "time over the free time",
+    "clearance_m": "least clearance (m)",
+    "energy_j": "energy (J)",
 }
-"""Columns of the CSV file and the fields of Episodes they hold."""
+_MEANS = {
+    "touches_per_100_m": "touches per 100 m",
+    "impulse_n_s": "impulse of contacts in a trial (N s)",
+    "cost_of_transport": "cost of transport",
+    "velocity_error_m_s": "velocity error (m/s)",
+    "free_velocity_error_m_s": "velocity error, nothing near (m/s)",
+    "yaw_rate_error_rad_s": "yaw rate error (rad/s)",
+    "mean_length_s": "length of a trial (s)",
+}
 
 
-def _rate(rate: dict) -> str:
+def _percent(rate: Mapping) -> str:
     return f"{100 * rate['rate']:.1f} % [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
 
 
-def _spread(spread: dict | None) -> str:
-    return "" if spread is None else f"{spread['median']:.2f} [{spread['p05']:.2f}, {spread['p95']:.2f}]"
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else float("nan")
 
 
-def _figure(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
-
-
-def _plain(values: torch.Tensor | None, count: int) -> list:
-    """A tensor as numbers with six digits; nothing where there is none, or where it is infinite."""
-    if values is None:
-        return [""] * count
-    return ["" if value == float("inf") else float(f"{value:.6g}") for value in values.tolist()]
+def _spread(values: Sequence[torch.Tensor | None]) -> str:
+    """Median with the 5 % to 95 % quantiles of all trials."""
+    there = [value for value in values if value is not None]
+    found = quantiles(torch.cat(there)) if there else None
+    return "–" if found is None else f"{found['median']:.2f} [{found['p05']:.2f}, {found['p95']:.2f}]"

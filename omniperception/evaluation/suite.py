@@ -1,41 +1,65 @@
-"""Evaluation of a run in scenarios, beside baselines, for the evaluate command and the ablation."""
+"""Evaluation of runs in worlds, beside baselines: which trials, in which processes, and what becomes of the results."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import multiprocessing
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+
+import torch
+import yaml
 
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
 from omniperception.common.figures import new_figure
-from omniperception.common.provenance import provenance
+from omniperception.common.provenance import ROOT, provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.evaluation.baselines import Limits, covered, steered
-from omniperception.evaluation.episodes import Episodes, run_episodes
+from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.exported import ExportedPolicies
-from omniperception.evaluation.plots import draw_tracks
-from omniperception.evaluation.report import DEFINITIONS, table, times_line, write_trials
-
-FOLDER = "evaluation"
-"""Folder of a run directory for the results."""
+from omniperception.evaluation.plots import draw_worlds
+from omniperception.evaluation.records import FOLDER, Record, merge, read, write
+from omniperception.evaluation.report import progress_line, table
+from omniperception.evaluation.tracks import Tracks
+from omniperception.learning import CheckpointError, latest_checkpoint
 
 POLICIES = {
     "run": "the run's policy",
     "blind": "the same policy, its LiDAR covered: every ray a miss",
-    "scripted": "a walking policy that follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from"
-    " ground-truth distances",
-    "command": "a walking policy that follows V_cmd alone",
+    "oracle": "the gait that follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the true distances"
+    " and velocities of all obstacles",
     "exported": "the run's exported policy on what a robot measures: onnxruntime",
 }
-"""Policies to evaluate; the walking policy is that of `walker`, or for `scripted` the run's own, LiDAR covered."""
+"""Policies to evaluate; the gait is the run's own, which then sees nothing, or that of `walker`."""
+_WALKS = ("oracle",)
+"""Policies that steer a gait."""
 
-ENVS = 256
-"""Most environments at a time, unless `num_envs` is given."""
+SPLITS = ("dev", "test")
+LOG = Path("docs") / "lab" / "evaluations.jsonl"
+"""Where evaluations on the test split are noted, below a checkout."""
+_TEST_SEEDS = 2**31, 2**42
+"""First of the seeds on the test split, and how many there are: far from what anybody types."""
+
+
+@dataclass(frozen=True)
+class World:
+    """Where a policy is tried.
+
+    Attributes:
+        name: preset of `scenario`.
+        terrain: preset of `terrain`; None: the scenario's own.
+    """
+
+    name: str
+    terrain: str | None = None
 
 
 @dataclass(frozen=True)
@@ -43,139 +67,332 @@ class Evaluation:
     """Settings of an evaluation.
 
     Attributes:
-        run_dir: the run.
-        scenarios: names from conf/scenario.
+        runs: run directories; several are the same training with other seeds.
+        worlds: where.
         policies: names from POLICIES.
-        trials: at least so many trials of each policy in each scenario.
-        num_envs: environments at a time; None: as few rounds of at most ENVS as the trials need.
-        walker: run directory of a policy that follows velocity commands, for the policies that walk; or None.
-        plots: whether to draw the trajectories.
+        split: dev or test.
+        condition: preset of `condition`; None: the randomization that scenario and run have.
+        trials: of each policy of each run in each world.
+        num_envs: environments at a time in each process.
+        jobs: tasks at a time, each in a process of one thread; None: as many as there are cores, 1 on a GPU.
+        walker: run directory of a policy that follows velocity commands, for the policies that steer a gait; or None.
+        plots: whether ways are kept and drawn.
+        again: whether to measure what has been measured before.
+        out: file that the results are added to, beside the run's folder; or None.
+        log: where evaluations on the test split are noted; None: LOG in a checkout, otherwise the run's folder.
         overrides: changes to the configuration, on top of the scenario's.
         trust: packages of one's own whose names the run's configuration may build.
     """
 
-    run_dir: Path
-    scenarios: Sequence[str]
+    runs: Sequence[Path]
+    worlds: Sequence[World]
     policies: Sequence[str] = ("run",)
-    trials: int = 1000
-    num_envs: int | None = None
+    split: str = "dev"
+    condition: str | None = None
+    trials: int = 250
+    num_envs: int = 64
+    jobs: int | None = None
     walker: Path | None = None
-    plots: bool = True
+    plots: bool = False
+    again: bool = False
+    out: Path | None = None
+    log: Path | None = None
     overrides: Sequence[str] = ()
     trust: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        folders = config.search_path(self.overrides, config.read(self.run_dir))
-        known = config.presets("scenario", folders)
-        for name in self.scenarios:
-            if name not in known:
-                raise ConfigError(f"scenario={name} is unknown; {config.suggest(name, known)}")
-        if "command" in self.policies and self.walker is None:
-            raise ConfigError(
-                "policy=command needs a policy that walks without avoiding: walker=<run directory of experiment=walk>;"
-                " the run's own without its LiDAR is policy=blind"
-            )
+        folders = config.search_path(self.overrides, config.read(self.runs[0]))
+        _check("scenario", [world.name for world in self.worlds], folders)
+        _check("terrain", [world.terrain for world in self.worlds if world.terrain is not None], folders)
+        _check("condition", [self.condition] if self.condition is not None else [], folders)
         for override in self.overrides:
-            if override.split("=", 1)[0] in ("scenario", "num_envs"):
+            if override.split("=", 1)[0] in ("scenario", "num_envs", "condition", "obstacles.split"):
                 raise ConfigError(f"{override} is not an override here; it is an argument of its own")
+            if self.split == "test" and override.split("=", 1)[0] == "seed":
+                raise ConfigError(f"{override}: the seed of split=test follows from the weights; use split=dev")
+
+    def tasks(self) -> list[Task]:
+        """What has to be measured, in the order of the table."""
+        return [
+            Task(self, run_dir, policy, world)
+            for world in self.worlds
+            for policy in self.policies
+            for run_dir in self.runs
+        ]
+
+
+def _check(group: str, names: Sequence[str], folders: Sequence[Path]) -> None:
+    known = config.presets(group, folders)
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{group}={name} is unknown; {config.suggest(name, known)}")
+
+
+def suite_worlds(name: str, folders: Sequence[Path] = ()) -> list[World]:
+    """The worlds of a suite, a file of conf/suite with the terrains of each scenario."""
+    known = config.presets("suite", folders)
+    if name not in known:
+        raise ConfigError(f"suite={name} is unknown; {config.suggest(name, known)}")
+    path = next(p for f in (*folders, config.CONFIG_DIR) if (p := f / "suite" / f"{name}.yaml").is_file())
+    worlds = yaml.safe_load(path.read_text()).get("worlds")
+    if not isinstance(worlds, dict) or not all(isinstance(terrains, list) for terrains in worlds.values()):
+        raise ConfigError(f"{path} must have 'worlds: {{scenario: [terrain, ...]}}'")
+    return [World(scenario, terrain) for scenario, terrains in worlds.items() for terrain in terrains]
+
+
+# ---- one task --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Task:
+    """One policy of one run in one world."""
+
+    evaluation: Evaluation
+    run_dir: Path
+    policy: str
+    world: World
 
     @property
-    def envs(self) -> int:
-        """Environments at a time."""
-        if self.num_envs is not None:
-            return self.num_envs
-        return math.ceil(self.trials / math.ceil(self.trials / ENVS))
+    def walker(self) -> Path:
+        """The run whose network moves the robot."""
+        walker = self.evaluation.walker
+        return walker if self.policy in _WALKS and walker is not None else self.run_dir
+
+    @cached_property
+    def weights(self) -> str:
+        """SHA-256 of the run's newest checkpoint."""
+        return weights_hash(self.run_dir)
+
+    @cached_property
+    def composed(self):
+        """The configuration: the run's, or the walker's, in the world."""
+        evaluation, overrides = self.evaluation, list(self.evaluation.overrides)
+        if self.walker != self.run_dir:  # takes the overrides that change the scene, and finds the presets
+            overrides += config.as_override(config.search_path((), config.read(self.run_dir)))
+            scene = (*config.FIXED_BY_SCENARIO, "randomization", "sim", "hydra")
+            overrides = [o for o in overrides if o.lstrip("+~").split("=", 1)[0].split(".", 1)[0] in scene]
+        if not any(override.startswith("sim.num_threads=") for override in overrides):
+            overrides.append("sim.num_threads=1")
+        if self.world.terrain is not None:
+            overrides.append(f"terrain={self.world.terrain}")
+        if evaluation.condition is not None:
+            overrides.append(f"condition={evaluation.condition}")
+        if evaluation.split == "test":
+            overrides += ["obstacles.split=test", f"seed={reported_seed(self.weights, self.world.name)}"]
+        return config.load(self.walker, [f"scenario={self.world.name}", *overrides, f"num_envs={evaluation.num_envs}"])
+
+    def settings(self) -> dict:
+        """What decides the outcomes, as the file says it."""
+        condition = self.composed.get("condition") or {}
+        return {
+            "run": shown(self.run_dir),
+            "policy": self.policy,
+            "condition": condition.get("name", "none"),
+            "world": self.world.name,
+            "terrain": self.world.terrain or "own",
+            "split": self.evaluation.split,
+            "condition_version": condition.get("version", 0),
+            "weights": self.weights,
+            "seed": self.composed.seed,
+            "walker": shown(self.walker),
+            "walker_weights": weights_hash(self.walker),
+            "trials": self.evaluation.trials,
+            "num_envs": self.evaluation.num_envs,
+            "overrides": list(self.evaluation.overrides),
+        }
+
+    @property
+    def path(self) -> Path:
+        """The file of the outcomes; that of the ways has another suffix."""
+        evaluation, world = self.evaluation, self.world
+        names = (evaluation.split, evaluation.condition or "own", world.name, world.terrain or "own", self.policy)
+        return self.run_dir / FOLDER / f"{'-'.join(names)}.json"
+
+    def done(self, facts: dict) -> Record | None:
+        """The record of an earlier measurement by the same code with the same settings; None without one."""
+        evaluation, path = self.evaluation, self.path
+        if evaluation.again or not path.is_file() or (evaluation.plots and not path.with_suffix(".npz").is_file()):
+            return None
+        (record,) = read(path)
+        now = self.settings() | {"commit": facts["commit"], "versions": facts["versions"]}
+        before = record.plain()
+        return record if all(before.get(name) == value for name, value in now.items()) else None
+
+    def measure(self, facts: dict) -> Record:
+        """Runs the trials and writes the files."""
+        settings, trained = self.settings(), self._contender()
+        env = trained.env
+        episodes = run_episodes(env, trained.policy, self.evaluation.trials, keep_tracks=self.evaluation.plots)
+        named = {name: settings.pop(name) for name in Record.__dataclass_fields__ if name in settings}
+        settings |= {
+            "what": POLICIES[self.policy],
+            "checkpoint": shown(trained.checkpoint),
+            "time_limit_s": env.config.terminations.episode_length_s,
+            **facts,
+        }
+        record = Record(**named, facts=settings, episodes=replace(episodes, tracks=None))
+        write(self.path, [record])
+        if episodes.tracks is not None:
+            episodes.tracks.save(self.path.with_suffix(".npz"))
+        return record
+
+    def assembled(self) -> RunConfig:
+        """The environment's configuration, checked."""
+        return build.assemble(self.composed, self.evaluation.trust)
+
+    def _contender(self) -> TrainedPolicy:
+        """The policy in a fresh environment of the world."""
+        trained = load_policy(self.assembled(), self.walker)
+        env, policy, checkpoint = trained.env, trained.policy, trained.checkpoint
+        try:
+            if self.policy == "blind":
+                policy = covered(env, policy)
+            if self.policy == "oracle":
+                policy = steered(env, policy, self._avoidance(), self._limits())
+            if self.policy == "exported":
+                checkpoint = self.run_dir / EXPORTED
+                policy = ExportedPolicies(env, ExportedPolicy.load(checkpoint))
+        except ValueError as error:
+            raise ConfigError(f"policy={self.policy}: {error}") from None
+        return TrainedPolicy(env, policy, checkpoint)
+
+    def _avoidance(self):
+        """The run's avoidance controller, whoever walks."""
+        return build.assemble(config.load(self.run_dir), self.evaluation.trust).env.rewards.avoidance
+
+    def _limits(self) -> Limits | None:
+        """Ranges (m/s) of what the gait has learned to follow; None where it is the run's own, made for V_avoid."""
+        commands = config.read(self.walker).commands
+        own = self.walker == self.run_dir and self._avoidance().risk is not None
+        if own or "lin_vel_x" not in commands:
+            return None
+        return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)
 
 
-def evaluate(evaluation: Evaluation) -> dict[str, dict]:
-    """Evaluates every policy in every scenario, prints tables and writes the run's evaluation folder.
+def weights_hash(run_dir: Path) -> str:
+    """SHA-256 of a run's newest checkpoint."""
+    return hashlib.sha256(latest_checkpoint(run_dir).read_bytes()).hexdigest()
+
+
+def reported_seed(weights: str, world: str) -> int:
+    """Seed of the trials on the test split, which nobody can choose weights by: it follows from their hash."""
+    first, count = _TEST_SEEDS
+    return first + int(hashlib.sha256(f"{weights} {world}".encode()).hexdigest(), 16) % count
+
+
+def shown(path: Path) -> str:
+    """A path as it is written down: from the working directory, or its last two parts."""
+    path, here = path.resolve(), Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(Path(*path.parts[-2:]))
+
+
+# ---- all tasks -------------------------------------------------------------------------------------------------------
+
+
+def evaluate(evaluation: Evaluation) -> list[Record]:
+    """Measures what has not been measured yet, prints progress and one table, and writes the files.
 
     Returns:
-        What <scenario>.json holds, by scenario.
+        A record for each task.
     """
     if evaluation.plots:
         new_figure(1.0, 1.0)  # refuses now what would fail after hours
-    folder = evaluation.run_dir / FOLDER
-    folder.mkdir(exist_ok=True)
-    reports = {}
-    for scenario in evaluation.scenarios:
-        report, episodes = evaluate_scenario(evaluation, scenario)
-        (folder / f"{scenario}.json").write_text(json.dumps(report, indent=2) + "\n")
-        write_trials(folder / f"{scenario}.csv", episodes)
-        written = [f"{scenario}.json", f"{scenario}.csv"]
-        if evaluation.plots:
-            obstacles = _assemble(evaluation, scenario, evaluation.run_dir).env.obstacles
-            draw_tracks(folder / f"{scenario}.png", scenario, episodes, obstacles)
-            written.append(f"{scenario}.png")
-        print(f"{scenario}, {report['num_envs']} environments, seed {report['seed']}:")
-        print(table(report["policies"]))
-        print(f"wrote {', '.join(str(folder / name) for name in written)}", flush=True)
-        reports[scenario] = report
-    return reports
+    for run_dir in evaluation.runs:
+        (run_dir / FOLDER).mkdir(exist_ok=True)
+    tasks = evaluation.tasks()
+    facts = provenance(tasks[0].assembled().env.sim.torch_device)
+    records = {k: record for k, task in enumerate(tasks) if (record := task.done(facts)) is not None}
+    if records:
+        print(f"{len(records)} of {len(tasks)} measured before and kept; again=true measures them again", flush=True)
+    for k, record in _measured({k: task for k, task in enumerate(tasks) if k not in records}, facts):
+        records[k] = record
+        print(f"[{len(records)}/{len(tasks)}] {progress_line(record)}", flush=True)
+        if evaluation.split == "test":
+            note(log_file(evaluation), record)
+    ordered = [records[k] for k in range(len(tasks))]
+    print(f"\n{table(ordered)}")
+    if evaluation.plots:
+        _draw(tasks, ordered)
+    if evaluation.out is not None:
+        merge(evaluation.out, ordered)
+        print(f"added to {evaluation.out}")
+    return ordered
 
 
-def evaluate_scenario(evaluation: Evaluation, scenario: str) -> tuple[dict, dict[str, Episodes]]:
-    """The report of one scenario and the episodes it was made from, by policy."""
-    episodes, summaries = {}, {}
-    for name in evaluation.policies:
-        trained = _contender(name, evaluation, scenario)
-        episodes[name] = run_episodes(trained.env, trained.policy, evaluation.trials, keep_tracks=evaluation.plots)
-        summaries[name] = {
-            "what": POLICIES[name],
-            "checkpoint": str(trained.checkpoint),
-            **episodes[name].summary(),
-        }
-        print(f"{scenario} {name}:{times_line(summaries[name])}", flush=True)
-    report = {
-        "scenario": scenario,
-        "run": str(evaluation.run_dir),
-        "overrides": list(evaluation.overrides),
-        "seed": trained.env.config.seed,
-        "num_envs": trained.env.num_envs,
-        "time_limit_s": trained.env.config.terminations.episode_length_s,
-        "policies": summaries,
-        "definitions": DEFINITIONS,
-        **provenance(trained.env.device),
-    }
-    return report, episodes
+def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Record]]:
+    """Numbers of the tasks with their records, in the order in which they end."""
+    workers = _workers(list(tasks.values()))
+    if workers == 1:
+        for k, task in tasks.items():
+            yield k, _in_worker(task, facts)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        futures = {pool.submit(_in_worker, task, facts): k for k, task in tasks.items()}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
-def _contender(name: str, evaluation: Evaluation, scenario: str) -> TrainedPolicy:
-    """One of POLICIES in a fresh environment of the scenario."""
-    walks = name in ("scripted", "command")
-    run_dir = evaluation.walker if walks and evaluation.walker is not None else evaluation.run_dir
-    run = _assemble(evaluation, scenario, run_dir)
-    trained = load_policy(run, run_dir)
-    policy, checkpoint = trained.policy, trained.checkpoint
+def _workers(tasks: Sequence[Task]) -> int:
+    """Processes; 1 where one of them drives a GPU."""
+    if not tasks:
+        return 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    on_gpu = tasks[0].assembled().env.sim.torch_device.type != "cpu"
+    return min(tasks[0].evaluation.jobs or (1 if on_gpu else cores), len(tasks))
+
+
+def _in_worker(task: Task, facts: dict) -> Record:
+    """`measure` in one thread; errors are such that another process can raise them again."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
     try:
-        if name == "blind":
-            policy = covered(trained.env, policy)
-        if name == "scripted":
-            avoidance = build.assemble(config.load(evaluation.run_dir), evaluation.trust).env.rewards.avoidance
-            own = run_dir == evaluation.run_dir and avoidance.risk is not None  # the run's commands follow from it
-            policy = steered(trained.env, policy, avoidance, None if own else _learned_commands(run_dir))
-        if name == "exported":
-            checkpoint = run_dir / EXPORTED
-            policy = ExportedPolicies(trained.env, ExportedPolicy.load(checkpoint))
-    except ValueError as error:
-        raise ConfigError(f"policy={name}: {error}") from None
-    return TrainedPolicy(trained.env, policy, checkpoint)
+        return task.measure(facts)
+    except ConfigError as error:
+        raise ConfigError(str(error)) from None
+    except CheckpointError as error:
+        raise CheckpointError(str(error)) from None
+    finally:
+        torch.set_num_threads(before)
 
 
-def _assemble(evaluation: Evaluation, scenario: str, run_dir: Path) -> RunConfig:
-    """The run with the scenario's scene; a walker takes the overrides that change the scene, and finds the presets."""
-    overrides = list(evaluation.overrides)
-    if run_dir != evaluation.run_dir:
-        overrides += config.as_override(config.search_path((), config.read(evaluation.run_dir)))
-        scene = (*config.FIXED_BY_SCENARIO, "sim", "hydra")
-        overrides = [o for o in overrides if o.lstrip("+~").split("=", 1)[0].split(".", 1)[0] in scene]
-    composed = config.load(run_dir, [f"scenario={scenario}", *overrides, f"num_envs={evaluation.envs}"])
-    return build.assemble(composed, evaluation.trust)
+def log_file(evaluation: Evaluation) -> Path:
+    """Where evaluations on the test split are noted."""
+    if evaluation.log is not None:
+        return evaluation.log
+    return ROOT / LOG if (ROOT / ".git").exists() else evaluation.runs[0] / FOLDER / LOG.name
 
 
-def _learned_commands(run_dir: Path) -> Limits | None:
-    """The ranges of v_x and v_y (m/s) that a run has been trained with, or None where it was given goals."""
-    commands = config.read(run_dir).commands
-    if "lin_vel_x" not in commands:
-        return None
-    return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)
+def note(log: Path, record: Record) -> None:
+    """Appends a line about an evaluation on the test split."""
+    facts = record.facts
+    commit, _, changes = (facts["commit"] or "").partition("+")
+    line = {
+        "date": facts["date"],
+        "commit": commit or None,
+        "changes": bool(changes),
+        **{name: facts[name] for name in ("command", "trials", "overrides", "versions")},
+        **{name: getattr(record, name) for name in ("run", "weights", "policy", "world", "terrain", "condition")},
+        "condition_version": record.condition_version,
+        "seed": record.seed,
+    }
+    if not log.exists():
+        log.parent.mkdir(parents=True, exist_ok=True)
+        print(f"evaluations with split=test are noted in {log}", flush=True)
+    with open(log, "a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def _draw(tasks: Sequence[Task], records: Sequence[Record]) -> None:
+    """A picture of each policy of each run: all worlds from above."""
+    panels: dict[Path, list[Record]] = {}
+    for task, record in zip(tasks, records, strict=True):
+        tracks = Tracks.load(task.path.with_suffix(".npz"))
+        path = task.run_dir / FOLDER / f"{record.split}-{record.condition}-{record.policy}.png"
+        panels.setdefault(path, []).append(replace(record, episodes=replace(record.episodes, tracks=tracks)))
+    for path, shown_records in panels.items():
+        draw_worlds(path, shown_records)
+        print(f"wrote {path}")

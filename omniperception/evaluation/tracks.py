@@ -1,82 +1,129 @@
-"""Ways of the robots through their episodes, for pictures."""
+"""Ways of the robots through their trials, and the scenes of the trials, for pictures."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
 
+from omniperception.common.random import TrialRandom
 from omniperception.env.env import OmniEnv
+from omniperception.scene.obstacle_field import PARKED_HEIGHT
 
 PERIOD_S = 0.1
 """Time between two points of a way."""
+KEPT_SCENES = 16
+"""Trials, the first ones, whose obstacles are kept."""
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Tracks of the episodes for a picture; lists are ordered by environment and then by time.
+    """Ways and scenes of trials; lists are in the order of the trials' numbers.
 
     Attributes:
-        xy: one (T, 2) per episode: the base's position (m, environment frame) every PERIOD_S and at the end.
-        goal: (num_episodes, 2) m; None without goals.
-        contact: (num_episodes, 2) m: where the base was at the first touch; NaN without one.
-        obstacles: (num_episodes, num_placed, 4): x, y, z (m) and yaw (rad) of the placed obstacles at the start.
+        xy: one (T, 2) per trial: the base's position (m, environment frame), at the start, every PERIOD_S and at the
+            end.
+        goal: (num_trials, 2) m; None without goals.
+        contact: (num_trials, 2) m: where the base was at the first touch; NaN without one.
+        parts: (min(num_trials, KEPT_SCENES), P, 7): the obstacles' footprints at the start, see `footprints`.
     """
 
     xy: list[torch.Tensor]
     goal: torch.Tensor | None
     contact: torch.Tensor
-    obstacles: torch.Tensor
+    parts: torch.Tensor
+
+    def save(self, path: Path) -> None:
+        """Writes them as float32 to an .npz file."""
+        arrays = {"points": torch.cat(self.xy), "counts": torch.tensor([len(way) for way in self.xy])}
+        arrays |= {"contact": self.contact, "parts": self.parts} | ({} if self.goal is None else {"goal": self.goal})
+        plain = {name: value.numpy() for name, value in arrays.items()}
+        with open(path, "wb") as file:
+            np.savez_compressed(file, **plain)  # type: ignore[arg-type]  # keywords are arrays
+
+    @classmethod
+    def load(cls, path: Path) -> Tracks:
+        """What `save` wrote."""
+        with np.load(path) as file:
+            arrays = {name: torch.from_numpy(file[name]) for name in file.files}
+        xy = list(arrays["points"].split(arrays["counts"].tolist()))
+        return cls(xy, arrays.get("goal"), arrays["contact"], arrays["parts"])
 
 
 class TrackRecorder:
-    """Follows the first `per_env` episodes of every environment."""
+    """Follows the first `num_trials` trials."""
 
-    def __init__(self, env: OmniEnv, per_env: int) -> None:
-        self._env, self._per_env = env, per_env
+    def __init__(self, env: OmniEnv, num_trials: int) -> None:
+        assert isinstance(env.random, TrialRandom)  # or there is no tally either
+        self._env, self._trial, self._count = env, env.random.trial, num_trials
         self._every = max(1, round(PERIOD_S / env.control_dt))
-        shape = env.num_envs, per_env
-        self._episode = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
         self._points: list[tuple[torch.Tensor, torch.Tensor]] = []
-        self._goal = torch.zeros(*shape, 2, device=env.device)
-        self._contact = torch.full((*shape, 2), torch.nan, device=env.device)
-        num_placed = env.sim.mocap_pos.shape[1]
-        self._obstacles = torch.zeros(*shape, num_placed, 4, device=env.device)
+        self._goal = torch.zeros(num_trials, 2, device=env.device)
+        self._contact = torch.full((num_trials, 2), torch.nan, device=env.device)
+        self._parts = torch.zeros(min(num_trials, KEPT_SCENES), *footprints(env).shape[1:], device=env.device)
+
+    def begin(self, fresh: torch.Tensor) -> None:
+        """Takes in the scenes of environments (n,) in which trials are about to begin."""
+        env, fresh = self._env, fresh[self._trial[fresh] < self._count]
+        trial = self._trial[fresh]
+        self._points.append((trial.clone(), env.state.kinematics.base_pos_w[fresh, :2].clone()))
+        if env.command.goal_w is not None:
+            self._goal[trial] = env.command.goal_w[fresh]
+        kept = trial < len(self._parts)
+        if bool(kept.any()):
+            self._parts[trial[kept]] = footprints(env)[fresh[kept]]
 
     def record(self) -> None:
         """Takes in the control step that has just been done, before finished environments are reset."""
-        env = self._env
-        running = self._episode < self._per_env
+        env, running = self._env, self._trial < self._count
         xy = env.state.kinematics.base_pos_w[:, :2]
-        first = (running & (env.episode_length_buf == 1)).nonzero().flatten()
-        if len(first):
-            self._keep_scene(first, self._episode[first])
-        due = running & (env.done | (env.episode_length_buf % self._every == 1))
-        ids = due.nonzero().flatten()
-        self._points.append((ids * self._per_env + self._episode[ids], xy[ids].clone()))
+        ids = (running & (env.done | (env.episode_length_buf % self._every == 0))).nonzero().flatten()
+        self._points.append((self._trial[ids], xy[ids].clone()))
         touched = (running & env.contacts).nonzero().flatten()
-        slot = self._episode[touched]
-        before = self._contact[touched, slot]
-        self._contact[touched, slot] = torch.where(before.isnan(), xy[touched], before)
-        self._episode += env.done
+        before = self._contact[self._trial[touched]]
+        self._contact[self._trial[touched]] = torch.where(before.isnan(), xy[touched], before)
 
     def tracks(self) -> Tracks:
         """The recorded tracks."""
-        episode = torch.cat([ids for ids, _ in self._points])
+        trial = torch.cat([ids for ids, _ in self._points])
         points = torch.cat([xy for _, xy in self._points])
-        order = episode.argsort(stable=True)
-        counts = episode.bincount(minlength=self._env.num_envs * self._per_env)
+        order = trial.argsort(stable=True)
+        counts = trial.bincount(minlength=self._count)
         return Tracks(
             xy=[way.cpu() for way in points[order].split(counts.tolist())],
-            goal=None if self._env.command.goal_w is None else self._goal.flatten(0, 1).cpu(),
-            contact=self._contact.flatten(0, 1).cpu(),
-            obstacles=self._obstacles.flatten(0, 1).cpu(),
+            goal=None if self._env.command.goal_w is None else self._goal.cpu(),
+            contact=self._contact.cpu(),
+            parts=self._parts.cpu(),
         )
 
-    def _keep_scene(self, env_ids: torch.Tensor, slot: torch.Tensor) -> None:
-        env = self._env
-        if env.command.goal_w is not None:
-            self._goal[env_ids, slot] = env.command.goal_w[env_ids]
-        w, z = env.sim.mocap_quat[env_ids, :, 0], env.sim.mocap_quat[env_ids, :, 3]
-        yaw = 2 * torch.atan2(z, w)
-        self._obstacles[env_ids, slot] = torch.cat((env.sim.mocap_pos[env_ids], yaw[..., None]), -1).float()
+
+def footprints(env: OmniEnv) -> torch.Tensor:
+    """(num_envs, P, 7) float32 what the obstacles' parts look like from above, at present.
+
+    The numbers are x, y (m, environment frame), yaw (rad), half length and half width (m; a negative width: a circle
+    whose radius is the half length), the height (m) of the lowest point above the ground and the speed (m/s). Parts
+    that are not there are NaN.
+    """
+    slots = env.config.obstacles.slots()
+    if not slots:
+        return torch.zeros(env.num_envs, 0, 7, device=env.device)
+    rows, placed = [], 0
+    for slot in slots:
+        half = slot.size[:2] if slot.kind == "box" else (slot.size[0], -1.0)
+        if slot.pose is not None:
+            x, y, yaw_deg = slot.pose
+            row = torch.tensor([x, y, math.radians(yaw_deg), *half, 0.0, 0.0], device=env.device)
+            rows.append(row.expand(env.num_envs, -1))
+            continue
+        assert env.obstacles is not None
+        field = env.obstacles
+        there = field.pos_w[:, placed, 2] > PARKED_HEIGHT / 2
+        pose = (*field.pos_w[:, placed, :2].unbind(1), field.yaw[:, placed])
+        fixed = [torch.full_like(pose[0], value) for value in half]
+        more = (field.bottom_above_ground()[:, placed], field.velocity_w[:, placed].norm(dim=-1))
+        rows.append(torch.where(there[:, None], torch.stack((*pose, *fixed, *more), 1), torch.nan).float())
+        placed += 1
+    return torch.stack(rows, 1)

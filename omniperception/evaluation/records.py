@@ -1,0 +1,116 @@
+"""Results as files: what one policy did in one world under one condition, trial by trial, with its provenance."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from omniperception.config import ConfigError
+from omniperception.evaluation.outcomes import Episodes
+
+FORMAT = 1
+FOLDER = "evaluation"
+"""Folder of a run directory for the results."""
+_KEY = ("run", "policy", "condition", "world", "terrain", "split")
+
+
+@dataclass(frozen=True)
+class Record:
+    """Trials of one policy in one world.
+
+    Attributes:
+        policy: name in `suite.POLICIES`.
+        world: preset of `scenario`.
+        terrain: preset of `terrain`; "own" for what the scenario says.
+        condition: preset of `condition`; "none" where randomization was chosen otherwise.
+        condition_version: its version; 0 without one.
+        split: dev or test: which obstacles, and which seed.
+        run: run directory, as far as it says anything on another machine.
+        weights: SHA-256 of the run's checkpoint.
+        seed: of the trials.
+        facts: everything else that is written down: overrides, checkpoint, date, commit, command, machine, versions.
+        episodes: the outcomes.
+    """
+
+    policy: str
+    world: str
+    terrain: str
+    condition: str
+    condition_version: int
+    split: str
+    run: str
+    weights: str
+    seed: int
+    facts: dict[str, Any] = field(repr=False)
+    episodes: Episodes = field(repr=False)
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What tells it from the others of a file."""
+        return tuple(getattr(self, name) for name in _KEY)
+
+    @property
+    def place(self) -> str:
+        """World and terrain, in words."""
+        return self.world if self.terrain in ("own", "flat") else f"{self.world}, {self.terrain}"
+
+    def plain(self) -> dict:
+        """As it is written; `of` reads it."""
+        names = (*_KEY, "condition_version", "weights", "seed")
+        return {
+            **{name: getattr(self, name) for name in names},
+            **self.facts,
+            "us_per_env_step": {stage: round(us, 1) for stage, us in self.episodes.us_per_env_step.items()},
+            "outcomes": self.episodes.columns(),
+        }
+
+    @classmethod
+    def of(cls, plain: dict) -> Record:
+        """A record that `plain` wrote."""
+        rest = dict(plain)
+        named = {name: rest.pop(name) for name in (*_KEY, "condition_version", "weights", "seed")}
+        episodes = Episodes.from_columns(rest.pop("outcomes"), rest.pop("us_per_env_step"))
+        return cls(**named, facts=rest, episodes=episodes)
+
+
+def write(path: Path, records: Iterable[Record]) -> None:
+    """Writes records to a .json file, or compressed to a .json.gz; the same records give the same bytes."""
+    lines = ",\n".join(json.dumps(record.plain(), separators=(",", ":")) for record in records)
+    text = f'{{"format": {FORMAT}, "records": [\n{lines}\n]}}\n'.encode()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_bytes(gzip.compress(text, mtime=0) if path.suffix == ".gz" else text)
+    temporary.replace(path)
+
+
+def read(path: Path) -> list[Record]:
+    """The records of a file that `write` wrote.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        raw = path.read_bytes()
+        content = json.loads(gzip.decompress(raw) if path.suffix == ".gz" else raw)
+        if content["format"] != FORMAT:
+            raise ConfigError(f"{path} has format {content['format']}, this version reads {FORMAT}; evaluate again")
+        return [Record.of(plain) for plain in content["records"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path} holds no results of evaluate: {error!r}") from None
+
+
+def merge(path: Path, records: Sequence[Record]) -> None:
+    """Adds records to a file; those that measured the same are replaced."""
+    kept = {record.key: record for record in (read(path) if path.exists() else [])}
+    write(path, (kept | {record.key: record for record in records}).values())
+
+
+def of_run(run_dir: Path) -> list[Record]:
+    """All results in a run's evaluation folder."""
+    return [record for path in sorted((run_dir / FOLDER).glob("*.json")) for record in read(path)]

@@ -1,0 +1,145 @@
+"""What is measured of every trial while it runs, filed by the trial's number when it ends."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from omniperception.common.random import TrialRandom
+from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.commands import GoalCommandConfig
+from omniperception.env.metrics import OUTCOMES
+from omniperception.evaluation.clearance import Clearance
+from omniperception.evaluation.outcomes import CLEARANCE_CAP, GRAVITY, Episodes
+from omniperception.evaluation.tracks import Tracks
+
+CLEARANCE_EVERY = 2
+"""Control steps between two measurements of the clearance, which take as long as a fifth of a control step."""
+
+_SUMS = (
+    *("steps", "velocity_error", "yaw_rate_error", "free", "free_velocity_error"),
+    *("contacts", "energy", "path"),
+)
+"""Sums over the control steps of a trial."""
+
+
+def trial_numbers(env: OmniEnv) -> torch.Tensor:
+    """(num_envs,) the trial that each environment is in.
+
+    Raises:
+        ValueError: its episodes are no trials.
+    """
+    if not isinstance(env.random, TrialRandom):
+        raise ValueError("the episodes of this environment are no trials; build it with EnvConfig.trials")
+    return env.random.trial
+
+
+class Tally:
+    """Adds up the running trial of every environment and files the first `num_trials` when they end.
+
+    Trials begin in the order of their numbers, and all that have begun are waited for: short ones count no more than
+    long ones.
+
+    Attributes:
+        left: trials that have not ended yet.
+    """
+
+    def __init__(self, env: OmniEnv, num_trials: int) -> None:
+        self._env, self._trial, self._count, self.left = env, trial_numbers(env), num_trials, num_trials
+        device, double = env.device, torch.float64
+        n, filed = (env.num_envs,), (num_trials,)
+        self._sums = torch.zeros(*n, len(_SUMS), dtype=double, device=device)
+        self._filed = torch.zeros(*filed, len(_SUMS), dtype=double, device=device)
+        self._outcome = torch.zeros(filed, dtype=torch.int64, device=device)
+        self._first_contact = torch.full(n, math.inf, dtype=double, device=device)
+        self._filed_contact = torch.zeros(filed, dtype=double, device=device)
+        self._free_time = torch.zeros(filed, dtype=double, device=device)
+        self._clearance = Clearance(env) if env.config.obstacles.num_obstacles else None
+        self._least = torch.full(n, CLEARANCE_CAP, device=device)
+        self._filed_least = torch.zeros(filed, device=device)
+        _ = env.state.joint_torque  # recorded from now on
+        self._was_touching = torch.zeros(n, dtype=torch.bool, device=device)
+        self._knows_free = True
+
+    def begin(self, fresh: torch.Tensor) -> None:
+        """Takes in the scenes of environments (n,) in which trials are about to begin."""
+        commands, goal = self._env.config.commands, self._env.command.goal_w
+        fresh = fresh[self._trial[fresh] < self._count]
+        if isinstance(commands, GoalCommandConfig) and goal is not None:
+            way = goal[fresh] - self._env.state.kinematics.base_pos_w[fresh, :2]
+            straight = way[:, 0] if commands.radius is None else way.norm(dim=1) - commands.radius
+            self._free_time[self._trial[fresh]] = straight.double().clamp(min=0.0) / commands.speed
+
+    def record(self) -> None:
+        """Takes in the control step that has just been done, before finished environments are reset."""
+        with self._env.timer.stage("measuring"):
+            self._add_step()
+            self._file_ended()
+
+    def _add_step(self) -> None:
+        env, dt = self._env, self._env.control_dt
+        free = env.no_obstacle_near
+        self._knows_free = free is not None
+        if free is None:
+            free = torch.zeros_like(env.done)
+        began = env.contacts & ~self._was_touching
+        kinematics = env.state.kinematics
+        step = {
+            "steps": torch.ones_like(free),
+            "velocity_error": env.velocity_error,
+            "yaw_rate_error": env.yaw_rate_error,
+            "free": free,
+            "free_velocity_error": env.velocity_error * free,
+            "contacts": began,
+            "energy": (env.state.joint_torque * kinematics.joint_vel).abs().sum(1) * dt,
+            "path": kinematics.base_lin_vel_yaw.norm(dim=1) * dt,
+        }
+        self._sums += torch.where(env.healthy[:, None], torch.stack([step[name].double() for name in _SUMS], 1), 0.0)
+        time = self._sums[:, 0] * dt
+        self._first_contact = torch.where(began, torch.minimum(self._first_contact, time), self._first_contact)
+        if self._clearance is not None and env.step_count % CLEARANCE_EVERY == 0:
+            known = (self._trial >= self._count) | self._first_contact.isfinite()
+            self._least = self._clearance.measure(self._least.masked_fill(known, 0.0))
+        self._was_touching = env.contacts & ~env.done
+
+    def _file_ended(self) -> None:
+        env = self._env
+        filed = (env.done & (self._trial < self._count)).nonzero().flatten()
+        if len(filed):
+            trial = self._trial[filed]
+            self._filed[trial] = self._sums[filed]
+            self._filed_contact[trial] = self._first_contact[filed]
+            untouched = self._first_contact[filed].isinf()
+            self._filed_least[trial] = torch.where(untouched, self._least[filed], 0.0)
+            outcomes = torch.stack([env.outcomes[name] for name in OUTCOMES], 1)
+            self._outcome[trial] = outcomes[filed].int().argmax(1)
+            self.left -= len(filed)
+        self._sums *= ~env.done[:, None]
+        self._first_contact.masked_fill_(env.done, math.inf)
+        self._least = self._least.masked_fill(env.done, CLEARANCE_CAP)
+
+    def episodes(self, us_per_env_step: dict[str, float], tracks: Tracks | None) -> Episodes:
+        """All trials, in their order."""
+        env, dt = self._env, self._env.control_dt
+        sums = dict(zip(_SUMS, self._filed.cpu().unbind(1), strict=True))
+        steps, free, has_goal = sums["steps"], sums["free"], env.command.goal_w is not None
+        return Episodes(
+            length_s=steps * dt,
+            outcome=self._outcome.cpu(),
+            contacts=sums["contacts"].long(),
+            first_contact_s=self._filed_contact.cpu(),
+            impulse=None,
+            clearance=self._filed_least.cpu().double() if self._clearance is not None else None,
+            energy=sums["energy"],
+            path=sums["path"],
+            free_time_s=self._free_time.cpu() if has_goal else None,
+            velocity_error=sums["velocity_error"] / steps,
+            free_velocity_error=sums["free_velocity_error"] / free if self._knows_free else None,
+            free_s=free * dt if self._knows_free else None,
+            yaw_rate_error=sums["yaw_rate_error"] / steps,
+            has_goal=has_goal,
+            weight=float(env.world.model.body_subtreemass[env.world.base_body]) * GRAVITY,
+            us_per_env_step=us_per_env_step,
+            tracks=tracks,
+        )
