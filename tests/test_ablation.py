@@ -5,28 +5,29 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
 from omniperception.commands import main
-from omniperception.evaluation.ablation import Ablation, pooled, write_tables
+from omniperception.env.metrics import OUTCOMES
+from omniperception.evaluation.ablation import Ablation, write_tables
+from omniperception.evaluation.outcomes import Episodes
+from omniperception.evaluation.records import Record, write
 
 GIVEN = {"out": Path("x"), "experiment": "avoid", "variants": ["fps_gru"], "seeds": [1], "scenarios": ["corridor"]}
-
-
-def test_pooled_rates_by_hand():
-    rate = pooled([(8, 10), (4, 10)])
-    assert (rate["rate"], rate["least"], rate["most"], rate["n"]) == (0.6, 0.4, 0.8, 20)
-    assert rate["low"] == pytest.approx(0.3866, abs=1e-4) and rate["high"] == pytest.approx(0.7812, abs=1e-4)
 
 
 def test_every_line_of_a_table_has_as_many_cells(tmp_path):
     """Or it is not shown as one."""
     study = Ablation(**GIVEN | {"out": tmp_path})
-    rates = {
-        name: {"count": 1, "rate": 0.5} for name in ("success", "success_untouched", "collision", "fall", "time_out")
-    }
-    file = study.run_dir("fps_gru", 1) / "evaluation" / "corridor.json"
-    file.parent.mkdir(parents=True)
-    file.write_text(json.dumps({"policies": {"run": {"rates": rates, "episodes": 2}}}))
+    outcome = torch.tensor([OUTCOMES.index("goal"), OUTCOMES.index("fall")])
+    zeros = torch.zeros(2, dtype=torch.float64)
+    plain = dict.fromkeys(("length_s", "first_contact_s", "energy", "path", "velocity_error", "yaw_rate_error"), zeros)
+    nothing = dict.fromkeys(("impulse", "clearance", "free_time_s", "free_velocity_error", "free_s"))
+    trials = Episodes(**plain, **nothing, outcome=outcome, contacts=outcome * 0, has_goal=True, weight=150.0)
+    named = {"policy": "run", "world": "corridor", "terrain": "own", "condition": "none", "split": "dev"}
+    facts = {"date": "2026-11-22"}
+    record = Record(**named, condition_version=0, run="a", weights="0f", seed=1, facts=facts, episodes=trials)
+    write(study.run_dir("fps_gru", 1) / "evaluation" / "any.json", [record])
     lines = [line for line in write_tables(study).splitlines() if line.startswith("|")]
     assert len(lines) == 3 and {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {8}
 
@@ -55,7 +56,7 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
     table = (tmp_path / "ablation.md").read_text()
     assert re.search(r"\| fps_mlp_small +\| .*33\.3 \\\| 93\.3 +\|", table)
     rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]
-    assert rows["fps_mlp_small"]["corridor"]["collision"]["n"] == 4
+    assert rows["fps_mlp_small"]["corridor"]["collision"]["seeds"] == 2
     with pytest.raises(SystemExit, match="2"):
         main(["ablate", *arguments, "ppo.gamma=0.9"])
     assert "holds a run of another configuration" in capfd.readouterr().err

@@ -1,6 +1,5 @@
 """The template in examples/own_project trains, plays and evaluates from a folder of its own."""
 
-import json
 import os
 import shutil
 import subprocess
@@ -12,6 +11,7 @@ import torch
 
 from omniperception import build, config
 from omniperception.env.mdp.terms import StatefulTerm
+from omniperception.evaluation.records import read
 
 ROOT = Path(__file__).resolve().parents[1]
 PRESETS = ("rewards", "obstacles", "terrain", "perception", "scenario", "experiment")
@@ -47,7 +47,8 @@ def test_it_trains_plays_and_evaluates(project):
     assert done.returncode == 0, done.stderr
     done = run("evaluate", "run=run", "scenario=mine", "plots=false", "trust=own_project", *short)
     assert done.returncode == 0, done.stderr
-    assert json.loads((folder / "run" / "evaluation" / "mine.json").read_text())["policies"]["run"]["episodes"] == 2
+    (record,) = read(folder / "run" / "evaluation" / "dev-own-mine-own-run.json")
+    assert len(record.episodes) == 2
 
 
 def test_its_presets_compose_and_are_built_of_its_own_parts(project, monkeypatch):

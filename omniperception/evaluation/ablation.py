@@ -159,11 +159,7 @@ def _table(scenario: str, rows: dict, study: Ablation) -> str:
     if scenario == "corridor":
         columns.append("paper (30 trials of its own scene and training): success | collision, %")
         for variant, row in zip(rows, cells, strict=True):
-<<<<<<< HEAD
             row.append(PAPER.get(variant, ""))
-=======
-            row.append(PAPER.get(variant.removesuffix("_small"), ""))
->>>>>>> a32a11a (Evaluation by trials: a queue whose scenes depend on the trial's number alone, one file format, suites in parallel processes)
     title = (
         f"**{scenario}**, {study.trials} trials of each of {len(study.seeds)} seeds: rate [95 % interval]"
         " (least to most of the seeds)"

@@ -15,6 +15,9 @@ from benchmarks.work_precision.__main__ import command
 from benchmarks.work_precision.scene import MovingScene, Truth, dense_directions, moving_scene
 from omniperception.commands.export import command as export
 from omniperception.config import ConfigError
+from omniperception.env.metrics import OUTCOMES
+from omniperception.evaluation.outcomes import Episodes
+from omniperception.evaluation.records import Record, write
 from omniperception.lidar import LidarConfig
 from omniperception.perception import ProximitySampler
 
@@ -174,18 +177,25 @@ def test_runs_are_named_below_the_folder_that_they_share(tmp_path, paths, labels
     assert found == labels
 
 
+def record(outcome: list[int], contacts: list[int], world: str = "corridor") -> Record:
+    columns = ("length_s", "first_contact_s", "energy", "path", "velocity_error", "yaw_rate_error")
+    plain = dict.fromkeys(columns, [1.0] * len(outcome)) | {"has_goal": True, "weight": 150.0}
+    episodes = Episodes.from_columns({**plain, "outcome": outcome, "contacts": contacts})
+    named = {"policy": "run", "world": world, "terrain": "own", "condition": "none", "split": "dev"}
+    facts = {"date": "2026-11-22"}
+    return Record(**named, condition_version=0, run="a", weights="0f", seed=1, facts=facts, episodes=episodes)
+
+
 def test_policies_are_judged_by_what_evaluation_wrote(tmp_path):
     run = policy.TrainedRun(tmp_path, "run")
     with pytest.raises(ConfigError, match=r"has not been evaluated; python scripts/evaluate.py run="):
         run.scenarios()
-    rates = {"success": 0.9, "success_untouched": 0.7, "collision": 0.25, "fall": 0.05}
-    summary = {"rates": {name: {"rate": r, "low": r - 0.1, "high": r + 0.1} for name, r in rates.items()}}
-    report = {"scenario": "corridor", "policies": {"run": summary, "blind": {}}}
-    (tmp_path / "evaluation").mkdir()
-    (tmp_path / "evaluation" / "corridor.json").write_text(json.dumps(report))
+    outcome = [OUTCOMES.index(name) for name in ["goal"] * 18 + ["fall", "time_out"]]
+    write(tmp_path / "evaluation" / "dev.json", [record(outcome, contacts=[0] * 14 + [1] * 5 + [0])])
     errors = policy.rates_of(run.scenarios()["corridor"])
     assert errors[policy.FAILED] == pytest.approx(30.0) and errors["collision (%)"] == pytest.approx(25.0)
-    assert errors["low (%)"] == pytest.approx(20.0) and errors["high (%)"] == pytest.approx(40.0)
+    assert errors["low (%)"] == pytest.approx(100 - 85.45, abs=0.01)  # Wilson, 14 of 20
+    assert errors["high (%)"] == pytest.approx(100 - 48.10, abs=0.01)
     with pytest.raises(ConfigError, match=r"has not been exported; python scripts/export.py run="):
         _ = run.exported
 
@@ -195,11 +205,8 @@ def test_trained_policies_are_timed_as_they_were_exported(tmp_path, capsys):
     run = tmp_path / "gait"
     shutil.copytree(ROOT / "pretrained" / "gait", run)
     export([f"run={run}", "formats=onnx"])
-    names = ("success", "success_untouched", "collision", "fall")
-    rates = {name: {"rate": 0.5, "low": 0.1, "high": 0.9} for name in names}
-    report = {"scenario": "static", "policies": {"run": {"rates": rates, "episodes": 4}}}
-    (run / "evaluation").mkdir()
-    (run / "evaluation" / "static.json").write_text(json.dumps(report))
+    outcome = [OUTCOMES.index(name) for name in ("goal", "goal", "time_out", "fall")]
+    write(run / "evaluation" / "dev.json", [record(outcome, contacts=[0, 0, 0, 0], world="static")])
     command(["subject=policy", f"runs={run}", f"default={run}", "size=small", f"out={tmp_path / 'out'}"])
     assert "The default, gait, is on it, alone." in capsys.readouterr().out
     (row,) = json.loads((tmp_path / "out" / "policy" / "policy_static.json").read_text())["rows"]

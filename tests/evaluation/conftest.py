@@ -13,10 +13,10 @@ MakeEnv = Callable[..., OmniEnv]
 
 @pytest.fixture(scope="session")
 def make_env() -> MakeEnv:
-    """Builds an environment from command-line overrides, with all obstacles."""
+    """Builds an environment of trials from command-line overrides, with all obstacles."""
 
-    def make(*overrides: str) -> OmniEnv:
+    def make(*overrides: str, trials: bool = True) -> OmniEnv:
         run = build.assemble(config.compose(["rewards=default", "perception=none", *overrides]))
-        return OmniEnv(replace(run.env, initial_obstacle_level=1.0))
+        return OmniEnv(replace(run.env, initial_obstacle_level=1.0, trials=trials))
 
     return make

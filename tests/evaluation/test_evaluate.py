@@ -1,6 +1,5 @@
-"""scripts/evaluate.py: results, determinism, files, baselines and mistakes."""
+"""scripts/evaluate.py: results, determinism, files, resuming, the log, baselines and mistakes."""
 
-import csv
 import json
 import sys
 from pathlib import Path
@@ -11,10 +10,12 @@ import torch
 from omniperception import build, config
 from omniperception.build import build_runner
 from omniperception.common.figures import PlotsUnavailable
+from omniperception.common.random import EnvRandom
 from omniperception.config import ConfigError
 from omniperception.evaluation import suite
 from omniperception.evaluation.baselines import steered
-from omniperception.evaluation.suite import Evaluation, evaluate
+from omniperception.evaluation.records import read
+from omniperception.evaluation.suite import Evaluation, Task, World, evaluate, reported_seed, suite_worlds
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1")
@@ -38,50 +39,121 @@ def seeing(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("seeing"), "experiment=quickstart", "obstacles.curriculum=null")
 
 
-def numbers(report: dict) -> dict:
+def evaluation(run_dir, *worlds, **given):
+    given = {"trials": 4, "num_envs": 2, "jobs": 1, "overrides": (SHORT,)} | given
+    return Evaluation([run_dir], [World(name) for name in worlds], **given)
+
+
+def outcomes(records):
     """What the same seed has to repeat: everything but wall times."""
-    return {
-        name: {key: value for key, value in summary.items() if key != "us_per_env_step"}
-        for name, summary in report["policies"].items()
-    }
+    return [(record.policy, record.world, record.seed, record.episodes.columns()) for record in records]
 
 
-def test_the_same_seed_gives_the_same_result_bit_for_bit(seeing, walker):
-    def run_it(*overrides):
-        policies = ["run", "blind", "scripted", "command"]
-        given = {"trials": 6, "num_envs": 3, "walker": walker, "plots": False, "overrides": [SHORT, *overrides]}
-        return evaluate(Evaluation(seeing, ["moving"], policies, **given))["moving"]
-
-    first = run_it()
-    table = (seeing / "evaluation" / "moving.csv").read_text()
-    second = run_it()
-    assert numbers(first) == numbers(second)
-    assert (seeing / "evaluation" / "moving.csv").read_text() == table
-    other = run_it("seed=8")
-    assert numbers(other) != numbers(first) and other["seed"] == 8 and first["seed"] == 1005
-    run, blind = first["policies"]["run"], first["policies"]["blind"]
-    assert run["episodes"] == 6 and run["velocity_error_m_s"] != blind["velocity_error_m_s"]
-    assert first["policies"]["command"]["checkpoint"].startswith(str(walker))
-    assert run["checkpoint"].startswith(str(seeing))
+def test_the_same_seed_gives_the_same_result_in_any_process(seeing, walker):
+    given = {"policies": ("run", "blind", "oracle"), "trials": 6, "num_envs": 3, "walker": walker, "again": True}
+    first = evaluate(evaluation(seeing, "moving", **given))
+    assert outcomes(evaluate(evaluation(seeing, "moving", jobs=2, **given))) == outcomes(first)
+    (run, blind, oracle) = (record.episodes for record in first)
+    assert len(run) == 6 and not torch.equal(run.velocity_error, blind.velocity_error)
+    assert not torch.equal(oracle.velocity_error, blind.velocity_error)
+    assert [record.facts["walker"] == first[0].run for record in first] == [True, True, False]
+    other = evaluate(evaluation(seeing, "moving", **given | {"policies": ("run",), "overrides": (SHORT, "seed=8")}))
+    assert other[0].seed == 8 and first[0].seed == 1005 and outcomes(other) != outcomes(first)[:1]
 
 
-def test_files_and_tables(walker, capsys):
-    reports = evaluate(
-        Evaluation(walker, ["static", "corridor"], ["run", "scripted"], trials=4, num_envs=2, overrides=[SHORT])
-    )
-    assert list(reports) == ["static", "corridor"]
-    for scenario, report in reports.items():
-        folder = walker / "evaluation"
-        assert json.loads((folder / f"{scenario}.json").read_text()) == report
-        assert report["time_limit_s"] == 0.3 and report["overrides"] == [SHORT]
-        assert {"success", "collision", "rates_to_first_contact", "clearance_m"} <= set(report["definitions"])
-        assert {"python", "torch", "mujoco-core"} <= set(report["versions"])
-        with open(folder / f"{scenario}.csv") as file:
-            rows = list(csv.DictReader(file))
-        assert [row["policy"] for row in rows] == ["run"] * 4 + ["scripted"] * 4
-        assert (folder / f"{scenario}.png").read_bytes()[:4] == b"\x89PNG"
+def test_the_number_of_threads_does_not_matter(walker):
+    results = []
+    for threads in (1, 2):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        given = (SHORT, f"sim.num_threads={threads}")
+        results.append(outcomes(evaluate(evaluation(walker, "rod", overrides=given))))
+        torch.set_num_threads(before)
+    assert results[0] == results[1]
+
+
+def test_files_hold_what_was_measured_and_by_what(walker, tmp_path, capsys):
+    given = {"policies": ("run", "oracle"), "plots": True, "out": tmp_path / "all.json.gz"}
+    records = evaluate(evaluation(walker, "static", "corridor", **given))
+    folder = walker / "evaluation"
+    assert [(r.world, r.policy) for r in records] == [(w, p) for w in ("static", "corridor") for p in ("run", "oracle")]
+    for record in records:
+        (written,) = read(folder / f"dev-own-{record.world}-own-{record.policy}.json")
+        assert written.plain() == record.plain()
+        facts = written.facts
+        assert facts["time_limit_s"] == 0.3 and facts["overrides"] == [SHORT] and facts["trials"] == 4
+        assert {"date", "commit", "command", "machine", "versions", "checkpoint"} <= set(facts)
+        assert {"python", "torch", "mujoco-core"} <= set(facts["versions"])
+    assert [record.key for record in read(tmp_path / "all.json.gz")] == [record.key for record in records]
     printed = capsys.readouterr().out
-    assert "ending at the first contact" in printed and "scripted" in printed and "time out" in printed
+    for policy in ("run", "oracle"):
+        (picture,) = folder.glob(f"dev-*-{policy}.png")
+        assert picture.read_bytes()[:4] == b"\x89PNG" and str(picture) in printed
+    assert printed.count("| static") == 2 and "mean of 2" in printed
+
+
+def test_the_same_command_goes_on_where_it_was(walker, monkeypatch, capsys):
+    measured = []
+    real = suite.run_episodes
+
+    def count(env, *args, **kwargs):
+        measured.append(env.config.seed)
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        return real(env, *args, **kwargs)
+
+    monkeypatch.setattr(suite, "run_episodes", count)
+    given = evaluation(walker, "aerial", "small", trials=3)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(given)
+    records = evaluate(given)
+    assert len(measured) == 3 and [record.world for record in records] == ["aerial", "small"]
+    assert outcomes(evaluate(given)) == outcomes(records) and len(measured) == 3
+    assert "2 of 2 measured before and kept" in capsys.readouterr().out
+    evaluate(evaluation(walker, "aerial", trials=2))  # something else is measured
+    evaluate(evaluation(walker, "aerial", trials=2, again=True))
+    assert len(measured) == 5
+    monkeypatch.setattr(suite, "provenance", lambda device: {**records[0].facts, "commit": "another"})
+    evaluate(evaluation(walker, "aerial", trials=2))  # by other code
+    assert len(measured) == 6
+
+
+def test_seeds_of_reported_evaluations_follow_from_the_weights(walker):
+    seeds = {reported_seed(weights, world) for weights in ("0a", "0b") for world in ("static", "corridor")}
+    assert len(seeds) == 4 and min(seeds) >= 2**31
+    assert reported_seed("0a", "static") == reported_seed("0a", "static")
+    draws = EnvRandom(2**31 + 2**42 - 1, 3).uniform(torch.arange(3), (4,))  # the largest
+    assert len(draws.unique()) == 12
+    task = Task(evaluation(walker, "static", overrides=()), walker, "run", World("static"))
+    assert task.composed.seed == 1002
+    with pytest.raises(ConfigError, match="the seed of split=test follows from the weights"):
+        evaluation(walker, "static", split="test", overrides=("seed=4",))
+
+
+def test_reported_evaluations_are_noted(walker, tmp_path, capsys):
+    (record,) = evaluate(evaluation(walker, "static"))
+    log = tmp_path / "new" / "log.jsonl"
+    suite.note(log, record)
+    suite.note(log, record)
+    assert str(log) in capsys.readouterr().out
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert len(lines) == 2 and lines[0] == lines[1]
+    line = lines[0]
+    assert line["weights"] == record.weights == suite.weights_hash(walker) and line["trials"] == 4
+    names = {"date", "commit", "changes", "command", "condition", "condition_version", "world", "policy", "versions"}
+    assert names <= set(line) and "+" not in (line["commit"] or "")
+    own = evaluation(walker, "static", log=log)
+    assert suite.log_file(own) == log and suite.log_file(evaluation(walker, "static")) == suite.ROOT / suite.LOG
+
+
+def test_outside_of_a_checkout_the_note_is_beside_the_results(walker, tmp_path, monkeypatch):
+    monkeypatch.setattr(suite, "ROOT", tmp_path)
+    assert suite.log_file(evaluation(walker, "static")) == walker / "evaluation" / "evaluations.jsonl"
+
+
+@pytest.mark.parametrize("world", suite_worlds("held_out"), ids=lambda world: f"{world.name}-{world.terrain}")
+def test_every_world_of_the_suite_can_be_evaluated(walker, world):
+    Task(evaluation(walker, world.name), walker, "run", world).assembled()
 
 
 def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
@@ -95,37 +167,20 @@ def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
     monkeypatch.setattr(suite, "steered", spy)
     run, walker = ROOT / "pretrained/avoider", ROOT / "pretrained/gait"
     for walks in (None, walker):
-        suite._contender("scripted", Evaluation(run, ["static"], ["scripted"], trials=2, walker=walks), "static")
+        Task(evaluation(run, "static", walker=walks), run, "oracle", World("static"))._contender()
     assert given == [None, ((-1.0, 1.5), (-1.0, 1.0))]
-
-
-def test_environments_default_to_even_rounds(walker):
-    def envs(trials, **given):
-        return Evaluation(walker, ["static"], trials=trials, **given).envs
-
-    assert [envs(1000), envs(256), envs(257), envs(3)] == [250, 256, 129, 3]
-    assert envs(1000, num_envs=7) == 7
 
 
 def test_what_does_not_fit_the_run_is_refused(walker):
     with pytest.raises(ConfigError, match="scenario=rod is not an override here"):
-        Evaluation(walker, ["static"], overrides=["scenario=rod"])
+        evaluation(walker, "static", overrides=("scenario=rod",))
     with pytest.raises(ConfigError, match="policy=blind: this policy does not look at the LiDAR"):
-        evaluate(Evaluation(walker, ["static"], ["blind"], trials=1, plots=False, overrides=[SHORT]))
+        evaluate(evaluation(walker, "static", policies=("blind",)))
+    with pytest.raises(ConfigError, match="policy=blind: this policy does not look at the LiDAR"):
+        evaluate(evaluation(walker, "static", "small", policies=("blind",), jobs=2))  # from another process
 
 
 def test_missing_matplotlib_is_refused_first(walker, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(PlotsUnavailable, match=r"pip install 'omniperception\[plots\]'"):
-        evaluate(Evaluation(walker, ["static"], trials=1))
-
-
-def test_the_number_of_threads_does_not_matter(walker):
-    results = []
-    for threads in (1, 2):
-        before = torch.get_num_threads()
-        torch.set_num_threads(threads)
-        given = [SHORT, f"sim.num_threads={threads}"]
-        results.append(numbers(evaluate(Evaluation(walker, ["rod"], trials=4, plots=False, overrides=given))["rod"]))
-        torch.set_num_threads(before)
-    assert results[0] == results[1]
+        evaluate(evaluation(walker, "static", plots=True))

@@ -1,8 +1,10 @@
-"""Wilson intervals against values from the closed formula."""
+"""Intervals against values from the closed formulas, and against how often they hold."""
 
 import pytest
+import torch
 
 from omniperception.evaluation import wilson
+from omniperception.evaluation.statistics import paired_difference, pooled
 
 
 @pytest.mark.parametrize(
@@ -26,3 +28,30 @@ def test_intervals_by_hand(successes, trials, low, high):
 def test_more_successes_than_trials():
     with pytest.raises(ValueError, match="successes=4"):
         wilson(4, 3)
+
+
+def test_pooled_rates_by_hand():
+    rate = pooled([torch.arange(10) < 8, torch.arange(10) < 4])
+    assert (rate["rate"], rate["least"], rate["most"], rate["seeds"]) == (0.6, pytest.approx(0.8 - 0.4), 0.8, 2)
+    assert rate["low"] == pytest.approx(0.3866, abs=1e-4) and rate["high"] == pytest.approx(0.7812, abs=1e-4)
+
+
+def test_paired_differences_by_hand():
+    """Of 20 trials 6 are won by the first alone, 1 by the second alone."""
+    ours, theirs = torch.arange(20) < 10, (torch.arange(20) >= 6) & (torch.arange(20) < 11)
+    got = paired_difference(ours, theirs)
+    assert (got["gained"], got["lost"], got["difference"]) == (6, 1, 0.25)
+    # (6.5 - 1.5) / 22 = 0.227273; half width = 1.959964 sqrt(7 + 1 - 25 / 22) / 22 = 0.233401
+    assert (got["low"], got["high"]) == pytest.approx((-0.006128, 0.460674), abs=2e-6)
+    with pytest.raises(ValueError, match="no pairs"):
+        paired_difference(ours, theirs[:5])
+
+
+def test_paired_intervals_hold_as_often_as_they_say():
+    """4000 pairs of 60 trials, of which 25 % are won by one alone and 10 % by the other alone."""
+    draws = torch.rand(4000, 60, generator=torch.Generator().manual_seed(1))
+    held = 0
+    for draw in draws:
+        got = paired_difference((draw < 0.25) | (draw > 0.8), ((draw >= 0.25) & (draw < 0.35)) | (draw > 0.8))
+        held += got["low"] <= 0.15 <= got["high"]
+    assert 0.935 < held / len(draws) < 0.975
