@@ -133,6 +133,22 @@ class TestGoal:
         second.advance(0.02, kinematics)
         assert torch.equal(first.goal_w, second.goal_w) and torch.equal(first.value, second.value)
 
+    def test_a_place_to_hold_is_reached_late_and_approached_slowly(self):
+        config = GoalCommandConfig(
+            (0.0, 0.0), (0.0, 0.0), 0.5, 0.8, 2.0, 1.0, SpawnConfig(), slow_within=1.0, hold_s=0.05
+        )
+        kinematics = robots([[-0.25, 0.0], [-0.6, 0.0], [0.0, 3.0]], [0.0, 0.5, -math.pi / 2])
+        command = config.build(3, torch.device("cpu"), EnvRandom(0, 3))
+        command.reset(torch.arange(3), kinematics)
+        assert command.value[0].tolist() == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
+        assert command.value[1, 2].item() == pytest.approx(0.6 * -1.0)  # 2 * 0.5 rad, at 0.6 of 1 m
+        assert command.value[2].tolist() == pytest.approx([0.8, 0.0, 0.0], abs=1e-6)
+        for expected in (False, False, True):
+            command.advance(0.02, kinematics)
+            assert command.reached(kinematics).tolist() == [expected, False, False]
+        command.reset(torch.tensor([0]), kinematics)
+        assert not command.reached(kinematics).any()
+
     @pytest.mark.parametrize(
         ("settings", "message"),
         [
@@ -144,6 +160,10 @@ class TestGoal:
     def test_wrong_settings_are_refused(self, settings, message):
         with pytest.raises(ValueError, match=message):
             GoalCommandConfig(*settings, 2.0, 1.0, SpawnConfig())
+
+    def test_a_line_cannot_be_held(self):
+        with pytest.raises(ValueError, match=r"commands\.hold_s=3"):
+            GoalCommandConfig((1.0, 1.0), (0.0, 0.0), None, 1.0, 2.0, 1.0, SpawnConfig(), hold_s=3.0)
 
 
 def test_robots_start_where_the_preset_says(make_env):

@@ -84,6 +84,9 @@ class GoalCommandConfig:
         yaw_gain: yaw rate per heading error (1/s).
         max_ang_vel_z: bound of the commanded yaw rate (rad/s).
         spawn: where the robot starts.
+        slow_within: at this distance (m) from the goal and nearer, speed and yaw rate fade in proportion to the
+            distance, so that a robot can stay; 0: they do not.
+        hold_s: the goal counts as reached only from this time (s) of an episode on, so that a robot has to stay.
     """
 
     goal_x: Sequence[float]
@@ -93,6 +96,8 @@ class GoalCommandConfig:
     yaw_gain: float
     max_ang_vel_z: float
     spawn: SpawnConfig
+    slow_within: float = 0.0
+    hold_s: float = 0.0
 
     def __post_init__(self) -> None:
         for key in ("goal_x", "goal_y"):
@@ -102,6 +107,11 @@ class GoalCommandConfig:
                 raise ValueError(f"commands.{key}={getattr(self, key)} must be positive")
         if self.radius is not None and self.radius <= 0:
             raise ValueError(f"commands.radius={self.radius} must be positive, or null for a line to cross")
+        for key in ("slow_within", "hold_s"):
+            if getattr(self, key) < 0:
+                raise ValueError(f"commands.{key}={getattr(self, key)} must not be negative")
+            if getattr(self, key) > 0 and self.radius is None:
+                raise ValueError(f"commands.{key}={getattr(self, key)} needs a place to stay: give commands.radius")
 
     def build(self, num_envs: int, device: torch.device, random: EnvRandom) -> GoalCommand:
         return GoalCommand(self, num_envs, device, random)
@@ -179,6 +189,7 @@ class GoalCommand:
         self.config = config
         self.value = torch.zeros(num_envs, 3, device=device)
         self.goal_w = torch.zeros(num_envs, 2, device=device)
+        self.elapsed = torch.zeros(num_envs, device=device)
         self._random = random
         ranges = (config.goal_x, config.goal_y)
         self._low = torch.tensor([r[0] for r in ranges], device=device)
@@ -186,10 +197,12 @@ class GoalCommand:
 
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
         self.goal_w[env_ids] = self._low + self._random.uniform(env_ids, (2,)) * (self._high - self._low)
+        self.elapsed[env_ids] = 0.0
         self.advance(0.0, kinematics)
 
     def advance(self, dt: float, kinematics: Kinematics) -> None:
         config = self.config
+        self.elapsed += dt
         ahead, aside = (self.goal_w - kinematics.base_pos_w[:, :2]).unbind(1)
         if config.radius is None:
             ahead = (ahead + 1.0).clamp(min=0.5)
@@ -198,15 +211,23 @@ class GoalCommand:
         self.value[:, :2] = rotate_yaw(-kinematics.yaw, to_goal) * config.speed
         error = torch.remainder(bearing - kinematics.yaw + math.pi, 2 * math.pi) - math.pi
         self.value[:, 2] = (config.yaw_gain * error).clamp(-config.max_ang_vel_z, config.max_ang_vel_z)
+        if config.slow_within > 0:
+            self.value *= (self._distance(kinematics) / config.slow_within).clamp(max=1.0)[:, None]
 
     def reached(self, kinematics: Kinematics) -> torch.Tensor:
         if self.config.radius is None:
             return kinematics.base_pos_w[:, 0] >= self.goal_w[:, 0]
-        return (self.goal_w - kinematics.base_pos_w[:, :2]).norm(dim=1) <= self.config.radius
+        near = self._distance(kinematics) <= self.config.radius
+        return near & (self.elapsed >= self.config.hold_s) if self.config.hold_s > 0 else near
+
+    def _distance(self, kinematics: Kinematics) -> torch.Tensor:
+        """(num_envs,) m, horizontal, to the goal."""
+        return (self.goal_w - kinematics.base_pos_w[:, :2]).norm(dim=1)
 
     def state_dict(self) -> dict:
-        return {"value": self.value, "goal_w": self.goal_w}
+        return {"value": self.value, "goal_w": self.goal_w, "elapsed": self.elapsed}
 
     def load_state_dict(self, state: dict) -> None:
         self.value.copy_(state["value"])
         self.goal_w.copy_(state["goal_w"])
+        self.elapsed.copy_(state["elapsed"])
