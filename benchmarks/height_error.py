@@ -23,7 +23,6 @@ HELD_OUT = (
     "terrain.seed=1000",
     "terrain.curriculum=null",
     "obstacles=all",
-    "obstacles.shape_seed=1000",
 )
 MEASURED = "perception.height_weight=1"
 """Whatever the last stage of the training was supervised with."""

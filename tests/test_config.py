@@ -56,12 +56,12 @@ class TestRunDirectories:
         folder = tmp_path / "conf" / "obstacles"
         folder.mkdir(parents=True)
         preset = (config.CONFIG_DIR / "obstacles" / "static.yaml").read_text()
-        (folder / "mine.yaml").write_text(f"{preset}shape_seed: 3\n")
+        (folder / "mine.yaml").write_text(f"{preset}spacing: 0.3\n")
         given = [f"hydra.searchpath=['file://{folder.parent}']", "experiment=quickstart"]
         run = build.assemble(config.compose([*given, "obstacles=mine"]))
-        assert run.env.obstacles.shape_seed == 3
+        assert run.env.obstacles.spacing == 0.3
         config.save(run.composed, tmp_path)
-        assert config.load(tmp_path, ["obstacles=mine"]).obstacles.shape_seed == 3
+        assert config.load(tmp_path, ["obstacles=mine"]).obstacles.spacing == 0.3
         with pytest.raises(ConfigError, match="obstacles=mine is unknown"):
             config.compose(["obstacles=mine"])
 

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import torch
 
 from benchmarks.harness.reference import compile_model, mujoco_ranges
 from benchmarks.harness.rotations import matrices, quat_about, quat_multiply, unit_vectors
 from omniperception.lidar import LidarConfig
 from omniperception.scene import ObstaclesConfig
+from omniperception.scene.parts import PartShapes
 
 GROUND, OBSTACLE = 0, 1
 """Classes of what is hit."""
@@ -74,19 +76,27 @@ class MovingScene:
 
 
 def moving_scene(obstacles: ObstaclesConfig, num_envs: int, seed: int = 0) -> MovingScene:
-    """Obstacles of a preset at random around the robot, moving at speeds drawn from their groups' ranges."""
-    rng = np.random.default_rng(seed)
-    slots = obstacles.placed_slots()
-    shape = (num_envs, len(slots))
+    """Obstacles of a preset at random around the robot, moving at speeds drawn from their groups' ranges.
+
+    Sizes are drawn once, the same in every environment.
+    """
+    rng, shapes = np.random.default_rng(seed), np.random.default_rng(0)
+    parts = [part for part in obstacles.parts() if part.group.poses is None]
+    sizes = np.zeros((len(parts), 3))
+    for size, part in zip(sizes, parts, strict=True):
+        size[: len(part.size)] = shapes.uniform(*np.transpose(part.size))
+    drawn = PartShapes(parts, torch.float64, torch.device("cpu"))
+    radius, half_height = (np.array(f(torch.from_numpy(sizes))) for f in (drawn.radius, drawn.half_height))
+    shape = (num_envs, len(parts))
     azimuth, course = rng.uniform(-math.pi, math.pi, (2, *shape))
-    nearest = np.array([SPREAD[0] + slot.radius for slot in slots])
+    nearest = SPREAD[0] + radius
     distance = np.sqrt(rng.uniform(nearest**2, SPREAD[1] ** 2, shape))
-    height = np.broadcast_to([slot.half_height for slot in slots], shape)
-    speed = np.stack([rng.uniform(*slot.group.speed, num_envs) for slot in slots], axis=1)
+    height = np.broadcast_to(half_height, shape)
+    speed = np.stack([rng.uniform(*part.group.speed, num_envs) for part in parts], axis=1)
     flat = np.zeros(shape)
     return MovingScene(
-        kinds=tuple(slot.kind for slot in slots),
-        sizes=np.array([[*slot.size, 0.0, 0.0][:3] for slot in slots]),
+        kinds=tuple(part.kind for part in parts),
+        sizes=sizes,
         start=np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), height], axis=-1),
         velocity=np.stack([speed * np.cos(course), speed * np.sin(course), flat], axis=-1),
         heading=rng.uniform(-math.pi, math.pi, shape),

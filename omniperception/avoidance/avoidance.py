@@ -49,7 +49,7 @@ class Avoidance:
             num_envs, device: of all tensors.
             max_distance: distance (m) of a sector without an obstacle.
             obstacles: every obstacle.
-            field: where the placed ones are; None without any.
+            field: where they are; None without any.
             reads_velocity: whether V_avoid and the sector distances are read, beside `motion`.
         """
         self.config, self._max_distance = config, max_distance

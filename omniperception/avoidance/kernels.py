@@ -60,7 +60,7 @@ def nearest_by_sector(
     axis: wp.array2d(dtype=wp.vec2),
     velocity: wp.array2d(dtype=wp.vec2),
     counts: wp.array2d(dtype=wp.bool),
-    outline: wp.array(dtype=wp.vec2),
+    outline: wp.array2d(dtype=wp.vec2),
     # out
     sectors_out: wp.array2d(dtype=wp.vec3),
 ):
@@ -73,13 +73,13 @@ def nearest_by_sector(
             p = place[env, o]
             a = axis[env, o]
             w = velocity[env, o]
-            near = nearest_point(p, a, outline[o])
+            near = nearest_point(p, a, outline[env, o])
             bearing = wp.atan2(near[1], near[0]) + wp.static(math.pi)
             own = wp.min(int(bearing / width), num_sectors - 1)
             sectors_out[env, own] = keep_nearer(wp.length(near), w, sectors_out[env, own])
             for s in range(num_sectors):
                 angle = (float(s) + 0.5) * width - wp.static(math.pi)
-                distance = entry(p, a, outline[o], wp.vec2(wp.cos(angle), wp.sin(angle)))
+                distance = entry(p, a, outline[env, o], wp.vec2(wp.cos(angle), wp.sin(angle)))
                 if distance < sectors_out[env, s][0]:
                     sectors_out[env, s] = keep_nearer(distance, w, sectors_out[env, s])
 

@@ -33,17 +33,10 @@ class TrueSectors:
         num_envs: int,
         device: torch.device,
     ) -> None:
-        """Args: num_sectors: S; obstacles: every obstacle; field: where the placed ones are, or None without any."""
+        """Args: num_sectors: S; obstacles: every obstacle; field: where they are, or None without any."""
         self.num_sectors, self._field, self._num_envs, self._device = num_sectors, field, num_envs, device
         self._headroom = obstacles.headroom
-        slots = obstacles.slots()
-        placed = [slot for slot in slots if slot.pose is None]
-        fixed = [slot for slot in slots if slot.pose is not None]
-        self.names = tuple(slot.name for slot in (*placed, *fixed))
-        outlines = [(*slot.size, 0.0)[:2] if slot.kind == "box" else (slot.size[0], -1.0) for slot in (*placed, *fixed)]
-        self._outline = torch.tensor(outlines, device=device).reshape(-1, 2)
-        poses = torch.tensor([slot.pose for slot in fixed], device=device).reshape(-1, 3)
-        self._fixed_xy, self._fixed_yaw = poses[:, :2], torch.deg2rad(poses[:, 2])
+        self.names = obstacles.geom_names()
 
     def measure(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, known: torch.Tensor | None = None) -> torch.Tensor:
         """Distances and velocities at the present state of the obstacles.
@@ -57,36 +50,22 @@ class TrueSectors:
             (num_envs, S, 3) distance (m, horizontal, infinite without an obstacle) and velocity (m/s, yaw-aligned).
         """
         out = nothing_near(self._num_envs, self.num_sectors, self._device)
-        if len(self._outline):
-            xy, obstacle_yaw, velocity, counts = self._obstacles()
+        field = self._field
+        if field is not None:
+            counts = field.active & (field.bottom_above_ground() < self._headroom)
             if known is not None:
                 counts = counts & known
-            place = rotate_yaw(-yaw, xy - base_pos_w[:, None, :2])
-            velocity = rotate_yaw(-yaw, velocity)
-            heading = obstacle_yaw - yaw[:, None]
+            place = rotate_yaw(-yaw, field.pos_w[..., :2].float() - base_pos_w[:, None, :2])
+            velocity = rotate_yaw(-yaw, field.velocity_w.float())
+            heading = field.yaw.float() - yaw[:, None]
             axis = torch.stack((heading.cos(), heading.sin()), -1)
             inputs = [
                 view(place, wp.vec2),
                 view(axis, wp.vec2),
                 view(velocity, wp.vec2),
                 view(counts, wp.bool),
-                view(self._outline, wp.vec2),
+                view(field.outline.float(), wp.vec2),
                 view(out, wp.vec3),
             ]
             launch_over_envs(nearest_by_sector, self._num_envs, inputs, self._device)
         return out
-
-    def _obstacles(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Places (n, O, 2), yaw angles (n, O), velocities (n, O, 2), and which count (n, O)."""
-        n, field = self._num_envs, self._field
-        fixed_xy, fixed_yaw = self._fixed_xy.expand(n, -1, -1), self._fixed_yaw.expand(n, -1)
-        still, always = torch.zeros_like(fixed_xy), torch.ones_like(fixed_yaw, dtype=torch.bool)
-        if field is None:
-            return fixed_xy, fixed_yaw, still, always
-        counts = field.active & (field.bottom_above_ground() < self._headroom)
-        return (
-            torch.cat((field.pos_w[..., :2].float(), fixed_xy), 1),
-            torch.cat((field.yaw.float(), fixed_yaw), 1),
-            torch.cat((field.velocity_w.float(), still), 1),
-            torch.cat((counts, always), 1),
-        )

@@ -63,8 +63,8 @@ def build_pushes(config: EnvConfig, sim: Simulator, random: EnvRandom) -> Pushes
 def build_obstacles(
     config: EnvConfig, sim: Simulator, random: EnvRandom, ground: Ground | None
 ) -> ObstacleField | None:
-    """The obstacles that are placed at resets."""
-    if not config.obstacles.placed_slots():
+    """The obstacles, where there are some."""
+    if not config.obstacles.num_obstacles:
         return None
     field = ObstacleField(config.obstacles, sim.mocap_pos, sim.mocap_quat, random, ground)
     if config.initial_obstacle_level is not None:

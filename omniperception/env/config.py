@@ -78,11 +78,6 @@ class EnvConfig:
                 "perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
                 " perception.motion_weight=0"
             )
-        fixed = [name for name, group in self.obstacles.groups.items() if group.poses is not None]
-        if fixed and isinstance(self.terrain, TiledTerrainConfig):
-            raise ValueError(
-                f"obstacles: {', '.join(fixed)} with fixed poses stand on flat ground only; use terrain=flat"
-            )
         if self.randomization.lidar_device and self.lidar is not None and self.lidar.device is None:
             raise ValueError(
                 "randomization.lidar_device needs a sensor whose maker states its noise, but lidar.device is null; name"

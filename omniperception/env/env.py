@@ -91,6 +91,7 @@ class OmniEnv(VecEnv):
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._spawn = self._spawn_bounds()
+        self._sized_geoms = self._find_sized_geoms()
         self._frame_heights: torch.Tensor | None = None  # at the newest frame, where only supervision reads heights
         self.rewards = RewardManager(config.rewards.terms, self.state)
         self._groups = {n: ObservationManager(n, g, self.state) for n, g in config.observations.groups.items()}
@@ -162,6 +163,15 @@ class OmniEnv(VecEnv):
                 self.pushes.advance()
             self.sim.step(target, self.config.sim.decimation, path)
             self.sim.detect_failures()
+
+    def _resize(self, obstacles: ObstacleField, env_ids: torch.Tensor) -> None:
+        """Gives the physics and the rays the obstacles' sizes in some environments (n,)."""
+        if obstacles.varying:
+            names = tuple(obstacles.parts[k].name for k in obstacles.varying)
+            sizes = obstacles.size[env_ids][:, obstacles.varying]
+            self.sim.resize(self._sized_geoms, env_ids, sizes)
+            if self.sensing is not None:
+                self.sensing.resize(names, env_ids, sizes)
 
     def _move(self, obstacles: ObstacleField) -> torch.Tensor:
         """Moves the obstacles through the control step; where they are during each of its physics steps."""
@@ -259,6 +269,7 @@ class OmniEnv(VecEnv):
             commanded = rotate_yaw(pose[:, 2], self.command.value[env_ids, :2])
             goal = None if self.command.goal_w is None else self.command.goal_w[env_ids]
             self.obstacles.reset(env_ids, pose[:, :2], commanded, goal)
+            self._resize(self.obstacles, env_ids)
         self.episode_length_buf[env_ids] = 0
         if self.sensing is not None:
             self.sensing.reset(env_ids, self.state.measured)
@@ -345,6 +356,8 @@ class OmniEnv(VecEnv):
         """Resumes from the `state_dict` of an environment with the same configuration."""
         for name, part in self._with_state().items():
             part.load_state_dict(state[name])
+        if self.obstacles is not None:
+            self._resize(self.obstacles, torch.arange(self.num_envs, device=self.device))
         self.random.load_state_dict(state["random"])
         self.step_count = state["step_count"]
         self.episode_length_buf.copy_(state["episode_length"])
@@ -361,6 +374,13 @@ class OmniEnv(VecEnv):
         names += ["pushes", "state", "metrics"]
         parts = {name: getattr(self, name) for name in names} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}
+
+    def _find_sized_geoms(self) -> tuple[int, ...]:
+        """MuJoCo ids of the obstacles' geoms whose sizes differ between environments."""
+        if self.obstacles is None:
+            return ()
+        names = [self.obstacles.parts[k].name for k in self.obstacles.varying]
+        return tuple(self.world.model.geom(name).id for name in names)
 
     def _spawn_bounds(self) -> torch.Tensor:
         """(2, 3) low and high of x, y (m) and yaw (rad) at which robots start."""

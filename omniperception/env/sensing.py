@@ -151,6 +151,7 @@ class LidarSensing:
         self.config, pattern = config, config.scan_pattern()
         shapes = ray_shapes(sim.world, config.exclude_geoms)
         self._bodies, self.base = shapes.bodies, shapes.base
+        self._shape_of = {name: k for k, name in enumerate(shapes.geom_names)}
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
         )
@@ -207,6 +208,11 @@ class LidarSensing:
         """The slices in which the clouds of `num_envs` environments are cast."""
         most = num_envs if self.whole else envs_at_once(self.config, self.lidar.outputs)
         return env_slices(num_envs, most)
+
+    def resize(self, geoms: Sequence[str], env_ids: torch.Tensor, sizes: torch.Tensor) -> None:
+        """Gives rays the sizes (n, k, 3) in m that k geoms have in environments (n,)."""
+        shapes = tuple(self._shape_of[name] for name in geoms)
+        self.scene.set_sizes(shapes, sizes, env_ids, check=False)
 
     def follow(self, measured: Kinematics) -> None:
         """Notes how the base moves, as measured, and where everything is; call at every control step."""

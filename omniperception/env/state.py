@@ -59,12 +59,12 @@ def requirements(term: Callable) -> frozenset[str]:
 
 
 class Obstacles(NamedTuple):
-    """The obstacles that are placed at resets; without any, O = 0.
+    """The parts of obstacles whose poses are not fixed; without any, O = 0.
 
     Attributes:
         pos_yaw: (n, O, 2) m, from the base's origin, in the yaw-aligned frame.
         vel_yaw: (n, O, 2) m/s, in the yaw-aligned frame.
-        radius: (O,) m, of the circles around the footprints.
+        radius: (n, O) m, of the circles around the footprints.
         active: (n, O) bool: which take part in the episode.
     """
 
@@ -111,7 +111,7 @@ class EnvState:
             control_dt: s.
             command: source of the commands.
             randomizer: tells how late `measured` is.
-            obstacles: those that are placed at resets.
+            obstacles: None without any.
             height_lookup: heights above ground that is not flat; None on a plane at 0.
             avoidance: source of V_avoid.
             sensing: the LiDAR.
@@ -287,14 +287,15 @@ class EnvState:
 
     @lazy
     def obstacles(self) -> Obstacles:
-        """Positions and velocities of the obstacles."""
+        """Positions and velocities of the obstacles that have no fixed pose: circles say little about long walls."""
         n, field, yaw = self.num_envs, self._obstacles, self.kinematics.yaw
         if field is None:
             nothing = torch.zeros(n, 0, 2, device=self.device)
-            return Obstacles(nothing, nothing, nothing[0, :, 0], nothing[..., 0].bool())
-        offset = field.pos_w[..., :2].float() - self.kinematics.base_pos_w[:, None, :2]
-        velocity = rotate_yaw(-yaw, field.velocity_w.float())
-        return Obstacles(rotate_yaw(-yaw, offset), velocity, field.radius.float(), field.active)
+            return Obstacles(nothing, nothing, nothing[..., 0], nothing[..., 0].bool())
+        free = field.free
+        offset = field.pos_w[:, free, :2].float() - self.kinematics.base_pos_w[:, None, :2]
+        velocity = rotate_yaw(-yaw, field.velocity_w[:, free].float())
+        return Obstacles(rotate_yaw(-yaw, offset), velocity, field.radius[:, free].float(), field.active[:, free])
 
     @property
     def avoidance_velocity(self) -> torch.Tensor:

@@ -60,6 +60,7 @@ class View:
         points_w: (P, 3) LiDAR points, m.
         proximal: (P,) bool which of them are proximal.
         arrows: painted in this order.
+        sizes: (k, 3) sizes of the shapes that the renderer was told to resize, m.
     """
 
     eye_w: torch.Tensor
@@ -69,6 +70,7 @@ class View:
     points_w: torch.Tensor
     proximal: torch.Tensor
     arrows: tuple[Arrow, ...] = ()
+    sizes: torch.Tensor | None = None
 
 
 class Renderer:
@@ -87,6 +89,7 @@ class Renderer:
         fov_deg: float = 46.0,
         device: str | torch.device = "cpu",
         num_threads: int | None = None,
+        sized: tuple[int, ...] = (),
     ) -> None:
         """
         Args:
@@ -96,8 +99,9 @@ class Renderer:
             fov_deg: vertical field of view.
             device: of the rays.
             num_threads: CPU threads; None for all cores.
+            sized: indices of the shapes whose sizes each view gives.
         """
-        self.width, self.height, self._samples = width, height, samples
+        self.width, self.height, self._samples, self._sized = width, height, samples, sized
         self._columns, self._rows = width * samples, height * samples
         self._focal = 0.5 * self._rows / math.tan(math.radians(fov_deg) / 2)
         strips = max(n for n in range(1, min(self._rows, 32) + 1) if self._rows % n == 0)
@@ -118,6 +122,9 @@ class Renderer:
         """The picture, (height, width, 3) uint8 on the CPU."""
         self._scene.body_pos.copy_(view.body_pos)
         self._scene.body_quat.copy_(view.body_quat)
+        if self._sized:
+            assert view.sizes is not None  # which it is to give
+            self._scene.set_sizes(self._sized, view.sizes)
         axes = _camera_axes(view.eye_w, view.target_w)
         rays = self._rays_c @ axes
         ranges, classes, colour = self._shade(view, rays)

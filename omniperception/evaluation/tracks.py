@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,23 +106,10 @@ def footprints(env: OmniEnv) -> torch.Tensor:
     whose radius is the half length), the height (m) of the lowest point above the ground and the speed (m/s). Parts
     that are not there are NaN.
     """
-    slots = env.config.obstacles.slots()
-    if not slots:
+    field = env.obstacles
+    if field is None:
         return torch.zeros(env.num_envs, 0, 7, device=env.device)
-    rows, placed = [], 0
-    for slot in slots:
-        half = slot.size[:2] if slot.kind == "box" else (slot.size[0], -1.0)
-        if slot.pose is not None:
-            x, y, yaw_deg = slot.pose
-            row = torch.tensor([x, y, math.radians(yaw_deg), *half, 0.0, 0.0], device=env.device)
-            rows.append(row.expand(env.num_envs, -1))
-            continue
-        assert env.obstacles is not None
-        field = env.obstacles
-        there = field.pos_w[:, placed, 2] > PARKED_HEIGHT / 2
-        pose = (*field.pos_w[:, placed, :2].unbind(1), field.yaw[:, placed])
-        fixed = [torch.full_like(pose[0], value) for value in half]
-        more = (field.bottom_above_ground()[:, placed], field.velocity_w[:, placed].norm(dim=-1))
-        rows.append(torch.where(there[:, None], torch.stack((*pose, *fixed, *more), 1), torch.nan).float())
-        placed += 1
-    return torch.stack(rows, 1)
+    pose = (field.pos_w[..., :2], field.yaw[..., None])
+    rest = torch.stack((field.bottom_above_ground(), field.velocity_w.norm(dim=-1)), -1)
+    there = field.pos_w[..., 2:] > PARKED_HEIGHT / 2
+    return torch.where(there, torch.cat((*pose, field.outline, rest), -1), torch.nan).float()

@@ -84,6 +84,9 @@ class Recorder:
         self.frames_left = max(1, round(duration_s / dt))
         self._steps = 0
         self._shapes = ray_shapes(env.world)
+        field = env.obstacles
+        names = [] if field is None else [field.parts[k].name for k in field.varying]
+        self._sized = self._shapes.indices(names)
         self._renderer = self._build_renderer(1, samples=1)
         self._camera = FollowCamera(dt)
         self._split = _split_elevation(env)
@@ -121,7 +124,8 @@ class Recorder:
     def _build_renderer(self, scale: int, samples: int) -> Renderer:
         width, height = (scale * pixels for pixels in self._size)
         threads = self._env.config.sim.num_threads or None
-        return Renderer(self._shapes, width, height, samples, device=self._env.device, num_threads=threads)
+        device, sized = self._env.device, self._sized
+        return Renderer(self._shapes, width, height, samples, device=device, num_threads=threads, sized=sized)
 
     def _view(self) -> View:
         env, state = self._env, self._env.state.kinematics
@@ -139,7 +143,9 @@ class Recorder:
             vector = rotate_yaw(yaw[None], velocity[self._id, None])[0]
             if float(vector.norm()) >= MIN_ARROW:
                 arrows.append(Arrow(base[:2].clone(), vector, width, colour))
-        return View(eye, target, pos[self._id].clone(), quat[self._id].clone(), points, proximal, tuple(arrows))
+        pose, field = (pos[self._id].clone(), quat[self._id].clone()), env.obstacles
+        sizes = None if field is None else field.size[self._id, list(field.varying)]
+        return View(eye, target, *pose, points, proximal, tuple(arrows), sizes)
 
     def _points(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Points (P, 3) (m, environment frame) of the episode's newest frame, and which are proximal."""

@@ -7,14 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
-import numpy as np
 
-_GEOM_TYPES = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-}
-_NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
+from omniperception.scene.parts import SIZES, Part
 
 
 @dataclass(frozen=True)
@@ -47,12 +41,13 @@ class ApproachConfig:
 
 @dataclass(frozen=True)
 class ObstacleGroup:
-    """Obstacles of one kind. What is a range is drawn uniformly for every obstacle at every reset, sizes once.
+    """Obstacles of one kind. What is a range is drawn uniformly for every obstacle at every reset.
 
     Attributes:
-        kind: 'box', 'cylinder' or 'sphere'.
+        kind: 'box', 'cylinder', 'sphere' or 'capsule'.
         count: number of them.
-        size: one (low, high) range (m) per size: box half extents x, y, z; cylinder radius, half height; sphere radius.
+        size: one (low, high) range (m) per size: box half extents x, y, z; cylinder radius, half height; sphere radius;
+            capsule radius, half length without its caps. What is round stands upright.
         speed: (low, high) range (m/s); (0, 0) stands still.
         poses: fixed (x, y, yaw in degrees) of each obstacle, for walls; None: placed at every reset.
         bottom: (low, high) range (m) of the height of its lowest point above the ground; (0, 0) stands on it.
@@ -75,12 +70,15 @@ class ObstacleGroup:
     approach: ApproachConfig | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in _GEOM_TYPES:
-            raise ValueError(f"obstacles: kind={self.kind} is unknown; known: {', '.join(_GEOM_TYPES)}")
+        if self.kind not in SIZES:
+            raise ValueError(f"obstacles: kind={self.kind} is unknown; known: {', '.join(SIZES)}")
         object.__setattr__(self, "size", tuple((float(low), float(high)) for low, high in self.size))
         object.__setattr__(self, "speed", tuple(float(s) for s in self.speed))
-        if len(self.size) != _NUM_SIZES[self.kind]:
-            raise ValueError(f"obstacles: a {self.kind} has {_NUM_SIZES[self.kind]} size ranges, got {len(self.size)}")
+        if len(self.size) != len(SIZES[self.kind]):
+            raise ValueError(
+                f"obstacles: a {self.kind} has {len(SIZES[self.kind])} size ranges ({', '.join(SIZES[self.kind])}), got"
+                f" {len(self.size)}"
+            )
         if any(not 0 < low <= high for low, high in self.size):
             raise ValueError(f"obstacles: size={self.size} must be ranges 0 < low <= high")
         if self.count < 1:
@@ -100,10 +98,20 @@ class ObstacleGroup:
             raise ValueError(f"obstacles: bottom={list(self.bottom)} must not lie below the ground")
         if self.area is not None:
             object.__setattr__(self, "area", _area("a group's area", self.area))
-        if self.poses is not None and (self.bottom != (0.0, 0.0) or self.approach is not None):
-            raise ValueError("obstacles: a group with fixed poses stands on the ground; leave out bottom and approach")
+        if self.poses is not None and (self.bottom != (0.0, 0.0) or self.approach is not None or self.moves):
+            raise ValueError("obstacles: a group with fixed poses stands; leave out bottom, speed and approach")
         if self.approach is not None and self.speed[0] <= 0:
             raise ValueError(f"obstacles: speed={list(self.speed)} of a group that approaches must be positive")
+
+    @property
+    def moves(self) -> bool:
+        return self.speed[1] > 0
+
+    @property
+    def largest_radius(self) -> float:
+        """Radius (m) of the circle around the footprint of its largest obstacle."""
+        x, y = self.size[0][1], self.size[1][1] if self.kind == "box" else 0.0
+        return math.hypot(x, y)
 
 
 def _area(name: str, bounds: Sequence[float]) -> tuple[float, float, float, float]:
@@ -115,25 +123,21 @@ def _area(name: str, bounds: Sequence[float]) -> tuple[float, float, float, floa
 
 @dataclass(frozen=True)
 class Obstacle:
-    """One obstacle slot: its name, its group, its shape (the same in every environment) and its fixed pose if any."""
+    """One obstacle: it is placed and moves as a whole.
+
+    Attributes:
+        name: of the obstacle.
+        group: its group.
+        pose: its fixed (x, y, yaw in degrees), if any.
+    """
 
     name: str
     group: ObstacleGroup
-    size: tuple[float, ...]
     pose: tuple[float, float, float] | None
 
-    @property
-    def kind(self) -> str:
-        return self.group.kind
-
-    @property
-    def half_height(self) -> float:
-        return self.size[0] if self.kind == "sphere" else self.size[-1]
-
-    @property
-    def radius(self) -> float:
-        """Radius (m) of the circle around its footprint."""
-        return math.hypot(self.size[0], self.size[1]) if self.kind == "box" else self.size[0]
+    def parts(self, index: int) -> tuple[Part, ...]:
+        """Its bodies, where it is obstacle number `index` of the scene."""
+        return (Part(self.name, index, self.group, self.group.kind, tuple(self.group.size)),)
 
 
 @dataclass(frozen=True)
@@ -189,7 +193,6 @@ class ObstaclesConfig:
         boundary: 'bounce': obstacles turn back at the area's edge; 'wrap': one that leaves the area enters it again
             at the opposite edge, so that a robot can walk for ever among them.
         clearance: free distance (m) kept at a reset between the robot's centre and an obstacle's edge.
-        shape_seed: seed of the sizes drawn for the slots.
         curriculum: None: everything is there from the first step.
         spacing: free distance (m) kept at a reset between the edges of any two standing obstacles, so that a robot fits
             through; 0 lets them overlap.
@@ -204,7 +207,6 @@ class ObstaclesConfig:
     area: Sequence[float] = (-5.0, 5.0, -5.0, 5.0)
     boundary: str = "bounce"
     clearance: float = 0.8
-    shape_seed: int = 0
     curriculum: CurriculumConfig | None = None
     spacing: float = 0.0
     free_path: FreePathConfig | None = None
@@ -220,55 +222,36 @@ class ObstaclesConfig:
         for key in ("spacing", "headroom"):
             if getattr(self, key) < 0:
                 raise ValueError(f"obstacles.{key}={getattr(self, key)} must not be negative")
-        for slot in self.slots():
-            approach = slot.group.approach
-            if approach is not None and approach.distance[0] < self.clearance + slot.radius:
+        for name, group in self.groups.items():
+            approach, least = group.approach, self.clearance + group.largest_radius
+            if approach is not None and approach.distance[0] < least:
                 raise ValueError(
-                    f"obstacles: approach.distance={list(approach.distance)} lets {slot.name} start on the"
-                    f" robot; its low end must be at least clearance + radius = {self.clearance + slot.radius:.2f}"
+                    f"obstacles: approach.distance={list(approach.distance)} lets those of {name} start on the robot;"
+                    f" its low end must be at least clearance + radius = {least:.2f}"
                 )
 
     @property
     def num_obstacles(self) -> int:
         return sum(group.count for group in self.groups.values())
 
-    def slots(self) -> tuple[Obstacle, ...]:
-        """Every obstacle, sizes drawn from the groups' ranges."""
-        rng = np.random.default_rng(self.shape_seed)
-        slots = []
-        for group_name, group in self.groups.items():
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """Every obstacle, group by group."""
+        found = []
+        for name, group in self.groups.items():
             for i in range(group.count):
-                size = tuple(float(rng.uniform(low, high)) for low, high in group.size)
-                x_y_yaw = group.poses[i] if group.poses is not None else None
+                x_y_yaw = None if group.poses is None else group.poses[i]
                 pose = None if x_y_yaw is None else (x_y_yaw[0], x_y_yaw[1], x_y_yaw[2])
-                slots.append(Obstacle(f"obstacle_{group_name}_{i}", group, size, pose))
-        return tuple(slots)
+                found.append(Obstacle(f"obstacle_{name}_{i}", group, pose))
+        return tuple(found)
+
+    def parts(self) -> tuple[Part, ...]:
+        """The parts of all obstacles, in the order of the kinematic bodies."""
+        return tuple(part for index, obstacle in enumerate(self.obstacles()) for part in obstacle.parts(index))
 
     def geom_names(self) -> tuple[str, ...]:
-        return tuple(slot.name for slot in self.slots())
-
-    def placed_slots(self) -> tuple[Obstacle, ...]:
-        """The obstacles that are placed at every reset, in the order of the kinematic bodies."""
-        return tuple(slot for slot in self.slots() if slot.pose is None)
+        return tuple(part.name for part in self.parts())
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Adds the obstacles: fixed ones as geoms of the world, the others as kinematic (mocap) bodies."""
-        for slot in self.slots():
-            if slot.pose is None:
-                body, pos, quat = spec.worldbody.add_body(name=slot.name, mocap=True), [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
-            else:
-                x, y, yaw = slot.pose[0], slot.pose[1], math.radians(slot.pose[2])
-                body, pos = spec.worldbody, [x, y, slot.half_height]
-                quat = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
-            size = list(slot.size) + [0.0] * (3 - len(slot.size))
-            body.add_geom(
-                name=slot.name,
-                type=_GEOM_TYPES[slot.kind],
-                size=size,
-                pos=pos,
-                quat=quat,
-                contype=1,
-                conaffinity=0,
-                condim=3,
-                friction=[0.5, 0.005, 0.0001],
-            )
+        """Adds the parts as kinematic (mocap) bodies."""
+        for part in self.parts():
+            part.add_to(spec)

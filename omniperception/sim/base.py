@@ -49,9 +49,9 @@ class Simulator(Protocol):
     qvel: torch.Tensor
     """(num_envs, 6 + num_joints): base linear velocity (m/s, world), angular velocity (rad/s, base), joints."""
     mocap_pos: torch.Tensor
-    """(num_envs, num_placed_obstacles, 3): positions (m) of the kinematic bodies."""
+    """(num_envs, num_parts, 3): positions (m) of the kinematic bodies."""
     mocap_quat: torch.Tensor
-    """(num_envs, num_placed_obstacles, 4): their quaternions."""
+    """(num_envs, num_parts, 4): their quaternions."""
     ground_pos: torch.Tensor | None
     """(num_envs, 3): where a ground that is a height field lies (m, environment frame); None for a plane."""
     failure: torch.Tensor
@@ -74,7 +74,7 @@ class Simulator(Protocol):
         Args:
             joint_target: held through all steps; one that is not finite is a failure, and the last one goes on.
             num_steps: physics steps.
-            mocap_path: (num_envs, num_steps, num_placed_obstacles, 3), m: where the kinematic bodies are during
+            mocap_path: (num_envs, num_steps, num_parts, 3), m: where the kinematic bodies are during
                 each step; None leaves them where they are.
         """
 

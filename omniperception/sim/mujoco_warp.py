@@ -96,7 +96,7 @@ class Capacity:
         robot = [k for k in range(model.ngeom) if model.geom_conaffinity[k]]
         tiled = world.ground_mocap is not None
         ground = sum(_MANY if tiled else _GROUND_CONTACTS.get(int(model.geom_type[k]), _MANY) for k in robot)
-        pairs = _PAIRS_PER_OBSTACLE * min(len(world.obstacles.placed_slots()), _OBSTACLES_AT_ONCE)
+        pairs = _PAIRS_PER_OBSTACLE * min(len(world.obstacles.parts()), _OBSTACLES_AT_ONCE)
         contacts = config.contacts_per_env or ground + _CONTACTS_PER_PAIR * pairs
         limits = int(model.jnt_limited.sum()) + int((model.dof_frictionloss > 0).sum())
         rows = config.rows_per_env or limits + _ROWS_PER_CONTACT[config.cone] * contacts

@@ -21,14 +21,11 @@ class Scene:
     """Robots at a pose and obstacles that a test places."""
 
     def __init__(self, groups, base=(0.0, 0.0), yaw=0.0, num_envs=1):
-        self.config, self.field, self.num_envs = ObstaclesConfig(groups), None, num_envs
-        if self.config.placed_slots():
-            slots = len(self.config.placed_slots())
-            pos, quat = (torch.zeros(num_envs, slots, n, dtype=torch.float64) for n in (3, 4))
-            quat[..., 0] = 1.0
-            self.field = ObstacleField(self.config, pos, quat, EnvRandom(0, num_envs))
-            self.field.active[:] = True
-            self.field.velocity_w[:] = 0.0
+        self.config, self.num_envs = ObstaclesConfig(groups), num_envs
+        count = len(self.config.parts())
+        pos, quat = (torch.zeros(num_envs, count, n, dtype=torch.float64) for n in (3, 4))
+        self.field = ObstacleField(self.config, pos, quat, EnvRandom(0, num_envs))
+        self.field.reset(torch.arange(num_envs), torch.full((num_envs, 2), 100.0))
         place = torch.tensor([[*base, 0.3]]).expand(num_envs, 3)
         self.base_pos_w, self.yaw = place, torch.full((num_envs,), yaw)
 
@@ -84,7 +81,7 @@ def test_what_hangs_overhead_is_parked_or_unknown_does_not_count():
     distance = scene.measure(4)[0, :, 0]
     assert distance[EAST].item() == pytest.approx(math.sqrt(8) - 0.5)
     assert distance[SOUTH_EAST].item() == pytest.approx(1.9)
-    known = torch.tensor([[False, True]])  # placed obstacles first
+    known = torch.tensor([[False, True]])
     assert scene.measure(4, known)[0, EAST, 0].isinf() and scene.measure(4, known)[0, SOUTH_EAST, 0].isfinite()
     scene.field.pos_w[0, 0, 2] = 0.5 + 0.46
     assert scene.measure(4)[0, EAST, 0].isinf()
@@ -108,17 +105,17 @@ def test_against_points_all_over_the_outlines():
     got = scene.measure(36)[..., 0].double()
     expected = torch.full((n, 36), torch.inf, dtype=torch.float64)
     middles = -math.pi + (torch.arange(36, dtype=torch.float64) + 0.5) * math.pi / 18
-    for k, slot in enumerate(scene.config.slots()):
+    for k, part in enumerate(scene.config.parts()):
         s = torch.linspace(0, 1, 8001, dtype=torch.float64)
-        if slot.kind == "box":
-            x, y = slot.size[:2]
-            corners = torch.tensor([[x, y], [-x, y], [-x, -y], [x, -y], [x, y]], dtype=torch.float64)
-            outline = torch.cat([corners[i] + s[:, None] * (corners[i + 1] - corners[i]) for i in range(4)])
+        size = field.size[:, k, None, :2]  # of each environment's own
+        if part.kind == "box":
+            corners = torch.tensor([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]], dtype=torch.float64)
+            outline = torch.cat([corners[i] + s[:, None] * (corners[i + 1] - corners[i]) for i in range(4)]) * size
         else:
-            outline = slot.size[0] * torch.stack(((2 * math.pi * s).cos(), (2 * math.pi * s).sin()), -1)
+            outline = size[..., :1] * torch.stack(((2 * math.pi * s).cos(), (2 * math.pi * s).sin()), -1)
         cos, sin = angle[:, k, None].cos(), angle[:, k, None].sin()
-        x = field.pos_w[:, k, :1] + cos * outline[:, 0] - sin * outline[:, 1] - 0.3
-        y = field.pos_w[:, k, 1:2] + sin * outline[:, 0] + cos * outline[:, 1] + 0.2
+        x = field.pos_w[:, k, :1] + cos * outline[..., 0] - sin * outline[..., 1] - 0.3
+        y = field.pos_w[:, k, 1:2] + sin * outline[..., 0] + cos * outline[..., 1] + 0.2
         bearing = torch.remainder(torch.atan2(y, x) - 0.7 + math.pi, 2 * math.pi) - math.pi
         reach = torch.hypot(x, y)
         off = (bearing[:, None] - middles[:, None]).abs()  # (n, 36, points)

@@ -173,7 +173,7 @@ def test_nearest_obstacles_by_hand(make_env):
     observations = env.step(torch.zeros(1, 12))[0]
     group = env._groups["privileged"]
     seen = observations["privileged"][0, group.slices["nearest_obstacles"]].unflatten(0, (2, 6))
-    radius = env.obstacles.radius.float()
+    radius = env.obstacles.radius[0].float()
     velocity = env.state.kinematics.base_lin_vel_yaw[0]
     near, ahead = seen
     assert near[:2].tolist() == pytest.approx([0.0, -0.5], abs=2e-3)  # to its right

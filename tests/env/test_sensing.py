@@ -70,7 +70,7 @@ def test_sector_distance_of_a_pillar_by_hand(make_env):
     for _ in range(5):
         env.step(still(env))
     sectors = env.avoidance.sector_distance[0]
-    radius = env.obstacles.radius[0].item()
+    radius = env.obstacles.radius[0, 0].item()
     base_shift = env.state.kinematics.base_pos_w[0, :2].norm().item()
     for sector in (26, 27):
         assert sectors[sector].item() == pytest.approx(2 - radius, abs=0.02 + base_shift)

@@ -32,7 +32,7 @@ class TestSteered:
         env.sim.mocap_pos[1, 2] = torch.tensor([50.0, 0.0, 0.3])
         given = env.get_observations()["command"].clone()
         assert torch.equal(self.commanded(env, None), given)  # nothing near: V_cmd alone
-        side = max(slot.radius for slot in env.world.obstacles.slots())
+        side = env.obstacles.radius.max().item()
         env.sim.mocap_pos[1, 0, :2] = env.state.kinematics.base_pos_w[1, :2] + torch.tensor([0.0, side + 0.3])
         env.sim.mocap_pos[1, 0, 2] = 0.5  # to its left
         commanded = self.commanded(env, None)

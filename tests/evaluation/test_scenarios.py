@@ -99,7 +99,7 @@ class TestMeasures:
     def test_clearance_is_the_least_of_the_trial_and_0_with_a_touch(self, make_env):
         env = make_env(*BLIND, "scenario=static", SHORT, "num_envs=4", "commands.spawn.yaw_deg=[0,0]")
         env.obstacles.advance = lambda dt, xy: None  # the test moves them
-        radius = float(env.obstacles.radius[0])
+        radius = float(env.obstacles.radius.max())
 
         def place(observations):
             step = int(env.episode_length_buf[0])

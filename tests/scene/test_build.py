@@ -57,15 +57,18 @@ def test_only_the_robot_touches_ground_and_obstacles(mixed):
     assert sum(data.ncon for data in shaken(spec.compile())) > 0
 
 
-def test_fixed_poses_are_geoms_of_the_world(make_config):
-    world = world_of(make_config("obstacles=corridor", "commands=corridor"))
-    data = mujoco.MjData(world.model)
-    mujoco.mj_forward(world.model, data)
-    expected = {"obstacle_wall_0": (5.5, 2.05, 0.5), "obstacle_wall_1": (5.5, -2.05, 0.5)}
-    for name, pos in {**expected, "obstacle_back_wall_0": (-1.15, 0.0, 0.5)}.items():
-        np.testing.assert_allclose(data.geom(name).xpos, pos, atol=1e-12)
-        assert world.model.geom(name).bodyid[0] == 0
-    assert world.model.nmocap == 6
+def test_every_part_is_a_kinematic_body_with_a_geom_of_its_name(make_config):
+    """In the order of the parts; as large as they can be, so that what is derived from the model has room."""
+    run = make_config("obstacles=corridor", "commands=corridor")
+    model, parts = world_of(run).model, run.env.obstacles.parts()
+    names = [f"obstacle_walker_{k}" for k in range(6)] + [f"obstacle_wall_{k}" for k in range(2)]
+    assert [part.name for part in parts] == [*names, "obstacle_back_wall_0"] and model.nmocap == 9
+    for k, part in enumerate(parts):
+        geom, body = model.geom(part.name), model.body(part.name)
+        assert geom.bodyid[0] == body.id and model.body_mocapid[body.id] == k
+        assert body.geomnum[0] == 1 and not geom.pos.any()
+    np.testing.assert_allclose(model.geom("obstacle_walker_5").size, [0.3, 0.9, 0.0])
+    np.testing.assert_allclose(model.geom("obstacle_wall_1").size, [6.6, 0.05, 0.5])
 
 
 def test_sensor_columns_are_those_of_the_named_geoms(make_config):

@@ -10,13 +10,9 @@ import torch
 from omniperception import build, config
 from omniperception.common.random import EnvRandom
 from omniperception.scene import ApproachConfig, FreePathConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
-from omniperception.scene.obstacle_field import (
-    LOSE_SIGHT,
-    PARKED_HEIGHT,
-    bent_path,
-    distance_to_path,
-    passing_velocity,
-)
+from omniperception.scene.obstacle_field import LOSE_SIGHT, PARKED_HEIGHT
+from omniperception.scene.obstacle_motion import passing_velocity
+from omniperception.scene.placement import bent_path, distance_to_path
 
 POST = [[0.3, 0.3], [0.5, 0.5]]
 
@@ -24,7 +20,7 @@ POST = [[0.3, 0.3], [0.5, 0.5]]
 def built(groups, num_envs=500, seed=0, **settings):
     settings = {"area": (-5.0, 5.0, -4.0, 4.0), "clearance": 0.5, **settings}
     config = ObstaclesConfig(groups, **settings)
-    count = len(config.placed_slots())
+    count = len(config.parts())
     pos, quat = (torch.zeros(num_envs, count, n, dtype=torch.float64) for n in (3, 4))
     return ObstacleField(config, pos, quat, EnvRandom(seed, num_envs))
 
@@ -201,7 +197,7 @@ def started_on_the_robot():
         (lambda: ApproachConfig(0.1, [4.0, 3.0]), r"distance=\[4\.0, 3\.0\]"),
         (lambda: FreePathConfig(0.0, 1.0), r"obstacles\.free_path\."),
         (lambda: FreePathConfig(1.0, -1.0), r"obstacles\.free_path\."),
-        (started_on_the_robot, "lets obstacle_person_0 start on the robot"),
+        (started_on_the_robot, "lets those of person start on the robot"),
     ],
 )
 def test_wrong_settings_are_refused(make, message):
@@ -221,7 +217,7 @@ def test_spacing_is_kept_between_what_stands():
     reset(field, (50.0, 50.0))
     assert field.active.float().mean() > 0.999
     between = (field.pos_w[:, :, None, :2] - field.pos_w[:, None, :, :2]).norm(dim=-1)
-    gap = between - field.radius - field.radius[:, None]
+    gap = between - field.radius[:, :, None] - field.radius[:, None]
     both = (field.active[:, :, None] & field.active[:, None]) & ~torch.eye(6, dtype=torch.bool)
     standing = both.clone()
     standing[:, 5] = standing[:, :, 5] = False
@@ -255,7 +251,7 @@ class TestFeasible:
 
     def discs(self, field, env_id):
         active = field.active[env_id]
-        return torch.cat((field.pos_w[env_id, active, :2], field.radius[active, None]), 1).tolist()
+        return torch.cat((field.pos_w[env_id, active, :2], field.radius[env_id, active, None]), 1).tolist()
 
     def test_every_scene_of_the_hardest_test(self):
         run = build.assemble(config.compose(["experiment=walk", "scenario=abs_hard"])).env

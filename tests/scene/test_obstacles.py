@@ -17,8 +17,12 @@ def field_of(num_envs=2000, seed=0, speed=(0.0, 1.0), **settings):
         "crate": ObstacleGroup("box", 2, [[0.1, 0.4], [0.1, 0.4], [0.1, 0.5]], speed),
     }
     config = ObstaclesConfig(groups, **settings)
-    pos, quat = (torch.zeros(num_envs, 5, n, dtype=torch.float64) for n in (3, 4))
-    return ObstacleField(config, pos, quat, EnvRandom(seed, num_envs))
+    return ObstacleField(config, *poses(num_envs, 5), EnvRandom(seed, num_envs))
+
+
+def poses(num_envs, num_parts):
+    """Positions and quaternions, in place of a simulator's."""
+    return tuple(torch.zeros(num_envs, num_parts, n, dtype=torch.float64) for n in (3, 4))
 
 
 def reset(field, robot_xy):
@@ -50,8 +54,7 @@ def test_a_reset_fills_the_area_the_speeds_and_the_headings_evenly_and_upright()
     speed = field.velocity_w.norm(dim=-1)
     assert 0.5 <= speed.min() < 0.51 and 1.49 < speed.max() <= 1.5
     assert field.velocity_w.mean((0, 1)).norm() < 0.03
-    heights = torch.tensor([slot.half_height for slot in field.config.slots()], dtype=torch.float64)
-    assert torch.equal(field.pos_w[..., 2], heights.expand(2000, 5))
+    assert torch.equal(field.pos_w[..., 2], torch.cat((field.size[:, :3, 1], field.size[:, 3:, 2]), 1))
     assert (field.quat_w[..., 1:3] == 0).all()
     torch.testing.assert_close(field.quat_w.norm(dim=-1), torch.ones(2000, 5, dtype=torch.float64))
 
@@ -119,16 +122,76 @@ class TestCurriculum:
         assert (field.pos_w[..., 2][field.active] > 0).all()
 
 
-def test_slots_are_the_same_every_time_and_another_seed_differs():
-    config = field_of(1).config
-    assert config.slots() == config.slots()
-    other = field_of(1, shape_seed=1).config
-    assert [s.size for s in other.slots()] != [s.size for s in config.slots()]
-    for slot, radius in zip(config.slots(), field_of(1).radius.tolist(), strict=True):
-        footprint = slot.size[0] if slot.kind == "cylinder" else math.hypot(slot.size[0], slot.size[1])
-        assert radius == pytest.approx(footprint)
-        low, high = (0.5, 0.9) if slot.kind == "cylinder" else (0.1, 0.5)
-        assert 0.1 <= slot.size[0] <= 0.4 and low <= slot.half_height <= high
+class TestSizes:
+    def test_every_environment_draws_its_own_evenly_from_the_ranges_at_every_reset(self):
+        field = field_of()
+        reset(field, torch.zeros(2000, 2))
+        post, crate = field.size[:, :3], field.size[:, 3:]
+        for sizes, low, high in ((post[..., 0], 0.1, 0.4), (post[..., 1], 0.5, 0.9), (crate[..., 2], 0.1, 0.5)):
+            assert low <= sizes.min() < low + 0.002 and high - 0.002 < sizes.max() <= high
+            assert sizes.mean().item() == pytest.approx((low + high) / 2, abs=0.01)
+            assert len(sizes.unique()) > 0.99 * sizes.numel()
+        assert not post[..., 2].any()
+        before = field.size.clone()
+        reset(field, torch.zeros(2000, 2))
+        assert (field.size != before)[..., 0].all()
+
+    def test_what_depends_on_them_by_hand(self):
+        kinds = {
+            "box": ([[0.3, 0.3], [0.4, 0.4], [0.2, 0.2]], (0.3, 0.4), 0.5, 0.2),
+            "cylinder": ([[0.3, 0.3], [0.7, 0.7]], (0.3, -1.0), 0.3, 0.7),
+            "sphere": ([[0.3, 0.3]], (0.3, -1.0), 0.3, 0.3),
+            "capsule": ([[0.3, 0.3], [0.7, 0.7]], (0.3, -1.0), 0.3, 1.0),
+        }
+        config = ObstaclesConfig({kind: ObstacleGroup(kind, 1, size) for kind, (size, *_) in kinds.items()})
+        field = ObstacleField(config, *poses(1, 4), EnvRandom(0, 1))
+        reset(field, torch.zeros(1, 2))
+        for k, (_, outline, radius, half_height) in enumerate(kinds.values()):
+            assert field.outline[0, k].tolist() == pytest.approx(outline)
+            assert field.radius[0, k].item() == pytest.approx(radius)
+            assert field.pos_w[0, k, 2].item() == pytest.approx(half_height) == field.half_height[0, k].item()
+        assert field.varying == ()
+
+    def test_a_reset_of_one_environment_leaves_the_others_bit_identical(self):
+        field = field_of(4, spacing=0.3)
+        reset(field, torch.zeros(4, 2))
+        names = ("pos_w", "quat_w", "velocity_w", "active", "size", "outline", "radius", "half_height")
+        before = {name: getattr(field, name).clone() for name in names}
+        field.reset(torch.tensor([2]), torch.zeros(1, 2))
+        for name in names:
+            assert torch.equal(getattr(field, name)[[0, 1, 3]], before[name][[0, 1, 3]]), name
+        assert not torch.equal(field.size[2], before["size"][2])
+
+    def test_a_loaded_state_goes_on_bit_identically(self):
+        field, other = field_of(3), field_of(3, seed=9)
+        reset(field, torch.zeros(3, 2))
+        reset(other, torch.zeros(3, 2))
+        other.load_state_dict(field.state_dict())
+        other.pos_w.copy_(field.pos_w)  # the simulator's
+        other.quat_w.copy_(field.quat_w)
+        assert torch.equal(other.radius, field.radius) and torch.equal(other.outline, field.outline)
+        for one in (field, other):
+            one.travel(0.005, 4, torch.zeros(3, 2))
+        assert torch.equal(other.pos_w, field.pos_w)
+
+
+def test_fixed_poses_hold_in_every_environment_whatever_moves_around_them():
+    groups = {
+        "wall": ObstacleGroup(
+            "box", 2, [[0.1, 0.2], [1.0, 1.0], [0.5, 0.5]], poses=[[9.0, 2.0, 90.0], [0.0, 0.0, 0.0]]
+        ),
+        "post": ObstacleGroup("cylinder", 1, [[0.1, 0.1], [0.5, 0.5]], [1.0, 1.0]),
+    }
+    for boundary in ("bounce", "wrap"):
+        config = ObstaclesConfig(groups, boundary=boundary, spacing=0.5, curriculum=CurriculumConfig())
+        field = ObstacleField(config, *poses(50, 3), EnvRandom(0, 50))
+        reset(field, torch.zeros(50, 2))  # one stands on the robot: it is there all the same
+        for _ in range(20):
+            field.travel(0.1, 3, torch.full((50, 2), 3.0))
+        assert field.active[:, :2].all() and not field.active[:, 2].any()
+        expected = torch.tensor([[9.0, 2.0, 0.5], [0.0, 0.0, 0.5]]).double()
+        assert torch.equal(field.pos_w[:, :2], expected.expand(50, 2, 3))
+        torch.testing.assert_close(field.yaw[:, :2], torch.tensor([math.pi / 2, 0.0]).double().expand(50, 2))
 
 
 @pytest.mark.parametrize(
@@ -143,6 +206,7 @@ def test_slots_are_the_same_every_time_and_another_seed_differs():
         ({"bottom": [0.5, 0.4]}, r"bottom=\[0\.5, 0\.4\]"),
         ({"bottom": [-0.1, 0.4]}, "below the ground"),
         ({"bottom": [0.1, 0.4], "poses": [[0.0, 0.0, 0.0]]}, "leave out bottom"),
+        ({"speed": [1.0, 1.0], "poses": [[0.0, 0.0, 0.0]]}, "with fixed poses stands"),
         ({"heading_deg": [90.0]}, "heading_deg"),
         ({"yaw_deg": [30.0, -30.0]}, "yaw_deg"),
         ({"area": [0.0, 1.0, 1.0]}, "a group's area"),

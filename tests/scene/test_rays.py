@@ -49,12 +49,14 @@ def test_shapes_are_the_models_geoms_with_their_classes(world):
     assert all((c == HitClass.OBSTACLE) == n.startswith("obstacle_") for n, c in classes.items())
 
 
-def test_fixed_obstacles_carry_no_pose(make_config):
+def test_every_part_is_a_body_of_its_own(make_config):
     run = make_config("obstacles=corridor", "commands=corridor")
-    shapes = ray_shapes(build_world(run.env.robot, run.env.terrain, run.env.obstacles))
+    world = build_world(run.env.robot, run.env.terrain, run.env.obstacles)
+    shapes = ray_shapes(world)
     wall = shapes.shapes[shapes.geom_names.index("obstacle_wall_0")]
-    assert wall.body == -1 and wall.pos == (5.5, 2.05, 0.5) and wall.class_id == HitClass.OBSTACLE
-    assert len(shapes.bodies) == 13 + 6  # base, four legs of three links, six walkers
+    assert shapes.bodies[wall.body] == world.model.body("obstacle_wall_0").id and wall.pos == (0.0, 0.0, 0.0)
+    assert wall.class_id == HitClass.OBSTACLE
+    assert len(shapes.bodies) == 13 + 9  # base, four legs of three links, six walkers, three walls
 
 
 def test_unknown_excluded_geoms_are_named(world):

@@ -9,7 +9,6 @@ import pytest
 import torch
 from mj_rays import assert_rays_are_those_of_mj_ray, ray_scene
 
-from omniperception.config import ConfigError
 from omniperception.scene import TerrainCurriculumConfig, TiledTerrainConfig, build_world
 from omniperception.scene.tiles import Rough, Slope, Stairs, Stones, TileGrid
 
@@ -119,10 +118,6 @@ class TestLayout:
         with pytest.raises(ValueError) as error:
             make(**settings)
         assert named in str(error.value) and "\n" not in str(error.value)
-
-    def test_fixed_obstacles_need_flat_ground(self, make_config):
-        with pytest.raises(ConfigError, match="wall, back_wall with fixed poses .* use terrain=flat"):
-            make_config("terrain=mixed", "obstacles=corridor")
 
 
 @pytest.fixture(scope="module")
@@ -316,18 +311,19 @@ class TestRobots:
 
 
 class TestObstacles:
-    @pytest.mark.parametrize("preset", ["mixed", "moving", "static"])
+    @pytest.mark.parametrize("preset", ["mixed", "moving", "static", "corridor"])
     def test_stand_on_the_ground_where_they_are_and_not_on_the_robot(self, make_env, preset):
         env = make_env(*SMALL, f"obstacles={preset}", num_envs=10, blind=True)
         field = env.obstacles
-        half = torch.tensor([slot.half_height for slot in field.config.placed_slots()])
+        half = field.half_height
         off = field.pos_w[..., :2] - env.sim.qpos[:, None, :2]
-        assert (off.norm(dim=-1) - field.radius).min() >= field.config.clearance - 1e-6
+        placed = [k for k, part in enumerate(field.parts) if part.group.poses is None]
+        assert (off.norm(dim=-1) - field.radius)[:, placed].min() >= field.config.clearance - 1e-6
         for _ in range(2):
             for i in range(10):
                 inside = ((field.pos_w[i, :, :2] - env.sim.ground_pos[i, :2]).abs() < env.ground._half).all(-1)
                 ground = looking_down(env, i, field.pos_w[i, inside, :2])
-                np.testing.assert_allclose(field.pos_w[i, inside, 2] - half[inside], ground, atol=1e-5)
+                np.testing.assert_allclose(field.pos_w[i, inside, 2] - half[i, inside], ground, atol=1e-5)
             before = env.sim.ground_pos.clone()
             for _ in range(25):
                 env.step(torch.zeros(10, 12))
@@ -337,7 +333,7 @@ class TestObstacles:
     def test_follow_the_ground_at_every_physics_step(self, make_env):
         env = make_env(*SMALL, "obstacles=moving", num_envs=4, blind=True)
         field = env.obstacles
-        half = torch.tensor([slot.half_height for slot in field.config.placed_slots()])
+        half = field.half_height
         before = field.pos_w[..., :2].clone()
         path = field.travel(0.05, 6, env.sim.qpos[:, :2])
         assert torch.equal(path[:, -1], field.pos_w) and field.travel(0.05, 6, env.sim.qpos[:, :2]) is path
@@ -346,7 +342,7 @@ class TestObstacles:
             for step in range(6):
                 inside = ((path[i, step, :, :2] - env.sim.ground_pos[i, :2]).abs() < env.ground._half).all(-1)
                 ground = looking_down(env, i, path[i, step, inside, :2])
-                np.testing.assert_allclose(path[i, step, inside, 2] - half[inside], ground, atol=1e-5)
+                np.testing.assert_allclose(path[i, step, inside, 2] - half[i, inside], ground, atol=1e-5)
         field.level = 0.0  # parked ones stay below the ground
         env._reset(torch.arange(4))
         env.step(torch.zeros(4, 12))

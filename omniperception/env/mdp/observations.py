@@ -95,7 +95,7 @@ def nearest_obstacles(state: EnvState, count: int, max_distance: float) -> torch
         (
             pos.gather(1, gather) / max_distance,
             rel_vel.gather(1, gather),
-            radius[index][..., None],
+            radius.gather(1, index)[..., None],
             nearness[..., None],
         ),
         -1,

@@ -1,0 +1,95 @@
+"""Where obstacles are put at a reset: off the robot, apart from one another, beside a free path."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+_PUSH_OFF_TURNS = 16
+
+
+def unit(angle: torch.Tensor) -> torch.Tensor:
+    """Horizontal unit vectors (..., 2) at angles (...) in rad."""
+    return torch.stack((angle.cos(), angle.sin()), -1)
+
+
+def push_off(
+    xy: torch.Tensor, robot: torch.Tensor, keep: torch.Tensor, bounds: tuple[torch.Tensor, torch.Tensor] | None
+) -> torch.Tensor:
+    """Moves obstacles that would stand on the robot radially away from it.
+
+    Args:
+        xy: (n, O, 2) m, where they would stand.
+        robot: (n, 2) m.
+        keep: (n, O) m, the least distance of their centres from the robot.
+        bounds: low and high (O, 2) m of where they may go; None: anywhere.
+
+    Returns:
+        (n, O, 2) m.
+    """
+    offset = xy - robot[:, None]
+    bearing = torch.atan2(offset[..., 1], offset[..., 0])
+    turns = torch.arange(_PUSH_OFF_TURNS, dtype=xy.dtype, device=xy.device)[:, None, None]
+    outside = robot[:, None] + unit(bearing + turns * _GOLDEN_ANGLE) * (keep + 1e-6)[..., None]
+    places = torch.cat((xy[None], outside))  # where it is, then other directions, for robots close to an edge
+    if bounds is not None:
+        places[1:] = places[1:].clamp(*bounds)
+    clear = (places - robot[:, None]).norm(dim=-1) >= keep
+    clear[-1] = True
+    first = clear.int().argmax(0)
+    return places.gather(0, first[None, ..., None].expand(1, -1, -1, 2))[0]
+
+
+def choose_apart(
+    places: torch.Tensor,
+    fits: torch.Tensor,
+    radius: torch.Tensor,
+    in_the_way: torch.Tensor,
+    placed: torch.Tensor,
+    spacing: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lets obstacles choose among candidate places in turn, so that those in the way keep apart.
+
+    Args:
+        places: (n, O, C, 2) m.
+        fits: (n, O, C) bool, which of them are fit but for the other obstacles.
+        radius: (n, O) m.
+        in_the_way: (n, O) bool, who keeps the spacing and from whom it is kept.
+        placed: (n, O) bool, who needs no place.
+        spacing: free distance (m) between edges; 0: none is kept.
+
+    Returns:
+        The places (n, O, 2) and who has found one (n, O) bool.
+    """
+    xy, found = places[:, :, 0].clone(), placed.clone()
+    rows = torch.arange(len(places), device=places.device)
+    for k in range(places.shape[1]):
+        free = fits[:, k]
+        if spacing > 0.0:
+            keep = spacing + radius[:, k, None] + radius[:, :k]  # (n, k)
+            gap = (places[:, k, :, None] - xy[:, None, :k]).norm(dim=-1) - keep[:, None]  # (n, C, k)
+            counts = in_the_way[:, :k] & found[:, :k] & in_the_way[:, k, None]
+            free = free & ((gap >= 0) | ~counts[:, None]).all(-1)
+        xy[:, k] = places[rows, k, free.int().argmax(1)]
+        found[:, k] |= free.any(1)
+    return xy, found
+
+
+def bent_path(start: torch.Tensor, goal: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+    """Corners (n, 4, 2) of a line from start (n, 2) to goal (n, 2) over points at one and two thirds of the way,
+    which lie `offset` (n, 2) m to the left of the straight line."""
+    way = goal - start
+    left = torch.stack((-way[:, 1], way[:, 0]), -1) / way.norm(dim=1, keepdim=True).clamp(min=1e-9)
+    corners = [start, *(start + (k + 1) / 3 * way + offset[:, k, None] * left for k in (0, 1)), goal]
+    return torch.stack(corners, 1)
+
+
+def distance_to_path(points: torch.Tensor, path: torch.Tensor) -> torch.Tensor:
+    """Distances (n, ...) in m of points (n, ..., 2) from lines with corners (n, C, 2)."""
+    flat = points.flatten(1, -2)[:, :, None]  # (n, P, 1, 2)
+    start, side = path[:, None, :-1], (path[:, 1:] - path[:, :-1])[:, None]
+    along = ((flat - start) * side).sum(-1) / side.square().sum(-1).clamp(min=1e-12)
+    foot = start + along.clamp(0.0, 1.0)[..., None] * side
+    return (flat - foot).norm(dim=-1).amin(-1).reshape(points.shape[:-1])
