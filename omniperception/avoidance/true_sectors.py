@@ -58,13 +58,13 @@ class TrueSectors:
             place = rotate_yaw(-yaw, field.pos_w[..., :2].float() - base_pos_w[:, None, :2])
             velocity = rotate_yaw(-yaw, field.velocity_w.float())
             heading = field.yaw.float() - yaw[:, None]
-            axis = torch.stack((heading.cos(), heading.sin()), -1)
+            axis, outline = torch.stack((heading.cos(), heading.sin()), -1), field.outline.float()
             inputs = [
                 view(place, wp.vec2),
                 view(axis, wp.vec2),
                 view(velocity, wp.vec2),
                 view(counts, wp.bool),
-                view(field.outline.float(), wp.vec2),
+                view(outline, wp.vec2),
                 view(out, wp.vec3),
             ]
             launch_over_envs(nearest_by_sector, self._num_envs, inputs, self._device)

@@ -101,7 +101,7 @@ def test_only_what_is_nearer_than_the_bound_is_measured(make_env):
     env = make_env(*BLIND, "scenario=corridor", "num_envs=3")
     clearance = Clearance(env)
     # in the middle of the corridor the trunk's nearest wall is 2 m less half the robot's width away
-    env.sim.mocap_pos[..., 0] = 100.0
+    env.sim.mocap_pos[:, :6, 0] = 100.0  # the people
     env.sim.qpos[:, :2] = torch.tensor([[3.0, 0.0], [3.0, 1.0], [3.0, 0.0]]).double()
     far = clearance.measure(torch.full((3,), 9.0))
     assert 1.7 < far[0] < 1.9 and far[1].item() == pytest.approx(far[0].item() - 1.0, abs=2 * TOLERANCE)

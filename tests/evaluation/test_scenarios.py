@@ -99,7 +99,7 @@ class TestMeasures:
     def test_clearance_is_the_least_of_the_trial_and_0_with_a_touch(self, make_env):
         env = make_env(*BLIND, "scenario=static", SHORT, "num_envs=4", "commands.spawn.yaw_deg=[0,0]")
         env.obstacles.advance = lambda dt, xy: None  # the test moves them
-        radius = float(env.obstacles.radius.max())
+        radius = env.obstacles.radius[:, 0]
 
         def place(observations):
             step = int(env.episode_length_buf[0])
@@ -107,7 +107,7 @@ class TestMeasures:
             at = {1: {3: 0.9, 10: 0.6, 11: 0.6, 15: 0.8}, 2: {10: 0.0}, 3: {10: 3.0}}
             for env_id, steps in at.items():
                 beside = env.state.kinematics.base_pos_w[env_id, :2] + torch.tensor(
-                    [0.0, radius + steps.get(step, 40.0)]
+                    [0.0, radius[env_id] + steps.get(step, 40.0)]
                 )
                 env.obstacles.pos_w[env_id, 0, :2] = beside.double()
                 env.obstacles.pos_w[env_id, 0, 2] = 0.3
