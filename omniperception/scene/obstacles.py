@@ -137,7 +137,8 @@ class Obstacle:
 
     def parts(self, index: int) -> tuple[Part, ...]:
         """Its bodies, where it is obstacle number `index` of the scene."""
-        return (Part(self.name, index, self.group, self.group.kind, tuple(self.group.size)),)
+        size = tuple((low, high) for low, high in self.group.size)
+        return (Part(self.name, index, self.group, self.group.kind, size),)
 
 
 @dataclass(frozen=True)
