@@ -12,10 +12,13 @@ split=test the obstacles are of kinds and sizes that no training scene has, the 
 weights, and each result is noted in `log`. Policies:
 
     run        the run's
-    blind      the same, its LiDAR covered
-    oracle     follows V_cmd + V_avoid, computed by the run's avoidance controller from ground truth: the walker's
-               policy, or without one the run's own, which sees no frame
+    blind      the same, as it acts before its first frame
+    stop       follows V_cmd, which falls to zero while something is near in its direction
+    histogram  follows V_cmd + V_avoid, by the run's avoidance controller from the raw cloud by geometry
+    oracle     follows V_cmd + V_avoid, by the run's avoidance controller from ground truth
     exported   the run's as the export command wrote it, on raw points, joint states and IMU
+
+`stop`, `histogram` and `oracle` drive the gait of `walker`, or without one the run's own, which then sees no frame.
 
 Prints one table. Each policy and world becomes a JSON file with every trial in the run's evaluation folder at once; the
 same command goes on where it was stopped. `out` adds all of them to one file, which the tables command renders.
@@ -49,7 +52,7 @@ class Arguments:
     jobs: int | None = argument(
         None, "worlds at a time, in a process of one thread each; null: as many as cores", least=1
     )
-    walker: str | None = argument(None, "run directory of experiment=walk, whose gait the oracle steers")
+    walker: str | None = argument(None, "run directory of experiment=walk, whose gait stop, histogram and oracle drive")
     plots: bool = argument(False, "whether the worlds are drawn from above, with the ways")
     again: bool = argument(False, "whether to measure again what has been measured before")
     out: Path | None = argument(None, "file (.json or .json.gz) that the results are added to, for tables")

@@ -45,3 +45,14 @@ def rotate_yaw(yaw: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
     cos, sin = yaw.cos().reshape(shape), yaw.sin().reshape(shape)
     x, y = vec.unbind(-1)
     return torch.stack((cos * x - sin * y, sin * x + cos * y), -1)
+
+
+def matrix_of(quat: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices (n, 3, 3) of quaternions (n, 4): from the body's frame to the one it is given in."""
+    w, x, y, z = quat.unbind(-1)
+    rows = (
+        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        *(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        *(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))

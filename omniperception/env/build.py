@@ -9,7 +9,7 @@ import torch
 from omniperception.avoidance.velocity import MOTION_TARGET
 from omniperception.common.random import EnvRandom
 from omniperception.env.config import EnvConfig
-from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE
+from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
 from omniperception.scene import ObstacleField, TiledTerrainConfig
 from omniperception.sim import Simulator
 
@@ -124,5 +124,6 @@ def build_sensing(
         obstacles=avoidance.obstacle_names if avoidance is not None else (),
         distal=DISTAL_RANGE in needed,
         whole=CLOUD in needed,
+        measured=MEASURED_CLOUD in needed,
         delivery=build_delivery(config, random),
     )

@@ -11,7 +11,7 @@ from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandCo
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mdp.terminations import TerminationsConfig
 from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
-from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE
+from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
 from omniperception.lidar import DEVICES, Noise
 from omniperception.scene import ObstaclesConfig, RobotConfig, TerrainConfig, TiledTerrainConfig
 from omniperception.scene.build import OBSTACLE_CONTACT
@@ -23,8 +23,8 @@ if TYPE_CHECKING:  # loaded where it is built
 HEIGHT_TARGET = "height_target"
 """Observation group with the height grid that a network can be supervised with."""
 
-FROM_LIDAR = frozenset({AVOIDANCE, DISTAL_RANGE, CLOUD})
-"""Requirements of terms that only a LiDAR fulfils."""
+FROM_LIDAR = frozenset({AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD})
+"""Requirements that only a LiDAR fulfils."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class EnvConfig:
         frame_history: LiDAR frames kept for the network.
         base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
+        read_besides: requirements of who acts in the task, beside those of its terms; see `state.requires`.
         log_interval: control steps between two reports of the metrics.
         initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
         trials: whether episodes are trials of an evaluation: the k-th to begin is the same scene whatever the number of
@@ -62,6 +63,7 @@ class EnvConfig:
     frame_history: int = 0
     base_motion: bool = False
     targets: Sequence[str] = ()
+    read_besides: Sequence[str] = ()
     log_interval: int = 24
     initial_obstacle_level: float | None = None
     trials: bool = False
@@ -97,7 +99,7 @@ class EnvConfig:
 
     def requirements(self) -> frozenset[str]:
         """Sensors that must exist before the world is compiled, see `state.requires`."""
-        needed = set(self.rewards.requirements() | self.observations.requirements())
+        needed = {*self.rewards.requirements(), *self.observations.requirements(), *self.read_besides}
         if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
             needed.add(AVOIDANCE)
         if self.obstacles.num_obstacles:

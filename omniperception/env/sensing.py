@@ -110,6 +110,7 @@ class LidarSensing:
         obstacles: Sequence[str] = (),
         distal: bool = False,
         whole: bool = False,
+        measured: bool = False,
         delivery: FrameDelivery | None = None,
     ) -> None:
         """
@@ -128,6 +129,7 @@ class LidarSensing:
             obstacles: geoms whose sightings are noted.
             distal: whether `mean_distal_range` is read.
             whole: whether `frame` is read, the clouds of all environments.
+            measured: likewise, as measured, with noise.
             delivery: which frames are lost and late; None: none.
         """
         ratio = config.period_s / control_dt
@@ -147,7 +149,7 @@ class LidarSensing:
                 f"lidar.motion_segments={config.motion_segments} casts along the way to the present, but"
                 " randomization.frames_late_s asks for the past; use lidar.motion_segments=0"
             )
-        self._sim, self.sampler, self.whole = sim, sampler, whole
+        self._sim, self.sampler, self.whole = sim, sampler, whole or measured
         self.config, pattern = config, config.scan_pattern()
         shapes = ray_shapes(sim.world, config.exclude_geoms)
         self._bodies, self.base = shapes.bodies, shapes.base
@@ -155,7 +157,7 @@ class LidarSensing:
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
         )
-        outputs = _outputs(sampler is not None, sector_distance is not None, bool(obstacles), distal, whole)
+        outputs = _outputs(sampler is not None, sector_distance is not None, bool(obstacles), distal, whole, measured)
         self.lidar = Lidar(
             config,
             pattern,
@@ -164,7 +166,7 @@ class LidarSensing:
             noise=tuple(noise),
             seed=seed,
             outputs=outputs,
-            envs_at_once=None if whole else envs_at_once(config, outputs),
+            envs_at_once=None if self.whole else envs_at_once(config, outputs),
         )
         n, device = sim.num_envs, sim.device
         self._time = torch.zeros(n, dtype=torch.float64, device=device)
@@ -394,7 +396,9 @@ class LidarSensing:
         return launches
 
 
-def _outputs(sampled: bool, sectors: bool, sightings: bool, distal: bool, whole: bool) -> tuple[str, ...]:
+def _outputs(
+    sampled: bool, sectors: bool, sightings: bool, distal: bool, whole: bool, measured: bool
+) -> tuple[str, ...]:
     """The outputs of the LiDAR that are read."""
     read = {
         ("ranges", "directions_s", "elevation", "azimuth"): sampled,
@@ -402,6 +406,7 @@ def _outputs(sampled: bool, sectors: bool, sightings: bool, distal: bool, whole:
         ("shape_id",): sightings,
         ("true_ranges", "elevation"): distal,
         ("true_ranges", "directions_s", "elevation"): whole,
+        ("ranges", "directions_s"): measured,
     }
     return tuple(sorted({name for names, is_read in read.items() if is_read for name in names}))
 

@@ -25,10 +25,11 @@ if TYPE_CHECKING:  # parts that not every task has
     from omniperception.scene import ObstacleField
     from omniperception.sim import Simulator
 
-AVOIDANCE, DISTAL_RANGE, CLOUD = "avoidance", "distal_range", "cloud"
-"""Outputs of the LiDAR that a term can require: V_avoid and sector distances, mean distal ranges, clouds."""
+AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD = "avoidance", "distal_range", "cloud", "measured_cloud"
+"""Outputs of the LiDAR that can be required: V_avoid and sector distances, mean distal ranges, clouds without noise and
+with it."""
 CONTACT_SENSORS = frozenset({FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT})
-REQUIREMENTS = (*sorted(CONTACT_SENSORS), AVOIDANCE, DISTAL_RANGE, CLOUD)
+REQUIREMENTS = (*sorted(CONTACT_SENSORS), AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD)
 """Sensors that must exist before the world is compiled."""
 
 CONTACT_FORCE = 1.0

@@ -1,17 +1,37 @@
-"""Policies to compare with: one whose LiDAR is covered, and one that is steered by the true distances of obstacles."""
+"""Policies to compare with: one that has never had a frame, and controllers without learning that steer a gait."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import torch
 from tensordict import TensorDict
 
+from omniperception.avoidance.sector_tracks import SectorTracks, TracksConfig
 from omniperception.avoidance.true_sectors import TrueSectors
 from omniperception.avoidance.velocity import AvoidanceConfig, avoidance_velocity
+from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
+from omniperception.env.odometry import Odometry
+from omniperception.env.sensing import SensorConfig
+from omniperception.env.state import MEASURED_CLOUD
 from omniperception.evaluation.episodes import Policy
 from omniperception.perception import Attitude
+from omniperception.perception.geometry import GeometryConfig, Nearest, nearest_obstacles
+
+BASELINES = {
+    "blind": "the run's policy as it acts before its first frame: it never has one",
+    "stop": "the gait follows V_cmd, which falls to zero while the raw noisy cloud has something near ahead",
+    "histogram": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the raw noisy cloud"
+    " by geometry: nearest return by sector, ground removed, velocities from successive frames, nothing learned",
+    "oracle": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the true places and"
+    " velocities of all obstacles",
+}
+"""Policies to compare with; the gait is the run's own, which then sees nothing, or that of another run."""
+
+DRIVEN = ("stop", "histogram", "oracle")
+"""Those that drive a gait by its command."""
 
 COMMAND_GROUP = "command"
 """The observation group that begins with the commanded velocity (v_x, v_y)."""
@@ -19,85 +39,255 @@ COMMAND_GROUP = "command"
 Limits = tuple[tuple[float, float], tuple[float, float]]
 """Ranges of v_x and v_y (m/s)."""
 
+Steering = Callable[[], torch.Tensor]
+"""Velocity (num_envs, 2) (m/s, yaw-aligned frame) that a gait is commanded now."""
 
-def covered(env: OmniEnv, policy: Policy) -> Policy:
-    """The policy with its LiDAR covered: rays all miss, and the points of frames are what the sampler makes of it.
 
-    How the base moved, which stands behind the points, stays as it is.
+def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvConfig:
+    """The task in which a policy can be tried: with the LiDAR of the run and its clouds where the policy reads them.
+
+    Args:
+        name: of any policy.
+        config: the task, of the run or of the walker.
+        lidar: the run's.
     """
+    return replace(config, lidar=lidar, read_besides=(MEASURED_CLOUD,)) if name in ("stop", "histogram") else config
+
+
+def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
+    """One of BASELINES.
+
+    Args:
+        name: which.
+        env: where it walks, of a task that was `prepared`.
+        policy: the run's, or the gait.
+        avoidance: the run's avoidance controller.
+        limits: ranges of the commands that the gait has learned to follow; None for no limits.
+
+    Raises:
+        ValueError: it cannot be had of this policy or in this environment.
+    """
+    if name == "blind":
+        return blind(env, policy)
+    if name == "stop":
+        return stop(env, policy, limits)
+    made = {"histogram": histogram, "oracle": oracle}[name]
+    return made(env, policy, avoidance, limits)
+
+
+def blind(env: OmniEnv, policy: Policy) -> Policy:
+    """The policy as it acts before its first frame: it has never had one."""
     if env.sensing is None or env.sensing.frames is None:
-        raise ValueError("this policy does not look at the LiDAR, there is nothing to cover; leave policy=blind out")
-    nothing = _empty_points(env)
-    given = frames = None
+        raise ValueError("this policy does not look at the LiDAR, it is blind already; leave policy=blind out")
 
-    def blind(observations: TensorDict) -> torch.Tensor:
-        nonlocal given, frames
-        if observations["frames"] is not given:  # a new frame; a policy embeds each tensor of frames once
-            given, frames = observations["frames"], observations["frames"].clone()
-            frames[:, :, : nothing.shape[2]] = nothing
-        observations = observations.clone(recurse=False)
-        observations["frames"] = frames
-        return policy(observations)
+    def act(observations: TensorDict) -> torch.Tensor:
+        return policy(_without_frames(observations))
 
-    return blind
+    return act
 
 
-def steered(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
-    """The policy with V_cmd + V_avoid in place of V_cmd, with V_avoid from the obstacles' true distances.
+def oracle(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
+    """The policy, driven by V_cmd + V_avoid with V_avoid from the true obstacles, seen or not."""
+    sectors = TrueSectors(avoidance.num_sectors, env.world.obstacles, env.obstacles, env.num_envs, env.device)
+
+    def motion() -> torch.Tensor:
+        kinematics = env.state.kinematics
+        return sectors.measure(kinematics.base_pos_w, kinematics.yaw)
+
+    return _driven(env, policy, _avoiding(env, avoidance, motion), limits)
+
+
+def histogram(
+    env: OmniEnv,
+    policy: Policy,
+    avoidance: AvoidanceConfig,
+    limits: Limits | None,
+    config: HistogramConfig | None = None,
+) -> Policy:
+    """The policy, driven by V_cmd + V_avoid with V_avoid from the raw noisy clouds by geometry alone."""
+    return _driven(env, policy, _avoiding(env, avoidance, _Histogram(env, config or HistogramConfig())), limits)
+
+
+def stop(env: OmniEnv, policy: Policy, limits: Limits | None, config: StopConfig | None = None) -> Policy:
+    """The policy, driven by V_cmd, which falls to zero while something is near in its direction."""
+    return _driven(env, policy, _Stop(env, config or StopConfig()), limits)
+
+
+@dataclass(frozen=True)
+class HistogramConfig:
+    """Settings of `histogram`.
+
+    Attributes:
+        geometry: from a cloud to the nearest obstacle by sector.
+        tracks: from frames to velocities and a memory; its period is the sensor's.
+    """
+
+    geometry: GeometryConfig = field(default_factory=GeometryConfig)
+    tracks: TracksConfig = field(default_factory=TracksConfig)
+
+
+@dataclass(frozen=True)
+class StopConfig:
+    """Settings of `stop`.
+
+    Attributes:
+        geometry: from a cloud to the nearest obstacle by sector.
+        stand, slow: the commanded speed is kept beyond `slow` (m) from the base's origin and falls linearly to zero at
+            `stand` (m).
+        half_width: (m) of the strip ahead of the base in which obstacles count.
+    """
+
+    geometry: GeometryConfig = field(default_factory=GeometryConfig)
+    stand: float = 0.7
+    slow: float = 1.4
+    half_width: float = 0.35
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.stand < self.slow:
+            raise ValueError(f"stand={self.stand} and slow={self.slow} must be 0 < stand < slow (m)")
+
+
+class _Clouds:
+    """Newest clouds of an environment's LiDAR, each handed on once.
+
+    Attributes:
+        attitude: of the bases as measured when the newest frame came.
+    """
+
+    def __init__(self, env: OmniEnv) -> None:
+        if env.sensing is None:
+            raise ValueError("this policy needs a LiDAR, but the run has none; use lidar=mid360")
+        self._env, self._sensing, self._tick = env, env.sensing, -1
+
+    @property
+    def is_new(self) -> bool:
+        """Tell whether a frame has come since the last `nearest`."""
+        return self._sensing.tick != self._tick
+
+    @property
+    def begun(self) -> torch.Tensor:
+        """(num_envs,) bool: whose episode has just begun; their newest cloud shows the one before."""
+        return (self._env.episode_length_buf == 0) & (self._env.step_count > 0)
+
+    @property
+    def fresh(self) -> torch.Tensor:
+        """(num_envs,) bool: whose newest cloud came with the newest tick and shows this episode."""
+        return self._sensing.fresh & ~self.begun
+
+    def nearest(self, config: GeometryConfig) -> Nearest:
+        """Nearest obstacle by sector in the newest clouds."""
+        self._tick, frame, sensor = self._sensing.tick, self._sensing.frame, self._sensing.config
+        assert frame is not None and frame.ranges is not None and frame.directions_s is not None  # it has been cast
+        attitude = Attitude(self._env.state.measured.base_quat_w, sensor.mount_pos, sensor.quat)
+        return nearest_obstacles(frame.ranges, frame.directions_s, attitude, config)
+
+
+class _Histogram:
+    """Distance and velocity of the nearest obstacle by sector, (num_envs, S, 3), at each control step."""
+
+    def __init__(self, env: OmniEnv, config: HistogramConfig) -> None:
+        self._env, self._config, self._clouds = env, config, _Clouds(env)
+        self._odometry = Odometry(env.num_envs, env.control_dt, env.device)
+        self._odometry.start(torch.arange(env.num_envs, device=env.device), env.state.measured)
+        self._tracks = SectorTracks(config.tracks, env.num_envs, config.geometry.num_sectors, env.device)
+
+    def __call__(self) -> torch.Tensor:
+        """Takes in the control step that has just been done."""
+        clouds, measured, begun = self._clouds, self._env.state.measured, self._clouds.begun
+        self._odometry.advance(measured)
+        self._odometry.start(begun.nonzero().flatten(), measured)
+        self._tracks.reset(begun)
+        if clouds.is_new:
+            nearest = clouds.nearest(self._config.geometry)
+            moved = self._odometry.since_last_frame()
+            self._tracks.update(nearest.distance, nearest.place, moved, clouds.fresh)
+        return self._tracks.motion
+
+
+class _Stop:
+    """The commanded velocity, slower while something stands in its way."""
+
+    def __init__(self, env: OmniEnv, config: StopConfig) -> None:
+        self._env, self._config, self._clouds = env, config, _Clouds(env)
+        self._place = torch.zeros(env.num_envs, config.geometry.num_sectors, 2, device=env.device)
+        self._distance = self._place.new_full(self._place.shape[:2], torch.inf)
+
+    def __call__(self) -> torch.Tensor:
+        """(num_envs, 2) m/s."""
+        clouds, config = self._clouds, self._config
+        if clouds.is_new:
+            fresh, nearest = clouds.fresh, clouds.nearest(config.geometry)
+            self._place = torch.where(fresh[:, None, None], nearest.place, self._place)
+            self._distance = torch.where(fresh[:, None], nearest.distance, self._distance)
+        self._distance = torch.where(clouds.begun[:, None], torch.inf, self._distance)
+        command = self._env.command.value[:, :2]
+        return command * free_share(self._place, self._distance, command, config)[:, None]
+
+
+def free_share(place: torch.Tensor, distance: torch.Tensor, command: torch.Tensor, config: StopConfig) -> torch.Tensor:
+    """(n,) share of the commanded speed that obstacles ahead leave.
+
+    Args:
+        place: (n, S, 2) m, yaw-aligned frame: nearest obstacle by sector.
+        distance: (n, S) m, infinite without one.
+        command: (n, 2) m/s.
+        config: how near is too near.
+    """
+    heading = command / command.norm(dim=1, keepdim=True).clamp(min=1e-6)
+    along = (place * heading[:, None]).sum(-1)
+    across = place[..., 0] * heading[:, None, 1] - place[..., 1] * heading[:, None, 0]
+    ahead = distance.isfinite() & (along > 0.0) & (across.abs() < config.half_width)
+    gap = torch.where(ahead, along, torch.inf).amin(1)
+    return ((gap - config.stand) / (config.slow - config.stand)).clamp(0.0, 1.0)
+
+
+def _avoiding(env: OmniEnv, avoidance: AvoidanceConfig, motion: Steering) -> Steering:
+    """V_cmd + V_avoid, from the distance and velocity of obstacles by sector (num_envs, S, 3)."""
+    risk = avoidance.risk
+    candidates = None if risk is None else risk.candidates(env.device)
+
+    def velocity() -> torch.Tensor:
+        command, sectors = env.command.value[:, :2], motion()
+        if risk is None or candidates is None:
+            return command + avoidance_velocity(sectors[..., 0], avoidance)
+        return command + risk.avoidance(risk.risk(sectors, candidates), command, candidates)
+
+    return velocity
+
+
+def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | None) -> Policy:
+    """The policy with another velocity in place of V_cmd.
 
     To a policy that sees, too, it is always before the first frame, so that it adds no avoidance of its own.
 
     Args:
         env: where it walks.
         policy: follows velocity commands.
-        avoidance: how distances by sector, or the risk of velocities, become V_avoid.
-        limits: ranges to which the sum is clipped: what the policy has learned to follow; None for no limits.
+        steering: the velocity, asked for once at each control step.
+        limits: ranges to which it is clipped: what the policy has learned to follow; None for no limits.
     """
     shape = env.get_observations()[COMMAND_GROUP].shape if COMMAND_GROUP in env.get_observations() else None
     if shape is None or shape[1] != env.command.value.shape[1]:
         raise ValueError(
-            f"a steered policy needs observations with a group '{COMMAND_GROUP}' that holds the command alone, without"
-            " history"
+            f"it drives a policy by its command and needs observations with a group '{COMMAND_GROUP}' that holds the"
+            " command alone, without history; name another gait: walker=<run directory of experiment=walk>"
         )
-    true_avoidance = _true_avoidance(env, avoidance)
 
-    def steer(observations: TensorDict) -> torch.Tensor:
-        velocity = env.command.value[:, :2] + true_avoidance()
+    def drive(observations: TensorDict) -> torch.Tensor:
+        velocity = steering()
         if limits is not None:
             low, high = velocity.new_tensor(limits).unbind(1)
             velocity = velocity.clamp(low, high)
-        observations = observations.clone(recurse=False)
+        observations = _without_frames(observations)
         observations[COMMAND_GROUP] = torch.cat((velocity, env.command.value[:, 2:]), 1)
-        if "frame_count" in observations:
-            observations["frame_count"] = torch.zeros_like(observations["frame_count"])
         return policy(observations)
 
-    return steer
+    return drive
 
 
-def _true_avoidance(env: OmniEnv, avoidance: AvoidanceConfig) -> Callable[[], torch.Tensor]:
-    """V_avoid of the moment, from where the obstacles are."""
-    sectors = TrueSectors(avoidance.num_sectors, env.world.obstacles, env.obstacles, env.num_envs, env.device)
-    candidates = None if avoidance.risk is None else avoidance.risk.candidates(env.device)
-
-    def velocity() -> torch.Tensor:
-        kinematics = env.state.kinematics
-        motion = sectors.measure(kinematics.base_pos_w, kinematics.yaw)
-        if avoidance.risk is None or candidates is None:
-            return avoidance_velocity(motion[..., 0], avoidance)
-        risk = avoidance.risk.risk(motion, candidates)
-        return avoidance.risk.avoidance(risk, env.command.value[:, :2], candidates)
-
-    return velocity
-
-
-def _empty_points(env: OmniEnv) -> torch.Tensor:
-    """(1, 1, num_points, 3) what the run's sampler makes of a frame without a hit."""
-    assert env.config.sampler is not None and env.config.lidar is not None  # it has frames
-    sampler, sensor = env.config.sampler(), env.config.lidar
-    rays = sampler.num_points  # as many as the raw sampler needs; any number of misses is the same to the others
-    points = torch.zeros(1, rays, 3, device=env.device)
-    directions, angles = torch.zeros_like(points), torch.zeros(1, rays, device=env.device)
-    attitude = Attitude(angles.new_tensor([[1.0, 0.0, 0.0, 0.0]]), sensor.mount_pos, sensor.quat)
-    sampler(torch.full_like(angles, torch.inf), directions, angles, angles, points, attitude)
-    return points[:, None]
+def _without_frames(observations: TensorDict) -> TensorDict:
+    """Observations in which no frame has come yet."""
+    observations = observations.clone(recurse=False)
+    if "frame_count" in observations:
+        observations["frame_count"] = torch.zeros_like(observations["frame_count"])
+    return observations

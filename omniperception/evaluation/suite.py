@@ -22,7 +22,8 @@ from omniperception.common.provenance import ROOT, provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.export import FOLDER as EXPORTED
-from omniperception.evaluation.baselines import Limits, covered, steered
+from omniperception.env.config import EnvConfig
+from omniperception.evaluation.baselines import BASELINES, DRIVEN, Limits, baseline, prepared
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.exported import ExportedPolicies
 from omniperception.evaluation.plots import draw_worlds
@@ -33,14 +34,10 @@ from omniperception.learning import CheckpointError, latest_checkpoint
 
 POLICIES = {
     "run": "the run's policy",
-    "blind": "the same policy, its LiDAR covered: every ray a miss",
-    "oracle": "the gait that follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the true distances"
-    " and velocities of all obstacles",
+    **BASELINES,
     "exported": "the run's exported policy on what a robot measures: onnxruntime",
 }
 """Policies to evaluate; the gait is the run's own, which then sees nothing, or that of `walker`."""
-_WALKS = ("oracle",)
-"""Policies that steer a gait."""
 
 SPLITS = ("dev", "test")
 LOG = Path("docs") / "lab" / "evaluations.jsonl"
@@ -75,7 +72,7 @@ class Evaluation:
         trials: of each policy of each run in each world.
         num_envs: environments at a time in each process.
         jobs: tasks at a time, each in a process of one thread; None: as many as there are cores, 1 on a GPU.
-        walker: run directory of a policy that follows velocity commands, for the policies that steer a gait; or None.
+        walker: run directory of a policy that follows velocity commands, for the policies that drive a gait; or None.
         plots: whether ways are kept and drawn.
         again: whether to measure what has been measured before.
         out: file that the results are added to, beside the run's folder; or None.
@@ -156,7 +153,7 @@ class Task:
     def walker(self) -> Path:
         """The run whose network moves the robot."""
         walker = self.evaluation.walker
-        return walker if self.policy in _WALKS and walker is not None else self.run_dir
+        return walker if self.policy in DRIVEN and walker is not None else self.run_dir
 
     @cached_property
     def weights(self) -> str:
@@ -242,13 +239,13 @@ class Task:
 
     def _contender(self) -> TrainedPolicy:
         """The policy in a fresh environment of the world."""
-        trained = load_policy(self.assembled(), self.walker)
+        run = self.assembled()
+        prepared_env = prepared(self.policy, run.env, self._own().lidar)
+        trained = load_policy(replace(run, env=prepared_env), self.walker)
         env, policy, checkpoint = trained.env, trained.policy, trained.checkpoint
         try:
-            if self.policy == "blind":
-                policy = covered(env, policy)
-            if self.policy == "oracle":
-                policy = steered(env, policy, self._avoidance(), self._limits())
+            if self.policy in BASELINES:
+                policy = baseline(self.policy, env, policy, self._own().rewards.avoidance, self._limits())
             if self.policy == "exported":
                 checkpoint = self.run_dir / EXPORTED
                 policy = ExportedPolicies(env, ExportedPolicy.load(checkpoint))
@@ -256,14 +253,14 @@ class Task:
             raise ConfigError(f"policy={self.policy}: {error}") from None
         return TrainedPolicy(env, policy, checkpoint)
 
-    def _avoidance(self):
-        """The run's avoidance controller, whoever walks."""
-        return build.assemble(config.load(self.run_dir), self.evaluation.trust).env.rewards.avoidance
+    def _own(self) -> EnvConfig:
+        """The run's task, whoever walks: its LiDAR and its avoidance controller."""
+        return build.assemble(config.load(self.run_dir), self.evaluation.trust).env
 
     def _limits(self) -> Limits | None:
         """Ranges (m/s) of what the gait has learned to follow; None where it is the run's own, made for V_avoid."""
         commands = config.read(self.walker).commands
-        own = self.walker == self.run_dir and self._avoidance().risk is not None
+        own = self.walker == self.run_dir and self._own().rewards.avoidance.risk is not None
         if own or "lin_vel_x" not in commands:
             return None
         return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)

@@ -1,5 +1,7 @@
-"""The blind and the scripted policy: what they observe and which command they get."""
+"""The baselines: what they observe and which command they give."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,22 +9,53 @@ import torch
 
 from omniperception import build, config
 from omniperception.avoidance.velocity import AvoidanceConfig
-from omniperception.build import build_runner, load_policy
-from omniperception.env.env import OmniEnv
-from omniperception.evaluation.baselines import covered, steered
-from omniperception.perception import Attitude
+from omniperception.build import TrainedPolicy, load_policy
+from omniperception.evaluation.baselines import StopConfig, baseline, blind, free_share, oracle, prepared
 
 ROOT = Path(__file__).resolve().parents[2]
+AVOIDER = ROOT / "pretrained/avoider"
 BLIND = ("experiment=walk", "rewards=walk")
-SEEING = ("experiment=quickstart", "scenario=static", "num_envs=3", "randomization=none")
+CONTROLLER = AvoidanceConfig(num_sectors=36, threshold=1.5, alpha=2.0, max_speed=None)
 
 
-class TestSteered:
-    controller = AvoidanceConfig(num_sectors=36, threshold=1.5, alpha=2.0, max_speed=None)
+def trained(name: str, *overrides: str) -> TrainedPolicy:
+    """The published policy, in an environment for the policy of this name."""
+    run = build.assemble(config.load(AVOIDER, ["num_envs=4", *overrides]))
+    return load_policy(replace(run, env=prepared(name, run.env, run.env.lidar)), AVOIDER)
 
+
+def walk(env, policy, steps):
+    with torch.no_grad():
+        for _ in range(steps):
+            env.step(policy(env.get_observations()))
+
+
+class TestBlind:
+    def test_acts_as_before_the_first_frame(self):
+        avoider = trained("blind", "scenario=corridor")
+        env, policy = avoider.env, blind(avoider.env, avoider.policy)
+        walk(env, policy, 30)
+        with torch.no_grad():
+            seen = env.get_observations()
+            before = seen.clone()
+            before["frames"], before["frame_count"] = torch.zeros_like(seen["frames"]), 0 * seen["frame_count"]
+            assert (seen["frame_count"] > 0).all() and seen["frames"].any()
+            acted, seeing = policy(seen), avoider.policy(seen)
+            assert not torch.allclose(acted, seeing)
+            assert (seen["frame_count"] > 0).all()  # what the task observes is what it was
+            before["frame_tick"] += 1  # the policy embeds each frame once
+            assert torch.equal(acted, avoider.policy(before))
+
+    def test_a_policy_without_a_lidar_is_blind_already(self, make_env):
+        env = make_env(*BLIND, "scenario=static", "num_envs=2")
+        with pytest.raises(ValueError, match="leave policy=blind out"):
+            blind(env, None)
+
+
+class TestOracle:
     def commanded(self, env, limits):
         heard = []
-        policy = steered(env, lambda obs: heard.append(obs["command"].clone()), self.controller, limits)
+        policy = oracle(env, lambda obs: heard.append(obs["command"].clone()), CONTROLLER, limits)
         policy(env.get_observations())
         return heard[0]
 
@@ -42,80 +75,87 @@ class TestSteered:
         assert limited[1, 1] == -0.5 and limited[0, 0] == given[0, 0].clamp(max=1.0)
         assert torch.equal(env.get_observations()["command"], given)  # the task's command is what it was
 
-    def test_what_the_policy_perceives_itself_does_not_matter(self):
-        run = config.load(ROOT / "pretrained/avoider", ["scenario=corridor", "num_envs=4"])
-        trained = load_policy(build.assemble(run), ROOT / "pretrained/avoider")
-        env, controller = trained.env, trained.env.config.rewards.avoidance
-        commanded = steered(env, trained.policy, controller, None)
-        with torch.no_grad():
-            for _ in range(30):
-                env.step(commanded(env.get_observations()))
-            seen = env.get_observations()
-            other = seen.clone()
-            other["frames"] = torch.rand_like(other["frames"])
-            assert torch.equal(commanded(seen), commanded(other))
-            other["frame_tick"] += 1  # a new frame, as the policy embeds each once
-            assert not torch.allclose(trained.policy(seen), trained.policy(other))
 
-    def test_needs_a_command_to_add_to(self, make_env):
-        env = make_env(*BLIND, "scenario=static", "num_envs=2", "observations.actor=[proprioception]")
-        env.observations = env.observations.exclude("command")
-        with pytest.raises(ValueError, match="group 'command'"):
-            steered(env, None, self.controller, None)
-
-
-@pytest.fixture(scope="module")
-def runner():
-    """An untrained policy to which its embedding counts."""
-    run = build.assemble(config.compose([*SEEING, "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1"]))
-    torch.manual_seed(3)
-    runner = build_runner(run, None)
+@pytest.mark.parametrize("name", ["oracle", "histogram", "stop"])
+def test_what_the_driven_policy_perceives_itself_does_not_matter(name):
+    avoider = trained(name, "scenario=corridor")
+    env, controller = avoider.env, avoider.env.config.rewards.avoidance
+    driven = baseline(name, env, avoider.policy, controller, None)
+    walk(env, driven, 30)
     with torch.no_grad():
-        runner.alg.actor.mlp[0].weight.normal_(0.0, 0.1)
-    return runner
+        seen = env.get_observations()
+        other = seen.clone()
+        other["frames"] = torch.rand_like(other["frames"])
+        assert torch.equal(driven(seen), driven(other))
+        other["frame_tick"] += 1  # a new frame, as the policy embeds each once
+        assert not torch.allclose(avoider.policy(seen), avoider.policy(other))
 
 
-class TestCovered:
-    def test_frames_are_what_the_sampler_makes_of_misses(self, runner):
-        env = runner.env
-        heard = []
-        covered(env, lambda obs: heard.append(obs["frames"].clone()))(env.get_observations())
-        frame = env.sensing.frame
-        misses = torch.full_like(frame.ranges, torch.inf)
-        expected = torch.zeros_like(env.sensing.frames[:, 0])
-        sensor = env.config.lidar
-        attitude = Attitude(env.state.kinematics.base_quat_w.contiguous(), sensor.mount_pos, sensor.quat)
-        env.config.sampler()(misses, frame.directions_s, frame.elevation, frame.azimuth, expected, attitude)
-        assert heard[0].shape == env.sensing.frames.shape
-        for k in range(heard[0].shape[1]):
-            torch.testing.assert_close(heard[0][:, k], expected)
-        assert not torch.equal(heard[0][:, -1], env.sensing.frames[:, -1])
+@pytest.mark.parametrize("name", ["oracle", "histogram", "stop"])
+def test_a_driven_policy_needs_a_command(make_env, name):
+    env = make_env("experiment=quickstart", "scenario=static", "num_envs=2", "perception=none")
+    env.observations = env.observations.exclude("command")
+    with pytest.raises(ValueError, match="group 'command'"):
+        baseline(name, env, None, CONTROLLER, None)
 
-    def test_how_the_base_moved_is_still_known(self):
-        given = ("experiment=avoid", "scenario=static", "num_envs=3", "lidar.num_rays=200")
-        env = OmniEnv(build.assemble(config.compose(given)).env)
-        for _ in range(12):
-            env.step(torch.randn(3, env.num_actions))
-        frames, heard = env.get_observations()["frames"].clone(), []
-        covered(env, lambda obs: heard.append(obs["frames"]))(env.get_observations())
-        points = env.config.sampler().num_points
-        assert frames.shape[2] == points + 1 and frames[:, -1, points].norm(dim=-1).min() > 0
-        assert torch.equal(heard[0][:, :, points], frames[:, :, points])
-        assert not heard[0][:, :, :points].any() and frames[:, :, :points].any()
-        assert torch.equal(env.get_observations()["frames"], frames)  # what the robot itself sees is what it was
 
-    def test_what_is_around_does_not_matter_to_a_blind_policy(self, runner):
-        env, seeing = runner.env, runner.policy
-        blind = covered(env, seeing)
-        with torch.no_grad():
-            observations = env.get_observations()
-            other = observations.clone()
-            other["frames"] = torch.rand_like(other["frames"])
-            assert torch.equal(blind(observations), blind(other))
-            assert not torch.allclose(seeing(observations), seeing(other))
-            assert not torch.allclose(blind(observations), seeing(observations))
+@pytest.mark.parametrize("name", ["histogram", "stop"])
+def test_geometry_needs_a_lidar(make_env, name):
+    env = make_env(*BLIND, "scenario=static", "num_envs=2")
+    with pytest.raises(ValueError, match="use lidar=mid360"):
+        baseline(name, env, None, CONTROLLER, None)
 
-    def test_a_policy_without_a_lidar_cannot_be_covered(self, make_env):
-        env = make_env(*BLIND, "scenario=static", "num_envs=2")
-        with pytest.raises(ValueError, match="leave policy=blind out"):
-            covered(env, None)
+
+class TestFromClouds:
+    """Before a wall of 4 m across the way, under the noise of the paper."""
+
+    def commanded(self, name, x, steps=12):
+        wall = (
+            f"{{wall: {{kind: box, count: 1, size: [[0.1, 0.1], [2.0, 2.0], [0.5, 0.5]], poses: [[{x}, 0.0, 0.0]]}}}}"
+        )
+        ahead = ("lin_vel_x=[0.8,0.8]", "lin_vel_y=[0,0]", "ang_vel_z=[0,0]", "standing=0", "spawn.yaw_deg=[0,0]")
+        given = ("obstacles=none", f"obstacles.groups={wall}", *(f"commands.{value}" for value in ahead))
+        avoider, heard = trained(name, *given, "num_envs=2"), []
+        env = avoider.env
+
+        def stand(observations):
+            heard.append(observations["command"].clone())
+            return torch.zeros(env.num_envs, env.num_actions)
+
+        walk(env, baseline(name, env, stand, env.config.rewards.avoidance, None), steps)
+        return torch.stack(heard), env.command.value
+
+    def test_stop_stops_before_a_wall_and_only_there(self):
+        far, command = self.commanded("stop", 4.0)
+        torch.testing.assert_close(far[-1], command)
+        near, command = self.commanded("stop", 0.75)  # its face is at 0.65 m
+        assert near[-1, :, :2].abs().max() < 1e-6 and command[:, 0].min() > 0.3
+        torch.testing.assert_close(near[-1, :, 2], command[:, 2])
+
+    def test_histogram_brakes_before_a_wall_and_only_there(self):
+        far, command = self.commanded("histogram", 5.5)
+        torch.testing.assert_close(far[-1], command, atol=0.15, rtol=0.0)
+        near, command = self.commanded("histogram", 0.75)
+        assert (near[-1, :, 0] < 0.3 * command[:, 0]).all()
+
+
+class TestFreeShare:
+    config = StopConfig(stand=0.5, slow=1.5, half_width=0.3)
+
+    def share(self, place, command):
+        place = torch.tensor([[place]])
+        return free_share(place, place.norm(dim=-1), torch.tensor([command]), self.config).item()
+
+    def test_falls_with_the_distance_ahead(self):
+        assert self.share([2.0, 0.0], [1.0, 0.0]) == 1.0
+        assert math.isclose(self.share([1.0, 0.2], [0.5, 0.0]), 0.5, abs_tol=1e-6)
+        assert self.share([0.4, 0.0], [1.0, 0.0]) == 0.0
+
+    def test_beside_and_behind_do_not_count(self):
+        assert self.share([0.6, 0.31], [1.0, 0.0]) == 1.0
+        assert self.share([-0.6, 0.0], [1.0, 0.0]) == 1.0
+        assert self.share([0.0, 0.5], [0.0, 1.0]) == 0.0  # ahead is where the command leads
+
+    def test_nothing_near_leaves_the_command(self):
+        empty = free_share(torch.zeros(1, 4, 2), torch.full((1, 4), math.inf), torch.tensor([[1.0, 0.0]]), self.config)
+        assert empty.item() == 1.0

@@ -13,7 +13,7 @@ from omniperception.common.figures import PlotsUnavailable
 from omniperception.common.random import EnvRandom
 from omniperception.config import ConfigError
 from omniperception.evaluation import suite
-from omniperception.evaluation.baselines import steered
+from omniperception.evaluation.baselines import baseline
 from omniperception.evaluation.records import read
 from omniperception.evaluation.suite import Evaluation, Task, World, evaluate, reported_seed, suite_worlds
 
@@ -160,11 +160,11 @@ def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
     """To the range of the walker's commands; a run that computes V_avoid itself is given all of it."""
     given = []
 
-    def spy(env, policy, avoidance, limits):
+    def spy(name, env, policy, avoidance, limits):
         given.append(limits)
-        return steered(env, policy, avoidance, limits)
+        return baseline(name, env, policy, avoidance, limits)
 
-    monkeypatch.setattr(suite, "steered", spy)
+    monkeypatch.setattr(suite, "baseline", spy)
     run, walker = ROOT / "pretrained/avoider", ROOT / "pretrained/gait"
     for walks in (None, walker):
         Task(evaluation(run, "static", walker=walks), run, "oracle", World("static"))._contender()
