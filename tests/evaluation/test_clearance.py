@@ -14,8 +14,8 @@ from omniperception.evaluation.clearance import (
     TOLERANCE,
     Clearance,
     Geoms,
+    Shapes,
     convex_distance,
-    support,
 )
 
 BLIND = ("experiment=walk", "rewards=walk")
@@ -23,10 +23,9 @@ BLIND = ("experiment=walk", "rewards=walk")
 
 def distance(a, b, pos, mat=None):
     """Between two shapes (kind, size) with B at `pos` in the frame of A."""
-    (kind_a, size_a), (kind_b, size_b) = a, b
+    a, b = (Shapes(torch.tensor([kind]), torch.tensor([size])) for kind, size in (a, b))
     mat = torch.eye(3) if mat is None else torch.tensor(mat)
-    rows = [torch.tensor(x)[None] for x in (kind_a, size_a, kind_b, size_b, pos)]
-    return convex_distance(*rows, mat[None], torch.tensor([10.0])).item()
+    return convex_distance(a, b, torch.tensor([pos]), mat[None], torch.tensor([10.0])).item()
 
 
 QUARTER_ABOUT_X = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
@@ -66,7 +65,8 @@ def test_support_by_hand():
         (PILLAR, 0.8 * 1.0 + 0.6 * 0.3),
         (CRATE, 0.6 * 0.2 + 0.8 * 0.4),
     ):
-        assert support(torch.tensor([kind]), torch.tensor([size]), direction).item() == pytest.approx(expected)
+        shape = Shapes(torch.tensor([kind]), torch.tensor([size]))
+        assert shape.support(direction).item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("scenario", ["static", "aerial", "rod"])
@@ -120,7 +120,56 @@ def test_shapes_beyond_the_primitives_are_their_bounding_boxes():
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=[0.1, 0.2, 0.3])
     model = spec.compile()
-    geoms = Geoms(model, [0], torch.device("cpu"))
+    geoms = Geoms(model, [0], 1, torch.device("cpu"))
     assert geoms.kind.tolist() == [BOX]
-    np.testing.assert_allclose(geoms.size[0], [0.1, 0.2, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(geoms.size[0, 0], [0.1, 0.2, 0.3], rtol=1e-6)
     assert geoms.radius[0].item() == pytest.approx(math.sqrt(0.14))
+
+
+def random_hulls(count, generator):
+    """A model of `count` rocks, and their poses (count, 3), (count, 3, 3)."""
+    spec = mujoco.MjSpec()
+    for k in range(count):
+        points = generator.normal(size=(generator.integers(4, 20), 3)) * generator.uniform(0.05, 0.3, 3)
+        spec.add_mesh(name=f"rock_{k}", uservert=points.ravel())
+        body = spec.worldbody.add_body(mocap=True)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"rock_{k}")
+    return spec
+
+
+def test_convex_hulls_as_mujoco_measures_them():
+    """Rocks against rocks and every other kind, near each other in random poses; penetration is 0."""
+    rng = np.random.default_rng(0)
+    spec = random_hulls(8, rng)
+    kinds = ("box", "sphere", "cylinder", "capsule")
+    for kind in kinds:
+        body = spec.worldbody.add_body(mocap=True)
+        body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), size=rng.uniform(0.05, 0.2, 3))
+    model = spec.compile()
+    data, geoms = mujoco.MjData(model), Geoms(model, range(model.ngeom), 1, torch.device("cpu"))
+    first, second = (torch.tensor(x) for x in np.triu_indices(model.ngeom, 1))
+    keep = first < 8
+    first, second, zeros = first[keep], second[keep], torch.zeros(int(keep.sum()), dtype=torch.int64)
+    expected, got = [], []
+    for _ in range(10):
+        data.mocap_pos[:] = rng.uniform(-0.6, 0.6, (model.nmocap, 3))
+        data.mocap_quat[:] = rng.normal(size=(model.nmocap, 4))
+        data.mocap_quat[:] /= np.linalg.norm(data.mocap_quat, axis=1, keepdims=True)
+        mujoco.mj_kinematics(model, data)
+        pairs = zip(first.tolist(), second.tolist(), strict=True)
+        expected += [max(mujoco.mj_geomDistance(model, data, a, b, 5.0, None), 0.0) for a, b in pairs]
+        mat = torch.tensor(data.geom_xmat, dtype=torch.float32).view(1, -1, 3, 3)
+        at = geoms.centres(torch.tensor(data.geom_xpos, dtype=torch.float32)[None], mat)[0]
+        frame_a, frame_b = mat[0, first], mat[0, second]
+        got.append(
+            convex_distance(
+                geoms.shapes(zeros, first),
+                geoms.shapes(zeros, second),
+                (frame_a.mT @ (at[second] - at[first])[..., None])[..., 0],
+                frame_a.mT @ frame_b,
+                torch.full((len(first),), 5.0),
+            )
+        )
+    expected, got = np.array(expected), torch.cat(got).numpy()
+    assert 0.05 < (expected == 0).mean() < 0.6
+    np.testing.assert_allclose(got, expected, atol=TOLERANCE + 1e-5)
