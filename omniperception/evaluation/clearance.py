@@ -120,7 +120,7 @@ class Geoms:
     """
 
     def __init__(self, model: mujoco.MjModel, ids: Sequence[int], num_envs: int, device: torch.device) -> None:
-        kinds, sizes, centres, faces = [], [], [], []
+        kinds, sizes, centres, faces, sized = [], [], [], [], []
         for i in ids:
             geom_type = mujoco.mjtGeom(int(model.geom_type[i]))
             kind, size, centre, own = _KINDS.get(geom_type, BOX), model.geom_size[i].copy(), np.zeros(3), None
@@ -135,12 +135,13 @@ class Geoms:
             sizes.append(size)
             centres.append(centre)
             faces.append(own)
+            sized.append(geom_type in _KINDS)
         self.ids, self.num = tuple(int(i) for i in ids), len(ids)
         self.kind = torch.tensor(kinds, device=device)
         size = torch.tensor(np.array(sizes), dtype=torch.float32, device=device)
         self.size = size.expand(num_envs, -1, -1)
         self._centre = torch.tensor(np.array(centres), dtype=torch.float32, device=device)
-        self._is_sized = torch.tensor([model.geom_type[i] in _KINDS for i in ids], device=device)[:, None]
+        self._is_sized = torch.tensor(sized, device=device)[:, None]
         self._faces = _padded(faces, device)
         by_kind = torch.stack((size[:, 0] + size[:, 1], torch.hypot(size[:, 0], size[:, 1]), *2 * [size.norm(dim=1)]))
         self.radius = by_kind.gather(0, self.kind[None])[0]

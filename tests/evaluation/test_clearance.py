@@ -73,7 +73,6 @@ def test_support_by_hand():
 def test_the_robot_as_mujoco_measures_it(make_env, scenario):
     env = make_env(*BLIND, f"scenario={scenario}", "num_envs=6")
     clearance, model = Clearance(env), env.world.model
-    data = mujoco.MjData(model)
     robot = [g for g in range(model.ngeom) if model.body_rootid[model.geom_bodyid[g]] == env.world.base_body]
     obstacles = [model.geom(name).id for name in env.world.obstacles.geom_names()]
     assert len(robot) == 19
@@ -88,8 +87,7 @@ def test_the_robot_as_mujoco_measures_it(make_env, scenario):
         env.sim.qpos[:, 7:] = env.state.default_joint_pos + 0.5 * uniform[:, 6:]
         got = clearance.measure(torch.full((6,), 2.0))
         for i in range(6):
-            data.qpos[:] = env.sim.qpos[i].numpy()
-            data.mocap_pos[:], data.mocap_quat[:] = env.sim.mocap_pos[i].numpy(), env.sim.mocap_quat[i].numpy()
+            model, data = env.sim.batch.get_model(i), env.sim.batch.get_data(i)  # with sizes of its own
             mujoco.mj_kinematics(model, data)
             pairs = [mujoco.mj_geomDistance(model, data, r, o, 2.0, None) for r in robot for o in obstacles]
             overlaps += min(pairs) < 0
