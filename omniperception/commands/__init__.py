@@ -9,7 +9,8 @@ from collections.abc import Sequence
 COMMANDS = {
     "train": "trains a policy, or goes on with a run",
     "play": "replays a run: rates over whole episodes, and a video",
-    "evaluate": "evaluates a run in fixed scenarios, beside baselines",
+    "evaluate": "evaluates runs in fixed worlds, beside baselines",
+    "tables": "renders the results tables of the docs from files of results",
     "ablate": "trains and evaluates variants of the perception over seeds",
     "export": "exports a policy for a robot or another simulator",
     "publish": "makes a small run directory, fit for a repository",

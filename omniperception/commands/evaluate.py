@@ -45,7 +45,7 @@ class Arguments:
     suite: str | None = argument(None, "file of conf/suite, such as held_out: many worlds")
     scenario: tuple[str, ...] = argument((), "scenarios in place of a suite, or all; corridor without either")
     split: str = argument("dev", "obstacles and seeds for choosing, or for reporting", choices=SPLITS)
-    condition: str | None = argument(None, "preset of conf/condition; null: the run's own randomization")
+    condition: str | None = argument("ideal", "preset of conf/condition; null: the run's own randomization")
     policy: tuple[str, ...] = argument(("run",), "policies", choices=tuple(POLICIES))
     trials: int = argument(250, "trials of each policy in each world", least=1)
     num_envs: int = argument(64, "environments at a time in each process", least=1)

@@ -68,7 +68,7 @@ class Evaluation:
         worlds: where.
         policies: names from POLICIES.
         split: dev or test.
-        condition: preset of `condition`; None: the randomization that scenario and run have.
+        condition: preset of `condition`; None: the randomization that the run has, or the overrides give it.
         trials: of each policy of each run in each world.
         num_envs: environments at a time in each process.
         jobs: tasks at a time, each in a process of one thread; None: as many as there are cores, 1 on a GPU.
@@ -85,7 +85,7 @@ class Evaluation:
     worlds: Sequence[World]
     policies: Sequence[str] = ("run",)
     split: str = "dev"
-    condition: str | None = None
+    condition: str | None = "ideal"
     trials: int = 250
     num_envs: int = 64
     jobs: int | None = None

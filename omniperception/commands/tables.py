@@ -1,0 +1,56 @@
+"""Renders the results tables of the docs from committed files of results.
+
+    tables                # writes every table anew
+    tables check=true     # says which pages differ, and writes nothing
+
+A table stands in a page between <!-- table: NAME view=... key=value ... --> and <!-- end -->; NAME is a file in `data`,
+written by evaluate out=. Views: all (every figure), policies (a row for each world, a column for each policy),
+conditions (a row for each policy). The keys policy, world, terrain, condition, split and run choose what is shown.
+Percentages and intervals are computed from the outcomes of single trials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from omniperception.cli import Command, argument
+from omniperception.config import ConfigError
+from omniperception.evaluation.tables import rendered
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's own arguments."""
+
+    pages: tuple[Path, ...] = argument((Path("README.md"), Path("docs")), "pages, or folders of them")
+    data: Path = argument(Path("docs/lab/data"), "folder of the files of results")
+    check: bool = argument(False, "whether to compare instead of writing")
+
+
+def main(arguments: Arguments) -> None:
+    """Writes the pages, or refuses those that differ."""
+    different = []
+    for page in _pages(arguments.pages):
+        text = page.read_text()
+        try:
+            new = rendered(text, arguments.data)
+        except ConfigError as error:
+            raise ConfigError(f"{page}: {error}") from None
+        if new != text:
+            different.append(str(page))
+            if not arguments.check:
+                page.write_text(new)
+    if arguments.check and different:
+        raise ConfigError(f"{', '.join(different)} differ from the files of results; run tables and commit")
+    print(f"wrote {', '.join(different)}" if different else "all tables are those of the files of results")
+
+
+def _pages(given: tuple[Path, ...]) -> list[Path]:
+    for path in given:
+        if not path.exists():
+            raise ConfigError(f"pages={path} does not exist; run it in a checkout, or give pages=")
+    return [page for path in given for page in (sorted(path.rglob("*.md")) if path.is_dir() else [path])]
+
+
+command = Command(main, Arguments, __doc__)

@@ -1,0 +1,124 @@
+"""Results tables in Markdown pages, rendered from files of results between two comments.
+
+<!-- table: before -->                                          all figures, of docs/lab/data/before.json(.gz)
+<!-- table: before view=policies condition=robot split=test --> untouched: a row for each world
+<!-- table: before view=conditions policy=run,blind -->         untouched and falls: a row for each policy
+<!-- end -->
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from omniperception.common.tables import markdown
+from omniperception.config import ConfigError, suggest
+from omniperception.evaluation.records import Record, read
+from omniperception.evaluation.report import grouped, headline, rate_cell, table
+
+_BLOCK = re.compile(r"<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)<!-- end -->", re.DOTALL)
+_FILTERS = ("policy", "world", "terrain", "condition", "split", "run")
+
+
+def rendered(text: str, data: Path) -> str:
+    """A page with its tables as the files in the folder `data` have them.
+
+    Raises:
+        ConfigError: a comment names no file, view or filter, or nothing is left to show.
+    """
+    if text.count("<!-- table:") != len(_BLOCK.findall(text)):
+        raise ConfigError("a comment <!-- table: ... --> has no <!-- end --> after it")
+    return _BLOCK.sub(lambda block: _filled(block["what"], data), text)
+
+
+def _filled(what: str, data: Path) -> str:
+    name, *settings = what.split()
+    given = dict(setting.partition("=")[::2] for setting in settings)
+    view = given.pop("view", "all")
+    if view not in VIEWS:
+        raise ConfigError(f"<!-- table: {what} -->: view={view} is unknown; {suggest(view, tuple(VIEWS))}")
+    records = read(data_file(name, data))
+    for key, value in given.items():
+        if key not in _FILTERS:
+            raise ConfigError(f"<!-- table: {what} -->: {key} is unknown; {suggest(key, _FILTERS)}")
+        records = [record for record in records if getattr(record, key) in value.split(",")]
+    if not records:
+        raise ConfigError(f"<!-- table: {what} --> shows nothing: no result in {name} is like that")
+    return f"<!-- table: {what} -->\n\n{VIEWS[view](records).strip()}\n\n{source(records)}\n\n<!-- end -->"
+
+
+def data_file(name: str, data: Path) -> Path:
+    """The file of a name: compressed, or not."""
+    found = [path for suffix in (".json.gz", ".json") if (path := data / f"{name}{suffix}").is_file()]
+    if not found:
+        raise ConfigError(f"{data} has no {name}.json.gz and no {name}.json; evaluate ... out={data / name}.json.gz")
+    return found[0]
+
+
+def by_policy(records: Sequence[Record]) -> str:
+    """How often each policy arrived untouched: a row for each world."""
+    policies = [policy for (policy,) in grouped(records, "policy")]
+    rows = []
+    for (world, terrain, condition), here in grouped(records, "world", "terrain", "condition").items():
+        cells = [_untouched([record for record in here if record.policy == policy]) for policy in policies]
+        rows.append([world, terrain, condition, *cells])
+    return _titled(
+        records, "reached, untouched and without a fall, %", ["world", "terrain", "condition"], policies, rows
+    )
+
+
+def by_condition(records: Sequence[Record]) -> str:
+    """How often each policy arrived untouched, and how often it fell, in the mean over all worlds."""
+    conditions = [condition for (condition,) in grouped(records, "condition")]
+    rows = []
+    for (policy,), theirs in grouped(records, "policy").items():
+        cells = []
+        for condition in conditions:
+            there = [record for record in theirs if record.condition == condition]
+            shares = [
+                sum(float(r.episodes.happened()[name].double().mean()) for r in there) / max(len(there), 1)
+                for name in ("untouched", "fall")
+            ]
+            cells.append(f"{100 * shares[0]:.1f} / {100 * shares[1]:.1f}" if there else "–")
+        rows.append([policy, *cells])
+    worlds = len({(record.world, record.terrain) for record in records})
+    what = f"reached, untouched and without a fall / falls, %, mean over {worlds} worlds"
+    return _titled(records, what, ["policy"], conditions, rows)
+
+
+VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
+    "all": table,
+    "policies": by_policy,
+    "conditions": by_condition,
+}
+
+
+def source(records: Sequence[Record]) -> str:
+    """Where the numbers come from: commands, commits, dates, seeds, machine."""
+    facts = [record.facts for record in records]
+    commands = sorted({fact["command"] for fact in facts})
+    commits = sorted({(fact["commit"] or "no checkout")[:12] + _changed(fact["commit"]) for fact in facts})
+    dates = sorted({fact["date"][:10] for fact in facts})
+    machines = sorted({f"{fact['machine']['cpu']}, {fact['machine']['device']}" for fact in facts})
+    seeds = sorted({record.seed for record in records})
+    shown = ", ".join(map(str, seeds)) if len(seeds) <= 3 else f"{len(seeds)} seeds in the file"
+    lines = [f"    {command}" for command in commands]
+    return "\n".join(
+        [*lines, "", f"{', '.join(dates)}; commit {', '.join(commits)}; seeds: {shown}; {'; '.join(machines)}."]
+    )
+
+
+def _changed(commit: str | None) -> str:
+    return " with changes" if commit and "+" in commit else ""
+
+
+def _untouched(records: Sequence[Record]) -> str:
+    return rate_cell([record.episodes.clean for record in records]) if records else "–"
+
+
+def _titled(records: Sequence[Record], what: str, keys: list[str], columns: list[str], rows: list[list[str]]) -> str:
+    """A table without the columns of keys that are the same everywhere."""
+    kept = [k for k in range(len(keys)) if k == 0 or len({row[k] for row in rows}) > 1]
+    rows = [[row[k] for k in kept] + row[len(keys) :] for row in rows]
+    return f"{what}; {headline(records)}\n\n{markdown([keys[k] for k in kept] + columns, rows)}"

@@ -1,0 +1,104 @@
+"""Tables of the docs: from outcomes of trials, and those that stand there are those of the files."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from omniperception.commands.tables import Arguments, main
+from omniperception.config import ConfigError
+from omniperception.evaluation.records import Record, read, write
+from omniperception.evaluation.tables import rendered
+
+from .test_outcomes import episodes
+
+ROOT = Path(__file__).resolve().parents[2]
+FACTS = {
+    "date": "2026-11-22T10:00:00+00:00",
+    "commit": "0123456789abcdef",
+    "command": "scripts/evaluate.py suite=held_out",
+    "machine": {"cpu": "a processor", "device": "cpu"},
+    "trials": 8,
+}
+
+
+def record(policy="run", world="corridor", condition="ideal", run="a", touches=None):
+    trials = episodes()
+    if touches is not None:
+        trials = replace(trials, contacts=torch.tensor(touches))
+    named = {"policy": policy, "world": world, "terrain": "flat", "condition": condition, "split": "test"}
+    return Record(**named, condition_version=1, run=run, weights="0f", seed=7, facts=FACTS, episodes=trials)
+
+
+@pytest.fixture
+def data(tmp_path):
+    records = [record(), record("blind", touches=[1] * 8), record(world="rod"), record(condition="robot")]
+    write(tmp_path / "first.json.gz", records)
+    return tmp_path
+
+
+def page(what: str) -> str:
+    return f"# Title\n\nBefore.\n\n<!-- table: {what} -->\nold\n<!-- end -->\n\nAfter.\n"
+
+
+def test_a_table_stands_between_its_comments_with_its_source(data):
+    text = rendered(page("first condition=ideal"), data)
+    assert text.startswith("# Title\n\nBefore.\n\n<!-- table: first condition=ideal -->\n\nsplit test")
+    assert text.endswith("\n\n<!-- end -->\n\nAfter.\n") and "old" not in text
+    assert "| corridor" in text and "25.0 [7.1, 59.1]" in text  # 2 of 8
+    assert "    scripts/evaluate.py suite=held_out\n" in text and "commit 0123456789ab;" in text and "seeds: 7;" in text
+    assert rendered(text, data) == text
+
+
+def test_views(data):
+    text = rendered(page("first view=policies condition=ideal"), data)
+    rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("|")]
+    cells = [[cell.strip() for cell in row] for row in rows]
+    assert cells[0] == ["world", "run", "blind"] and cells[3] == ["rod", "25.0 [7.1, 59.1]", "–"]
+    assert cells[2] == ["corridor", "25.0 [7.1, 59.1]", "0.0 [0.0, 32.4]"]
+    text = rendered(page("first view=conditions world=corridor"), data)
+    assert "| run    | 25.0 / 25.0 | 25.0 / 25.0 |" in text and "| blind  | 0.0 / 25.0  | –           |" in text
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("second", "has no second.json.gz"),
+        ("first view=pie", "view=pie is unknown"),
+        ("first colour=red", "colour is unknown"),
+        ("first policy=magic", "shows nothing"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(data, what, message):
+    with pytest.raises(ConfigError, match=message):
+        rendered(page(what), data)
+
+
+def test_an_open_end_is_refused(data):
+    with pytest.raises(ConfigError, match="no <!-- end -->"):
+        rendered("<!-- table: first -->\nforgotten", data)
+
+
+def test_a_figure_changed_by_hand_and_a_changed_file_are_found(data, capsys):
+    path = data / "page.md"
+    path.write_text(page("first condition=ideal"))
+    given = {"pages": (data,), "data": data}
+    main(Arguments(**given))
+    main(Arguments(**given, check=True))
+    good = path.read_text()
+    path.write_text(good.replace("25.0 [7.1", "26.0 [7.1"))
+    with pytest.raises(ConfigError, match=r"page\.md differ"):
+        main(Arguments(**given, check=True))
+    path.write_text(good)
+    first, *rest = read(data / "first.json.gz")
+    write(
+        data / "first.json.gz", [replace(first, episodes=replace(first.episodes, contacts=1 - first.episodes.contacts))]
+    )
+    with pytest.raises(ConfigError, match=r"page\.md differ"):
+        main(Arguments(**given, check=True))
+
+
+def test_the_tables_of_the_docs_are_those_of_the_files():
+    pages = (ROOT / "README.md", ROOT / "docs")
+    main(Arguments(pages=pages, data=ROOT / "docs" / "lab" / "data", check=True))
