@@ -14,7 +14,7 @@ from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
 from omniperception.lidar import DEVICES, Noise
 from omniperception.scene import ObstaclesConfig, RobotConfig, TerrainConfig, TiledTerrainConfig
-from omniperception.scene.build import OBSTACLE_CONTACT
+from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.sim import SimConfig
 
 if TYPE_CHECKING:  # loaded where it is built
@@ -104,6 +104,7 @@ class EnvConfig:
             needed.add(AVOIDANCE)
         if self.obstacles.num_obstacles:
             needed.add(OBSTACLE_CONTACT)  # metrics count contacts
+            needed |= {OBSTACLE_FORCE} if self.trials else set()
         return frozenset(needed)
 
     @property

@@ -12,7 +12,7 @@ from omniperception.common.lazy import lazy
 from omniperception.common.rotations import rotate_yaw
 from omniperception.env.heights import flat_heights
 from omniperception.env.kinematics import Kinematics
-from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT
+from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE
 
 if TYPE_CHECKING:  # parts that not every task has
     from omniperception.avoidance.avoidance import Avoidance
@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # parts that not every task has
 AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD = "avoidance", "distal_range", "cloud", "measured_cloud"
 """Outputs of the LiDAR that can be required: V_avoid and sector distances, mean distal ranges, clouds without noise and
 with it."""
-CONTACT_SENSORS = frozenset({FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT})
+CONTACT_SENSORS = frozenset({FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE})
 REQUIREMENTS = (*sorted(CONTACT_SENSORS), AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD)
 """Sensors that must exist before the world is compiled."""
 
@@ -255,6 +255,14 @@ class EnvState:
         if OBSTACLE_CONTACT not in self._sim.world.sensors:
             return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         return self._sim.touched(OBSTACLE_CONTACT)
+
+    @lazy
+    def obstacle_impulse(self) -> torch.Tensor:
+        """(num_envs,) N s: sum over the physics steps of the control step and over obstacles of |force on it| * step.
+        Requires "obstacle_force"; 0 for all without obstacles."""
+        if OBSTACLE_FORCE not in self._sim.world.sensors:
+            return torch.zeros(self.num_envs, device=self.device)
+        return self._sim.contact_impulse(OBSTACLE_FORCE)
 
     def _contact_force(self, kind: str) -> torch.Tensor:
         _declared(kind if kind in self._sim.world.sensors else None, kind)

@@ -19,7 +19,7 @@ CLEARANCE_EVERY = 2
 
 _SUMS = (
     *("steps", "velocity_error", "yaw_rate_error", "free", "free_velocity_error"),
-    *("contacts", "energy", "path"),
+    *("contacts", "impulse", "energy", "path"),
 )
 """Sums over the control steps of a trial."""
 
@@ -92,6 +92,7 @@ class Tally:
             "free": free,
             "free_velocity_error": env.velocity_error * free,
             "contacts": began,
+            "impulse": env.state.obstacle_impulse,
             "energy": (env.state.joint_torque * kinematics.joint_vel).abs().sum(1) * dt,
             "path": kinematics.base_lin_vel_yaw.norm(dim=1) * dt,
         }
@@ -129,7 +130,7 @@ class Tally:
             outcome=self._outcome.cpu(),
             contacts=sums["contacts"].long(),
             first_contact_s=self._filed_contact.cpu(),
-            impulse=None,
+            impulse=sums["impulse"] if self._clearance is not None else None,
             clearance=self._filed_least.cpu().double() if self._clearance is not None else None,
             energy=sums["energy"],
             path=sums["path"],

@@ -14,6 +14,7 @@ from omniperception.scene.terrain import GROUND, TerrainConfig
 from omniperception.scene.tiled_terrain import TiledTerrainConfig
 
 FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT = "foot_force", "link_force", "obstacle_contact"
+OBSTACLE_FORCE = "obstacle_force"
 """Contact sensors that exist only when something reads them."""
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
@@ -30,7 +31,7 @@ class World:
         robot: the robot preset.
         terrain: the ground preset.
         obstacles: the obstacle preset.
-        sensors: the contact sensors built in; a subset of FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT.
+        sensors: the contact sensors built in; a subset of FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE.
     """
 
     model: mujoco.MjModel
@@ -122,6 +123,7 @@ def _add_contact_sensors(
         FOOT_FORCE: (robot.foot_geoms, _FORCE),
         LINK_FORCE: (robot.penalized_geoms, _FORCE),
         OBSTACLE_CONTACT: (obstacles.geom_names(), _FOUND),
+        OBSTACLE_FORCE: (obstacles.geom_names(), _FORCE),
     }
     unknown = kinds - set(geoms)
     if unknown:

@@ -96,6 +96,10 @@ class Simulator(Protocol):
     def touched(self, kind: str) -> torch.Tensor:
         """(num_envs,) bool: whether a sensor of that kind found a contact in any step of the last call."""
 
+    def contact_impulse(self, kind: str) -> torch.Tensor:
+        """(num_envs,) float32, N s: the sum over sensors of that kind, which measure forces, and over the steps of the
+        last call of |force| * time step."""
+
     def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions (num_envs, n, 3) (m) and quaternions (num_envs, n, 4) of bodies at the current state, float32."""
 

@@ -210,6 +210,10 @@ class MujocoSimulator:
         found = self._records["sensordata"][:, :, self.world.sensor_slice(kind)] > 0
         return torch.from_numpy(found.any(axis=(1, 2)))
 
+    def contact_impulse(self, kind: str) -> torch.Tensor:
+        forces = torch.from_numpy(self._records["sensordata"][:, :, self.world.sensor_slice(kind)])
+        return (forces.unflatten(2, (-1, 3)).norm(dim=-1).sum((1, 2)) * self.config.timestep).float()
+
     def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         if set(bodies) <= self._roots.keys():
             return self._root_poses(bodies)

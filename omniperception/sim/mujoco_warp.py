@@ -207,6 +207,10 @@ class MujocoWarpSimulator:
     def touched(self, kind: str) -> torch.Tensor:
         return (self._records["sensordata"][:, :, self.world.sensor_slice(kind)] > 0).flatten(1).any(1)
 
+    def contact_impulse(self, kind: str) -> torch.Tensor:
+        forces = self._records["sensordata"][:, :, self.world.sensor_slice(kind)]
+        return forces.unflatten(2, (-1, 3)).norm(dim=-1).sum((1, 2)) * self.config.timestep
+
     def body_poses(self, bodies: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         self._launch("kinematics", self._kinematics)
         index = self._index(bodies)

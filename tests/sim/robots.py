@@ -6,7 +6,8 @@ from omniperception.scene import build_world
 
 
 def simulator(run, engine, num_envs=4):
-    world = build_world(run.env.robot, run.env.terrain, run.env.obstacles, ("foot_force", "obstacle_contact"))
+    sensors = ("foot_force", "obstacle_contact", "obstacle_force")
+    world = build_world(run.env.robot, run.env.terrain, run.env.obstacles, sensors)
     return engine.build(world, num_envs)
 
 

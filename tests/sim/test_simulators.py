@@ -51,6 +51,30 @@ def test_a_state_that_was_read_stays_as_it_was(sim):
     assert not torch.equal(sim.robot_state()[1], before[1])
 
 
+def test_impulses_of_obstacles_are_those_of_the_contacts(sim, engine):
+    """Against mj_contactForce, of a pillar that overlaps one robot and is far from the others."""
+    model, steps = sim.world.model, 4
+    pillar = model.geom("obstacle_pillar_0").id
+    sim.mocap_pos[0, 0] = torch.tensor([0.32 + float(model.geom_size[pillar, 0]), 0.05, 0.5])
+    data = mujoco.MjData(model)
+    data.qpos[:], data.ctrl[:] = sim.qpos[0].double().numpy(), default_joints(sim).numpy()
+    data.mocap_pos[:] = sim.mocap_pos[0].double().numpy()
+    expected, force = 0.0, np.zeros(6)
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+        total = np.zeros(3)
+        for k in range(data.ncon):
+            if pillar in data.contact[k].geom:
+                mujoco.mj_contactForce(model, data, k, force)
+                sign = 1.0 if data.contact[k].geom[1] == pillar else -1.0
+                total += sign * data.contact[k].frame.reshape(3, 3).T @ force[:3]
+        expected += float(np.linalg.norm(total)) * model.opt.timestep
+    sim.step(default_joints(sim).expand(4, -1), steps)
+    got = sim.contact_impulse("obstacle_force")
+    assert expected > 0.1 and got[0] == pytest.approx(expected, rel=1e-3 if isinstance(engine, SimConfig) else 0.05)
+    assert got[1:].tolist() == [0.0] * 3 and sim.touched("obstacle_contact").tolist() == [True, False, False, False]
+
+
 def test_standing_feet_carry_the_weight(sim):
     """The reading is what a foot does to the ground: downwards."""
     target = default_joints(sim).expand(4, -1)
