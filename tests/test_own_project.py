@@ -47,7 +47,7 @@ def test_it_trains_plays_and_evaluates(project):
     assert done.returncode == 0, done.stderr
     done = run("evaluate", "run=run", "scenario=mine", "plots=false", "trust=own_project", *short)
     assert done.returncode == 0, done.stderr
-    (record,) = read(folder / "run" / "evaluation" / "dev-own-mine-own-run.json")
+    (record,) = read(folder / "run" / "evaluation" / "dev-ideal-mine-own-run.json")
     assert len(record.episodes) == 2
 
 
