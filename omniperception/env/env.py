@@ -91,7 +91,7 @@ class OmniEnv(VecEnv):
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._spawn = self._spawn_bounds()
-        self._sized_geoms = self._find_sized_geoms()
+        self._sized = self._find_sized()
         self._frame_heights: torch.Tensor | None = None  # at the newest frame, where only supervision reads heights
         self.rewards = RewardManager(config.rewards.terms, self.state)
         self._groups = {n: ObservationManager(n, g, self.state) for n, g in config.observations.groups.items()}
@@ -166,10 +166,10 @@ class OmniEnv(VecEnv):
 
     def _resize(self, obstacles: ObstacleField, env_ids: torch.Tensor) -> None:
         """Gives the physics and the rays the obstacles' sizes in some environments (n,)."""
-        if obstacles.varying:
-            names = tuple(obstacles.parts[k].name for k in obstacles.varying)
-            sizes = obstacles.size[env_ids][:, obstacles.varying]
-            self.sim.resize(self._sized_geoms, env_ids, sizes)
+        names, geoms, parts = self._sized
+        if geoms:
+            sizes = obstacles.size[env_ids[:, None], parts]
+            self.sim.resize(geoms, env_ids, sizes)
             if self.sensing is not None:
                 self.sensing.resize(names, env_ids, sizes)
 
@@ -375,12 +375,15 @@ class OmniEnv(VecEnv):
         parts = {name: getattr(self, name) for name in names} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}
 
-    def _find_sized_geoms(self) -> tuple[int, ...]:
-        """MuJoCo ids of the obstacles' geoms whose sizes differ between environments."""
-        if self.obstacles is None:
-            return ()
-        names = [self.obstacles.parts[k].name for k in self.obstacles.varying]
-        return tuple(self.world.model.geom(name).id for name in names)
+    def _find_sized(self) -> tuple[tuple[str, ...], tuple[int, ...], torch.Tensor]:
+        """Names, geoms and indices of the parts of obstacles whose sizes differ between environments."""
+        names: tuple[str, ...] = ()
+        varying: tuple[int, ...] = ()
+        if self.obstacles is not None:
+            varying = self.obstacles.varying
+            names = tuple(self.obstacles.parts[k].name for k in varying)
+        geoms = tuple(self.world.model.geom(name).id for name in names)
+        return names, geoms, torch.tensor(varying, dtype=torch.int64, device=self.device)
 
     def _spawn_bounds(self) -> torch.Tensor:
         """(2, 3) low and high of x, y (m) and yaw (rad) at which robots start."""
