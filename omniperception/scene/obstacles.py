@@ -50,7 +50,8 @@ class ObstacleGroup:
             capsule radius, half length without its caps. What is round stands upright.
         speed: (low, high) range (m/s); (0, 0) stands still.
         poses: fixed (x, y, yaw in degrees) of each obstacle, for walls; None: placed at every reset.
-        bottom: (low, high) range (m) of the height of its lowest point above the ground; (0, 0) stands on it.
+        bottom: (low, high) range (m) of the height of its lowest point above the ground; (0, 0) stands on it. Negative:
+            it reaches into the ground, so that no gap opens below a long wall on a slope.
         heading_deg: (low, high) range (deg) of the direction in which it sets out, 0 along x.
         yaw_deg: (low, high) range (deg) of its orientation about the vertical.
         area: where this group is placed and moves, in place of the preset's `area`; see `ObstaclesConfig`.
@@ -94,12 +95,10 @@ class ObstacleGroup:
             object.__setattr__(self, key, bounds)
             if len(bounds) != 2 or bounds[0] > bounds[1]:
                 raise ValueError(f"obstacles: {key}={list(bounds)} must be a range [low, high] with low <= high")
-        if self.bottom[0] < 0:
-            raise ValueError(f"obstacles: bottom={list(self.bottom)} must not lie below the ground")
         if self.area is not None:
             object.__setattr__(self, "area", _area("a group's area", self.area))
-        if self.poses is not None and (self.bottom != (0.0, 0.0) or self.approach is not None or self.moves):
-            raise ValueError("obstacles: a group with fixed poses stands; leave out bottom, speed and approach")
+        if self.poses is not None and (self.approach is not None or self.moves):
+            raise ValueError("obstacles: a group with fixed poses stands; leave out speed and approach")
         if self.approach is not None and self.speed[0] <= 0:
             raise ValueError(f"obstacles: speed={list(self.speed)} of a group that approaches must be positive")
 

@@ -61,14 +61,14 @@ def test_every_part_is_a_kinematic_body_with_a_geom_of_its_name(make_config):
     """In the order of the parts; as large as they can be, so that what is derived from the model has room."""
     run = make_config("obstacles=corridor", "commands=corridor")
     model, parts = world_of(run).model, run.env.obstacles.parts()
-    names = [f"obstacle_walker_{k}" for k in range(6)] + [f"obstacle_wall_{k}" for k in range(2)]
-    assert [part.name for part in parts] == [*names, "obstacle_back_wall_0"] and model.nmocap == 9
+    names = [f"obstacle_walker_{k}" for k in range(6)] + [f"obstacle_wall_{k}" for k in range(8)]
+    assert [part.name for part in parts] == [*names, "obstacle_back_wall_0"] and model.nmocap == 15
     for k, part in enumerate(parts):
         geom, body = model.geom(part.name), model.body(part.name)
         assert geom.bodyid[0] == body.id and model.body_mocapid[body.id] == k
         assert body.geomnum[0] == 1 and not geom.pos.any()
     np.testing.assert_allclose(model.geom("obstacle_walker_5").size, [0.3, 0.9, 0.0])
-    np.testing.assert_allclose(model.geom("obstacle_wall_1").size, [6.6, 0.05, 0.5])
+    np.testing.assert_allclose(model.geom("obstacle_wall_1").size, [1.65, 0.05, 1.0])
 
 
 def test_sensor_columns_are_those_of_the_named_geoms(make_config):

@@ -204,8 +204,6 @@ def test_fixed_poses_hold_in_every_environment_whatever_moves_around_them():
         ({"speed": (-1.0, 1.0)}, "speed="),
         ({"poses": [[0.0, 0.0]]}, "poses must be 1 triples"),
         ({"bottom": [0.5, 0.4]}, r"bottom=\[0\.5, 0\.4\]"),
-        ({"bottom": [-0.1, 0.4]}, "below the ground"),
-        ({"bottom": [0.1, 0.4], "poses": [[0.0, 0.0, 0.0]]}, "leave out bottom"),
         ({"speed": [1.0, 1.0], "poses": [[0.0, 0.0, 0.0]]}, "with fixed poses stands"),
         ({"heading_deg": [90.0]}, "heading_deg"),
         ({"yaw_deg": [30.0, -30.0]}, "yaw_deg"),
@@ -217,3 +215,11 @@ def test_wrong_groups_are_refused(settings, message):
     good = {"kind": "cylinder", "count": 1, "size": [[0.1, 0.2], [0.5, 0.6]]}
     with pytest.raises(ValueError, match=message):
         ObstacleGroup(**{**good, **settings})
+
+
+def test_a_wall_may_reach_into_the_ground():
+    wall = ObstacleGroup("box", 1, [[1.0, 1.0], [0.1, 0.1], [0.8, 0.8]], poses=[[3.0, 0.0, 90.0]], bottom=[-0.6, -0.6])
+    field = ObstacleField(ObstaclesConfig({"wall": wall}), *poses(2, 1), EnvRandom(0, 2))
+    reset(field, torch.zeros(2, 2))
+    assert field.pos_w[:, 0].tolist() == [pytest.approx([3.0, 0.0, 0.2])] * 2  # 1 m of 1.6 m stands out
+    assert field.bottom_above_ground()[:, 0].tolist() == pytest.approx([-0.6] * 2)

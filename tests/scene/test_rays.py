@@ -56,7 +56,7 @@ def test_every_part_is_a_body_of_its_own(make_config):
     wall = shapes.shapes[shapes.geom_names.index("obstacle_wall_0")]
     assert shapes.bodies[wall.body] == world.model.body("obstacle_wall_0").id and wall.pos == (0.0, 0.0, 0.0)
     assert wall.class_id == HitClass.OBSTACLE
-    assert len(shapes.bodies) == 13 + 9  # base, four legs of three links, six walkers, three walls
+    assert len(shapes.bodies) == 13 + 15  # base, four legs of three links, six walkers, nine pieces of wall
 
 
 def test_unknown_excluded_geoms_are_named(world):
