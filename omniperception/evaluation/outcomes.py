@@ -122,6 +122,14 @@ class Episodes:
         return self.length_s[self.success] / self.free_time_s[self.success].clamp(min=1e-6)
 
     @property
+    def touched_impulse(self) -> torch.Tensor | None:
+        """(num_touched,) N s: impulse of the contacts in the trials with a touch; None where it was not measured.
+
+        Obstacles do not give way: between one and a wall forces have no bound, so that means say nothing.
+        """
+        return None if self.impulse is None else self.impulse[self.collided]
+
+    @property
     def touches_per_100_m(self) -> float:
         """Touches of all trials over the length of all ways."""
         return 100.0 * float(self.contacts.sum()) / max(float(self.path.sum()), 1e-6)
@@ -133,7 +141,7 @@ class Episodes:
             "success_means": "goal reached" if self.has_goal else "time limit reached",
             "rates": {name: rate(happened) for name, happened in self.happened().items()},
             "touches_per_100_m": self.touches_per_100_m,
-            "impulse_n_s": None if self.impulse is None else float(self.impulse.mean()),
+            "touched_impulse_n_s": quantiles(self.touched_impulse),
             "time_over_free_time": quantiles(self.time_ratio),
             "clearance_m": quantiles(self.clearance),
             "mean_length_s": float(self.length_s.mean()),

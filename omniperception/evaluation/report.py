@@ -17,7 +17,7 @@ COLUMNS = {
     "untouched": "reached, untouched, %",
     "success": "reached, %",
     "touches": "touches / 100 m",
-    "impulse": "impulse, N s",
+    "impulse": "impulse of a touched trial, N s",
     "time": "time / free time",
     "clearance": "least clearance, m",
     "fall": "falls, %",
@@ -81,12 +81,11 @@ def figures(seeds: Sequence[Episodes]) -> dict[str, str]:
     def share(name: str) -> str:
         return rate_cell([by_name[name] for by_name in happened]) if name in happened[0] else "–"
 
-    first = seeds[0]
     return {
         "untouched": share("untouched"),
         "success": share("success"),
         "touches": f"{_mean([episodes.touches_per_100_m for episodes in seeds]):.2f}",
-        "impulse": "–" if first.impulse is None else f"{_mean([float(e.impulse.mean()) for e in seeds]):.2f}",  # type: ignore[union-attr]
+        "impulse": _spread([episodes.touched_impulse for episodes in seeds], digits=0),
         "time": _spread([episodes.time_ratio for episodes in seeds]),
         "clearance": _spread([episodes.clearance for episodes in seeds]),
         **{name: share(name) for name in ("fall", "time_out", "diverged")},
@@ -105,10 +104,8 @@ def mean_figures(records: Sequence[Record]) -> list[str]:
         return f"{100 * _mean(rates):.1f}"
 
     touches = _mean([_mean([record.episodes.touches_per_100_m for record in here]) for here in by_world])
-    impulses = [r.episodes.impulse for r in records if r.episodes.impulse is not None]
-    impulse = f"{_mean([float(values.mean()) for values in impulses]):.2f}" if impulses else "–"
     rest = [mean(name) for name in ("fall", "time_out", "diverged")]
-    return [mean("untouched"), mean("success"), f"{touches:.2f}", impulse, "", "", *rest]
+    return [mean("untouched"), mean("success"), f"{touches:.2f}", "", "", "", *rest]
 
 
 def difference(ours: Sequence[Record], theirs: Sequence[Record]) -> str:
@@ -158,11 +155,11 @@ def times_line(summary: Mapping) -> str:
 _QUANTILES = {
     "time_over_free_time": "time over the free time",
     "clearance_m": "least clearance (m)",
+    "touched_impulse_n_s": "impulse of a touched trial (N s)",
     "energy_j": "energy (J)",
 }
 _MEANS = {
     "touches_per_100_m": "touches per 100 m",
-    "impulse_n_s": "impulse of contacts in a trial (N s)",
     "cost_of_transport": "cost of transport",
     "velocity_error_m_s": "velocity error (m/s)",
     "free_velocity_error_m_s": "velocity error, nothing near (m/s)",
@@ -179,8 +176,8 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else float("nan")
 
 
-def _spread(values: Sequence[torch.Tensor | None]) -> str:
+def _spread(values: Sequence[torch.Tensor | None], digits: int = 2) -> str:
     """Median with the 5 % to 95 % quantiles of all trials."""
     there = [value for value in values if value is not None]
     found = quantiles(torch.cat(there)) if there else None
-    return "–" if found is None else f"{found['median']:.2f} [{found['p05']:.2f}, {found['p95']:.2f}]"
+    return "–" if found is None else "{median:.{0}f} [{p05:.{0}f}, {p95:.{0}f}]".format(digits, **found)

@@ -100,7 +100,7 @@ def test_figures_by_hand():
     summary = episodes(clearance=torch.linspace(0, 0.7, 8)).summary()
     assert summary["time_over_free_time"]["median"] == 12.0 / 8.0  # of the three that arrived: 10, 12 and 14 s
     assert summary["touches_per_100_m"] == pytest.approx(100 * 6 / 40)  # six touches on eight ways of 5 m
-    assert summary["impulse_n_s"] == pytest.approx(2.0 * 6 / 8)
+    assert summary["touched_impulse_n_s"]["median"] == 4.0  # of 2, 4 and 6 N s
     assert summary["cost_of_transport"] == pytest.approx(300 / (150 * 5))
     assert summary["clearance_m"]["median"] == pytest.approx(0.35)
     assert episodes().summary()["clearance_m"] is None
