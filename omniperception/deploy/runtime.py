@@ -43,8 +43,9 @@ class ExportedPolicy:
     """The policy of one robot with its memory: proprioception, frames and the previous action.
 
     Call :meth:`step` once per `description.control_period_s`, with the points of a LiDAR frame whenever one is
-    complete, once per `description.lidar.period_s`. Points are in the sensor frame, in metres, in the order of their
-    measurement, without a correction for the robot's motion. Rows that are not finite or zero are misses.
+    complete, once per `description.lidar.period_s`; where one is lost, call :meth:`miss`. Points are in the sensor
+    frame, in metres, in the order of their measurement, without a correction for the robot's motion. Rows that are not
+    finite or zero are misses.
 
     Attributes:
         description: names, scales and rates.
@@ -139,6 +140,19 @@ class ExportedPolicy:
         frames[-1, : sampler.num_points] = sampler(points, attitude)
         if self._odometry is not None:
             frames[-1, -1] = self._odometry.since_last_frame()
+        self.frame_count = min(self.frame_count + 1, len(frames))
+
+    def miss(self) -> None:
+        """Repeats the last frame in the history, with no motion of the base, where one was due and did not come.
+
+        Training does the same (`randomization.frames_lost`); the motion of the next frame spans both periods.
+        """
+        frames = self._perception()[2]
+        if not self.frame_count:
+            return
+        frames[:-1] = frames[1:]
+        if self._odometry is not None:
+            frames[-1, -1] = 0.0
         self.frame_count = min(self.frame_count + 1, len(frames))
 
     def step(self, state: RobotState, command: ArrayLike, points: np.ndarray | None = None) -> np.ndarray:

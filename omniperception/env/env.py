@@ -71,7 +71,7 @@ class OmniEnv(VecEnv):
         streams = TrialRandom if config.trials else EnvRandom
         self.random: EnvRandom = streams(config.seed, self.num_envs, self.device)
         self.command = config.commands.build(self.num_envs, self.device, self.random)
-        self.randomizer = Randomizer(config.randomization, self.sim, self.random)
+        self.randomizer = Randomizer(config.randomization, self.sim, self.random.branch("randomization"))
         self.ground, self.terrain_levels, lookup = build_ground(config, self.sim, self.random)
         self.obstacles = build_obstacles(config, self.sim, self.random, self.ground)
         self.avoidance = build_avoidance(config, self.obstacles, self.device)

@@ -42,15 +42,18 @@ class ExportedPolicies:
         return torch.from_numpy(np.stack([robot.action for robot in self.robots])).to(env.device)
 
     def _new_clouds(self) -> list[np.ndarray | None]:
-        """Points of the frame that has just been cast; None without one, or where the episode has just begun."""
+        """Points of the frame that has just come; None without one, or where the episode has just begun."""
         env = self._env
         if self.robots[0].frames is None or env.sensing is None or env.sensing.tick == self._tick:
             return [None] * env.num_envs
         self._tick = env.sensing.tick
         frame = env.sensing.frame
         assert frame is not None  # it has ticked
-        clouds = raw_points(frame)
-        return [cloud if count else None for cloud, count in zip(clouds, env.sensing.frame_count, strict=True)]
+        for robot, came in zip(self.robots, env.sensing.fresh.tolist(), strict=True):
+            if not came:
+                robot.miss()
+        new = (env.sensing.fresh & (env.sensing.frame_count[:, 0] > 0)).tolist()
+        return [cloud if is_new else None for cloud, is_new in zip(raw_points(frame), new, strict=True)]
 
 
 def robot_states(env: OmniEnv) -> list[RobotState]:

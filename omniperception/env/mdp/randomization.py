@@ -255,6 +255,7 @@ class Randomizer:
         """Draws new parameters for some environments (n,)."""
         if not self._shapes:
             return
+        self._random.start_episode(env_ids)
         drawn = self._draw(env_ids)
         if "ground_friction" in drawn:
             self._write("geom_friction", env_ids, drawn["ground_friction"], self._ground, 0)
