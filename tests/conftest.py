@@ -43,10 +43,10 @@ def one_thread(request):
 
 INTEGRATION = (
     *("benchmarks", "evaluation", "learning/test_runner.py", "test_*.py"),
-    *(f"env/test_{name}.py" for name in ("devices", "isolation", "joint_order", "sensing")),
+    *(f"env/test_{name}.py" for name in ("devices", "frame_delivery", "isolation", "joint_order", "sensing")),
 )
 """Tests of whole runs and commands, which `make test-fast` leaves out; of the top folder all but UNITS."""
-UNITS = ("test_cli.py", "test_config.py")
+UNITS = ("test_cli.py", "test_conditions.py", "test_config.py")
 
 
 def pytest_collection_modifyitems(items):

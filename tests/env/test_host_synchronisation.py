@@ -14,7 +14,7 @@ PACKAGE = Path(omniperception.__file__).parent
 NEEDS_HOST = {"nonzero", "_local_scalar_dense", "is_nonzero", "equal", "bincount", "masked_select", "_unique2"}
 """Operators whose result has a size, or is a number, that the host has to know."""
 BY_MASK = {"index", "index_put", "index_put_", "_index_put_impl_"}
-ON_WARP = ("sim=mujoco_warp", "sim.device=cpu", "randomization=paper")
+ON_WARP = ("sim=mujoco_warp", "sim.device=cpu")
 
 
 class Synchronisations(TorchDispatchMode):
@@ -36,8 +36,9 @@ class Synchronisations(TorchDispatchMode):
 @pytest.mark.parametrize(
     ("overrides", "times"),
     [
-        (("experiment=walk",), 2),
-        (("experiment=avoid", "terrain=mixed", "lidar.num_rays=100"), 3),
+        (("experiment=walk", "randomization=paper"), 2),
+        (("experiment=avoid", "terrain=mixed", "lidar.num_rays=100", "randomization=paper"), 3),
+        (("experiment=avoid", "terrain=flat", "lidar.num_rays=100", "randomization=robot"), 3),
     ],
 )
 def test_a_step_counts_environments_and_nothing_else(make_env, overrides, times):

@@ -10,7 +10,12 @@ from omniperception.learning import TrainingDiverged, load_checkpoint, save_chec
 from omniperception.sim import Failure
 
 TERRAIN = ("terrain=mixed", "terrain.curriculum.start_level=9", "randomization=paper", "obstacles=moving")
-TASKS = {**{name: (*FULL, *sim) for name, sim in SIMS.items()}, "terrain": TERRAIN}
+ROBOT = (
+    *("experiment=avoid", "terrain=flat", "obstacles=crowd", "obstacles.curriculum=null", "randomization=robot"),
+    *("randomization.frames_lost=0.4", "randomization.pushes.every_s=[0.02,0.1]"),
+    *("lidar.num_rays=200", "lidar.selection=every_kth", "lidar.period_s=0.04"),
+)
+TASKS = {**{name: (*FULL, *sim) for name, sim in SIMS.items()}, "terrain": TERRAIN, "robot": ROBOT}
 
 
 @pytest.mark.parametrize("task", TASKS)

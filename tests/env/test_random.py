@@ -73,3 +73,41 @@ def test_an_episode_draws_the_same_whatever_was_drawn_before():
     second = idle.uniform(everyone(4), (5,))
     assert torch.equal(busy.uniform(everyone(4), (5,)), second)
     assert not torch.equal(second[1], first[1])  # another episode, another scene
+
+
+class TestBranches:
+    def test_drawing_from_one_changes_no_other(self):
+        busy, idle = EnvRandom(1, 4), EnvRandom(1, 4)
+        branches = [(random.branch("a"), random.branch("b")) for random in (busy, idle)]
+        for random, (a, b) in zip((busy, idle), branches, strict=True):
+            for stream in (random, a, b):
+                stream.start_episode(everyone(4))
+        branches[0][0].uniform(everyone(4), (9,))
+        assert torch.equal(busy.uniform(everyone(4), (5,)), idle.uniform(everyone(4), (5,)))
+        first = branches[1][1].uniform(everyone(4), (500,))
+        assert torch.equal(branches[0][1].uniform(everyone(4), (500,)), first)
+        others = (EnvRandom(1, 4).uniform(everyone(4), (500,)), EnvRandom(1, 4).branch("a").uniform(everyone(4), (500,)))
+        assert all((first == other).float().mean() < 0.01 for other in others)
+
+    def test_an_episode_follows_from_the_trunks(self):
+        """Also where the trunk takes up a stream that another environment has had before."""
+        trunk, other = EnvRandom(2, 3), EnvRandom(2, 3)
+        branch, again = trunk.branch("a"), other.branch("a")
+        first = branch.uniform(torch.tensor([2]), (6,))
+        again.uniform(everyone(3), (2,))
+        other._key[0], other.counter[0] = other._key[2], 0
+        again.start_episode(torch.tensor([0]))
+        assert torch.equal(again.uniform(torch.tensor([0]), (6,)), first)
+
+    def test_a_saved_state_goes_on(self):
+        def make():
+            random = EnvRandom(4, 3)
+            return random, random.branch("a")
+
+        (whole, branch), (resumed, later) = make(), make()
+        whole.start_episode(torch.tensor([1]))
+        branch.start_episode(torch.tensor([1]))
+        branch.uniform(torch.tensor([0, 1]), (3,))
+        resumed.load_state_dict(whole.state_dict())
+        assert torch.equal(branch.uniform(everyone(3), (4,)), later.uniform(everyone(3), (4,)))
+        assert torch.equal(whole.uniform(everyone(3), (4,)), resumed.uniform(everyone(3), (4,)))
