@@ -91,7 +91,8 @@ def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
-            given = [*(str(o.input_line) for o in chosen), *as_override(folders)]
+            named = [o for o in chosen if not _chooses_none(o)]
+            given = [*(str(o.input_line) for o in named), *as_override(folders)]
             config = hydra_compose("config", given, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(one_line(error)) from None
@@ -133,13 +134,13 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
         group = override.key_or_group
         if group == "experiment" or override.is_hydra_override():
             raise ConfigError(f"{override.input_line}: a run keeps its {group}; override the groups that should differ")
-        if group == "condition" and override.value() is None:
-            config["condition"] = None
+        if _chooses_none(override):
+            config.pop(group, None)
             continue
         for key in {"scenario": FIXED_BY_SCENARIO, "condition": FIXED_BY_CONDITION}.get(group, (group,)):
             config[key] = fresh[key]
-    if config.get("condition") and any(_group_of(override) == "randomization" for override in parsed):
-        config["condition"] = None
+    if any(_group_of(override) == "randomization" for override in parsed):
+        config.pop("condition", None)
     OmegaConf.set_struct(config, True)
     apply(config, values)
     _check_keys(config)
@@ -247,10 +248,15 @@ def _group_of(override: Override) -> str:
     return override.key_or_group.partition(".")[0]
 
 
+def _chooses_none(override: Override) -> bool:
+    """Tell whether an override leaves an optional group out."""
+    return override.value() is None and override.key_or_group in OPTIONAL_GROUPS
+
+
 def _check_preset(override: Override, known: Sequence[str]) -> None:
     """Refuses a preset that does not exist."""
     value, group = override.value(), override.key_or_group
-    if value is None and group in OPTIONAL_GROUPS:
+    if _chooses_none(override):
         return
     for name in value if isinstance(value, list) and value else [value]:
         if override.is_delete() or not isinstance(name, str):

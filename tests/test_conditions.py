@@ -93,8 +93,8 @@ def test_its_values_are_those_of_its_version(make_config, name):
     )
 
 
-@pytest.mark.parametrize("recipe", config.presets("experiment"))
-@pytest.mark.parametrize("scenario", config.presets("scenario")[:3])
+@pytest.mark.parametrize("recipe", ["quickstart", "paper"])
+@pytest.mark.parametrize("scenario", ["corridor", "rod"])
 def test_it_wins_over_recipe_and_scenario(make_config, recipe, scenario):
     run = make_config(f"experiment={recipe}", "init=unread", f"scenario={scenario}", "condition=robot")
     assert values(run.env.randomization) == ROBOT
@@ -111,7 +111,10 @@ def test_no_scenario_chooses_the_randomization(make_config):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["condition=robot", "randomization=none"], "condition=robot fixes the randomization; leave randomization=none"),
+        (
+            ["condition=robot", "randomization=none"],
+            "condition=robot fixes the randomization; leave randomization=none",
+        ),
         (["condition=ideal", "randomization.frames_lost=0.1"], "condition=ideal fixes the randomization"),
         (["condition=robot", "condition.version=2"], "condition.version=2: a condition is chosen as a whole"),
         (["condition=rob"], "condition=rob is unknown; did you mean robot?"),
@@ -165,7 +168,7 @@ def test_a_trial_is_the_same_scene_in_every_condition(make_env):
         seen = []
         for _ in range(2):
             field = env.obstacles
-            seen += [env.sim.qpos[:, :7].clone(), env.command.goal_w.clone(), field.pos_w.clone()]
+            seen += [env.sim.qpos[:, :7].clone(), env.command.goal_w.clone(), field.pos_w.clone(), field.size.clone()]
             for _ in range(3):
                 env.step(0.1 * env.observations["privileged"].new_ones(3, 12))
             env.episode_length_buf[:] = env.max_episode_length
@@ -173,4 +176,4 @@ def test_a_trial_is_the_same_scene_in_every_condition(make_env):
         scenes.append(seen)
     for other in scenes[1:]:
         assert all((a == b).all() for a, b in zip(scenes[0], other, strict=True))
-    assert not (scenes[0][0] == scenes[0][3]).all()
+    assert not (scenes[0][0] == scenes[0][4]).all()

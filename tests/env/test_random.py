@@ -86,7 +86,10 @@ class TestBranches:
         assert torch.equal(busy.uniform(everyone(4), (5,)), idle.uniform(everyone(4), (5,)))
         first = branches[1][1].uniform(everyone(4), (500,))
         assert torch.equal(branches[0][1].uniform(everyone(4), (500,)), first)
-        others = (EnvRandom(1, 4).uniform(everyone(4), (500,)), EnvRandom(1, 4).branch("a").uniform(everyone(4), (500,)))
+        others = (
+            EnvRandom(1, 4).uniform(everyone(4), (500,)),
+            EnvRandom(1, 4).branch("a").uniform(everyone(4), (500,)),
+        )
         assert all((first == other).float().mean() < 0.01 for other in others)
 
     def test_an_episode_follows_from_the_trunks(self):
