@@ -240,7 +240,7 @@ def _check_condition(condition: Override | None, overrides: Sequence[Override]) 
             raise ConfigError(f"{override.input_line}: a condition is chosen as a whole, such as condition=robot")
         if fixed_by and _group_of(override) == "randomization":
             given = override.input_line
-            raise ConfigError(f"condition={fixed_by} fixes the randomization; leave {given} out, or condition")
+            raise ConfigError(f"condition={fixed_by} fixes the randomization; use condition=null or leave {given} out")
 
 
 def _group_of(override: Override) -> str:

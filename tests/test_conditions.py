@@ -113,7 +113,7 @@ def test_no_scenario_chooses_the_randomization(make_config):
     [
         (
             ["condition=robot", "randomization=none"],
-            "condition=robot fixes the randomization; leave randomization=none",
+            "condition=robot fixes the randomization; use condition=null",
         ),
         (["condition=ideal", "randomization.frames_lost=0.1"], "condition=ideal fixes the randomization"),
         (["condition=robot", "condition.version=2"], "condition.version=2: a condition is chosen as a whole"),

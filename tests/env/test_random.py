@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from omniperception.common.random import EnvRandom
+from omniperception.common.random import EnvRandom, TrialRandom
 
 
 def everyone(n):
@@ -92,15 +92,17 @@ class TestBranches:
         )
         assert all((first == other).float().mean() < 0.01 for other in others)
 
-    def test_an_episode_follows_from_the_trunks(self):
-        """Also where the trunk takes up a stream that another environment has had before."""
-        trunk, other = EnvRandom(2, 3), EnvRandom(2, 3)
-        branch, again = trunk.branch("a"), other.branch("a")
-        first = branch.uniform(torch.tensor([2]), (6,))
-        again.uniform(everyone(3), (2,))
-        other._key[0], other.counter[0] = other._key[2], 0
-        again.start_episode(torch.tensor([0]))
-        assert torch.equal(again.uniform(torch.tensor([0]), (6,)), first)
+    def test_a_trial_draws_the_same_whoever_runs_it(self):
+        """The third trial: begun by the third of five environments, or by the second of two after other trials."""
+        many, few = TrialRandom(2, 5), TrialRandom(2, 2)
+        expected, branch = many.branch("a"), few.branch("a")
+        for random in (many, expected):
+            random.start_episode(everyone(5))
+        for env_ids in (everyone(2), torch.tensor([1])):
+            for random in (few, branch):
+                random.start_episode(env_ids)
+            got = branch.uniform(torch.tensor([1]), (6,))
+        assert torch.equal(expected.uniform(torch.tensor([2]), (6,)), got)
 
     def test_a_saved_state_goes_on(self):
         def make():
