@@ -36,6 +36,8 @@ DEFINED_BY_SCENARIO = ("obstacles", "commands")
 """Groups that a scenario writes out in full, so that another preset would be mixed with it."""
 OPTIONAL_GROUPS = ("experiment", "scenario", "condition")
 """Groups of which none may be chosen."""
+SUITES = "suite"
+"""Folder of lists of scenarios, which evaluate reads; no group of a configuration."""
 _EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
 
 
@@ -150,7 +152,8 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
 
 def _keys() -> set[str]:
     """Keys at the top of a command line."""
-    return {"seed", "num_envs", "init", *(path.name for path in CONFIG_DIR.iterdir() if path.is_dir())}
+    groups = {path.name for path in CONFIG_DIR.iterdir() if path.is_dir()} - {SUITES}
+    return {"seed", "num_envs", "init", *groups}
 
 
 def _check_keys(config: DictConfig) -> None:
@@ -216,7 +219,7 @@ def _split(overrides: Sequence[Override], folders: Sequence[Path]) -> tuple[list
     values: list[Override] = []
     for override in overrides:
         group = override.key_or_group
-        if presets(group, folders):
+        if group != SUITES and presets(group, folders):
             _check_preset(override, presets(group, folders))
             chosen.append(override)
         elif group != "hydra.searchpath":

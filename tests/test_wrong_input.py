@@ -125,6 +125,7 @@ LINES = [
     ("train robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),
     ("train robot.mounts.head.exclude_geoms=[nose]", "nose"),
     ("train init=nowhere", "init=nowhere"),
+    ("train suite=held_out", "suite=held_out is unknown"),
     ("train experiment=gait", "init=<run of experiment=walk> does not exist; give a run directory or init=latest"),
     ("train experiment=walk ppo.num_learning_epochs=0", "ppo.num_learning_epochs=0 keeps the policy as it is"),
     ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape,weight:1.0}", "has shape (3, 5), expected (2,)"),

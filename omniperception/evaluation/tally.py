@@ -69,7 +69,8 @@ class Tally:
         if isinstance(commands, GoalCommandConfig) and goal is not None:
             way = goal[fresh] - self._env.state.kinematics.base_pos_w[fresh, :2]
             straight = way[:, 0] if commands.radius is None else way.norm(dim=1) - commands.radius
-            self._free_time[self._trial[fresh]] = straight.double().clamp(min=0.0) / commands.speed
+            free = (straight.double() / commands.speed).clamp(min=commands.hold_s)
+            self._free_time[self._trial[fresh]] = free
 
     def record(self) -> None:
         """Takes in the control step that has just been done, before finished environments are reset."""

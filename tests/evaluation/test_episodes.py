@@ -1,5 +1,6 @@
 """What is recorded of trials, on the real environment."""
 
+import pytest
 import torch
 
 from omniperception.evaluation import run_episodes
@@ -56,6 +57,19 @@ def test_goals_are_successes_of_goal_commands(make_env):
     episodes = run_episodes(env, stand, 2)
     assert episodes.has_goal and episodes.ended("goal").all() and episodes.success.all()
     assert episodes.summary()["rates"]["success"]["count"] == 2
+
+
+def test_the_free_time_is_that_of_the_straight_way(make_env):
+    """To the goal's edge at the commanded speed: 10 - 0.5 m, or 12 m to a line; and no less than it has to be held."""
+    spawn = ("commands.spawn.x=[0,0]", "commands.spawn.y=[3,3]", "commands.speed=0.5")
+    for commands, goal, expected in (
+        (("commands=goal", "commands.radius=0.5"), (6.0, -5.0), 19.0),  # 6 m ahead, 8 m aside
+        (("commands=goal", "commands.radius=null"), (12.0, 0.0), 24.0),
+        (("commands=goal", "commands.radius=0.5", "commands.hold_s=20.0"), (6.0, -5.0), 20.0),
+    ):
+        at = tuple(f"commands.goal_{axis}=[{x},{x}]" for axis, x in zip("xy", goal, strict=True))
+        episodes = run_episodes(make_env(*BLIND, *commands, *spawn, *at, SHORT, "num_envs=2"), stand, 3)
+        assert episodes.free_time_s.tolist() == pytest.approx([expected] * 3, abs=1e-5)
 
 
 def test_stage_times_survive_the_reports_of_the_log(make_env):
