@@ -17,12 +17,13 @@ UNTOUCHED, TOUCHED, FAILED = "#1b7f4d", "#d62728", "#3b6fb6"
 """Colours of ways: reached and untouched; touched, wherever they end; neither touched nor at the goal."""
 SHOWN = 25
 """Ways drawn of each world, the first ones."""
-COLUMNS = 2
 OVERHEAD = 0.45
 """Obstacles whose lower edge is higher (m) are drawn as outlines: the robot passes below."""
 _MARGIN = 0.6
-_PANEL = 6.2
+_PANEL = 4.6
 """Width of a panel (inches)."""
+_SHAPES = 0.36, 0.75
+"""Least and greatest height of a panel over its width."""
 
 
 def draw_worlds(path: Path, records: Sequence[Record]) -> None:
@@ -32,22 +33,40 @@ def draw_worlds(path: Path, records: Sequence[Record]) -> None:
         path: the picture.
         records: with tracks.
     """
-    bounds = [_bounds(_tracks(record)) for record in records]
-    rows = math.ceil(len(records) / COLUMNS)
-    shapes = [(high_y - low_y) / (high_x - low_x) for low_x, high_x, low_y, high_y in bounds]
-    heights = [max(shapes[row * COLUMNS : (row + 1) * COLUMNS]) for row in range(rows)]
-    figure = new_figure(COLUMNS * _PANEL, sum(_PANEL * height + 0.55 for height in heights) + 0.7)
-    axes = figure.subplots(rows, COLUMNS, squeeze=False, gridspec_kw={"height_ratios": heights}).flatten()
-    for axis, record, area in zip(axes, records, bounds, strict=False):
-        _draw(axis, record)
-        axis.set(xlim=area[:2], ylim=area[2:])
-    for axis in axes[len(records) :]:
-        axis.set_axis_off()
-    first = records[0]
-    title = f"{first.policy} of {first.run}, split {first.split}, condition {first.condition}"
-    figure.suptitle(title, fontsize=11)
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=5, fontsize=9, frameon=False)
+    columns = min(len(records), 2 if len(records) <= 10 else 4)
+    rows = [records[k : k + columns] for k in range(0, len(records), columns)]
+    areas = [_same_shape([_bounds(_tracks(record)) for record in row]) for row in rows]
+    heights = [(row[0][3] - row[0][2]) / (row[0][1] - row[0][0]) for row in areas]
+    figure = new_figure(columns * _PANEL, sum(_PANEL * height + 0.35 for height in heights) + 0.9)
+    axes = figure.subplots(len(rows), columns, squeeze=False, gridspec_kw={"height_ratios": heights})
+    for row_axes, row, row_areas in zip(axes, rows, areas, strict=True):
+        for axis in row_axes[len(row) :]:
+            axis.set_axis_off()
+        for axis, record, area in zip(row_axes, row, row_areas, strict=False):
+            _draw(axis, record)
+            axis.set(xlim=area[:2], ylim=area[2:])
+    for axis in axes[-1]:
+        axis.set_xlabel("x (m)", fontsize=8)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y (m)", fontsize=8)
+    first, ways = records[0], min(SHOWN, max(len(record.episodes) for record in records))
+    what = f"{first.policy} of {first.run}, split {first.split}, condition {first.condition}"
+    key = "thick: the first trial, obstacles where they were at its start (dashed: moving)"
+    figure.suptitle(f"{what}\n{key}; thin: {ways - 1} more", fontsize=9)
+    figure.legend(handles=_legend(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
+
+
+def _same_shape(areas: Sequence[tuple[float, ...]]) -> list[tuple[float, float, float, float]]:
+    """Areas (low x, high x, low y, high y) grown to one ratio of height to width, within _SHAPES."""
+    ratio = max((high_y - low_y) / (high_x - low_x) for low_x, high_x, low_y, high_y in areas)
+    ratio = min(max(ratio, _SHAPES[0]), _SHAPES[1])
+    grown = []
+    for low_x, high_x, low_y, high_y in areas:
+        wide, high = high_x - low_x, high_y - low_y
+        more_x, more_y = max(high / ratio - wide, 0.0) / 2, max(wide * ratio - high, 0.0) / 2
+        grown.append((low_x - more_x, high_x + more_x, low_y - more_y, high_y + more_y))
+    return grown
 
 
 def _draw(axis, record: Record) -> None:
@@ -62,7 +81,7 @@ def _draw(axis, record: Record) -> None:
         for touched, clean in zip(episodes.collided.tolist(), episodes.clean.tolist(), strict=True)
     ]
     ways = [way.numpy() for way in tracks.xy[:SHOWN]]
-    axis.add_collection(LineCollection(ways[1:], colors=colours[1 : len(ways)], linewidths=0.6, alpha=0.4))
+    axis.add_collection(LineCollection(ways[1:], colors=colours[1 : len(ways)], linewidths=0.8, alpha=0.45))
     axis.plot(ways[0][:, 0], ways[0][:, 1], color=colours[0], linewidth=2.2)
     axis.plot(*ways[0][0].tolist(), "o", color="black", markersize=4)
     axis.plot(*tracks.contact[0].tolist(), "x", color="black", markersize=7, markeredgewidth=1.6)
@@ -97,12 +116,7 @@ def _legend() -> list:
     ways = ((UNTOUCHED, "reached, untouched"), (TOUCHED, "touched"), (FAILED, "untouched, not reached"))
     lines = [Line2D([], [], color=colour, label=label) for colour, label in ways]
     marks = (("x", "first touch"), ("*", "goal"))
-    thick = f"thick: the first trial, with its obstacles at its start (dashed: moving); thin: {SHOWN - 1} more"
-    return [
-        *lines,
-        *(Line2D([], [], color="black", marker=mark, linestyle="", label=label) for mark, label in marks),
-        Line2D([], [], color="none", label=thick),
-    ]
+    return [*lines, *(Line2D([], [], color="black", marker=mark, linestyle="", label=label) for mark, label in marks)]
 
 
 def _tracks(record: Record) -> Tracks:

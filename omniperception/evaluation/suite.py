@@ -384,12 +384,13 @@ def note(log: Path, record: Record) -> None:
 
 
 def _draw(tasks: Sequence[Task], records: Sequence[Record]) -> None:
-    """A picture of each policy of each run: all worlds from above."""
-    panels: dict[Path, list[Record]] = {}
+    """A picture of each policy of each run: all worlds from above, each on the first of its terrains."""
+    panels: dict[Path, dict[str, Record]] = {}
     for task, record in zip(tasks, records, strict=True):
-        tracks = Tracks.load(task.path.with_suffix(".npz"))
         path = task.run_dir / FOLDER / f"{record.split}-{record.condition}-{record.policy}.png"
-        panels.setdefault(path, []).append(replace(record, episodes=replace(record.episodes, tracks=tracks)))
-    for path, shown_records in panels.items():
-        draw_worlds(path, shown_records)
+        if record.world not in panels.setdefault(path, {}):
+            tracks = Tracks.load(task.path.with_suffix(".npz"))
+            panels[path][record.world] = replace(record, episodes=replace(record.episodes, tracks=tracks))
+    for path, worlds in panels.items():
+        draw_worlds(path, list(worlds.values()))
         print(f"wrote {path}")
