@@ -8,6 +8,7 @@ from omniperception.build import build_runner
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
 from omniperception.lidar import DEVICES
+from omniperception.scene.tiled_terrain import TiledTerrainConfig
 
 PRESETS = sorted(
     str(path.relative_to(config.CONFIG_DIR).with_suffix(""))
@@ -88,6 +89,7 @@ class TestPaper:
         assert run.env.rewards.avoidance.threshold == 1.0
         assert run.env.randomization.gravity_offset == (-1.0, 1.0)
         assert run.env.randomization.noise and run.env.observations.actor == ("proprioception", "command")
+        assert isinstance(run.env.terrain, TiledTerrainConfig)  # on a plane the supervision is one number
 
 
 def test_default_rates(make_config):
