@@ -228,9 +228,11 @@ class Task:
             **facts,
         }
         record = Record(**named, facts=settings, episodes=replace(episodes, tracks=None))
-        write(self.path, [record])
+        ways = self.path.with_suffix(".npz")
+        ways.unlink(missing_ok=True)  # those of an earlier measurement
         if episodes.tracks is not None:
-            episodes.tracks.save(self.path.with_suffix(".npz"))
+            episodes.tracks.save(ways)
+        write(self.path, [record])
         return record
 
     def assembled(self) -> RunConfig:

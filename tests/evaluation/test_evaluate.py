@@ -111,11 +111,14 @@ def test_the_same_command_goes_on_where_it_was(walker, monkeypatch, capsys):
     assert outcomes(evaluate(given)) == outcomes(records) and len(measured) == 3
     assert "2 of 2 measured before and kept" in capsys.readouterr().out
     evaluate(evaluation(walker, "aerial", trials=2))  # something else is measured
-    evaluate(evaluation(walker, "aerial", trials=2, again=True))
+    evaluate(evaluation(walker, "aerial", trials=2, again=True, plots=True))
+    assert len(measured) == 5
+    evaluate(evaluation(walker, "aerial", trials=2))
+    evaluate(evaluation(walker, "aerial", trials=2, plots=True))  # its ways are there
     assert len(measured) == 5
     monkeypatch.setattr(suite, "provenance", lambda device: {**records[0].facts, "commit": "another"})
     evaluate(evaluation(walker, "aerial", trials=2))  # by other code
-    assert len(measured) == 6
+    assert len(measured) == 6 and not list((walker / "evaluation").glob("*-aerial-*.npz"))
 
 
 def test_seeds_of_reported_evaluations_follow_from_the_weights(walker):

@@ -136,6 +136,20 @@ class TestMeasures:
             assert episodes.path[i].item() == pytest.approx(path.item(), rel=1e-4)
         assert episodes.weight == pytest.approx(15.2 * 9.81, rel=0.03)  # the Go2 weighs about 15 kg
 
+    def test_scenes_show_obstacles_in_the_sizes_of_their_trial(self, make_env):
+        """Those that the physics has, by environment; what has not been placed is not there."""
+        env = make_env(*BLIND, "scenario=static", SHORT, "num_envs=3")
+        ids = [env.world.model.geom(part.name).id for part in env.obstacles.parts]
+        sizes = env.sim.model_field("geom_size")[:, ids].float().clone()
+        tracks = run_episodes(env, stand, 3, keep_tracks=True).tracks
+        parts = tracks.parts
+        there = ~parts[..., 0].isnan()
+        box = torch.tensor(["crate" in part.name for part in env.obstacles.parts]).expand_as(there)
+        assert there.sum() >= 9 and (parts[..., 3][there].unique().numel()) == there.sum()  # all of other sizes
+        torch.testing.assert_close(parts[..., 3][there], sizes[..., 0][there])
+        torch.testing.assert_close(parts[..., 4][there & box], sizes[..., 1][there & box])
+        assert (parts[..., 4][there & ~box] < 0).all()  # round
+
     def test_tracks_end_where_the_episode_ends(self, make_env):
         env = make_env(*BLIND, "scenario=abs_hard", SHORT, "num_envs=2")
         ends = []
