@@ -13,18 +13,18 @@ def rotate_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
 
 
 def rotate(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    """Expresses in the world a vector (n, 3) given in the frame whose orientation in the world is `quat` (n, 4)."""
-    w, q = quat[:, :1], quat[:, 1:]
+    """Expresses in the world a vector (..., 3) given in the frame whose orientation in the world is `quat` (..., 4)."""
+    w, q = quat[..., :1], quat[..., 1:]
     t = 2.0 * torch.linalg.cross(q, vec)
     return vec + w * t + torch.linalg.cross(q, t)
 
 
 def multiply(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Quaternions (n, 4) of the rotations by `second` and then by `first`, each (n, 4)."""
-    w, q = first[:, :1], first[:, 1:]
-    v, r = second[:, :1], second[:, 1:]
-    real = w * v - (q * r).sum(1, keepdim=True)
-    return torch.cat((real, w * r + v * q + torch.linalg.cross(q, r)), 1)
+    """Quaternions (..., 4) of the rotations by `second` and then by `first`, each (..., 4)."""
+    w, q = first[..., :1], first[..., 1:]
+    v, r = second[..., :1], second[..., 1:]
+    real = w * v - (q * r).sum(-1, keepdim=True)
+    return torch.cat((real, w * r + v * q + torch.linalg.cross(q, r)), -1)
 
 
 def yaw_of(quat: torch.Tensor) -> torch.Tensor:
@@ -34,7 +34,7 @@ def yaw_of(quat: torch.Tensor) -> torch.Tensor:
 
 
 def yaw_quat(yaw: torch.Tensor) -> torch.Tensor:
-    """Quaternion (n, 4) of a rotation by `yaw` (n,) about the vertical."""
+    """Quaternion (..., 4) of a rotation by `yaw` (...) about the vertical."""
     zero = torch.zeros_like(yaw)
     return torch.stack(((yaw / 2).cos(), zero, zero, (yaw / 2).sin()), -1)
 
@@ -48,7 +48,7 @@ def rotate_yaw(yaw: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
 
 
 def matrix_of(quat: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices (n, 3, 3) of quaternions (n, 4): from the body's frame to the one it is given in."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4): from the body's frame to the one it is given in."""
     w, x, y, z = quat.unbind(-1)
     rows = (
         *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),

@@ -9,10 +9,22 @@ from typing import TYPE_CHECKING
 import torch
 
 from omniperception.common.random import EnvRandom
-from omniperception.scene.obstacle_motion import bounce, passing_velocity, wrap
+from omniperception.common.rotations import yaw_quat
+from omniperception.scene.articulation import Articulation, tilt_of
+from omniperception.scene.obstacle_group import COMPOUND
+from omniperception.scene.obstacle_motion import Wander, bounce, passing_velocity, wrap
 from omniperception.scene.obstacles import ObstaclesConfig
-from omniperception.scene.parts import PartShapes
-from omniperception.scene.placement import bent_path, choose_apart, distance_to_path, push_off, unit
+from omniperception.scene.part_shapes import PartShapes, SizeRanges, footprint_radius, reach
+from omniperception.scene.placement import (
+    Poses,
+    Presence,
+    bent_path,
+    choose_apart,
+    distance_to_path,
+    push_off,
+    unit,
+    within,
+)
 
 if TYPE_CHECKING:
     from omniperception.scene.ground import Ground
@@ -26,22 +38,29 @@ _CANDIDATES = 48
 
 
 class ObstacleField:
-    """Places and moves the obstacles of all environments; P is the number of their parts.
+    """Places and moves the O obstacles of all environments, and their P parts.
+
+    Where every obstacle is its own only part, what is known of obstacles is the very memory of what is known of parts.
 
     Attributes:
         parts: the parts, in the order of the kinematic bodies.
-        pos_w: (num_envs, P, 3) m, environment frame; the simulator's own kinematic positions, whose precision
-            everything here has.
+        pos_w: (num_envs, P, 3) m, environment frame, middles of the parts; the simulator's own kinematic positions,
+            whose precision everything here has.
         quat_w: (num_envs, P, 4); the simulator's own kinematic orientations.
-        velocity_w: (num_envs, P, 2) m/s.
+        velocity_w: (num_envs, P, 2) m/s, of the middles.
         active: (num_envs, P) bool: whether a part takes part in the current episode.
-        size: (num_envs, P, 3) m, in MuJoCo's order, padded with 0; drawn at every reset.
+        size: (num_envs, P, 3) m, in MuJoCo's order, padded with 0; drawn at every reset. A mesh's is its box's.
         outline: (num_envs, P, 2) m: half x and half y of the rectangle seen from above, about `yaw`; radius and -1 of
             a circle.
         radius: (num_envs, P) m, of the circle around the outline.
         half_height: (num_envs, P) m.
         free: index of the parts that have no fixed pose.
-        approaches: (P,) bool: which obstacles come at the robot.
+        articulation: how parts belong to their obstacles; None where every obstacle is its own only part.
+        root_pos_w: (num_envs, O, 3) m, where the obstacles are: the parts' middles without an articulation.
+        root_velocity_w: (num_envs, O, 2) m/s.
+        root_active: (num_envs, O) bool.
+        root_radius: (num_envs, O) m, of the circle around all that an obstacle covers, however it swings.
+        approaches: (O,) bool: which obstacles come at the robot.
         any_approaches: whether some do, and `restart_approaching` has to be called.
         varying: indices of the parts whose sizes differ between environments.
         level: share of obstacles and of their speed that the curriculum lets in, 0 to 1; fixed ones are always there.
@@ -55,18 +74,22 @@ class ObstacleField:
         random: EnvRandom,
         ground: Ground | None = None,
     ) -> None:
-        """`ground` is what they stand on and move over, at the height below their centres; None: a plane at 0."""
+        """`ground` is what they stand on and move over, at the height below their roots; None: a plane at 0."""
         self.config, self._ground = config, ground
         self.pos_w, self.quat_w = pos_w, quat_w
         self._random = random
         self.parts, obstacles, device = config.parts(), config.obstacles(), pos_w.device
-        self._dtype = pos_w.dtype
+        self._dtype, n, count = pos_w.dtype, len(pos_w), len(obstacles)
 
         def column(*values: float | Sequence[float]) -> torch.Tensor:
             return torch.tensor(values, dtype=self._dtype, device=device)
 
+        def flags(values: list[bool]) -> torch.Tensor:
+            return torch.tensor(values, dtype=torch.bool, device=device)
+
         groups = [obstacle.group for obstacle in obstacles]
-        self._shapes = PartShapes(self.parts, self._dtype, device)
+        self._ranges = SizeRanges(self.parts, self._dtype, device)
+        self._shapes = PartShapes([part.kind for part in self.parts], self._dtype, device)
         self.varying = tuple(k for k, part in enumerate(self.parts) if part.varies)
         self._speed = column(*(group.speed for group in groups))
         self._bottom = column(*(group.bottom for group in groups))
@@ -74,36 +97,47 @@ class ObstacleField:
         self._yaw = torch.deg2rad(column(*(group.yaw_deg for group in groups)))
         area = column(*(group.area or config.area for group in groups))
         self._bounds = area[:, [0, 2]], area[:, [1, 3]]
-        poses = column(*(obstacle.pose or (0.0, 0.0, 0.0) for obstacle in obstacles))
-        self._fixed_xy, self._fixed_yaw = poses[:, :2], torch.deg2rad(poses[:, 2])
-        self._fixed = torch.tensor([obstacle.pose is not None for obstacle in obstacles], device=device)
-        self._any_fixed = bool(self._fixed.any())
+        self._poses, self._presence = Poses(config, random, pos_w), Presence(config, random)
         loose = [k for k, part in enumerate(self.parts) if part.group.poses is None]
-        self.free = torch.tensor(loose, device=device) if self._any_fixed else slice(None)
-        self.approaches = torch.tensor([group.approach is not None for group in groups], device=device)
+        self.free = slice(None) if len(loose) == len(self.parts) else torch.tensor(loose, device=device)
+        self.approaches = flags([group.approach is not None for group in groups])
         self._within = column(*(group.approach.within if group.approach else 0.0 for group in groups))
         self._start = column(*(group.approach.distance if group.approach else (0.0, 0.0) for group in groups))
-        self.any_approaches = bool(self.approaches.any())
-        self._bound = ~(self.approaches | self._fixed)
+        self.any_approaches = any(group.approach is not None for group in groups)
+        wanders = any(group.motion is not None for group in groups)
+        self._wander = Wander(groups, n, random, pos_w) if wanders else None
+        self._bound = ~(self.approaches | self._poses.which)
         self._searches = config.spacing > 0.0 or config.free_path is not None
         self._any_moves = any(group.moves for group in groups)
-        self._in_the_way = torch.tensor([not group.moves for group in groups], device=device) & ~self._fixed
-        n, count = len(pos_w), len(groups)
-        self.velocity_w = torch.zeros(n, count, 2, dtype=self._dtype, device=device)
-        self.active = torch.zeros(n, count, dtype=torch.bool, device=device)
+        self._stands = flags([not group.moves for group in groups]) & ~self._poses.which
+        self._faces = flags([group.moves and group.kind == COMPOUND for group in groups])
+        self._any_faces = bool(self._faces.any())
+        self._scale = column(*(group.scale for group in groups))
+        self._reach = column(*(reach(group.parts) if group.kind == COMPOUND else 0.0 for group in groups))
+        self.velocity_w = torch.zeros(n, len(self.parts), 2, dtype=self._dtype, device=device)
+        self.active = torch.zeros(n, len(self.parts), dtype=torch.bool, device=device)
+        self.articulation: Articulation | None = None
+        self.root_pos_w, self.root_velocity_w, self.root_active = self.pos_w, self.velocity_w, self.active
+        if any(part.form is not None for part in self.parts):
+            self.articulation = Articulation(self.parts, n, self._dtype, device)
+            self.root_pos_w, self.root_velocity_w = pos_w.new_zeros(n, count, 3), pos_w.new_zeros(n, count, 2)
+            self.root_active = self.active.new_zeros(n, count)
+        self._root_yaw, self._pace = pos_w.new_zeros(2, n, count).unbind(0)
         self.level = 1.0 if config.curriculum is None else 0.0
-        self._above_ground = torch.zeros(n if ground is not None else 0, count, dtype=self._dtype, device=device)
-        self._path = torch.zeros(n, 0, count, 3, dtype=self._dtype, device=device)
-        self.size = self._shapes.draw(torch.zeros(n, 3, count, dtype=self._dtype, device=device))
+        self._above_ground = pos_w.new_zeros(n if ground is not None else 0, count)
+        self._allocate_path(0)
+        first = {part.obstacle: k for k, part in reversed(list(enumerate(self.parts)))}
+        self._first_part = torch.tensor([first[k] for k in range(count)], device=device)
+        self.size = self._ranges.draw(pos_w.new_zeros(n, 3, len(self.parts)), pos_w.new_zeros(n, count))
         self._follow_sizes()
 
     @property
     def yaw(self) -> torch.Tensor:
-        """(num_envs, P) orientation (rad) about the vertical; obstacles turn about no other axis."""
+        """(num_envs, P) orientation (rad) about the vertical; what a swinging part does besides is its tilt."""
         return 2 * torch.atan2(self.quat_w[..., 3], self.quat_w[..., 0])
 
     def bottom_above_ground(self) -> torch.Tensor:
-        """(num_envs, P) height (m) of the lowest points above the ground below the centres."""
+        """(num_envs, P) height (m) of the lowest points above the ground below the middles."""
         bottom = self.pos_w[..., 2] - self.half_height
         return bottom if self._ground is None else bottom - self._ground.height(self.pos_w[..., :2])
 
@@ -123,70 +157,100 @@ class ObstacleField:
             goal_w: (n, 2) where it is to go, m; only a free path needs it.
         """
         robot = robot_xy_w.to(self._dtype)
-        u = self._random.uniform(env_ids, (10, self.pos_w.shape[1])).to(self._dtype)
-        self.size[env_ids] = self._shapes.draw(u[:, 7:])
-        self._follow_sizes(env_ids)
+        u = self._random.uniform(env_ids, (9, self.root_pos_w.shape[1])).to(self._dtype)
         bottom, yaw, heading = (
-            _within(bounds, u[:, row]) for row, bounds in ((6, self._bottom), (2, self._yaw), (4, self._heading))
+            within(bounds, u[:, row]) for row, bounds in ((6, self._bottom), (2, self._yaw), (4, self._heading))
         )
-        speed = _within(self._speed, u[:, 3]) * self.level
-        active = u[:, 5] < self.level
+        pose, posed = self._resize(env_ids, u[:, 7], u[:, 8])
+        active = (u[:, 5] < self.level) | self._poses.fixed
+        present = self._presence.draw(env_ids)
+        if present is not None:
+            active = active & present
         if self._searches:
-            xy, found = self._keep_clear(env_ids, robot, goal_w, bottom)
+            xy, found = self._keep_clear(
+                env_ids, robot, goal_w, active & self._stands & (bottom < self.config.headroom)
+            )
             active = active & found
         else:
             bounds = self._bounds if self.config.boundary == "bounce" else None
-            keep = self.config.clearance + self.radius[env_ids]
+            keep = self.config.clearance + self.root_radius[env_ids]
             xy = push_off(self._in_area(u[:, :2], robot), robot, keep, bounds)
-        if self._any_fixed:
-            active = active | self._fixed
-            xy = torch.where(self._fixed[:, None], self._fixed_xy, xy)
-            yaw = torch.where(self._fixed, self._fixed_yaw, yaw)
-        self.active[env_ids] = active
-        self.velocity_w[env_ids] = unit(heading) * (speed * active)[..., None]
-        above_ground = bottom + self.half_height[env_ids]
+        if self._poses.any:
+            active = active & (posed | ~self._poses.which)
+            xy = torch.where(self._poses.which[:, None], pose[..., :2], xy)
+            yaw = torch.where(self._poses.which, pose[..., 2], yaw)
+        self._pace[env_ids] = within(self._speed, u[:, 3]) * self.level * active
+        self.root_active[env_ids], self._root_yaw[env_ids] = active, yaw
+        self.root_velocity_w[env_ids] = unit(heading) * self._pace[env_ids][..., None]
+        above_ground = bottom if self.articulation is not None else bottom + self.half_height[env_ids]
         z = torch.where(active, above_ground, PARKED_HEIGHT)
-        self.pos_w[env_ids] = torch.cat((xy, z[..., None]), -1)
-        zero = torch.zeros_like(yaw)
-        self.quat_w[env_ids] = torch.stack(((yaw / 2).cos(), zero, zero, (yaw / 2).sin()), -1)
+        self.root_pos_w[env_ids] = torch.cat((xy, z[..., None]), -1)
+        if self._wander is not None:
+            self._wander.reset(env_ids, heading)
         if self.any_approaches:
             command = torch.zeros_like(robot) if command_w is None else command_w.to(self._dtype)
             self._start_approach(env_ids, self.approaches & active, robot, command)
         if self._ground is not None:
             self._above_ground[env_ids] = above_ground
-            self.pos_w[env_ids, :, 2] = self._over_ground(self.pos_w[env_ids, :, :2], env_ids)
+            self.root_pos_w[env_ids, :, 2] = self._over_ground(env_ids)
+        self._face(env_ids)
+        self._place_parts(env_ids)
 
     def advance(self, dt: float, robot_xy_w: torch.Tensor) -> None:
-        """Moves every obstacle level by `dt` (s); `robot_xy_w` (num_envs, 2) is the centre of a wrapping area."""
-        xy = self.pos_w[..., :2]
+        """Moves every obstacle level by `dt` (s); `robot_xy_w` (num_envs, 2) is the centre of a wrapping area.
+
+        Parts of compounds follow in `travel`.
+        """
+        xy = self.root_pos_w[..., :2]
         if self._any_moves:
-            xy += self.velocity_w * dt
+            xy += self.root_velocity_w * dt
         if self.config.boundary == "wrap":
             wrap(xy, robot_xy_w.to(self._dtype), self._bounds, self._bound)
         elif self._any_moves:
-            bounce(xy, self.velocity_w, self._bounds, self._bound)
+            bounce(xy, self.root_velocity_w, self._bounds, self._bound)
 
-    def travel(self, dt: float, num_steps: int, robot_xy_w: torch.Tensor) -> torch.Tensor:
+    def travel(self, dt: float, num_steps: int, robot_xy_w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Moves every obstacle by `num_steps` steps of `dt` (s); see `advance`.
 
         Returns:
-            (num_envs, num_steps, P, 3) m, where they are after each step, on the ground; the same memory in every call.
+            (num_envs, num_steps, P, 3) m, where the parts are after each step, on the ground, and
+            (num_envs, num_steps, P, 4) their orientations, None where they keep them; the same memory in every call.
         """
         if self._path.shape[1] != num_steps:
-            with torch.inference_mode(False):  # it is written in and out of rollouts
-                self._path = self._path.new_zeros(len(self.pos_w), num_steps, *self.pos_w.shape[1:])
+            self._allocate_path(num_steps)
+        if self._wander is not None:
+            robot = robot_xy_w.to(self._dtype)
+            self._wander.choose(dt * num_steps, self.root_pos_w[..., :2], self.root_velocity_w, self._pace, robot)
         for step in range(num_steps):
             self.advance(dt, robot_xy_w)
-            self._path[:, step] = self.pos_w
+            self._path[:, step] = self.root_pos_w
+            if self.articulation is not None:
+                self._face()
+                self._yaw_path[:, step] = self._root_yaw
         if self._ground is not None and self._path.numel():
-            self._ground.lift(self._path, self._above_ground, self.active, PARKED_HEIGHT)
-            self.pos_w.copy_(self._path[:, -1])
-        return self._path
+            self._ground.lift(self._path, self._above_ground, self.root_active, PARKED_HEIGHT)
+            self.root_pos_w.copy_(self._path[:, -1])
+        return (self._path, None) if self.articulation is None else self._articulate(dt)
+
+    def _articulate(self, dt: float) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """The way of the parts along that of their obstacles, and the parts at its end."""
+        parts, speed = self.articulation, self.root_velocity_w.norm(dim=-1)
+        assert parts is not None
+        for step in range(self._path.shape[1]):
+            parts.advance(dt, speed)
+            pos, quat = parts.pose(self._path[:, step], self._yaw_path[:, step])
+            self._part_path[:, step], self._quat_path[:, step] = pos, quat
+        self.pos_w.copy_(pos)
+        self.quat_w.copy_(quat)
+        self.velocity_w.copy_(parts.velocity(self.root_velocity_w, self._root_yaw))
+        if parts.swings:
+            self._follow_sizes()
+        return self._part_path, self._quat_path if parts.turns else None
 
     def restart_approaching(self, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
         """Restarts approaching obstacles that have passed the robot; see `reset` for the arguments."""
-        distance = (self.pos_w[..., :2] - robot_xy_w.to(self._dtype)[:, None]).norm(dim=-1)
-        gone = self.approaches & self.active & (distance > self._start[:, 1] + LOSE_SIGHT)
+        distance = (self.root_pos_w[..., :2] - robot_xy_w.to(self._dtype)[:, None]).norm(dim=-1)
+        gone = self.approaches & self.root_active & (distance > self._start[:, 1] + LOSE_SIGHT)
         env_ids = gone.any(1).nonzero().flatten()
         if len(env_ids):
             robot, command = (xy[env_ids].to(self._dtype) for xy in (robot_xy_w, command_w))
@@ -202,27 +266,93 @@ class ObstacleField:
             self.level = min(1.0, self.level + curriculum.rise * seconds)
 
     def state_dict(self) -> dict:
-        """State that `load_state_dict` needs to go on; positions belong to the simulator's state."""
-        kept = ("velocity_w", "active", "size", "_above_ground")
-        return {"level": self.level, **{name: getattr(self, name).clone() for name in kept}}
+        """State that `load_state_dict` needs to go on; poses of the parts belong to the simulator's state."""
+        state = {name: value.clone() for name, value in self._kept().items()}
+        return {"level": self.level, **state, **{name: part.state_dict() for name, part in self._with_state().items()}}
 
     def load_state_dict(self, state: dict) -> None:
-        for name, value in state.items():
-            if name == "level":
-                self.level = value
-            else:
-                getattr(self, name).copy_(value)
+        self.level = state["level"]
+        for name, value in self._kept().items():
+            value.copy_(state[name])
+        for name, part in self._with_state().items():
+            part.load_state_dict(state[name])
         self._follow_sizes()
 
+    def _kept(self) -> dict[str, torch.Tensor]:
+        """Tensors of the state, by name."""
+        kept = {"size": self.size, "velocity_w": self.velocity_w, "active": self.active, "pace": self._pace}
+        kept |= {"above_ground": self._above_ground, "yaw": self._root_yaw}
+        if self.articulation is not None:
+            kept |= {"root_pos_w": self.root_pos_w, "root_velocity_w": self.root_velocity_w}
+            kept["root_active"] = self.root_active
+        return kept
+
+    def _with_state(self) -> dict[str, Articulation | Wander]:
+        parts = {"articulation": self.articulation, "wander": self._wander}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    # ---- sizes and parts ---------------------------------------------------------------------------------------------
+
+    def _resize(
+        self, env_ids: torch.Tensor, share: torch.Tensor, cycle: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draws sizes; compounds are as large as `share` (n, O) of their ranges, and their swings begin at `cycle`.
+
+        Returns:
+            What `Poses.draw` does, which decides sizes of layouts.
+        """
+        u = self._random.uniform(env_ids, (3, len(self.parts))).to(self._dtype)
+        size = self._ranges.draw(u, share)
+        told = self._poses.draw(env_ids, size)
+        self.size[env_ids] = size
+        if self.articulation is not None:
+            half_height = self._shapes.half_extents(size)[..., 2]
+            self.articulation.reset(env_ids, within(self._scale, share), half_height, cycle)
+        self._follow_sizes(env_ids)
+        return told
+
     def _follow_sizes(self, env_ids: torch.Tensor | None = None) -> None:
-        """Brings what depends on the sizes up to date, in all environments or in some (n,)."""
-        size = self.size if env_ids is None else self.size[env_ids]
-        derived = self._shapes.outline(size), self._shapes.radius(size), self._shapes.half_height(size)
-        if env_ids is None:
-            self.outline, self.radius, self.half_height = derived
+        """Brings what depends on sizes and tilts up to date, in all environments or in some (n,)."""
+        rows = slice(None) if env_ids is None else env_ids
+        parts, size = self.articulation, self.size[rows]
+        tilt = None if parts is None else tilt_of(parts.orientation(rows))
+        half = self._shapes.half_extents(size, tilt)
+        outline = self._shapes.outline(half, tilt)
+        radius = root_radius = footprint_radius(outline)
+        if parts is not None:
+            root_radius = torch.where(self._reach > 0, self._reach * parts.scale[rows], radius[:, self._first_part])
+        derived = {"outline": outline, "radius": radius, "half_height": half[..., 2], "root_radius": root_radius}
+        for name, value in derived.items():
+            if env_ids is None:
+                setattr(self, name, value)
+            else:
+                getattr(self, name)[env_ids] = value
+
+    def _face(self, rows: torch.Tensor | slice = slice(None)) -> None:
+        """Turns compounds that move into the way they move."""
+        if self._any_faces:
+            velocity, yaw = self.root_velocity_w[rows], self._root_yaw[rows]
+            moving = self._faces & (velocity.square().sum(-1) > 0)
+            self._root_yaw[rows] = torch.where(moving, torch.atan2(velocity[..., 1], velocity[..., 0]), yaw)
+
+    def _place_parts(self, env_ids: torch.Tensor) -> None:
+        """Puts the parts where their obstacles are, in some environments (n,)."""
+        parts, yaw = self.articulation, self._root_yaw[env_ids]
+        if parts is None:
+            self.quat_w[env_ids] = yaw_quat(yaw)
             return
-        for own, new in zip((self.outline, self.radius, self.half_height), derived, strict=True):
-            own[env_ids] = new
+        self.pos_w[env_ids], self.quat_w[env_ids] = parts.pose(self.root_pos_w[env_ids], yaw, env_ids)
+        self.velocity_w[env_ids] = parts.velocity(self.root_velocity_w[env_ids], yaw, env_ids)
+        self.active[env_ids] = self.root_active[env_ids][:, parts.obstacle]
+
+    @torch.inference_mode(False)  # it is written in and out of rollouts
+    def _allocate_path(self, num_steps: int) -> None:
+        n, count = self.root_pos_w.shape[:2]
+        self._path = self.root_pos_w.new_zeros(n, num_steps, count, 3)
+        if self.articulation is not None:
+            self._yaw_path = self._path.new_zeros(n, num_steps, count)
+            self._part_path = self._path.new_zeros(n, num_steps, len(self.parts), 3)
+            self._quat_path = self._path.new_zeros(n, num_steps, len(self.parts), 4)
 
     # ---- placing -----------------------------------------------------------------------------------------------------
 
@@ -233,47 +363,39 @@ class ObstacleField:
         return low + u.transpose(1, 2) * (high - low) + anchor
 
     def _keep_clear(
-        self, env_ids: torch.Tensor, robot: torch.Tensor, goal: torch.Tensor | None, bottom: torch.Tensor
+        self, env_ids: torch.Tensor, robot: torch.Tensor, goal: torch.Tensor | None, in_the_way: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Places (n, O, 2) with the spacing and off the free path, and (n, O) whether found.
+        """Places (n, O, 2), with the spacing and off the free path for those `in_the_way` (n, O), and whether found.
 
         Every environment draws equally many random numbers, whatever fits.
         """
-        config, radius = self.config, self.radius[env_ids]
+        config, radius = self.config, self.root_radius[env_ids]
         u = self._random.uniform(env_ids, (_CANDIDATES * 2, radius.shape[1])).to(self._dtype)
         places = torch.stack([self._in_area(pair, robot) for pair in u.split(2, 1)], 2)  # (n, O, C, 2)
-        in_the_way = self._in_the_way & (bottom < config.headroom)
         fits = (places - robot[:, None, None]).norm(dim=-1) - radius[..., None] >= config.clearance
         if config.free_path is not None:
             assert goal is not None
             bends = config.free_path.bend * (2 * self._random.uniform(env_ids, (2,)).to(self._dtype) - 1)
             off_path = distance_to_path(places, bent_path(robot, goal.to(self._dtype), bends)) - radius[..., None]
             fits &= (off_path >= config.free_path.width / 2) | ~in_the_way[..., None]
-        placed = (self.approaches | self._fixed).expand(len(robot), -1)
+        placed = (self.approaches | self._poses.which).expand(len(robot), -1)
         return choose_apart(places, fits, radius, in_the_way, placed, config.spacing)
 
     def _start_approach(
         self, env_ids: torch.Tensor, which: torch.Tensor, robot: torch.Tensor, command: torch.Tensor
     ) -> None:
         """Puts obstacles `which` (n, O) around the robots (n, 2) on courses that lead past them."""
-        u = self._random.uniform(env_ids, (3, self.pos_w.shape[1])).to(self._dtype)
+        u = self._random.uniform(env_ids, (3, self.root_pos_w.shape[1])).to(self._dtype)
         bearing = unit(2 * math.pi * u[:, 0])
-        distance = _within(self._start, u[:, 1])
+        distance = within(self._start, u[:, 1])
         miss = (2 * u[:, 2] - 1) * self._within
-        before = self.velocity_w[env_ids]
-        speed = before.norm(dim=-1)  # which an obstacle keeps through the episode
-        velocity = passing_velocity(bearing, distance, miss, speed, command[:, None])
+        velocity = passing_velocity(bearing, distance, miss, self._pace[env_ids], command[:, None])
         xy = robot[:, None] + bearing * distance[..., None]
-        self.pos_w[env_ids, :, :2] = torch.where(which[..., None], xy, self.pos_w[env_ids, :, :2])
-        self.velocity_w[env_ids] = torch.where(which[..., None], velocity, before)
+        self.root_pos_w[env_ids, :, :2] = torch.where(which[..., None], xy, self.root_pos_w[env_ids, :, :2])
+        self.root_velocity_w[env_ids] = torch.where(which[..., None], velocity, self.root_velocity_w[env_ids])
 
-    def _over_ground(self, xy: torch.Tensor, env_ids: torch.Tensor) -> torch.Tensor:
-        """Heights (n, P) of the centres where they are at (n, P, 2)."""
+    def _over_ground(self, env_ids: torch.Tensor) -> torch.Tensor:
+        """Heights (n, O) of the obstacles where they are."""
         assert self._ground is not None
-        above = self._above_ground[env_ids] + self._ground.height(xy, env_ids)
-        return torch.where(self.active[env_ids], above, PARKED_HEIGHT)
-
-
-def _within(bounds: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-    """Maps draws (n, num) from [0, 1) to ranges (num, 2)."""
-    return bounds[:, 0] + u * (bounds[:, 1] - bounds[:, 0])
+        above = self._above_ground[env_ids] + self._ground.height(self.root_pos_w[env_ids, :, :2], env_ids)
+        return torch.where(self.root_active[env_ids], above, PARKED_HEIGHT)

@@ -1,8 +1,14 @@
-"""How obstacles move: courses past the robot, and what happens at the edge of an area."""
+"""How obstacles move: courses past the robot, changes of mind, and what happens at the edge of an area."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
+
+from omniperception.common.random import EnvRandom
+from omniperception.scene.obstacle_group import MotionConfig, ObstacleGroup
+from omniperception.scene.placement import unit, within
 
 
 def passing_velocity(
@@ -61,3 +67,66 @@ def wrap(
     low = bounds[0] + centre[:, None]
     wrapped = low + torch.remainder(xy - low, bounds[1] - bounds[0])
     xy.copy_(torch.where(bound[:, None], wrapped, xy))
+
+
+class Wander:
+    """Obstacles of groups with `motion`, which choose again where they go after random times.
+
+    Attributes:
+        timer: (num_envs, O) s until an obstacle chooses again.
+        course: (num_envs, O) rad, of the way in which it moved last.
+    """
+
+    def __init__(self, groups: Sequence[ObstacleGroup], num_envs: int, random: EnvRandom, like: torch.Tensor) -> None:
+        """`groups` of the O obstacles; `like` has the precision and the device of their positions."""
+        never = MotionConfig((1.0, 1.0))
+        motions = [group.motion or never for group in groups]
+        self._random, self._which = random, torch.tensor([g.motion is not None for g in groups], device=like.device)
+        self._every = like.new_tensor([motion.every_s for motion in motions])
+        self._turn = torch.deg2rad(like.new_tensor([motion.turn_deg for motion in motions]))
+        self._stop = like.new_tensor([motion.stop for motion in motions])
+        self._home = like.new_tensor([motion.home for motion in motions])
+        self.timer, self.course = like.new_zeros(2, num_envs, len(groups)).unbind(0)
+
+    def reset(self, env_ids: torch.Tensor, course: torch.Tensor) -> None:
+        """Begins an episode in environments (n,), in which obstacles set out on courses (n, O) in rad."""
+        u = self._random.uniform(env_ids, (self._every.shape[0],)).to(course.dtype)
+        self.timer[env_ids], self.course[env_ids] = within(self._every, u), course
+
+    def choose(
+        self, dt: float, xy: torch.Tensor, velocity: torch.Tensor, pace: torch.Tensor, robot: torch.Tensor
+    ) -> None:
+        """Lets `dt` (s) pass; whose time has come gets another velocity, in place.
+
+        Args:
+            dt: s.
+            xy, velocity: (num_envs, O, 2) m and m/s.
+            pace: (num_envs, O) m/s, at which they move when they do not stand; 0 for those that are not there.
+            robot: (num_envs, 2) m.
+        """
+        self.timer -= dt
+        due = (self.timer <= 0) & self._which & (pace > 0)
+        env_ids = due.any(1).nonzero().flatten()
+        if not len(env_ids):
+            return
+        due, now, speed = due[env_ids], velocity[env_ids], pace[env_ids]
+        u = self._random.uniform(env_ids, (3, due.shape[1])).to(now.dtype)
+        moving = now.square().sum(-1) > 0
+        course = torch.where(moving, torch.atan2(now[..., 1], now[..., 0]), self.course[env_ids])
+        to_robot = robot[env_ids, None] - xy[env_ids]
+        homing = (u[:, 1] >= self._stop) & (u[:, 1] < self._stop + self._home)
+        turned = course + (2 * u[:, 2] - 1) * self._turn
+        chosen = torch.where(homing, torch.atan2(to_robot[..., 1], to_robot[..., 0]), turned)
+        stands = u[:, 1] < self._stop
+        course = torch.where(stands, course, chosen)
+        new = unit(course) * (speed * ~stands)[..., None]
+        velocity[env_ids] = torch.where(due[..., None], new, now)
+        self.course[env_ids] = torch.where(due, course, self.course[env_ids])
+        self.timer[env_ids] = torch.where(due, within(self._every, u[:, 0]), self.timer[env_ids])
+
+    def state_dict(self) -> dict:
+        return {"timer": self.timer.clone(), "course": self.course.clone()}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.timer.copy_(state["timer"])
+        self.course.copy_(state["course"])

@@ -1,123 +1,16 @@
-"""Configuration of obstacles: shapes, placement and motion."""
+"""Configuration of the obstacles of a scene: all groups and what holds for all of them."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
 
-from omniperception.scene.parts import SIZES, Part
+from omniperception.scene.obstacle_group import ObstacleGroup, checked_area
+from omniperception.scene.parts import Part
 
-
-@dataclass(frozen=True)
-class ApproachConfig:
-    """Approach of obstacles to the robot: each walks straight on, on a course that leads past the robot.
-
-    One starts at a random bearing, all sides alike. Its course is such that its centre would pass within `within` of
-    the robot's base if the robot kept the velocity that it is commanded at that moment; where no course does because
-    the robot outruns it, it heads for where the robot is. Once it is farther than `distance[1]` + 1 m from the robot
-    it starts again.
-
-    Attributes:
-        within: (m); the miss distance is uniform in [-within, within].
-        distance: (low, high) range (m) of the distance from the robot at which one starts.
-    """
-
-    within: float
-    distance: Sequence[float]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "distance", tuple(float(d) for d in self.distance))
-        if self.within < 0:
-            raise ValueError(f"obstacles: approach.within={self.within} must not be negative")
-        if len(self.distance) != 2 or not self.within < self.distance[0] <= self.distance[1]:
-            raise ValueError(
-                f"obstacles: approach.distance={list(self.distance)} must be a range [low, high] with low >"
-                f" approach.within={self.within}"
-            )
-
-
-@dataclass(frozen=True)
-class ObstacleGroup:
-    """Obstacles of one kind. What is a range is drawn uniformly for every obstacle at every reset.
-
-    Attributes:
-        kind: 'box', 'cylinder', 'sphere' or 'capsule'.
-        count: number of them.
-        size: one (low, high) range (m) per size: box half extents x, y, z; cylinder radius, half height; sphere radius;
-            capsule radius, half length without its caps. What is round stands upright.
-        speed: (low, high) range (m/s); (0, 0) stands still.
-        poses: fixed (x, y, yaw in degrees) of each obstacle, for walls; None: placed at every reset.
-        bottom: (low, high) range (m) of the height of its lowest point above the ground; (0, 0) stands on it. Negative:
-            it reaches into the ground, so that no gap opens below a long wall on a slope.
-        heading_deg: (low, high) range (deg) of the direction in which it sets out, 0 along x.
-        yaw_deg: (low, high) range (deg) of its orientation about the vertical.
-        area: where this group is placed and moves, in place of the preset's `area`; see `ObstaclesConfig`.
-        approach: None: it keeps its heading, up to the boundary; otherwise it comes at the robot, and neither area,
-            boundary nor heading apply.
-    """
-
-    kind: str
-    count: int
-    size: Sequence[Sequence[float]]
-    speed: Sequence[float] = (0.0, 0.0)
-    poses: Sequence[Sequence[float]] | None = None
-    bottom: Sequence[float] = (0.0, 0.0)
-    heading_deg: Sequence[float] = (-180.0, 180.0)
-    yaw_deg: Sequence[float] = (-180.0, 180.0)
-    area: Sequence[float] | None = None
-    approach: ApproachConfig | None = None
-
-    def __post_init__(self) -> None:
-        if self.kind not in SIZES:
-            raise ValueError(f"obstacles: kind={self.kind} is unknown; known: {', '.join(SIZES)}")
-        object.__setattr__(self, "size", tuple((float(low), float(high)) for low, high in self.size))
-        object.__setattr__(self, "speed", tuple(float(s) for s in self.speed))
-        if len(self.size) != len(SIZES[self.kind]):
-            raise ValueError(
-                f"obstacles: a {self.kind} has {len(SIZES[self.kind])} size ranges ({', '.join(SIZES[self.kind])}), got"
-                f" {len(self.size)}"
-            )
-        if any(not 0 < low <= high for low, high in self.size):
-            raise ValueError(f"obstacles: size={self.size} must be ranges 0 < low <= high")
-        if self.count < 1:
-            raise ValueError(f"obstacles: count={self.count} must be at least 1; leave the group out instead")
-        if len(self.speed) != 2 or not 0 <= self.speed[0] <= self.speed[1]:
-            raise ValueError(f"obstacles: speed={self.speed} must be a range 0 <= low <= high")
-        if self.poses is not None:
-            object.__setattr__(self, "poses", tuple(tuple(float(x) for x in pose) for pose in self.poses))
-            if len(self.poses) != self.count or any(len(pose) != 3 for pose in self.poses):
-                raise ValueError(f"obstacles: poses must be {self.count} triples (x, y, yaw_deg)")
-        for key in ("bottom", "heading_deg", "yaw_deg"):
-            bounds = tuple(float(bound) for bound in getattr(self, key))
-            object.__setattr__(self, key, bounds)
-            if len(bounds) != 2 or bounds[0] > bounds[1]:
-                raise ValueError(f"obstacles: {key}={list(bounds)} must be a range [low, high] with low <= high")
-        if self.area is not None:
-            object.__setattr__(self, "area", _area("a group's area", self.area))
-        if self.poses is not None and (self.approach is not None or self.moves):
-            raise ValueError("obstacles: a group with fixed poses stands; leave out speed and approach")
-        if self.approach is not None and self.speed[0] <= 0:
-            raise ValueError(f"obstacles: speed={list(self.speed)} of a group that approaches must be positive")
-
-    @property
-    def moves(self) -> bool:
-        return self.speed[1] > 0
-
-    @property
-    def largest_radius(self) -> float:
-        """Radius (m) of the circle around the footprint of its largest obstacle."""
-        x, y = self.size[0][1], self.size[1][1] if self.kind == "box" else 0.0
-        return math.hypot(x, y)
-
-
-def _area(name: str, bounds: Sequence[float]) -> tuple[float, float, float, float]:
-    area = tuple(float(x) for x in bounds)
-    if len(area) != 4 or area[0] >= area[1] or area[2] >= area[3]:
-        raise ValueError(f"obstacles: {name}={list(area)} must be [x_low, x_high, y_low, y_high]")
-    return area
+SPLITS = ("dev", "test")
 
 
 @dataclass(frozen=True)
@@ -127,17 +20,17 @@ class Obstacle:
     Attributes:
         name: of the obstacle.
         group: its group.
-        pose: its fixed (x, y, yaw in degrees), if any.
+        index: its number in the group.
     """
 
     name: str
     group: ObstacleGroup
-    pose: tuple[float, float, float] | None
+    index: int
 
-    def parts(self, index: int) -> tuple[Part, ...]:
-        """Its bodies, where it is obstacle number `index` of the scene."""
-        size = tuple((low, high) for low, high in self.group.size)
-        return (Part(self.name, index, self.group, self.group.kind, size),)
+    @property
+    def pose(self) -> Sequence[float] | None:
+        """Its fixed (x, y, yaw in degrees), if any."""
+        return None if self.group.poses is None else self.group.poses[self.index]
 
 
 @dataclass(frozen=True)
@@ -198,6 +91,8 @@ class ObstaclesConfig:
             through; 0 lets them overlap.
         free_path: a way to the goal that standing obstacles keep free; None for none.
         headroom: spacing and free path do not count obstacles that hang at least this high (m).
+        split: 'dev' or 'test': the scenes for choosing anything, and those for reports, which no training may see.
+            `build.assemble` turns those of 'test' into `held_out` ones; here it chooses the worlds of layouts.
 
     Edges are those of the circles around the footprints. A standing obstacle that finds no place with the spacing and
     off the free path is left out of the episode.
@@ -211,14 +106,17 @@ class ObstaclesConfig:
     spacing: float = 0.0
     free_path: FreePathConfig | None = None
     headroom: float = 0.45
+    split: str = "dev"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", dict(self.groups))
-        object.__setattr__(self, "area", _area("area", self.area))
+        object.__setattr__(self, "area", checked_area("area", self.area))
         if self.boundary not in ("bounce", "wrap"):
             raise ValueError(f"obstacles.boundary={self.boundary} must be bounce or wrap")
         if self.clearance <= 0:
             raise ValueError(f"obstacles.clearance={self.clearance} must be positive")
+        if self.split not in SPLITS:
+            raise ValueError(f"obstacles.split={self.split} must be dev or test")
         for key in ("spacing", "headroom"):
             if getattr(self, key) < 0:
                 raise ValueError(f"obstacles.{key}={getattr(self, key)} must not be negative")
@@ -236,17 +134,13 @@ class ObstaclesConfig:
 
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Every obstacle, group by group."""
-        found = []
-        for name, group in self.groups.items():
-            for i in range(group.count):
-                x_y_yaw = None if group.poses is None else group.poses[i]
-                pose = None if x_y_yaw is None else (x_y_yaw[0], x_y_yaw[1], x_y_yaw[2])
-                found.append(Obstacle(f"obstacle_{name}_{i}", group, pose))
-        return tuple(found)
+        named = self.groups.items()
+        return tuple(Obstacle(f"obstacle_{name}_{i}", group, i) for name, group in named for i in range(group.count))
 
     def parts(self) -> tuple[Part, ...]:
         """The parts of all obstacles, in the order of the kinematic bodies."""
-        return tuple(part for index, obstacle in enumerate(self.obstacles()) for part in obstacle.parts(index))
+        numbered = enumerate(self.obstacles())
+        return tuple(part for k, own in numbered for part in own.group.make_parts(own.name, k, own.index))
 
     def geom_names(self) -> tuple[str, ...]:
         return tuple(part.name for part in self.parts())

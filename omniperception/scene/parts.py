@@ -1,4 +1,4 @@
-"""Parts of obstacles: one kinematic body with one geom each; kinds, sizes, and what follows from them."""
+"""Parts of obstacles: one kinematic body with one geom each; their configuration and kinds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import mujoco
-import torch
+
+from omniperception.scene.meshes import check_mesh, mesh_points
 
 if TYPE_CHECKING:
     from omniperception.scene.obstacles import ObstacleGroup
@@ -17,17 +18,112 @@ SIZES = {
     "cylinder": ("radius", "half height"),
     "sphere": ("radius",),
     "capsule": ("radius", "half length"),
+    "mesh": ("half x", "half y", "half z"),
 }
-"""Sizes (m) of each kind, in MuJoCo's order; round kinds stand upright."""
+"""Sizes (m) of each kind, in MuJoCo's order; those of a mesh are of the box around it."""
 _GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "mesh": mujoco.mjtGeom.mjGEOM_MESH,
 }
-_ROUND = ("cylinder", "sphere", "capsule")
-_HALF_HEIGHT = {"box": (0, 0, 1), "cylinder": (0, 1, 0), "sphere": (1, 0, 0), "capsule": (1, 1, 0)}
-"""How often each size counts in the half height."""
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class SwingConfig:
+    """Swing of a part about its joint: its angle is amplitude sin(2 pi c + phase) after c cycles.
+
+    All of an obstacle's parts begin at the same c, drawn at every reset.
+
+    Attributes:
+        axis: 'x', 'y' or 'z' of the part's own frame.
+        amplitude_deg: (deg).
+        frequency: cycles per second.
+        per_metre: cycles per metre that the obstacle moves.
+        phase_deg: (deg).
+    """
+
+    axis: str
+    amplitude_deg: float
+    frequency: float = 0.0
+    per_metre: float = 0.0
+    phase_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.axis not in AXES:
+            raise ValueError(f"obstacles: swing.axis={self.axis} must be one of {', '.join(AXES)}")
+        if not 0 < self.amplitude_deg <= 180:
+            raise ValueError(f"obstacles: swing.amplitude_deg={self.amplitude_deg} must lie above 0, up to 180")
+        if self.frequency < 0 or self.per_metre < 0 or (self.frequency > 0) == (self.per_metre > 0):
+            raise ValueError(
+                f"obstacles: swing has frequency={self.frequency} and per_metre={self.per_metre}; give one of them,"
+                " positive"
+            )
+
+
+@dataclass(frozen=True)
+class PartConfig:
+    """A part of a compound, in a frame on the ground below the obstacle, x ahead, at scale 1.
+
+    Attributes:
+        kind: one of `SIZES`.
+        size: its sizes (m); see `SIZES`. None is the mesh's own.
+        pos: of its joint (m); where it has no `hang`, of its middle.
+        rpy_deg: roll, pitch and yaw (deg) of its frame, turned in this order about fixed axes.
+        hang: how far its middle lies below the joint (m), or where from the joint (x, y, z) in its own frame.
+        swing: None: it does not move against the others.
+        file: of a mesh; see `ObstacleGroup`.
+    """
+
+    kind: str
+    size: Sequence[float] = ()
+    pos: Sequence[float] = (0.0, 0.0, 0.0)
+    rpy_deg: Sequence[float] = (0.0, 0.0, 0.0)
+    hang: float | Sequence[float] = 0.0
+    swing: SwingConfig | None = None
+    file: str | None = None
+
+    def __post_init__(self) -> None:
+        check_kind(self.kind, self.file, tuple(SIZES))
+        hang = (0.0, 0.0, -float(self.hang)) if isinstance(self.hang, int | float) else self.hang
+        for key, value in (("pos", self.pos), ("rpy_deg", self.rpy_deg), ("hang", hang)):
+            if len(value) != 3:
+                raise ValueError(f"obstacles: {key}={list(value)} of a part must have 3 numbers")
+            object.__setattr__(self, key, tuple(float(x) for x in value))
+        size = tuple(float(x) for x in self.size)
+        if self.file is not None and not size:
+            size = mesh_points(self.file)[1]
+        object.__setattr__(self, "size", size)
+        if len(size) != len(SIZES[self.kind]) or min(size) <= 0:
+            raise ValueError(f"obstacles: size={list(size)} of a {self.kind} must be positive: {_names(self.kind)}")
+
+
+def check_kind(kind: str, file: str | None, known: Sequence[str]) -> None:
+    """Raises a ValueError in one line if a kind is unknown, or its file is missing or out of place."""
+    if kind not in known:
+        raise ValueError(f"obstacles: kind={kind} is unknown; known: {', '.join(known)}")
+    if (kind == "mesh") != (file is not None):
+        raise ValueError(f"obstacles: a {kind} with file={file}; a mesh needs a file, and nothing else has one")
+    if file is not None:
+        check_mesh(file)
+
+
+def check_sizes(kind: str, size: Sequence[Sequence[float]]) -> tuple[tuple[float, float], ...]:
+    """Ranges of sizes as floats; raises a ValueError in one line if they do not fit the kind."""
+    if len(size) != len(SIZES[kind]) or any(len(bounds) != 2 for bounds in size):
+        raise ValueError(
+            f"obstacles: a {kind} has {len(SIZES[kind])} size ranges [low, high] ({_names(kind)}), got {len(size)}"
+        )
+    ranges = tuple((float(low), float(high)) for low, high in size)
+    if any(not 0 < low <= high for low, high in ranges):
+        raise ValueError(f"obstacles: size={ranges} must be ranges 0 < low <= high")
+    return ranges
+
+
+def _names(kind: str) -> str:
+    return ", ".join(SIZES[kind])
 
 
 @dataclass(frozen=True)
@@ -39,7 +135,9 @@ class Part:
         obstacle: index of the obstacle that it belongs to.
         group: of that obstacle.
         kind: one of `SIZES`.
-        size: one (low, high) range (m) per size.
+        size: one (low, high) range (m) per size; within a compound all sizes vary together.
+        file: of a mesh.
+        form: how it belongs to its compound; None where it is the whole obstacle.
     """
 
     name: str
@@ -47,51 +145,29 @@ class Part:
     group: ObstacleGroup
     kind: str
     size: tuple[tuple[float, float], ...]
+    file: str | None = None
+    form: PartConfig | None = None
 
     @property
     def varies(self) -> bool:
         """Tell whether its size differs between environments."""
-        return any(low < high for low, high in self.size)
+        return self.group.layout is not None or any(low < high for low, high in self.size)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Adds body and geom, as large as the part can be."""
+        size, more = [high for _, high in self.size] + [0.0] * (3 - len(self.size)), {}
+        if self.file is not None:
+            points = mesh_points(self.file)[0] * size
+            spec.add_mesh(name=self.name, uservert=points.flatten().tolist())  # without faces: their convex hull
+            size, more = [0.0] * 3, {"meshname": self.name}
         body = spec.worldbody.add_body(name=self.name, mocap=True)
         body.add_geom(
             name=self.name,
             type=_GEOM_TYPES[self.kind],
-            size=[high for _, high in self.size] + [0.0] * (3 - len(self.size)),
+            size=size,
             contype=1,
             conaffinity=0,
             condim=3,
             friction=[0.5, 0.005, 0.0001],
+            **more,
         )
-
-
-class PartShapes:
-    """Sizes of all parts, drawn from their ranges, and what follows from sizes (n, P, 3), padded with 0."""
-
-    def __init__(self, parts: Sequence[Part], dtype: torch.dtype, device: torch.device) -> None:
-        def column(rows: list) -> torch.Tensor:
-            return torch.tensor(rows, dtype=dtype, device=device).reshape(len(parts), -1)
-
-        padded = [[*part.size, *[(0.0, 0.0)] * (3 - len(part.size))] for part in parts]
-        self._low = column([[low for low, _ in ranges] for ranges in padded])
-        self._high = column([[high for _, high in ranges] for ranges in padded])
-        self._round = torch.tensor([part.kind in _ROUND for part in parts], device=device)
-        self._to_half_height = column([_HALF_HEIGHT[part.kind] for part in parts])
-
-    def draw(self, u: torch.Tensor) -> torch.Tensor:
-        """Sizes (n, P, 3) in m from draws (n, 3, P)."""
-        return self._low + u.transpose(1, 2) * (self._high - self._low)
-
-    def half_height(self, size: torch.Tensor) -> torch.Tensor:
-        """(n, P) m."""
-        return (size * self._to_half_height).sum(-1)
-
-    def outline(self, size: torch.Tensor) -> torch.Tensor:
-        """(n, P, 2) m: half x, half y of the rectangle seen from above; radius, -1 of a circle."""
-        return torch.stack((size[..., 0], torch.where(self._round, -1.0, size[..., 1])), -1)
-
-    def radius(self, size: torch.Tensor) -> torch.Tensor:
-        """(n, P) m, of the circle around what is seen from above."""
-        return torch.where(self._round, size[..., 0], torch.hypot(size[..., 0], size[..., 1]))

@@ -1,0 +1,81 @@
+"""Convex meshes for obstacles: packaged ones, made by code, and files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+
+def _prism(corners: np.ndarray) -> np.ndarray:
+    """Vertices (2 N, 3) over and under corners (N, 2)."""
+    return np.concatenate([np.column_stack((corners, np.full(len(corners), z))) for z in (-1.0, 1.0)])
+
+
+def _circle(num: int) -> np.ndarray:
+    angle = 2 * math.pi * np.arange(num) / num
+    return np.column_stack((np.cos(angle), np.sin(angle)))
+
+
+def rock() -> np.ndarray:
+    """A boulder: 40 points on a sphere, each drawn in or out by up to a fifth."""
+    rng = np.random.default_rng(7)
+    points = rng.normal(size=(40, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True) * rng.uniform(0.8, 1.2, (40, 1))
+
+
+def wedge() -> np.ndarray:
+    """A block whose top slopes along x, from its full height down to a third of it."""
+    corners = [(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
+    return np.array([(x, y, -1.0) for x, y in corners] + [(x, y, 1.0 if x < 0 else -1.0 / 3.0) for x, y in corners])
+
+
+def hexagon() -> np.ndarray:
+    """An upright hexagonal prism."""
+    return _prism(_circle(6))
+
+
+def bollard() -> np.ndarray:
+    """An octagonal post that is thicker at its foot and has a pointed top."""
+    ring = _circle(8)
+    levels = ((1.0, -1.0), (0.8, -0.4), (0.7, 0.7))
+    return np.concatenate([np.column_stack((r * ring, np.full(8, z))) for r, z in levels] + [[[0.0, 0.0, 1.0]]])
+
+
+MESHES: dict[str, Callable[[], np.ndarray]] = {"rock": rock, "wedge": wedge, "hexagon": hexagon, "bollard": bollard}
+"""Makers of vertices (V, 3) of packaged meshes, by name."""
+
+
+def check_mesh(file: str) -> None:
+    """Raises a ValueError in one line if `file` is neither a packaged mesh nor a file."""
+    if file not in MESHES and not Path(file).is_file():
+        raise ValueError(f"obstacles: file={file} is neither a packaged mesh ({', '.join(MESHES)}) nor a file")
+
+
+@cache
+def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Points of a mesh, whose convex hull is meant.
+
+    Args:
+        file: name of a packaged mesh, or path of a file in any format that trimesh reads (extra `meshes`).
+
+    Returns:
+        Vertices (V, 3) that fill the box from -1 to 1, and the half extents (m) of the mesh as it is; packaged ones are
+        0.25 m.
+    """
+    if file in MESHES:
+        points, unit = MESHES[file](), 0.25
+    else:
+        from omniperception.lidar.meshes import TriangleMesh
+
+        mesh = TriangleMesh.from_file(file)
+        points, unit = np.unique(mesh.vertices[mesh.triangles.flatten()].astype(np.float64), axis=0), None
+    low, high = points.min(0), points.max(0)
+    half = (high - low) / 2
+    if not (half > 0).all():
+        raise ValueError(f"obstacles: file={file} is flat; a mesh needs a volume")
+    x, y, z = half if unit is None else (unit, unit, unit)
+    return (points - (low + high) / 2) / half, (float(x), float(y), float(z))

@@ -1,0 +1,239 @@
+"""Configuration of a group of obstacles: what they are, where they are and how they move."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from omniperception.scene.layouts import Layout
+from omniperception.scene.meshes import mesh_points
+from omniperception.scene.part_shapes import reach
+from omniperception.scene.parts import SIZES, Part, PartConfig, check_kind, check_sizes
+
+COMPOUND = "compound"
+"""Kind of an obstacle of several parts."""
+
+
+@dataclass(frozen=True)
+class ApproachConfig:
+    """Approach of obstacles to the robot: each walks straight on, on a course that leads past the robot.
+
+    One starts at a random bearing, all sides alike. Its course is such that its centre would pass within `within` of
+    the robot's base if the robot kept the velocity that it is commanded at that moment; where no course does because
+    the robot outruns it, it heads for where the robot is. Once it is farther than `distance[1]` + 1 m from the robot
+    it starts again.
+
+    Attributes:
+        within: (m); the miss distance is uniform in [-within, within].
+        distance: (low, high) range (m) of the distance from the robot at which one starts.
+    """
+
+    within: float
+    distance: Sequence[float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "distance", tuple(float(d) for d in self.distance))
+        if self.within < 0:
+            raise ValueError(f"obstacles: approach.within={self.within} must not be negative")
+        if len(self.distance) != 2 or not self.within < self.distance[0] <= self.distance[1]:
+            raise ValueError(
+                f"obstacles: approach.distance={list(self.distance)} must be a range [low, high] with low >"
+                f" approach.within={self.within}"
+            )
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Changes of mind of what moves: after random times an obstacle stands, heads for the robot, or turns.
+
+    Attributes:
+        every_s: (low, high) range (s) of the time until it chooses again.
+        turn_deg: it turns by up to this (deg) to either side, uniformly.
+        stop: probability that it stands instead, until it chooses again.
+        home: probability that it heads for where the robot is instead.
+    """
+
+    every_s: Sequence[float]
+    turn_deg: float = 0.0
+    stop: float = 0.0
+    home: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "every_s", tuple(float(s) for s in self.every_s))
+        if len(self.every_s) != 2 or not 0 < self.every_s[0] <= self.every_s[1]:
+            raise ValueError(f"obstacles: motion.every_s={list(self.every_s)} must be a range 0 < low <= high")
+        if not 0 <= self.turn_deg <= 180:
+            raise ValueError(f"obstacles: motion.turn_deg={self.turn_deg} must lie in 0 to 180")
+        if self.stop < 0 or self.home < 0 or self.stop + self.home > 1:
+            raise ValueError(
+                f"obstacles: motion.stop={self.stop} and motion.home={self.home} must be probabilities whose sum is at"
+                " most 1"
+            )
+
+
+@dataclass(frozen=True)
+class ObstacleGroup:
+    """Obstacles of one kind. What is a range is drawn uniformly for every obstacle at every reset.
+
+    Attributes:
+        kind: 'box', 'cylinder', 'sphere', 'capsule', 'mesh' or 'compound'.
+        count: number of them.
+        size: one (low, high) range (m) per size: box half extents x, y, z; cylinder radius, half height; sphere radius;
+            capsule radius, half length without its caps; mesh half extents of the box around it, none: its own. What is
+            round stands upright. A mesh cannot be drawn: those of a group divide the range evenly, the first is the
+            smallest. A layout brings sizes of its own.
+        speed: (low, high) range (m/s); (0, 0) stands still.
+        poses: fixed (x, y, yaw in degrees) of each obstacle, for walls; None: placed at every reset.
+        bottom: (low, high) range (m) of the height of its lowest point above the ground; (0, 0) stands on it. Negative:
+            it reaches into the ground, so that no gap opens below a long wall on a slope. A compound is lifted as a
+            whole.
+        heading_deg: (low, high) range (deg) of the direction in which it sets out, 0 along x.
+        yaw_deg: (low, high) range (deg) of its orientation about the vertical; a compound that moves faces its way.
+        area: where this group is placed and moves, in place of the preset's `area`; see `ObstaclesConfig`.
+        approach: None: it keeps its heading, up to the boundary; otherwise it comes at the robot, and neither area,
+            boundary nor heading apply.
+        motion: None: it keeps its heading.
+        file: of a mesh: one of the packaged ones (see `scene.meshes`) or a path. Rays and contacts are with its hull.
+        parts: of a compound, by name.
+        scale: (low, high) range of a compound's size.
+        present: (low, high) range of how many of them take part in an episode, which ones is random; None: all.
+        layout: generator of the whole group's poses and sizes, one world at every reset; a group of boxes.
+    """
+
+    kind: str
+    count: int
+    size: Sequence[Sequence[float]] = ()
+    speed: Sequence[float] = (0.0, 0.0)
+    poses: Sequence[Sequence[float]] | None = None
+    bottom: Sequence[float] = (0.0, 0.0)
+    heading_deg: Sequence[float] = (-180.0, 180.0)
+    yaw_deg: Sequence[float] = (-180.0, 180.0)
+    area: Sequence[float] | None = None
+    approach: ApproachConfig | None = None
+    motion: MotionConfig | None = None
+    file: str | None = None
+    parts: Mapping[str, PartConfig] = field(default_factory=dict)
+    scale: Sequence[float] = (1.0, 1.0)
+    present: Sequence[int] | None = None
+    layout: Layout | None = None
+
+    def __post_init__(self) -> None:
+        check_kind(self.kind, self.file, (*SIZES, COMPOUND))
+        if self.count < 1:
+            raise ValueError(f"obstacles: count={self.count} must be at least 1; leave the group out instead")
+        for key in ("speed", "bottom", "heading_deg", "yaw_deg", "scale"):
+            bounds = tuple(float(bound) for bound in getattr(self, key))
+            object.__setattr__(self, key, bounds)
+            if len(bounds) != 2 or bounds[0] > bounds[1]:
+                raise ValueError(f"obstacles: {key}={list(bounds)} must be a range [low, high] with low <= high")
+        if self.speed[0] < 0:
+            raise ValueError(f"obstacles: speed={list(self.speed)} must be a range 0 <= low <= high")
+        if self.area is not None:
+            object.__setattr__(self, "area", checked_area("a group's area", self.area))
+        self._check_shape()
+        self._check_places()
+        self._check_motion()
+
+    def _check_shape(self) -> None:
+        object.__setattr__(self, "parts", dict(self.parts))
+        if self.kind != COMPOUND:
+            if self.parts or self.scale != (1.0, 1.0):
+                raise ValueError(f"obstacles: a {self.kind} has no parts and no scale; use kind=compound")
+            own_size = self.layout is not None or self.file is not None
+            if self.size or not own_size:
+                object.__setattr__(self, "size", check_sizes(self.kind, self.size))
+            return
+        if not self.parts or self.size:
+            raise ValueError("obstacles: a compound has parts, and each of them its size; give parts, leave out size")
+        if self.scale[0] <= 0:
+            raise ValueError(f"obstacles: scale={list(self.scale)} must be a range 0 < low <= high")
+        meshes = [name for name, part in self.parts.items() if part.kind == "mesh"]
+        if meshes and self.scale[0] < self.scale[1]:
+            raise ValueError(
+                f"obstacles: scale={list(self.scale)} cannot vary with a mesh among the parts: {meshes[0]}"
+            )
+
+    def _check_places(self) -> None:
+        if self.present is not None:
+            object.__setattr__(self, "present", tuple(self.present))
+            if len(self.present) != 2 or not 0 <= self.present[0] <= self.present[1] <= self.count:
+                raise ValueError(
+                    f"obstacles: present={list(self.present)} must be a range within 0 to count={self.count}"
+                )
+        if self.poses is not None:
+            object.__setattr__(self, "poses", tuple(tuple(float(x) for x in pose) for pose in self.poses))
+            if len(self.poses) != self.count or any(len(pose) != 3 for pose in self.poses):
+                raise ValueError(f"obstacles: poses must be {self.count} triples (x, y, yaw_deg)")
+        if self.layout is not None and (self.kind != "box" or self.size or self.poses is not None or self.present):
+            raise ValueError("obstacles: a layout is for boxes and decides size, poses and present; leave them out")
+        if self.layout is not None and self.count != self.layout.count:
+            raise ValueError(f"obstacles: count={self.count} of a group must be its layout's, {self.layout.count}")
+
+    def _check_motion(self) -> None:
+        if self.has_poses and (self.approach is not None or self.moves):
+            raise ValueError("obstacles: a group with fixed poses or a layout stands; leave out speed and approach")
+        if self.approach is not None and self.speed[0] <= 0:
+            raise ValueError(f"obstacles: speed={list(self.speed)} of a group that approaches must be positive")
+        if self.motion is not None and not self.moves:
+            raise ValueError(f"obstacles: speed={list(self.speed)} of a group with motion must be positive")
+
+    @property
+    def moves(self) -> bool:
+        return self.speed[1] > 0
+
+    @property
+    def has_poses(self) -> bool:
+        """Tell whether its obstacles stand where they are told: fixed poses or a layout's."""
+        return self.poses is not None or self.layout is not None
+
+    @property
+    def largest_radius(self) -> float:
+        """Radius (m) of the circle around the footprint of its largest obstacle."""
+        if self.kind == COMPOUND:
+            return self.scale[1] * reach(self.parts)
+        sizes = self.sizes_of(self.count - 1)
+        return math.hypot(sizes[0][1], sizes[1][1] if self.kind in ("box", "mesh") else 0.0)
+
+    def sizes_of(self, index: int) -> tuple[tuple[float, float], ...]:
+        """(low, high) range (m) of each size of obstacle number `index`."""
+        if self.layout is not None:
+            return ((0.1, 0.1),) * 3  # until the first reset
+        if self.file is None:
+            return tuple((low, high) for low, high in self.size)
+        if not self.size:
+            return tuple((half, half) for half in mesh_points(self.file)[1])
+        share = index / max(self.count - 1, 1)
+        return tuple((low + share * (high - low),) * 2 for low, high in self.size)
+
+    def make_parts(self, name: str, obstacle: int, index: int) -> tuple[Part, ...]:
+        """Parts of obstacle number `index` of the group.
+
+        Args:
+            name: of the obstacle.
+            obstacle: its number in the scene.
+            index: its number in the group.
+        """
+        if self.kind != COMPOUND:
+            return (Part(name, obstacle, self, self.kind, self.sizes_of(index), self.file),)
+        low, high = self.scale
+        return tuple(
+            Part(
+                f"{name}_{key}",
+                obstacle,
+                self,
+                form.kind,
+                tuple((low * size, high * size) for size in form.size),
+                form.file,
+                form,
+            )
+            for key, form in self.parts.items()
+        )
+
+
+def checked_area(name: str, bounds: Sequence[float]) -> tuple[float, float, float, float]:
+    """Bounds of an area; raises a ValueError in one line that names it."""
+    area = tuple(float(x) for x in bounds)
+    if len(area) != 4 or area[0] >= area[1] or area[2] >= area[3]:
+        raise ValueError(f"obstacles: {name}={list(area)} must be [x_low, x_high, y_low, y_high]")
+    return area
