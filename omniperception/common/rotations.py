@@ -14,13 +14,14 @@ def rotate_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
 
 def rotate(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
     """Expresses in the world a vector (..., 3) given in the frame whose orientation in the world is `quat` (..., 4)."""
-    w, q = quat[..., :1], quat[..., 1:]
+    w, (q, vec) = quat[..., :1], torch.broadcast_tensors(quat[..., 1:], vec)
     t = 2.0 * torch.linalg.cross(q, vec)
     return vec + w * t + torch.linalg.cross(q, t)
 
 
 def multiply(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """Quaternions (..., 4) of the rotations by `second` and then by `first`, each (..., 4)."""
+    first, second = torch.broadcast_tensors(first, second)
     w, q = first[..., :1], first[..., 1:]
     v, r = second[..., :1], second[..., 1:]
     real = w * v - (q * r).sum(-1, keepdim=True)

@@ -154,14 +154,14 @@ class OmniEnv(VecEnv):
         target = self.state.default_joint_pos + self.robot.action_scale * actions
         if self.randomizer.joint_offset is not None:
             target = target + self.randomizer.joint_offset
-        path = None
+        path = turn = None
         if self.obstacles is not None:
             with self.timer.stage("obstacles"):
-                path = self._move(self.obstacles)
+                path, turn = self._move(self.obstacles)
         with self.timer.stage("physics"):
             if self.pushes is not None:
                 self.pushes.advance()
-            self.sim.step(target, self.config.sim.decimation, path)
+            self.sim.step(target, self.config.sim.decimation, path, turn)
             self.sim.detect_failures()
 
     def _resize(self, obstacles: ObstacleField, env_ids: torch.Tensor) -> None:
@@ -173,8 +173,8 @@ class OmniEnv(VecEnv):
             if self.sensing is not None:
                 self.sensing.resize(names, env_ids, sizes)
 
-    def _move(self, obstacles: ObstacleField) -> torch.Tensor:
-        """Moves the obstacles through the control step; where they are during each of its physics steps."""
+    def _move(self, obstacles: ObstacleField) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Moves the obstacles through the control step; see `ObstacleField.travel`."""
         sim, robot_xy_w = self.config.sim, self.sim.qpos[:, :2]
         if obstacles.any_approaches:
             commanded = rotate_yaw(self.state.kinematics.yaw, self.command.value[:, :2])

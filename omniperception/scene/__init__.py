@@ -5,7 +5,9 @@
 
 from omniperception.scene.build import World, build_world
 from omniperception.scene.obstacle_field import ObstacleField
-from omniperception.scene.obstacles import ApproachConfig, FreePathConfig, ObstacleGroup, ObstaclesConfig
+from omniperception.scene.obstacle_group import ApproachConfig, MotionConfig, ObstacleGroup
+from omniperception.scene.obstacles import FreePathConfig, ObstaclesConfig
+from omniperception.scene.parts import PartConfig, SwingConfig
 from omniperception.scene.robot import Mount, RobotConfig
 from omniperception.scene.terrain import TerrainConfig
 from omniperception.scene.tiled_terrain import TerrainCurriculumConfig, TiledTerrainConfig
@@ -13,11 +15,14 @@ from omniperception.scene.tiled_terrain import TerrainCurriculumConfig, TiledTer
 __all__ = [
     "ApproachConfig",
     "FreePathConfig",
+    "MotionConfig",
     "Mount",
     "ObstacleField",
     "ObstacleGroup",
     "ObstaclesConfig",
+    "PartConfig",
     "RobotConfig",
+    "SwingConfig",
     "TerrainConfig",
     "TerrainCurriculumConfig",
     "TiledTerrainConfig",

@@ -99,7 +99,7 @@ class Articulation:
             rows: which environments.
         """
         turned, heading = self.orientation(rows), yaw_quat(yaw)[:, self.obstacle]
-        middle = self._joint + rotate(turned, self._hang.expand(len(root), -1, -1))
+        middle = self._joint + rotate(turned, self._hang)
         middle = middle * self.scale[rows][:, self.obstacle, None]
         middle[..., 2] += self.lift[rows]
         return root[:, self.obstacle] + rotate(heading, middle), multiply(heading, turned)
@@ -118,9 +118,9 @@ class Articulation:
         speed = root_velocity.norm(dim=-1)[:, self.obstacle]
         per_second = self._frequency + self._per_metre * speed
         rate = self._amplitude * self._turn(rows).cos() * 2 * math.pi * per_second  # rad/s
-        arm = rotate(quat_about(self._axis, self.angles(rows)), self._hang.expand(len(rate), -1, -1))
+        arm = rotate(quat_about(self._axis, self.angles(rows)), self._hang)
         arm = arm * self.scale[rows][:, self.obstacle, None]
-        swing = rotate(self._rest.expand(len(rate), -1, -1), torch.linalg.cross(self._axis.expand_as(arm), arm))
+        swing = rotate(self._rest, torch.linalg.cross(self._axis.expand_as(arm), arm))
         swing = rotate(yaw_quat(yaw)[:, self.obstacle], swing * rate[..., None])
         return whole + swing[..., :2]
 

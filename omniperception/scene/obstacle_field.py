@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -12,29 +11,17 @@ from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import yaw_quat
 from omniperception.scene.articulation import Articulation, tilt_of
 from omniperception.scene.obstacle_group import COMPOUND
-from omniperception.scene.obstacle_motion import Wander, bounce, passing_velocity, wrap
+from omniperception.scene.obstacle_motion import Approach, Wander, bounce, wrap
 from omniperception.scene.obstacles import ObstaclesConfig
 from omniperception.scene.part_shapes import PartShapes, SizeRanges, footprint_radius, reach
-from omniperception.scene.placement import (
-    Poses,
-    Presence,
-    bent_path,
-    choose_apart,
-    distance_to_path,
-    push_off,
-    unit,
-    within,
-)
+from omniperception.scene.placement import Placement, unit, within
+from omniperception.scene.poses import Poses, Presence
 
 if TYPE_CHECKING:
     from omniperception.scene.ground import Ground
 
 PARKED_HEIGHT = -100.0
 """Height (m) at which an inactive obstacle is parked, below the ground where no ray and no contact finds it."""
-LOSE_SIGHT = 1.0
-"""Distance (m) beyond its farthest start at which an approaching obstacle starts again."""
-_CANDIDATES = 48
-"""Places drawn for an obstacle that has to keep clear of something; the first that does is taken."""
 
 
 class ObstacleField:
@@ -60,11 +47,15 @@ class ObstacleField:
         root_velocity_w: (num_envs, O, 2) m/s.
         root_active: (num_envs, O) bool.
         root_radius: (num_envs, O) m, of the circle around all that an obstacle covers, however it swings.
-        approaches: (O,) bool: which obstacles come at the robot.
-        any_approaches: whether some do, and `restart_approaching` has to be called.
+        any_approaches: whether some come at the robot, and `restart_approaching` has to be called.
         varying: indices of the parts whose sizes differ between environments.
         level: share of obstacles and of their speed that the curriculum lets in, 0 to 1; fixed ones are always there.
     """
+
+    outline: torch.Tensor
+    radius: torch.Tensor
+    half_height: torch.Tensor
+    root_radius: torch.Tensor
 
     def __init__(
         self,
@@ -95,19 +86,15 @@ class ObstacleField:
         self._bottom = column(*(group.bottom for group in groups))
         self._heading = torch.deg2rad(column(*(group.heading_deg for group in groups)))
         self._yaw = torch.deg2rad(column(*(group.yaw_deg for group in groups)))
-        area = column(*(group.area or config.area for group in groups))
-        self._bounds = area[:, [0, 2]], area[:, [1, 3]]
+        self._placement = Placement(config, random, pos_w)
         self._poses, self._presence = Poses(config, random, pos_w), Presence(config, random)
         loose = [k for k, part in enumerate(self.parts) if part.group.poses is None]
         self.free = slice(None) if len(loose) == len(self.parts) else torch.tensor(loose, device=device)
-        self.approaches = flags([group.approach is not None for group in groups])
-        self._within = column(*(group.approach.within if group.approach else 0.0 for group in groups))
-        self._start = column(*(group.approach.distance if group.approach else (0.0, 0.0) for group in groups))
-        self.any_approaches = any(group.approach is not None for group in groups)
+        self._approach = Approach(groups, random, pos_w)
+        self.any_approaches = self._approach.any
         wanders = any(group.motion is not None for group in groups)
         self._wander = Wander(groups, n, random, pos_w) if wanders else None
-        self._bound = ~(self.approaches | self._poses.which)
-        self._searches = config.spacing > 0.0 or config.free_path is not None
+        self._placed = self._approach.which | self._poses.which
         self._any_moves = any(group.moves for group in groups)
         self._stands = flags([not group.moves for group in groups]) & ~self._poses.which
         self._faces = flags([group.moves and group.kind == COMPOUND for group in groups])
@@ -166,15 +153,10 @@ class ObstacleField:
         present = self._presence.draw(env_ids)
         if present is not None:
             active = active & present
-        if self._searches:
-            xy, found = self._keep_clear(
-                env_ids, robot, goal_w, active & self._stands & (bottom < self.config.headroom)
-            )
-            active = active & found
-        else:
-            bounds = self._bounds if self.config.boundary == "bounce" else None
-            keep = self.config.clearance + self.root_radius[env_ids]
-            xy = push_off(self._in_area(u[:, :2], robot), robot, keep, bounds)
+        in_the_way = active & self._stands & (bottom < self.config.headroom)
+        radius, placed = self.root_radius[env_ids], self._placed
+        xy, found = self._placement.choose(env_ids, u[:, :2], robot, goal_w, radius, in_the_way, placed)
+        active = active & found
         if self._poses.any:
             active = active & (posed | ~self._poses.which)
             xy = torch.where(self._poses.which[:, None], pose[..., :2], xy)
@@ -189,7 +171,7 @@ class ObstacleField:
             self._wander.reset(env_ids, heading)
         if self.any_approaches:
             command = torch.zeros_like(robot) if command_w is None else command_w.to(self._dtype)
-            self._start_approach(env_ids, self.approaches & active, robot, command)
+            self._start_approach(env_ids, self._approach.which & active, robot, command)
         if self._ground is not None:
             self._above_ground[env_ids] = above_ground
             self.root_pos_w[env_ids, :, 2] = self._over_ground(env_ids)
@@ -204,10 +186,10 @@ class ObstacleField:
         xy = self.root_pos_w[..., :2]
         if self._any_moves:
             xy += self.root_velocity_w * dt
-        if self.config.boundary == "wrap":
-            wrap(xy, robot_xy_w.to(self._dtype), self._bounds, self._bound)
+        if self._placement.follows:
+            wrap(xy, robot_xy_w.to(self._dtype), self._placement.bounds, ~self._placed)
         elif self._any_moves:
-            bounce(xy, self.root_velocity_w, self._bounds, self._bound)
+            bounce(xy, self.root_velocity_w, self._placement.bounds, ~self._placed)
 
     def travel(self, dt: float, num_steps: int, robot_xy_w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Moves every obstacle by `num_steps` steps of `dt` (s); see `advance`.
@@ -249,12 +231,11 @@ class ObstacleField:
 
     def restart_approaching(self, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
         """Restarts approaching obstacles that have passed the robot; see `reset` for the arguments."""
-        distance = (self.root_pos_w[..., :2] - robot_xy_w.to(self._dtype)[:, None]).norm(dim=-1)
-        gone = self.approaches & self.root_active & (distance > self._start[:, 1] + LOSE_SIGHT)
+        robot_xy = robot_xy_w.to(self._dtype)
+        gone = self._approach.have_passed(self.root_pos_w[..., :2], robot_xy) & self.root_active
         env_ids = gone.any(1).nonzero().flatten()
         if len(env_ids):
-            robot, command = (xy[env_ids].to(self._dtype) for xy in (robot_xy_w, command_w))
-            self._start_approach(env_ids, gone[env_ids], robot, command)
+            self._start_approach(env_ids, gone[env_ids], robot_xy[env_ids], command_w[env_ids].to(self._dtype))
 
     def raise_level(self, velocity_error: float, seconds: float) -> None:
         """Raises the curriculum's level while the robot walks well (`velocity_error` in m/s)."""
@@ -354,43 +335,11 @@ class ObstacleField:
             self._part_path = self._path.new_zeros(n, num_steps, len(self.parts), 3)
             self._quat_path = self._path.new_zeros(n, num_steps, len(self.parts), 4)
 
-    # ---- placing -----------------------------------------------------------------------------------------------------
-
-    def _in_area(self, u: torch.Tensor, robot: torch.Tensor) -> torch.Tensor:
-        """Places (n, O, 2) in the areas from (n, 2, O) draws."""
-        anchor = robot[:, None] if self.config.boundary == "wrap" else 0.0
-        low, high = self._bounds
-        return low + u.transpose(1, 2) * (high - low) + anchor
-
-    def _keep_clear(
-        self, env_ids: torch.Tensor, robot: torch.Tensor, goal: torch.Tensor | None, in_the_way: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Places (n, O, 2), with the spacing and off the free path for those `in_the_way` (n, O), and whether found.
-
-        Every environment draws equally many random numbers, whatever fits.
-        """
-        config, radius = self.config, self.root_radius[env_ids]
-        u = self._random.uniform(env_ids, (_CANDIDATES * 2, radius.shape[1])).to(self._dtype)
-        places = torch.stack([self._in_area(pair, robot) for pair in u.split(2, 1)], 2)  # (n, O, C, 2)
-        fits = (places - robot[:, None, None]).norm(dim=-1) - radius[..., None] >= config.clearance
-        if config.free_path is not None:
-            assert goal is not None
-            bends = config.free_path.bend * (2 * self._random.uniform(env_ids, (2,)).to(self._dtype) - 1)
-            off_path = distance_to_path(places, bent_path(robot, goal.to(self._dtype), bends)) - radius[..., None]
-            fits &= (off_path >= config.free_path.width / 2) | ~in_the_way[..., None]
-        placed = (self.approaches | self._poses.which).expand(len(robot), -1)
-        return choose_apart(places, fits, radius, in_the_way, placed, config.spacing)
-
     def _start_approach(
         self, env_ids: torch.Tensor, which: torch.Tensor, robot: torch.Tensor, command: torch.Tensor
     ) -> None:
         """Puts obstacles `which` (n, O) around the robots (n, 2) on courses that lead past them."""
-        u = self._random.uniform(env_ids, (3, self.root_pos_w.shape[1])).to(self._dtype)
-        bearing = unit(2 * math.pi * u[:, 0])
-        distance = within(self._start, u[:, 1])
-        miss = (2 * u[:, 2] - 1) * self._within
-        velocity = passing_velocity(bearing, distance, miss, self._pace[env_ids], command[:, None])
-        xy = robot[:, None] + bearing * distance[..., None]
+        xy, velocity = self._approach.start(env_ids, robot, command, self._pace[env_ids])
         self.root_pos_w[env_ids, :, :2] = torch.where(which[..., None], xy, self.root_pos_w[env_ids, :, :2])
         self.root_velocity_w[env_ids] = torch.where(which[..., None], velocity, self.root_velocity_w[env_ids])
 

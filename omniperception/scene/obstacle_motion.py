@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -9,6 +10,9 @@ import torch
 from omniperception.common.random import EnvRandom
 from omniperception.scene.obstacle_group import MotionConfig, ObstacleGroup
 from omniperception.scene.placement import unit, within
+
+LOSE_SIGHT = 1.0
+"""Distance (m) beyond its farthest start at which an approaching obstacle starts again."""
 
 
 def passing_velocity(
@@ -67,6 +71,45 @@ def wrap(
     low = bounds[0] + centre[:, None]
     wrapped = low + torch.remainder(xy - low, bounds[1] - bounds[0])
     xy.copy_(torch.where(bound[:, None], wrapped, xy))
+
+
+class Approach:
+    """Obstacles of groups with `approach`, which come at the robot again and again.
+
+    Attributes:
+        which: (O,) bool.
+        any: whether there are some.
+    """
+
+    def __init__(self, groups: Sequence[ObstacleGroup], random: EnvRandom, like: torch.Tensor) -> None:
+        """`groups` of the O obstacles; `like` has the precision and the device of their positions."""
+        given = [group.approach for group in groups]
+        self._random, self.any = random, any(given)
+        self.which = torch.tensor([own is not None for own in given], dtype=torch.bool, device=like.device)
+        self._within = like.new_tensor([own.within if own else 0.0 for own in given])
+        self._start = like.new_tensor([own.distance if own else (0.0, 0.0) for own in given])
+
+    def have_passed(self, xy: torch.Tensor, robot: torch.Tensor) -> torch.Tensor:
+        """(n, O) bool: which of them at (n, O, 2) have left robots (n, 2) behind."""
+        return self.which & ((xy - robot[:, None]).norm(dim=-1) > self._start[:, 1] + LOSE_SIGHT)
+
+    def start(
+        self, env_ids: torch.Tensor, robot: torch.Tensor, command: torch.Tensor, pace: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Places (n, O, 2) around the robots and velocities (n, O, 2) that lead past them.
+
+        Args:
+            env_ids: (n,) which environments.
+            robot: (n, 2) m.
+            command: (n, 2) m/s, the velocity that it is commanded.
+            pace: (n, O) m/s, of the obstacles.
+        """
+        u = self._random.uniform(env_ids, (3, pace.shape[1])).to(pace.dtype)
+        bearing = unit(2 * math.pi * u[:, 0])
+        distance = within(self._start, u[:, 1])
+        miss = (2 * u[:, 2] - 1) * self._within
+        velocity = passing_velocity(bearing, distance, miss, pace, command[:, None])
+        return robot[:, None] + bearing * distance[..., None], velocity
 
 
 class Wander:

@@ -21,7 +21,7 @@ class SizeRanges:
         self._jointly = torch.tensor([part.form is not None for part in parts], dtype=torch.bool, device=device)
 
     def draw(self, u: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
-        """Sizes (n, P, 3) in m, padded with 0, from draws (n, 3, P); compounds are at `share` (n, O) of their ranges."""
+        """Sizes (n, P, 3) in m, padded with 0, from draws (n, 3, P), of compounds at `share` (n, O) of their ranges."""
         u = torch.where(self._jointly, share[:, None, self._obstacle], u)
         return self._low + u.transpose(1, 2) * (self._high - self._low)
 
@@ -72,7 +72,7 @@ def _reach(form: PartConfig) -> float:
     pos, hang = (torch.tensor(value, dtype=torch.float64) for value in (form.pos, form.hang))
     size = torch.tensor([[*form.size, 0.0, 0.0][:3]], dtype=torch.float64)
     half = PartShapes([form.kind], size.dtype, size.device).half_extents(size, matrix_of(turned)[:, None])[:, 0, :2]
-    centre = (pos + rotate(turned, hang.expand(37, 3)))[:, :2]
+    centre = (pos + rotate(turned, hang))[:, :2]
     return float((centre.norm(dim=1) + half.norm(dim=1)).max())
 
 

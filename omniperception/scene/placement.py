@@ -9,15 +9,81 @@ import torch
 from omniperception.common.random import EnvRandom
 from omniperception.scene.obstacles import ObstaclesConfig
 
-LAYOUT_SEEDS = {"dev": 1, "test": 2}
-"""Seeds of the layouts' worlds, by split."""
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _PUSH_OFF_TURNS = 16
+_CANDIDATES = 48
+"""Places drawn for an obstacle that has to keep clear of something; the first that does is taken."""
 
 
 def unit(angle: torch.Tensor) -> torch.Tensor:
     """Horizontal unit vectors (..., 2) at angles (...) in rad."""
     return torch.stack((angle.cos(), angle.sin()), -1)
+
+
+def within(bounds: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+    """Maps draws (n, num) from [0, 1) to ranges (num, 2)."""
+    return bounds[:, 0] + u * (bounds[:, 1] - bounds[:, 0])
+
+
+class Placement:
+    """Chooses where obstacles stand.
+
+    Attributes:
+        bounds: low and high (O, 2) m of the obstacles' areas.
+        follows: whether the areas lie around the robot.
+    """
+
+    def __init__(self, config: ObstaclesConfig, random: EnvRandom, like: torch.Tensor) -> None:
+        """`like` has the precision and the device of positions."""
+        self._config, self._random = config, random
+        area = like.new_tensor([own.group.area or config.area for own in config.obstacles()])
+        self.bounds = area[:, [0, 2]], area[:, [1, 3]]
+        self.follows = config.boundary == "wrap"
+        self._searches = config.spacing > 0.0 or config.free_path is not None
+
+    def choose(
+        self,
+        env_ids: torch.Tensor,
+        u: torch.Tensor,
+        robot: torch.Tensor,
+        goal: torch.Tensor | None,
+        radius: torch.Tensor,
+        in_the_way: torch.Tensor,
+        placed: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Places in environments (n,) that keep the clearance from the robot.
+
+        Every environment draws equally many random numbers, whatever fits.
+
+        Args:
+            env_ids: (n,).
+            u: (n, 2, O) draws.
+            robot, goal: (n, 2) m.
+            radius: (n, O) m.
+            in_the_way: (n, O) bool, who keeps the spacing and stays off the free path.
+            placed: (O,) bool, who needs no place.
+
+        Returns:
+            (n, O, 2) m, and who has found one (n, O) bool.
+        """
+        config = self._config
+        if not self._searches:
+            xy, bounds = self._in_area(u, robot), None if self.follows else self.bounds
+            return push_off(xy, robot, config.clearance + radius, bounds), torch.ones_like(in_the_way)
+        u = self._random.uniform(env_ids, (_CANDIDATES * 2, radius.shape[1])).to(radius.dtype)
+        places = torch.stack([self._in_area(pair, robot) for pair in u.split(2, 1)], 2)  # (n, O, C, 2)
+        fits = (places - robot[:, None, None]).norm(dim=-1) - radius[..., None] >= config.clearance
+        if config.free_path is not None:
+            assert goal is not None
+            bends = config.free_path.bend * (2 * self._random.uniform(env_ids, (2,)).to(radius.dtype) - 1)
+            off_path = distance_to_path(places, bent_path(robot, goal.to(radius.dtype), bends)) - radius[..., None]
+            fits &= (off_path >= config.free_path.width / 2) | ~in_the_way[..., None]
+        return choose_apart(places, fits, radius, in_the_way, placed.expand(len(robot), -1), config.spacing)
+
+    def _in_area(self, u: torch.Tensor, robot: torch.Tensor) -> torch.Tensor:
+        """Places (n, O, 2) in the areas from (n, 2, O) draws."""
+        low, high = self.bounds
+        return low + u.transpose(1, 2) * (high - low) + (robot[:, None] if self.follows else 0.0)
 
 
 def push_off(
@@ -98,82 +164,3 @@ def distance_to_path(points: torch.Tensor, path: torch.Tensor) -> torch.Tensor:
     along = ((flat - start) * side).sum(-1) / side.square().sum(-1).clamp(min=1e-12)
     foot = start + along.clamp(0.0, 1.0)[..., None] * side
     return (flat - foot).norm(dim=-1).amin(-1).reshape(points.shape[:-1])
-
-
-def within(bounds: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-    """Maps draws (n, num) from [0, 1) to ranges (num, 2)."""
-    return bounds[:, 0] + u * (bounds[:, 1] - bounds[:, 0])
-
-
-class Poses:
-    """Obstacles that stand where they are told: at fixed poses, or as the worlds of layouts have them.
-
-    Attributes:
-        which: (O,) bool, those with fixed poses or in a layout.
-        fixed: (O,) bool, those with fixed poses.
-        any: whether there are some.
-    """
-
-    def __init__(self, config: ObstaclesConfig, random: EnvRandom, like: torch.Tensor) -> None:
-        """`like` has the precision and the device of positions. The layouts' worlds are made here."""
-        obstacles = config.obstacles()
-        self._random = random
-        self.fixed = torch.tensor([o.pose is not None for o in obstacles], dtype=torch.bool, device=like.device)
-        self.which = torch.tensor([o.group.has_poses for o in obstacles], dtype=torch.bool, device=like.device)
-        self.any = any(o.group.has_poses for o in obstacles)
-        poses = like.new_tensor([o.pose or (0.0, 0.0, 0.0) for o in obstacles])
-        poses[:, 2] = torch.deg2rad(poses[:, 2])
-        self._pose = poses
-        self._tables: list[tuple[int, torch.Tensor]] = []
-        names = [own.name for own in obstacles]
-        part_names = config.geom_names()
-        self._columns: list[tuple[slice, slice]] = []
-        for name, group in config.groups.items():
-            if group.layout is not None:
-                table = like.new_tensor(group.layout.table(LAYOUT_SEEDS[config.split], group.layout.worlds))
-                own, part = names.index(f"obstacle_{name}_0"), part_names.index(f"obstacle_{name}_0")
-                self._columns.append((slice(own, own + group.count), slice(part, part + group.count)))
-                self._tables.append((group.layout.worlds, table))
-
-    def draw(self, env_ids: torch.Tensor, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Poses (n, O, 3), x and y in m and yaw in rad, of environments (n,), and which of them there are (n, O).
-
-        The sizes (n, P, 3) of what layouts have are written into `size`.
-        """
-        pose = self._pose.expand(len(env_ids), -1, -1)
-        there = self.which.expand(len(env_ids), -1)
-        if not self._tables:
-            return pose, there
-        pose, there = pose.clone(), there.clone()
-        u = self._random.uniform(env_ids, (len(self._tables),))
-        for k, ((worlds, table), (own, parts)) in enumerate(zip(self._tables, self._columns, strict=True)):
-            rows = table[(u[:, k] * worlds).long()]
-            there[:, own] = rows[..., 0].isfinite()
-            pose[:, own] = rows[..., :3].nan_to_num(0.0)
-            size[:, parts] = torch.where(there[:, own, None], rows[..., 3:], size[:, parts])
-        return pose, there
-
-
-class Presence:
-    """Who of the groups with `present` takes part in an episode."""
-
-    def __init__(self, config: ObstaclesConfig, random: EnvRandom) -> None:
-        self._random, self._groups, first = random, [], 0
-        for group in config.groups.values():
-            if group.present is not None:
-                low, high = group.present
-                self._groups.append((slice(first, first + group.count), low, high))
-            first += group.count
-        self._count = first
-
-    def draw(self, env_ids: torch.Tensor) -> torch.Tensor | None:
-        """(n, O) bool for environments (n,); None where all always take part."""
-        if not self._groups:
-            return None
-        u = self._random.uniform(env_ids, (self._count + len(self._groups),))
-        there = torch.ones(len(env_ids), self._count, dtype=torch.bool, device=u.device)
-        for k, (own, low, high) in enumerate(self._groups):
-            number = low + (u[:, self._count + k] * (high - low + 1)).long()
-            rank = u[:, own].argsort(1).argsort(1)
-            there[:, own] = rank < number[:, None]
-        return there

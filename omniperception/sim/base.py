@@ -68,7 +68,13 @@ class Simulator(Protocol):
         """(num_envs, num_steps, nq) and (num_envs, num_steps, nv): positions and velocities after each physics step of
         the last call of `step`, joints likewise, of a simulator that records states; valid until the next call."""
 
-    def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
+    def step(
+        self,
+        joint_target: torch.Tensor,
+        num_steps: int = 1,
+        mocap_path: torch.Tensor | None = None,
+        mocap_turn: torch.Tensor | None = None,
+    ) -> None:
         """Physics steps with (num_envs, num_joints) joint position targets (rad).
 
         Args:
@@ -76,6 +82,7 @@ class Simulator(Protocol):
             num_steps: physics steps.
             mocap_path: (num_envs, num_steps, num_parts, 3), m: where the kinematic bodies are during
                 each step; None leaves them where they are.
+            mocap_turn: (num_envs, num_steps, num_parts, 4), their orientations likewise; None leaves them as they are.
         """
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:

@@ -19,7 +19,7 @@ _INTEGRATORS = {
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
 }
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-_MOCAP_POS = int(mujoco.mjtState.mjSTATE_MOCAP_POS)
+_MOCAP_POS, _MOCAP_QUAT = int(mujoco.mjtState.mjSTATE_MOCAP_POS), int(mujoco.mjtState.mjSTATE_MOCAP_QUAT)
 _STAGE_POS, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_POS.value, mujoco.mjtStage.mjSTAGE_VEL.value
 
 
@@ -131,7 +131,13 @@ class MujocoSimulator:
         qpos, qvel = (torch.from_numpy(self._records[name]) for name in ("qpos", "qvel"))
         return self._order.from_file(qpos), self._order.from_file(qvel)
 
-    def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
+    def step(
+        self,
+        joint_target: torch.Tensor,
+        num_steps: int = 1,
+        mocap_path: torch.Tensor | None = None,
+        mocap_turn: torch.Tensor | None = None,
+    ) -> None:
         if not bool(torch.isfinite(joint_target).all()):
             joint_target = self._finite_targets(joint_target)
         self._ctrl.copy_(joint_target)
@@ -139,7 +145,7 @@ class MujocoSimulator:
             if mocap_path is None and not self._record:
                 self.batch.step(nstep=num_steps)
             else:
-                self._roll_out(num_steps, mocap_path)
+                self._roll_out(num_steps, mocap_path, mocap_turn)
         except SimulationError as error:
             raised = torch.zeros(self.num_envs, dtype=torch.bool)
             raised[torch.from_numpy(np.asarray(error.ids))] = True
@@ -153,17 +159,28 @@ class MujocoSimulator:
         self.mark_failed(~finite, Failure.ACTION)
         return torch.where(finite[:, None], joint_target.double(), self._ctrl)
 
-    def _roll_out(self, num_steps: int, mocap_path: torch.Tensor | None) -> None:
+    def _roll_out(self, num_steps: int, mocap_path: torch.Tensor | None, mocap_turn: torch.Tensor | None) -> None:
         """Steps with the kinematic bodies on their way, recording the requested fields after every step."""
         if self._records and next(iter(self._records.values())).shape[1] != num_steps:
             self._records = self._allocate_records(num_steps)
-        if mocap_path is not None and self.ground_pos is not None:
-            ground = self.ground_pos[:, None, None].expand(-1, num_steps, -1, -1)
-            mocap_path = torch.cat((ground, mocap_path), 2)
-        control = None if mocap_path is None else mocap_path.flatten(2).numpy()
+        control, spec = self._control(num_steps, mocap_path, mocap_turn)
         self.batch.rollout(
-            num_steps, control=control, control_spec=_MOCAP_POS, record=self._record or ("time",), out=self._records
+            num_steps, control=control, control_spec=spec, record=self._record or ("time",), out=self._records
         )
+
+    def _control(
+        self, num_steps: int, mocap_path: torch.Tensor | None, mocap_turn: torch.Tensor | None
+    ) -> tuple[np.ndarray | None, int]:
+        """What the engine writes into each step's state, and which part of the state that is."""
+        if mocap_path is None:
+            return None, _MOCAP_POS
+        given = [mocap_path] if mocap_turn is None else [mocap_path, mocap_turn]
+        if self.ground_pos is not None:  # it is the first kinematic body
+            ground = (self.ground_pos, self._kinematic[1][:, 0])
+            own = [pose[:, None, None].expand(-1, num_steps, -1, -1) for pose in ground]
+            given = [torch.cat(pair, 2) for pair in zip(own, given, strict=False)]
+        control = given[0].flatten(2) if len(given) == 1 else torch.cat([path.flatten(2) for path in given], 2)
+        return control.numpy(), _MOCAP_POS if mocap_turn is None else _MOCAP_POS | _MOCAP_QUAT
 
     def _allocate_records(self, num_steps: int) -> dict[str, np.ndarray]:
         model = self.world.model

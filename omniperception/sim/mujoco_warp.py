@@ -16,7 +16,7 @@ import warp as wp
 from omniperception.lidar.launch import wp_device
 from omniperception.scene import World
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, SizedGeoms
-from omniperception.sim.kernels import move_kinematic, record
+from omniperception.sim.kernels import move_kinematic, record, turn_kinematic
 from omniperception.sim.mujoco import SimConfig, apply_options
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
@@ -169,7 +169,13 @@ class MujocoWarpSimulator:
         qpos, qvel = (self._records[name] for name in ("qpos", "qvel"))
         return self._order.from_file(qpos), self._order.from_file(qvel)
 
-    def step(self, joint_target: torch.Tensor, num_steps: int = 1, mocap_path: torch.Tensor | None = None) -> None:
+    def step(
+        self,
+        joint_target: torch.Tensor,
+        num_steps: int = 1,
+        mocap_path: torch.Tensor | None = None,
+        mocap_turn: torch.Tensor | None = None,
+    ) -> None:
         if num_steps != self._num_steps:
             self._allocate_steps(num_steps)
         finite = torch.isfinite(joint_target).all(1)
@@ -177,9 +183,13 @@ class MujocoWarpSimulator:
         self._ctrl.copy_(torch.where(finite[:, None], joint_target.float(), self._ctrl))
         if mocap_path is None:
             self._launch("steps", self._steps)
-        else:
-            self._path.copy_(mocap_path)
+            return
+        self._path.copy_(mocap_path)
+        if mocap_turn is None:
             self._launch("steps along the path", self._steps_along_path)
+        else:
+            self._turns().copy_(mocap_turn)
+            self._launch("steps along the path, turning", self._steps_turning)
 
     def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
         self.failure.copy_(torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure))
@@ -292,16 +302,21 @@ class MujocoWarpSimulator:
             self._record(step)
 
     def _steps_along_path(self) -> None:
-        first = 0 if self.ground_pos is None else 1
         for step in range(self._num_steps):
-            wp.launch(
-                move_kinematic,
-                dim=(self.num_envs, self._path.shape[2]),
-                inputs=[step, first, self._wp_path],
-                outputs=[self.data.mocap_pos],
-            )
+            self._move(move_kinematic, step, self._wp_path, self.data.mocap_pos)
             self._engine.step(self.model, self.data)
             self._record(step)
+
+    def _steps_turning(self) -> None:
+        for step in range(self._num_steps):
+            self._move(move_kinematic, step, self._wp_path, self.data.mocap_pos)
+            self._move(turn_kinematic, step, self._wp_turn, self.data.mocap_quat)
+            self._engine.step(self.model, self.data)
+            self._record(step)
+
+    def _move(self, kernel: wp.Kernel, step: int, path: object, out: wp.array) -> None:
+        first = 0 if self.ground_pos is None else 1
+        wp.launch(kernel, dim=(self.num_envs, self._path.shape[2]), inputs=[step, first, path], outputs=[out])
 
     def _record(self, step: int) -> None:
         for name, out in self._wp_records.items():
@@ -355,7 +370,17 @@ class MujocoWarpSimulator:
         self._wp_records = {name: wp.from_torch(values) for name, values in self._records.items()}
         self._path = torch.zeros(self.num_envs, num_steps, self.mocap_pos.shape[1], 3, device=device)
         self._wp_path = wp.from_torch(self._path, dtype=wp.vec3)
+        self._turn: torch.Tensor | None = None
+        self._wp_turn: object = None
         self._graphs.clear()
+
+    @torch.inference_mode(False)
+    def _turns(self) -> torch.Tensor:
+        """Buffer for orientations of the kinematic bodies, made at its first use."""
+        if self._turn is None:
+            self._turn = torch.zeros(*self._path.shape[:3], 4, device=self.device)
+            self._wp_turn = wp.from_torch(self._turn, dtype=wp.quat)
+        return self._turn
 
     @torch.inference_mode(False)
     def _expand(self, name: str) -> None:

@@ -10,8 +10,8 @@ import torch
 from omniperception import build, config
 from omniperception.common.random import EnvRandom
 from omniperception.scene import ApproachConfig, FreePathConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
-from omniperception.scene.obstacle_field import LOSE_SIGHT, PARKED_HEIGHT
-from omniperception.scene.obstacle_motion import passing_velocity
+from omniperception.scene.obstacle_field import PARKED_HEIGHT
+from omniperception.scene.obstacle_motion import LOSE_SIGHT, passing_velocity
 from omniperception.scene.placement import bent_path, distance_to_path
 
 POST = [[0.3, 0.3], [0.5, 0.5]]

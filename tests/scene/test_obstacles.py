@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from omniperception.common.random import EnvRandom
-from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.scene import ApproachConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
-from omniperception.scene.obstacles import ApproachConfig, CurriculumConfig
+from omniperception.scene.obstacles import CurriculumConfig
 
 
 def field_of(num_envs=2000, seed=0, speed=(0.0, 1.0), **settings):
@@ -204,7 +204,7 @@ def test_fixed_poses_hold_in_every_environment_whatever_moves_around_them():
         ({"speed": (-1.0, 1.0)}, "speed="),
         ({"poses": [[0.0, 0.0]]}, "poses must be 1 triples"),
         ({"bottom": [0.5, 0.4]}, r"bottom=\[0\.5, 0\.4\]"),
-        ({"speed": [1.0, 1.0], "poses": [[0.0, 0.0, 0.0]]}, "with fixed poses stands"),
+        ({"speed": [1.0, 1.0], "poses": [[0.0, 0.0, 0.0]]}, "fixed poses or a layout stands"),
         ({"heading_deg": [90.0]}, "heading_deg"),
         ({"yaw_deg": [30.0, -30.0]}, "yaw_deg"),
         ({"area": [0.0, 1.0, 1.0]}, "a group's area"),

@@ -335,8 +335,12 @@ class TestObstacles:
         field = env.obstacles
         half = field.half_height
         before = field.pos_w[..., :2].clone()
-        path = field.travel(0.05, 6, env.sim.qpos[:, :2])
-        assert torch.equal(path[:, -1], field.pos_w) and field.travel(0.05, 6, env.sim.qpos[:, :2]) is path
+        path, turn = field.travel(0.05, 6, env.sim.qpos[:, :2])
+        assert (
+            torch.equal(path[:, -1], field.pos_w)
+            and field.travel(0.05, 6, env.sim.qpos[:, :2])[0] is path
+            and turn is None
+        )
         assert path.shape == (4, 6, field.pos_w.shape[1], 3) and (field.pos_w[..., :2] - before).abs().max() > 0.5
         for i in range(4):
             for step in range(6):

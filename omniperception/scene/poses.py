@@ -1,0 +1,85 @@
+"""Obstacles that stand where they are told, and which obstacles take part in an episode."""
+
+from __future__ import annotations
+
+import torch
+
+from omniperception.common.random import EnvRandom
+from omniperception.scene.obstacles import ObstaclesConfig
+
+LAYOUT_SEEDS = {"dev": 1, "test": 2}
+"""Seeds of the layouts' worlds, by split."""
+
+
+class Poses:
+    """Obstacles that stand where they are told: at fixed poses, or as the worlds of layouts have them.
+
+    Attributes:
+        which: (O,) bool, those with fixed poses or in a layout.
+        fixed: (O,) bool, those with fixed poses.
+        any: whether there are some.
+    """
+
+    def __init__(self, config: ObstaclesConfig, random: EnvRandom, like: torch.Tensor) -> None:
+        """`like` has the precision and the device of positions. The layouts' worlds are made here."""
+        obstacles = config.obstacles()
+        self._random = random
+        self.fixed = torch.tensor([o.pose is not None for o in obstacles], dtype=torch.bool, device=like.device)
+        self.which = torch.tensor([o.group.has_poses for o in obstacles], dtype=torch.bool, device=like.device)
+        self.any = any(o.group.has_poses for o in obstacles)
+        poses = like.new_tensor([o.pose or (0.0, 0.0, 0.0) for o in obstacles])
+        poses[:, 2] = torch.deg2rad(poses[:, 2])
+        self._pose = poses
+        self._tables: list[tuple[int, torch.Tensor]] = []
+        names = [own.name for own in obstacles]
+        part_names = config.geom_names()
+        self._columns: list[tuple[slice, slice]] = []
+        for name, group in config.groups.items():
+            if group.layout is not None:
+                table = like.new_tensor(group.layout.table(LAYOUT_SEEDS[config.split], group.layout.worlds))
+                own, part = names.index(f"obstacle_{name}_0"), part_names.index(f"obstacle_{name}_0")
+                self._columns.append((slice(own, own + group.count), slice(part, part + group.count)))
+                self._tables.append((group.layout.worlds, table))
+
+    def draw(self, env_ids: torch.Tensor, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Poses (n, O, 3), x and y in m and yaw in rad, of environments (n,), and which of them there are (n, O).
+
+        The sizes (n, P, 3) of what layouts have are written into `size`.
+        """
+        pose = self._pose.expand(len(env_ids), -1, -1)
+        there = self.which.expand(len(env_ids), -1)
+        if not self._tables:
+            return pose, there
+        pose, there = pose.clone(), there.clone()
+        u = self._random.uniform(env_ids, (len(self._tables),))
+        for k, ((worlds, table), (own, parts)) in enumerate(zip(self._tables, self._columns, strict=True)):
+            rows = table[(u[:, k] * worlds).long()]
+            there[:, own] = rows[..., 0].isfinite()
+            pose[:, own] = rows[..., :3].nan_to_num(0.0)
+            size[:, parts] = torch.where(there[:, own, None], rows[..., 3:], size[:, parts])
+        return pose, there
+
+
+class Presence:
+    """Who of the groups with `present` takes part in an episode."""
+
+    def __init__(self, config: ObstaclesConfig, random: EnvRandom) -> None:
+        self._random, self._groups, first = random, [], 0
+        for group in config.groups.values():
+            if group.present is not None:
+                low, high = group.present
+                self._groups.append((slice(first, first + group.count), low, high))
+            first += group.count
+        self._count = first
+
+    def draw(self, env_ids: torch.Tensor) -> torch.Tensor | None:
+        """(n, O) bool for environments (n,); None where all always take part."""
+        if not self._groups:
+            return None
+        u = self._random.uniform(env_ids, (self._count + len(self._groups),))
+        there = torch.ones(len(env_ids), self._count, dtype=torch.bool, device=u.device)
+        for k, (own, low, high) in enumerate(self._groups):
+            number = low + (u[:, self._count + k] * (high - low + 1)).long()
+            rank = u[:, own].argsort(1).argsort(1)
+            there[:, own] = rank < number[:, None]
+        return there
