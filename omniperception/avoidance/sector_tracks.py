@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import torch
 
-from omniperception.avoidance.sector_motion import nothing_near
 from omniperception.common.rotations import rotate_yaw
+
+_NOWHERE = 1e3
+"""Coordinate (m) of what is not there."""
 
 
 @dataclass(frozen=True)
@@ -16,165 +18,205 @@ class TracksConfig:
     """How frames are matched.
 
     Attributes:
-        period_s: s, from frame to frame.
-        link: places of neighbouring sectors at most this far (m) apart belong to one cluster.
+        link: places of neighbouring sectors belong to one cluster where they are at most this (m) and the width of a
+            sector there apart.
         gate: a cluster is the one of the frame before that would by now be nearest to it, if within this (m).
         widest: clusters that reach farther (m) from their middle stand still: walls, whose middle moves with the view.
-        beta: least gain of the velocity filter; it starts as the least-squares line through all frames so far.
+        gain: least gain of the velocity's filter, which starts as the straight line through all frames so far.
+        turn: a cluster this far (m) off has turned, and its filter starts anew.
         min_frames: matches before a cluster has a velocity.
-        min_speed: slower ones (m/s) stand still: what range noise makes of standing ones.
-        max_speed: bound of speeds (m/s).
+        min_speed, max_speed: slower ones (m/s) stand still, faster ones move at this speed.
+        look_back: frames after which a place that is taken again shows that something stands there.
+        same_place: how near it has to be (m), beside the width of a sector there.
+        stands: a cluster stands still where this share of its places was taken.
         remember: frames for which a place that is not seen any more still counts.
-        blind: those nearer than this (m) count for `remember_near` frames: the sensor sees little of what is close.
-        remember_near: see `blind`.
+        blind, remember_near: those nearer than `blind` (m) count for `remember_near` frames, because the sensor sees
+            little of what is close.
     """
 
-    period_s: float = 0.1
-    link: float = 0.35
+    link: float = 0.1
     gate: float = 0.5
     widest: float = 0.6
-    beta: float = 0.15
+    gain: float = 0.15
+    turn: float = 0.2
     min_frames: int = 2
-    min_speed: float = 0.35
+    min_speed: float = 0.3
     max_speed: float = 2.5
+    look_back: int = 5
+    same_place: float = 0.06
+    stands: float = 0.8
     remember: int = 1
     blind: float = 0.8
     remember_near: int = 10
 
 
 class SectorTracks:
-    """Nearest obstacles by sector with their velocities, over frames.
+    """Nearest obstacles by sector with their velocities, over frames: `advance` at each control step, `update` at each
+    frame.
 
-    All tensors are in the yaw-aligned frame of the base at the newest frame and hold 2 S tracks: the clusters of the
-    newest frame and those of the one before that it did not match.
+    All places are in the yaw-aligned frame of the base as it is now. There are 2 S tracks: the clusters of the newest
+    frame, and those of the one before that it did not match.
     """
 
-    def __init__(self, config: TracksConfig, num_envs: int, num_sectors: int, device: torch.device) -> None:
-        self.config, self._sectors = config, num_sectors
+    def __init__(
+        self, config: TracksConfig, num_envs: int, num_sectors: int, period_s: float, device: torch.device
+    ) -> None:
+        """Args: config: settings; num_sectors: S; period_s: s, from frame to frame."""
+        self.config, self._sectors, self._period = config, num_sectors, period_s
         self._pos = torch.zeros(num_envs, 2 * num_sectors, 2, device=device)
         self._vel = torch.zeros_like(self._pos)
-        self._age = torch.full(self._pos.shape[:2], -1, device=device)  # matches so far; -1: no track
-        self.motion = nothing_near(num_envs, num_sectors, device)
-        self._place = torch.zeros(num_envs, num_sectors, 2, device=device)
+        self._matches = torch.full(self._pos.shape[:2], -1, device=device)  # -1: no track
+        self._past = torch.full((num_envs, config.look_back, num_sectors, 2), _NOWHERE, device=device)
+        self._place = torch.full((num_envs, num_sectors, 2), _NOWHERE, device=device)  # what counts as an obstacle
+        self._place_vel = torch.zeros_like(self._place)
         self._unseen = torch.zeros(num_envs, num_sectors, dtype=torch.int64, device=device)
 
     def reset(self, ended: torch.Tensor) -> None:
         """Forgets everything in environments (n,) bool."""
-        self._age = self._age.masked_fill(ended[:, None], -1)
-        self.motion = torch.where(ended[:, None, None], nothing_near(1, self._sectors, ended.device), self.motion)
+        self._matches = self._matches.masked_fill(ended[:, None], -1)
+        self._past = self._past.masked_fill(ended[:, None, None, None], _NOWHERE)
+        self._place = self._place.masked_fill(ended[:, None, None], _NOWHERE)
 
-    def update(
-        self, distance: torch.Tensor, place: torch.Tensor, moved: torch.Tensor, fresh: torch.Tensor
-    ) -> torch.Tensor:
+    def advance(self, moved: torch.Tensor, dt: float) -> None:
+        """Takes in that the base has moved by (n, 3) x, y (m), yaw (rad), in its frame before, in `dt` (s)."""
+        back, turn = moved[:, None, :2], -moved[:, 2]
+        self._pos = rotate_yaw(turn, self._pos + dt * self._vel - back)
+        self._vel = rotate_yaw(turn, self._vel)
+        self._past = rotate_yaw(turn, self._past - back[:, None])
+        self._place = rotate_yaw(turn, self._place + dt * self._place_vel - back)
+        self._place_vel = rotate_yaw(turn, self._place_vel)
+
+    def motion(self) -> torch.Tensor:
+        """(n, S, 3) distance (m, infinite without an obstacle) and velocity (m/s) of the nearest by sector, now."""
+        distance = self._place.norm(dim=-1)
+        nearest, who = _nearest(self._place, distance, self._sectors)
+        velocity = torch.where(nearest.isfinite()[..., None], self._place_vel.gather(1, _pairs(who)), 0.0)
+        return torch.cat((nearest[..., None], velocity), -1)
+
+    def update(self, distance: torch.Tensor, place: torch.Tensor, fresh: torch.Tensor) -> None:
         """Takes in a frame.
 
         Args:
             distance: (n, S) m, infinite without an obstacle.
             place: (n, S, 2) m.
-            moved: (n, 3) own motion since the frame before: x, y (m) and yaw (rad), in that one's frame.
             fresh: (n,) bool: which have a new frame; the others' obstacles go on as they did.
-
-        Returns:
-            (n, S, 3) distance (m, infinite without an obstacle) and velocity (m/s).
         """
-        self._move(moved)
         distance = torch.where(fresh[:, None], distance, math.inf)
-        label = self._clusters(distance, place)
-        velocity = self._match(distance, place, label, fresh)
-        self._merge(distance, place, velocity)
-        return self.motion
-
-    def _move(self, moved: torch.Tensor) -> None:
-        """Tracks and remembered places as they would be seen now."""
-        dt, back, turn = self.config.period_s, moved[:, None, :2], -moved[:, 2]
-        self._pos = rotate_yaw(turn, self._pos + dt * self._vel - back)
-        self._vel = rotate_yaw(turn, self._vel)
-        velocity = self.motion[..., 1:]
-        self._place = rotate_yaw(turn, self._place + dt * velocity - back)
-        self.motion = torch.cat((self.motion[..., :1], rotate_yaw(turn, velocity)), -1)
-
-    def _clusters(self, distance: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-        """(n, S) int64 cluster of each sector; neighbours on either side of the ring's ends belong together too."""
         seen = distance.isfinite()
-        apart = (place - place.roll(1, 1)).norm(dim=-1) > self.config.link
-        linked = seen & seen.roll(1, 1) & ~apart  # to the sector before
-        label = (~linked).long().cumsum(1).clamp(max=self._sectors - 1)
-        closes = linked[:, :1] & (label == label[:, -1:])
-        return torch.where(closes, label[:, :1], label)
+        place = torch.where(seen[..., None], place, _NOWHERE)
+        clusters = _Clusters(place, seen, self.config.link + self._width(distance))
+        velocity = self._match(clusters, fresh)
+        moves = (clusters.extent < self.config.widest) & ~self._stands(clusters, distance)
+        self._past = torch.where(
+            fresh[:, None, None, None], torch.cat((self._past[:, 1:], place[:, None]), 1), self._past
+        )
+        self._merge(distance, place, (velocity * moves[..., None]).gather(1, _pairs(clusters.label)))
 
-    def _match(
-        self, distance: torch.Tensor, place: torch.Tensor, label: torch.Tensor, fresh: torch.Tensor
-    ) -> torch.Tensor:
-        """(n, S, 2) velocities of the sectors' clusters, which become the tracks."""
-        config, seen = self.config, distance.isfinite()
-        members = _sums(seen.float(), label)
-        exists = members > 0
-        middle = torch.stack([_sums(torch.where(seen, x, 0.0), label) for x in place.unbind(-1)], -1)
-        middle = middle / members.clamp(min=1.0)[..., None]
-        off = torch.where(seen, (place - middle.gather(1, _pairs(label))).norm(dim=-1), 0.0)
-        extent = torch.zeros_like(off).scatter_reduce_(1, label, off, "amax")
-        gap = torch.cdist(middle, self._pos).masked_fill((self._age < 0)[:, None], math.inf)
+    def _width(self, distance: torch.Tensor) -> torch.Tensor:
+        """(n, S) m: width of sectors at a distance (m)."""
+        return 2.0 * math.pi / self._sectors * distance.clamp(max=_NOWHERE)
+
+    def _match(self, clusters: _Clusters, fresh: torch.Tensor) -> torch.Tensor:
+        """(n, S, 2) velocities of the clusters, which become the tracks."""
+        config = self.config
+        gap = torch.cdist(clusters.middle, self._pos).masked_fill((self._matches < 0)[:, None], math.inf)
         nearest, track = gap.min(2)
-        matched = exists & (nearest < config.gate)
+        matched = clusters.exists & (nearest < config.gate)
         expected, before = self._pos.gather(1, _pairs(track)), self._vel.gather(1, _pairs(track))
-        matches = torch.where(matched, self._age.gather(1, track) + 1, 0)
-        alpha, beta = _gains(matches, config.beta)
-        error = torch.where(matched[..., None], middle - expected, 0.0)
-        pos = torch.where(matched[..., None], expected + alpha[..., None] * error, middle)
-        vel = torch.where(matched[..., None], before + (beta / config.period_s)[..., None] * error, 0.0)
-        age = torch.where(exists, matches, -1)
-        self._keep(pos, vel, age, track, matched, fresh)
-        speed = vel.norm(dim=-1)
-        moves = (extent < config.widest) & (matches >= config.min_frames) & (speed > config.min_speed)
-        vel = vel * (moves * (config.max_speed / speed.clamp(min=config.max_speed)))[..., None]
-        return vel.gather(1, _pairs(label))
-
-    def _keep(
-        self,
-        pos: torch.Tensor,
-        vel: torch.Tensor,
-        age: torch.Tensor,
-        track: torch.Tensor,
-        matched: torch.Tensor,
-        fresh: torch.Tensor,
-    ) -> None:
-        """The clusters become tracks, beside the unmatched ones of the frame before."""
-        taken = torch.zeros_like(self._age).scatter_reduce_(1, track, matched.long(), "amax").bool()
+        error = torch.where(matched[..., None], clusters.middle - expected, 0.0)
+        matches = torch.where(matched, self._matches.gather(1, track) + 1, 0)
+        matches = torch.where(nearest > config.turn, matches.clamp(max=2), matches)
+        alpha, beta = _gains(matches, config.gain)
+        pos = torch.where(matched[..., None], expected + alpha[..., None] * error, clusters.middle)
+        vel = torch.where(matched[..., None], before + (beta / self._period)[..., None] * error, 0.0)
+        taken = torch.zeros_like(self._matches).scatter_reduce_(1, track, matched.long(), "amax")
         s = self._sectors
-        left = torch.where(taken[:, :s], -1, self._age[:, :s])
-        kept = torch.cat((pos, self._pos[:, :s]), 1), torch.cat((vel, self._vel[:, :s]), 1), torch.cat((age, left), 1)
-        self._pos = torch.where(fresh[:, None, None], kept[0], self._pos)
-        self._vel = torch.where(fresh[:, None, None], kept[1], self._vel)
-        self._age = torch.where(fresh[:, None], kept[2], self._age)
+        left = torch.where(taken[:, :s] > 0, -1, self._matches[:, :s])
+        tracks = (pos, self._pos[:, :s]), (vel, self._vel[:, :s]), (torch.where(clusters.exists, matches, -1), left)
+        self._pos = torch.where(fresh[:, None, None], torch.cat(tracks[0], 1), self._pos)
+        self._vel = torch.where(fresh[:, None, None], torch.cat(tracks[1], 1), self._vel)
+        self._matches = torch.where(fresh[:, None], torch.cat(tracks[2], 1), self._matches)
+        speed = vel.norm(dim=-1)
+        moves = (matches >= config.min_frames) & (speed > config.min_speed)
+        return vel * (moves * (config.max_speed / speed.clamp(min=config.max_speed)))[..., None]
+
+    def _stands(self, clusters: _Clusters, distance: torch.Tensor) -> torch.Tensor:
+        """(n, S) bool: clusters most of whose places were taken `look_back` frames ago."""
+        off = torch.cdist(clusters.place, self._past[:, 0]).amin(2)
+        near = self.config.same_place + self._width(distance)
+        stood = _sums((clusters.seen & (off < near)).float(), clusters.label)
+        return stood >= self.config.stands * clusters.members
 
     def _merge(self, distance: torch.Tensor, place: torch.Tensor, velocity: torch.Tensor) -> None:
         """The nearest by sector of what is seen now and what is remembered."""
-        config, s = self.config, self._sectors
-        was, age = self._place.norm(dim=-1), self._unseen + 1
-        lasts = age <= torch.where(was < config.blind, config.remember_near, config.remember)
-        was = torch.where(self.motion[..., 0].isfinite() & lasts, was, math.inf)
-        far = torch.cat((distance, was), 1)
-        places, speeds = torch.cat((place, self._place), 1), torch.cat((velocity, self.motion[..., 1:]), 1)
+        config, was, age = self.config, self._place.norm(dim=-1), self._unseen + 1
+        there = distance.gather(1, _sector(self._place, self._sectors))
+        is_near = was < config.blind
+        lasts = age <= torch.where(is_near, config.remember_near, config.remember)
+        lasts &= torch.where(is_near, there > was + config.link, there.isinf())  # nothing is seen in its stead
+        places = torch.cat((place, self._place), 1)
         ages = torch.cat((torch.zeros_like(age), age), 1)
-        turned = (torch.atan2(places[..., 1], places[..., 0]) + math.pi) * (s / (2.0 * math.pi))
-        sector = turned.long().clamp(0, s - 1)
-        nearest = far.new_full((len(far), s), math.inf).scatter_reduce_(1, sector, far, "amin")
-        wins = far.isfinite() & (far <= nearest.gather(1, sector))
-        who = torch.zeros_like(sector[:, :s]).scatter_reduce_(
-            1, sector, torch.where(wins, torch.arange(2 * s, device=far.device), 0), "amax"
-        )
-        self._place, self._unseen = places.gather(1, _pairs(who)), ages.gather(1, who)
-        speeds = torch.where(nearest.isfinite()[..., None], speeds.gather(1, _pairs(who)), 0.0)
-        self.motion = torch.cat((nearest[..., None], speeds), -1)
+        far = torch.cat((distance, torch.where(lasts, was, math.inf)), 1)
+        nearest, who = _nearest(places, far, self._sectors)
+        self._place = torch.where(nearest.isfinite()[..., None], places.gather(1, _pairs(who)), _NOWHERE)
+        self._place_vel = torch.cat((velocity, self._place_vel), 1).gather(1, _pairs(who))
+        self._unseen = ages.gather(1, who)
+
+
+class _Clusters:
+    """Places of neighbouring sectors that are close to each other.
+
+    Attributes:
+        place, seen: (n, S, 2) and (n, S), as given.
+        label: (n, S) int64: cluster of each sector; the numbers are below S.
+        members, exists, middle, extent: (n, S), (n, S) bool, (n, S, 2) m, (n, S) m by cluster: sectors, whether there
+            are any, their mean place, and the largest distance from it.
+    """
+
+    def __init__(self, place: torch.Tensor, seen: torch.Tensor, link: torch.Tensor) -> None:
+        self.place, self.seen = place, seen
+        apart = (place - place.roll(1, 1)).norm(dim=-1) > link
+        linked = seen & seen.roll(1, 1) & ~apart  # to the sector before
+        label = (~linked).long().cumsum(1).clamp(max=seen.shape[1] - 1)
+        self.label = torch.where(linked[:, :1] & (label == label[:, -1:]), label[:, :1], label)  # closes the ring
+        self.members = _sums(seen.float(), self.label)
+        self.exists = self.members > 0
+        total = torch.stack([_sums(torch.where(seen, x, 0.0), self.label) for x in place.unbind(-1)], -1)
+        self.middle = total / self.members.clamp(min=1.0)[..., None]
+        off = (place - self.middle.gather(1, _pairs(self.label))).norm(dim=-1)
+        self.extent = torch.zeros_like(off).scatter_reduce_(1, self.label, torch.where(seen, off, 0.0), "amax")
 
 
 def _gains(matches: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Gains of position and velocity of a line fitted to `matches` + 1 frames, until the latter falls to `least`."""
     k = matches.float().clamp(min=1.0)
-    beta = (6.0 / ((k + 1.0) * (k + 2.0))).clamp(max=1.0)
-    alpha = (2.0 * (2.0 * k + 1.0) / ((k + 1.0) * (k + 2.0))).clamp(max=1.0)
-    steady = math.sqrt(2.0 * least) - 0.5 * least  # critically damped
-    return alpha.clamp(min=steady), beta.clamp(min=least)
+    alpha = 2.0 * (2.0 * k + 1.0) / ((k + 1.0) * (k + 2.0))
+    beta = 6.0 / ((k + 1.0) * (k + 2.0))
+    steady = math.sqrt(2.0 * least) - 0.5 * least
+    return alpha.clamp(min=steady, max=1.0), beta.clamp(min=least, max=1.0)
+
+
+def _nearest(places: torch.Tensor, distance: torch.Tensor, num_sectors: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """(n, S) distance to the nearest of places (n, k, 2) by sector, infinite without one, and which it is, int64.
+
+    Args:
+        places: (n, k, 2) m.
+        distance: (n, k) m; `_NOWHERE` and beyond, for what is not there.
+        num_sectors: S.
+    """
+    distance = torch.where(distance < 0.5 * _NOWHERE, distance, math.inf)
+    sector = _sector(places, num_sectors)
+    nearest = distance.new_full((len(distance), num_sectors), math.inf).scatter_reduce_(1, sector, distance, "amin")
+    wins = distance.isfinite() & (distance <= nearest.gather(1, sector))
+    index = torch.arange(distance.shape[1], device=distance.device)
+    who = torch.zeros_like(nearest, dtype=torch.int64)
+    return nearest, who.scatter_reduce_(1, sector, torch.where(wins, index, 0), "amax")
+
+
+def _sector(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
+    """(n, k) int64 azimuth sector of places (n, k, 2)."""
+    turned = (torch.atan2(places[..., 1], places[..., 0]) + math.pi) * (num_sectors / (2.0 * math.pi))
+    return turned.long().clamp(0, num_sectors - 1)
 
 
 def _pairs(index: torch.Tensor) -> torch.Tensor:

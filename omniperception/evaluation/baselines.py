@@ -165,6 +165,11 @@ class _Clouds:
         return self._sensing.tick != self._tick
 
     @property
+    def period_s(self) -> float:
+        """Time (s) from frame to frame."""
+        return self._sensing.period_steps * self._env.control_dt
+
+    @property
     def begun(self) -> torch.Tensor:
         """(num_envs,) bool: whose episode has just begun; their newest cloud shows the one before."""
         return (self._env.episode_length_buf == 0) & (self._env.step_count > 0)
@@ -186,22 +191,29 @@ class _Histogram:
     """Distance and velocity of the nearest obstacle by sector, (num_envs, S, 3), at each control step."""
 
     def __init__(self, env: OmniEnv, config: HistogramConfig) -> None:
-        self._env, self._config, self._clouds = env, config, _Clouds(env)
+        self._env, self._config, self._clouds, self._step = env, config, _Clouds(env), -1
         self._odometry = Odometry(env.num_envs, env.control_dt, env.device)
         self._odometry.start(torch.arange(env.num_envs, device=env.device), env.state.measured)
-        self._tracks = SectorTracks(config.tracks, env.num_envs, config.geometry.num_sectors, env.device)
+        self._tracks = SectorTracks(
+            config.tracks, env.num_envs, config.geometry.num_sectors, self._clouds.period_s, env.device
+        )
 
     def __call__(self) -> torch.Tensor:
-        """Takes in the control step that has just been done."""
+        """As of now; takes in the control step that has just been done, once."""
+        if self._env.step_count != self._step:
+            self._step = self._env.step_count
+            self._follow()
+        return self._tracks.motion()
+
+    def _follow(self) -> None:
         clouds, measured, begun = self._clouds, self._env.state.measured, self._clouds.begun
         self._odometry.advance(measured)
         self._odometry.start(begun.nonzero().flatten(), measured)
         self._tracks.reset(begun)
+        self._tracks.advance(self._odometry.since_last_frame(), self._env.control_dt)
         if clouds.is_new:
             nearest = clouds.nearest(self._config.geometry)
-            moved = self._odometry.since_last_frame()
-            self._tracks.update(nearest.distance, nearest.place, moved, clouds.fresh)
-        return self._tracks.motion
+            self._tracks.update(nearest.distance, nearest.place, clouds.fresh)
 
 
 class _Stop:

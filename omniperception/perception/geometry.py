@@ -34,7 +34,8 @@ class GeometryConfig:
         cell_sectors, ring: cells of the local ground: azimuth sectors, and depth (m) of the rings around the base.
         lowest: returns up to this (m) above the lowest of a cell are its ground: how far range noise spreads them.
         slope: most that the local ground rises outwards against the plane.
-        min_height: returns that stand at most this (m) above the ground are ground.
+        min_height, rise: returns that stand at most this (m) above the ground are ground, and by so much (m/m) more
+            with the distance from the base.
         headroom: returns at least this (m) above it hang too high to matter.
         min_points: returns that make an obstacle in a sector.
         spread: returns up to this share behind the nearest are the same surface; twice what range noise spreads it.
@@ -46,16 +47,17 @@ class GeometryConfig:
     near: float = 0.32
     near_share: float = 0.35
     standing: float = 0.33
-    bands: tuple[float, ...] = (0.25, 0.15, 0.08)
+    bands: tuple[float, ...] = (0.25, 0.25, 0.25, 0.15, 0.08)
     fit_reach: float = 2.5
     cell_sectors: int = 24
     ring: float = 0.3
     lowest: float = 0.06
     slope: float = 0.2
     min_height: float = 0.05
+    rise: float = 0.005
     headroom: float = 0.45
     min_points: int = 1
-    spread: float = 0.2
+    spread: float = 0.15
 
 
 class Nearest(NamedTuple):
@@ -85,9 +87,12 @@ def nearest_obstacles(
     """
     in_base, points = _points(ranges, directions_s, attitude)
     counts = ranges.isfinite() & ~own_body(in_base, config)
-    counts &= ~near_noise(ranges, points, attitude, counts, config)
-    height = height_above_ground(points, counts, config)
-    return by_sector(points[..., :2], counts & (height > config.min_height) & (height < config.headroom), config)
+    is_near = ranges < config.near
+    height = height_above_ground(points, counts & ~is_near, config)
+    least = config.min_height + config.rise * points[..., :2].norm(dim=-1)
+    stands = counts & (height > least) & (height < config.headroom)
+    stands &= ~near_noise(points, stands & is_near, counts, attitude, config)
+    return by_sector(points[..., :2], stands, config)
 
 
 def _points(ranges: torch.Tensor, directions_s: torch.Tensor, attitude: Attitude) -> tuple[torch.Tensor, torch.Tensor]:
@@ -116,21 +121,19 @@ def own_body(points_b: torch.Tensor, config: GeometryConfig) -> torch.Tensor:
 
 
 def near_noise(
-    ranges: torch.Tensor, points: torch.Tensor, attitude: Attitude, counts: torch.Tensor, config: GeometryConfig
+    points: torch.Tensor, near: torch.Tensor, counts: torch.Tensor, attitude: Attitude, config: GeometryConfig
 ) -> torch.Tensor:
     """(n, R) bool: which returns next to the sensor stand alone among farther ones of their direction: noise.
 
     Args:
-        ranges: (n, R) m.
         points: (n, R, 3) m, yaw-aligned frame.
+        near: (n, R) bool: the returns in question.
+        counts: (n, R) bool: all returns.
         attitude: with the mount of the sensor.
-        counts: (n, R) bool: returns.
-        config: `near` and `near_share`.
+        config: `near_share`.
     """
-    mount = points.new_tensor(attitude.mount_pos)
-    sensor = levelling(attitude.base_quat) @ mount
+    sensor = levelling(attitude.base_quat) @ points.new_tensor(attitude.mount_pos)
     sector = sector_of(points[..., :2] - sensor[:, None, :2], config.cell_sectors)
-    near = counts & (ranges < config.near)
     share = _sums(near.float(), sector, config.cell_sectors)
     share = share / _sums(counts.float(), sector, config.cell_sectors).clamp(min=1.0)
     return near & (share.gather(1, sector) < config.near_share)
@@ -145,7 +148,7 @@ def height_above_ground(points: torch.Tensor, counts: torch.Tensor, config: Geom
 
     Args:
         points: (n, R, 3) m, yaw-aligned frame.
-        counts: (n, R) bool: returns.
+        counts: (n, R) bool: which tell of the ground; those next to the sensor may be noise.
         config: how the ground is found.
     """
     distance = points[..., :2].norm(dim=-1)
