@@ -48,7 +48,7 @@ FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
 def blocks() -> dict[str, str]:
     """The blocks of Python of the LiDAR's page, by what is in and out of them."""
     found = re.findall(r"```python\n(.*?)```", LIDAR.read_text(), flags=re.DOTALL)
-    return dict(zip(("numpy", "torch", "mujoco", "simulators", "mesh", "table"), found, strict=True))
+    return dict(zip(("numpy", "torch", "mujoco", "simulators", "mesh", "sizes", "table"), found, strict=True))
 
 
 @pytest.fixture
@@ -210,6 +210,13 @@ def test_a_mesh_file(run):
     height = corners[1][2] - (normal[0] * (0.1 - corners[1][0]) + normal[1] * (0.0 - corners[1][1])) / normal[2]
     assert hits.shape_id.tolist() == [[1], [1]]
     np.testing.assert_allclose(hits.ranges.numpy(), 5.0 - (2.0 + height), rtol=1e-5)
+
+
+def test_sizes_by_environment(run):
+    sizes = run("sizes")["scene"].sizes((0, 1))
+    kept = torch.tensor([[0.2, 0.2, 0.4], [0.1, 0.5, 0.0]], dtype=torch.float64)
+    changed = (sizes != kept).flatten(1).any(1).nonzero().flatten().tolist()
+    assert changed == [3, 7] and (sizes[:, 1, 2] == 0.0).all()
 
 
 def test_a_scan_table(run):
