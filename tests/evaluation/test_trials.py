@@ -62,7 +62,7 @@ def test_another_policy_gets_the_same_scenes(make_env):
     found = []
     for which in (lambda trial: trial < 0, lambda trial: trial % 2 == 1):
         env = make_env(*WALK, "scenario=moving", SHORT, "terminations.min_base_height=0.25", "num_envs=3")
-        env.obstacles._start *= 0.2
+        env.obstacles._approach._start *= 0.2
         found.append(scenes(env, fling(env, which), 9))
     for trial in range(9):
         assert torch.equal(found[0][trial], found[1][trial])
