@@ -187,3 +187,15 @@ def test_missing_matplotlib_is_refused_first(walker, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(PlotsUnavailable, match=r"pip install 'omniperception\[plots\]'"):
         evaluate(evaluation(walker, "static", plots=True))
+
+
+def test_reported_evaluations_have_other_obstacles_and_seeds_and_are_noted_once(walker, tmp_path):
+    log = tmp_path / "log.jsonl"
+    given = evaluation(walker, "static", "rod", split="test", log=log)
+    records = evaluate(given)
+    assert [record.seed for record in records] == [reported_seed(records[0].weights, w) for w in ("static", "rod")]
+    assert {record.split for record in records} == {"test"} and len(log.read_text().splitlines()) == 2
+    assert outcomes(evaluate(given)) == outcomes(records)
+    assert len(log.read_text().splitlines()) == 2  # nothing was measured
+    task = Task(given, walker, "run", World("static"))
+    assert task.assembled().env.obstacles.split == "test"
