@@ -11,6 +11,10 @@ WALK = ("experiment=walk", "rewards=walk")
 SHORT = "terminations.episode_length_s=0.4"  # 20 control steps
 
 
+DRAWN = "scenario=static condition=robot"
+"""With parameters of the robot that are drawn, too."""
+
+
 def stand(observations):
     return torch.zeros(len(observations), 12)
 
@@ -36,6 +40,9 @@ def scenes(env, policy, trials):
             parts = [env.command.value[env_id], env.sim.qpos[env_id].float(), footprints(env)[env_id].flatten()]
             if env.command.goal_w is not None:
                 parts.append(env.command.goal_w[env_id])
+            if env.randomizer.joint_offset is not None:
+                mass = env.sim.model_field("body_mass")[env_id, env.world.base_body]
+                parts += [env.randomizer.joint_offset[env_id], torch.stack((env.randomizer.delay[env_id], mass))]
             if env.ground is not None:
                 parts.append(torch.stack((env.ground.level[env_id], env.ground.column[env_id])))
             found[int(env.random.trial[env_id])] = torch.cat([part.double() for part in parts])
@@ -45,7 +52,7 @@ def scenes(env, policy, trials):
     return found
 
 
-@pytest.mark.parametrize("scene", ["scenario=moving", "scenario=abs_hard", "terrain=mixed obstacles=static"])
+@pytest.mark.parametrize("scene", ["scenario=moving", "scenario=abs_hard", "terrain=mixed obstacles=static", DRAWN])
 def test_a_trial_is_the_same_scene_however_many_environments_there_are(make_env, scene):
     by_number = []
     for num_envs in (1, 3, 5):
