@@ -72,6 +72,8 @@ def test_none_changes_no_model_field(make_env):
     assert all(env.sim.batch.expanded(name) is None for name in MODEL_FIELDS)
     assert env.randomizer.joint_offset is None and env.randomizer.delay is None
     assert env.state.measured is env.state.kinematics
+    assert env.pushes is None and env.sensing.fresh.all()
+    assert set(env.random.state_dict()["branches"]) == {"randomization"}
     assert env.sensing.frame.ranges is env.sensing.frame.true_ranges
 
 
