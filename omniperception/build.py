@@ -22,6 +22,7 @@ from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.learning.memory import check_fits
 from omniperception.scene import Mount, RobotConfig
+from omniperception.scene.held_out import held_out
 from omniperception.schema import ANYTHING, make, types_of
 
 if TYPE_CHECKING:
@@ -83,6 +84,8 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         raise ConfigError(f"the configuration has no {key}")
     hints = types_of(EnvConfig)
     task = {key: make(hints[key], composed[key], key, trusted) for key in _TASK}
+    if task["obstacles"].split == "test":
+        task["obstacles"] = held_out(task["obstacles"])
     ppo = make(PPOConfig, composed["ppo"], "ppo", trusted)
     perception = make(PerceptionConfig | None, composed["perception"] or None, "perception", trusted)
     seen = {}

@@ -56,9 +56,9 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         if flags:
             raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
         run_dir = config.find_run(arguments.run)
-        learn(build.assemble(config.load(run_dir, values), arguments.trust), run_dir, resume=True)
+        learn(assemble(config.load(run_dir, values), arguments.trust), run_dir, resume=True)
     elif flags & SHOW:
-        print(config.as_yaml(build.assemble(config.compose(values)).composed), end="")
+        print(config.as_yaml(assemble(config.compose(values)).composed), end="")
     elif flags:
         sweep(values)
     else:
@@ -68,9 +68,24 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         train(config.without_hydra(composed), run_dir)
 
 
+def assemble(composed: DictConfig, trust: Sequence[str] = ()) -> build.RunConfig:
+    """Builds and validates a run that may be trained; see `build.assemble`.
+
+    Raises:
+        ConfigError: it would see obstacles of the test split.
+    """
+    run = build.assemble(composed, trust)
+    if run.env.obstacles.split != "dev":
+        raise config.ConfigError(
+            f"obstacles.split={run.env.obstacles.split} is for reports, and no training may see it; use"
+            " obstacles.split=dev"
+        )
+    return run
+
+
 def train(composed: DictConfig, run_dir: Path) -> None:
     """Trains one composed configuration in its directory."""
-    run = build.assemble(composed)
+    run = assemble(composed)
     distributed.connect(run.env.sim.torch_device)
     run_dir = distributed.of_first(run_dir)
     begun = distributed.of_first(config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir)))
@@ -135,7 +150,7 @@ def check_jobs(overrides: Sequence[str]) -> None:
         raise config.ConfigError(config.one_line(error)) from None
     for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None):
         for job in batch:
-            build.assemble(config.compose(job))
+            assemble(config.compose(job))
 
 
 command = Command(main, Arguments, __doc__, "of the configuration", ERRORS, flags=(*sorted(SWEEP), *sorted(SHOW)))

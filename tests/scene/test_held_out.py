@@ -1,0 +1,153 @@
+"""The test split: what no training scene has, in every preset, and no way for a training to see it."""
+
+import math
+
+import pytest
+import torch
+
+from omniperception import build, config
+from omniperception.commands import train
+from omniperception.common.random import EnvRandom
+from omniperception.config import CONFIG_DIR, ConfigError
+from omniperception.scene import ApproachConfig, ObstacleField, ObstacleGroup, ObstaclesConfig, PartConfig
+from omniperception.scene.held_out import VARIANTS, held_out
+
+PRESETS = sorted(path.stem for path in (CONFIG_DIR / "obstacles").glob("*.yaml") if path.stem != "none")
+EXPERIMENTS = sorted(path.stem for path in (CONFIG_DIR / "experiment").rglob("*.yaml"))
+WALK = ("experiment=walk", "init=null")
+
+
+def scene(preset, split="dev"):
+    return build.assemble(config.compose([*WALK, f"obstacles={preset}", f"obstacles.split={split}"])).env.obstacles
+
+
+@pytest.fixture(scope="module")
+def trained_on():
+    """(kind, ranges of sizes) of every obstacle that a training preset has."""
+    return [(group.kind, group.size) for preset in PRESETS for group in scene(preset).groups.values()]
+
+
+def drawn(obstacles, num_envs=200):
+    """(kind, size, moves) of all parts that take part in some episodes, but those with fixed poses."""
+    parts = obstacles.parts()
+    pos, quat = (torch.zeros(num_envs, len(parts), n, dtype=torch.float64) for n in (3, 4))
+    field = ObstacleField(obstacles, pos, quat, EnvRandom(3, num_envs))
+    field.reset(torch.arange(num_envs), torch.zeros(num_envs, 2))
+    for k, part in enumerate(parts):
+        if not part.group.has_poses:
+            yield from ((part.kind, tuple(size), part) for size in field.size[field.active[:, k], k].tolist())
+
+
+def within(size, ranges):
+    return all(low <= value <= high for value, (low, high) in zip(size, ranges, strict=False))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_of_training_has_other_kinds_and_sizes_in_the_test(preset, trained_on):
+    """Half of what is drawn is of a kind that no preset has; the rest has no size of its own group's ranges."""
+    new, seen, kinds = 0, 0, {kind for kind, _ in trained_on}
+    ranges = {name: group.size for name, group in scene(preset).groups.items()}
+    for kind, size, part in drawn(scene(preset, "test")):
+        origin = max((name for name in ranges if part.name.startswith(f"obstacle_{name}_")), key=len)
+        new, seen = new + (kind not in kinds), seen + 1
+        if kind in kinds:
+            margins = [value < low or value > high for value, (low, high) in zip(size, ranges[origin], strict=False)]
+            assert all(margins[: len(ranges[origin])]) or _one_point(ranges[origin], size), part.name
+    assert new >= 0.5 * seen > 0
+
+
+def _one_point(ranges, size):
+    return any(low == high for low, high in ranges) and not within(size, ranges)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_as_many_take_part_and_move_as_in_the_scene_itself(preset):
+    dev, test = scene(preset), scene(preset, "test")
+
+    def numbers(obstacles):
+        groups = obstacles.groups.values()
+        return [sum((g.present or (g.count,))[0] for g in groups if g.moves == moves) for moves in (True, False)]
+
+    assert numbers(dev) == numbers(test) and test.split == "test" and dev.split == "dev"
+    assert {n: g for n, g in test.groups.items() if g.has_poses} == {n: g for n, g in dev.groups.items() if g.has_poses}
+    for obstacles in (dev, test):
+        assert {(g.speed, g.bottom, g.area) for g in obstacles.groups.values()} == {
+            (g.speed, g.bottom, g.area) for g in dev.groups.values()
+        }
+
+
+def test_sizes_by_hand():
+    groups = {
+        "person": ObstacleGroup(
+            "cylinder", 4, [[0.2, 0.3], [0.8, 0.9]], [1.0, 1.0], approach=ApproachConfig(0.1, [1.1, 3.0])
+        ),
+        "stump": ObstacleGroup("cylinder", 1, [[0.1, 0.2], [0.05, 0.1]]),
+        "ball": ObstacleGroup("sphere", 2, [[0.1, 0.2]]),
+        "table": ObstacleGroup("compound", 2, parts={"top": PartConfig("box", [0.6, 0.4, 0.02])}, scale=[0.8, 1.2]),
+        "grass": ObstacleGroup("capsule", 10, [[0.01, 0.02], [0.3, 0.6]], present=[6, 10]),
+    }
+    found = held_out(ObstaclesConfig(groups, clearance=0.8)).groups
+    assert list(found) == [
+        *("person_larger_capsule", "person_smaller_capsule", "person_smaller_cylinder", "person_larger_cylinder"),
+        *("stump_smaller_hexagon", "ball_larger_rock", "ball_smaller_sphere", "table_larger_compound"),
+        *("table_smaller_compound", "grass_smaller_capsule", "grass_larger_capsule"),
+    ]
+
+    def sizes(name):
+        return [pytest.approx(bounds) for bounds in found[name].size]
+
+    assert sizes("person_larger_capsule") == [(0.3, 0.39), (0.6, 0.78)]  # of a height of 0.9 to 1.17 m, less its caps
+    assert sizes("person_smaller_cylinder") == [(0.15, 0.2), (0.6, 0.8)]
+    assert found["person_larger_cylinder"].approach.distance == pytest.approx((0.8 + 0.39, 3.0))
+    assert sizes("stump_smaller_hexagon") == [(0.075, 0.1), (0.075, 0.1), (0.0375, 0.05)]
+    assert sizes("ball_larger_rock") == [(0.2, 0.26)] * 3
+    assert (found["ball_larger_rock"].count, found["ball_larger_rock"].present) == (VARIANTS, (1, 1))
+    assert found["table_larger_compound"].scale == pytest.approx((1.2, 1.56))
+    assert found["grass_larger_capsule"].count == 5 and found["grass_larger_capsule"].present == (3, 5)
+
+
+def test_wedges_are_for_what_is_long():
+    groups = {"wall": ObstacleGroup("box", 2, [[0.03, 0.08], [1.0, 2.5], [0.4, 0.6]])}
+    groups["crate"] = ObstacleGroup("box", 2, [[0.2, 0.3], [0.2, 0.3], [0.2, 0.3]])
+    files = [group.file for group in held_out(ObstaclesConfig(groups)).groups.values()]
+    assert files == ["wedge", None, "hexagon", None]
+
+
+def test_it_runs(make_env):
+    env = make_env("obstacles=all", "obstacles.split=test", num_envs=2)
+    for _ in range(6):
+        env.step(torch.zeros(2, 12))
+    assert math.isfinite(float(env.sim.qpos.sum()))
+    kinds = {part.kind for part in env.obstacles.parts}
+    assert {"mesh", "capsule", "box", "cylinder"} <= kinds
+    counts = env.obstacles.root_active.sum(1)
+    assert (counts == scene("all").num_obstacles).all()
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_no_recipe_sees_it(experiment):
+    run = build.assemble(config.compose([f"experiment={experiment}", "init=null"]))
+    assert run.env.obstacles.split == "dev"
+    assert "split" not in (CONFIG_DIR / "experiment" / f"{experiment}.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    "given", [["obstacles.split=test"], ["--cfg", "job", "obstacles.split=test"], ["-m", "obstacles.split=test,dev"]]
+)
+def test_training_refuses_it_in_one_line(given, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"obstacles.split=test is for reports, .* use obstacles.split=dev") as error:
+        train.main(train.Arguments(), [*WALK, "obstacles=static", *given])
+    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+
+
+def test_going_on_with_a_run_refuses_it(tmp_path):
+    run = build.assemble(config.compose([*WALK, "obstacles=static"]))
+    config.save(run.composed, tmp_path)
+    with pytest.raises(ConfigError, match="is for reports"):
+        train.main(train.Arguments(run=str(tmp_path)), ["obstacles.split=test"])
+
+
+def test_another_split_is_unknown():
+    with pytest.raises(ValueError, match=r"obstacles.split=train must be dev or test"):
+        ObstaclesConfig(split="train")
