@@ -14,7 +14,7 @@ from benchmarks.harness.reference import compile_model, mujoco_ranges
 from benchmarks.harness.rotations import matrices, quat_about, quat_multiply, unit_vectors
 from omniperception.lidar import LidarConfig
 from omniperception.scene import ObstaclesConfig
-from omniperception.scene.parts import PartShapes
+from omniperception.scene.part_shapes import PartShapes, footprint_radius
 
 GROUND, OBSTACLE = 0, 1
 """Classes of what is hit."""
@@ -85,8 +85,9 @@ def moving_scene(obstacles: ObstaclesConfig, num_envs: int, seed: int = 0) -> Mo
     sizes = np.zeros((len(parts), 3))
     for size, part in zip(sizes, parts, strict=True):
         size[: len(part.size)] = shapes.uniform(*np.transpose(part.size))
-    drawn = PartShapes(parts, torch.float64, torch.device("cpu"))
-    radius, half_height = (np.array(f(torch.from_numpy(sizes))) for f in (drawn.radius, drawn.half_height))
+    drawn = PartShapes([part.kind for part in parts], torch.float64, torch.device("cpu"))
+    half = drawn.half_extents(torch.from_numpy(sizes)[None])
+    radius, half_height = footprint_radius(drawn.outline(half))[0].numpy(), half[0, :, 2].numpy()
     shape = (num_envs, len(parts))
     azimuth, course = rng.uniform(-math.pi, math.pi, (2, *shape))
     nearest = SPREAD[0] + radius
