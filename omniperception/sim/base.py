@@ -8,8 +8,6 @@ from typing import Protocol
 import mujoco
 import torch
 
-from omniperception.lidar.mujoco import geom_kind
-from omniperception.lidar.sizes import ShapeSizes
 from omniperception.scene import World
 
 MAX_SPEED = 1e3
@@ -159,6 +157,9 @@ class SizedGeoms:
     """
 
     def __init__(self, model: mujoco.MjModel, geoms: tuple[int, ...], device: torch.device) -> None:
+        from omniperception.lidar.mujoco import geom_kind  # with what casts rays, which other tasks do without
+        from omniperception.lidar.sizes import ShapeSizes
+
         names = [f"geom {model.geom(k).name}" for k in geoms]
         for name, k in zip(names, geoms, strict=True):
             if model.body_geomnum[model.geom_bodyid[k]] != 1:
