@@ -162,7 +162,7 @@ LINES = [
     ("ablate seeds=a", "seeds=a"),
     ("ablate scenarios=statik", "scenarios=statik"),
     ("ablate seed=3", "seed=3: give experiment=, variants= and seeds= instead"),
-    ("ablate stage=table out=EMPTY variants=fps_mlp seeds=1", "seed1 has not been evaluated; use stage=eval"),
+    ("ablate stage=table out=EMPTY variants=fps_mlp seeds=1", "use stage=evaluate or stage=all"),
     ("export run=RUN formats=tarball", "formats=tarball"),
     ("export run=RUN num_envs=3", "num_envs=3"),
     ("export run=EMPTY", "is not a run directory"),

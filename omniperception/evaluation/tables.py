@@ -17,7 +17,9 @@ from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.records import Record, read
 from omniperception.evaluation.report import grouped, headline, rate_cell, table
 
-_BLOCK = re.compile(r"<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)<!-- end -->", re.DOTALL)
+_BLOCK = re.compile(r"^<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
+_BEGIN = re.compile(r"^<!-- table:", re.MULTILINE)
+"""Comments count at the beginning of a line; within one they are talked about."""
 _FILTERS = ("policy", "world", "terrain", "condition", "split", "run")
 
 
@@ -27,7 +29,7 @@ def rendered(text: str, data: Path) -> str:
     Raises:
         ConfigError: a comment names no file, view or filter, or nothing is left to show.
     """
-    if text.count("<!-- table:") != len(_BLOCK.findall(text)):
+    if len(_BEGIN.findall(text)) != len(_BLOCK.findall(text)):
         raise ConfigError("a comment <!-- table: ... --> has no <!-- end --> after it")
     return _BLOCK.sub(lambda block: _filled(block["what"], data), text)
 

@@ -75,6 +75,11 @@ def test_what_cannot_be_shown_is_refused(data, what, message):
         rendered(page(what), data)
 
 
+def test_a_comment_within_a_line_is_text(data):
+    text = "A page holds `<!-- table: first -->` and `<!-- end -->`.\n"
+    assert rendered(text, data) == text
+
+
 def test_an_open_end_is_refused(data):
     with pytest.raises(ConfigError, match="no <!-- end -->"):
         rendered("<!-- table: first -->\nforgotten", data)
