@@ -15,7 +15,7 @@ _NOWHERE = 1e3
 
 @dataclass(frozen=True)
 class TracksConfig:
-    """How frames are matched.
+    """How frames are matched; the values were chosen on split=dev, see docs/lab/baselines.md.
 
     Attributes:
         link: places of neighbouring sectors belong to one cluster where they are at most this (m) and the width of a
@@ -37,17 +37,25 @@ class TracksConfig:
     link: float = 0.1
     gate: float = 0.5
     widest: float = 0.6
-    gain: float = 0.15
-    turn: float = 0.2
+    gain: float = 0.1
+    turn: float = 0.35
     min_frames: int = 2
     min_speed: float = 0.3
     max_speed: float = 2.5
     look_back: int = 5
-    same_place: float = 0.06
-    stands: float = 0.8
+    same_place: float = 0.0
+    stands: float = 0.95
     remember: int = 1
     blind: float = 0.8
     remember_near: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("gate", "widest", "gain", "turn", "max_speed", "look_back", "stands"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"TracksConfig.{name}={getattr(self, name)} must be positive")
+        for name in ("link", "same_place", "min_speed", "min_frames", "remember", "blind", "remember_near"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"TracksConfig.{name}={getattr(self, name)} must not be negative")
 
 
 class SectorTracks:

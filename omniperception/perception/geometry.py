@@ -20,7 +20,7 @@ _RIDGE = 1e-3
 
 @dataclass(frozen=True)
 class GeometryConfig:
-    """What is ground, noise and body.
+    """What is ground, noise and body; the values were chosen on split=dev, see docs/lab/baselines.md.
 
     Attributes:
         num_sectors: azimuth sectors of the result; sector 0 starts at -pi in the yaw-aligned frame.
@@ -58,6 +58,13 @@ class GeometryConfig:
     headroom: float = 0.45
     min_points: int = 1
     spread: float = 0.15
+
+    def __post_init__(self) -> None:
+        for name in ("num_sectors", "reach", "standing", "fit_reach", "cell_sectors", "ring", "headroom", "min_points"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"GeometryConfig.{name}={getattr(self, name)} must be positive")
+        if not 0.0 <= self.near_share <= 1.0:
+            raise ValueError(f"GeometryConfig.near_share={self.near_share} must be in 0..1")
 
 
 class Nearest(NamedTuple):

@@ -95,8 +95,8 @@ def test_a_wall_stands_however_it_is_seen():
     walk = Walk((1.0, 0.0))
     for _ in range(10):
         motion = walk.frame((walk.pose[0] + 0.1, 20.8, 20.0, 0, 0))
-    near = motion[:, 0] < 2.0  # beyond, neighbouring sectors see it at places far apart
-    assert near.sum() > 20 and not motion[near, 1:].any()
+    near = motion[:, 0] < 1.5  # beyond, neighbouring sectors see it at places far apart
+    assert near.sum() > 15 and not motion[near, 1:].any()
 
 
 def test_a_lost_frame_lets_things_go_on():
