@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -286,17 +287,17 @@ class BarnLayout:
         return self.boxes
 
     def table(self, seed: int, num_worlds: int) -> np.ndarray:
-        """See `Layout`; the boxes cover the filled cells of `grids`, some of them twice."""
-        rows = np.full((num_worlds, self.boxes, ROW), np.nan)
-        for world in range(num_worlds):
-            rng = _stream(seed, world)
-            corners = rectangles(self._grid(rng, world, num_worlds))
-            low, high = corners[:, :2] * self.cell, corners[:, 2:] * self.cell
-            middle = (low + high) / 2 + [self.lead, -self.cells[1] * self.cell / 2]
-            half_height = (_draw(rng, self.height, len(corners)) + self.depth) / 2
-            rows[world, : len(corners)] = np.column_stack(
-                (middle, np.zeros(len(corners)), (high - low) / 2, half_height)
-            )
+        """See `Layout`; the boxes cover the filled cells of `grids`, some of them twice. It takes seconds, once."""
+        return _barn_table(self, seed, num_worlds).copy()
+
+    def make_world(self, seed: int, world: int, num_worlds: int) -> np.ndarray:
+        """(boxes, ROW) one world of a table."""
+        rng, rows = _stream(seed, world), np.full((self.boxes, ROW), np.nan)
+        corners = rectangles(self._grid(rng, world, num_worlds))
+        low, high = corners[:, :2] * self.cell, corners[:, 2:] * self.cell
+        middle = (low + high) / 2 + [self.lead, -self.cells[1] * self.cell / 2]
+        half_height = (_draw(rng, self.height, len(corners)) + self.depth) / 2
+        rows[: len(corners)] = np.column_stack((middle, np.zeros(len(corners)), (high - low) / 2, half_height))
         return rows
 
     def grids(self, seed: int, num_worlds: int) -> np.ndarray:
@@ -327,6 +328,11 @@ class BarnLayout:
                 if len(rectangles(grid)) <= self.boxes:
                     return grid
         raise AssertionError("batches never end")
+
+
+@lru_cache(maxsize=4)
+def _barn_table(layout: BarnLayout, seed: int, num_worlds: int) -> np.ndarray:
+    return np.stack([layout.make_world(seed, world, num_worlds) for world in range(num_worlds)])
 
 
 HARDER = {"closest": -1.0, "visibility": -1.0, "dispersion": 1.0, "dimension": -1.0, "tortuosity": 1.0}
@@ -405,6 +411,8 @@ def inflated(grids: np.ndarray, cells: int) -> np.ndarray:
 def passable(grids: np.ndarray, robot: int) -> np.ndarray:
     """(...) bool: whether a square of `robot` cells to each side gets from the first x of (..., nx, ny) to the last."""
     free = ~inflated(grids, robot)
+    maybe = np.asarray(free.any(-1).all(-1))  # somewhere at every x
+    free = free[maybe]
     reached = np.zeros_like(free)
     reached[..., 0, :] = free[..., 0, :]
     while True:
@@ -415,8 +423,10 @@ def passable(grids: np.ndarray, robot: int) -> np.ndarray:
         grown[..., :-1] |= reached[..., 1:]
         grown &= free
         if (grown == reached).all():
-            return np.asarray(reached[..., -1, :].any(-1))
+            break
         reached = grown
+    maybe[maybe] = reached[..., -1, :].any(-1)
+    return maybe
 
 
 def barn_scores(grid: np.ndarray, robot: int, cell: float) -> dict[str, float]:
