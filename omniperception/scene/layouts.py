@@ -97,13 +97,26 @@ class MazeLayout:
         """See `Layout`; the inner walls come first, then the border's."""
         return np.stack([self._world(_stream(seed, world)) for world in range(num_worlds)])
 
-    def _world(self, rng: np.random.Generator) -> np.ndarray:
+    def routes(self, seed: int, num_worlds: int) -> np.ndarray:
+        """(num_worlds, R, 2) m: a shortest way through the middles of cells from the robot's to the goal, which is
+        repeated up to the length of the longest."""
+        ways = [self._walls_and_way(_stream(seed, world))[1] for world in range(num_worlds)]
+        longest = max(len(way) for way in ways)
+        cells = np.array([way + way[-1:] * (longest - len(way)) for way in ways], dtype=np.float64)
+        return (cells - [0, self.rows // 2]) * self.cell
+
+    def _walls_and_way(self, rng: np.random.Generator) -> tuple[list[tuple[int, int, int]], list[tuple[int, int]]]:
+        """Edges with a wall, and cells (column, row) from the start's to the goal's."""
         edges = self._inner_edges()
         while True:
             chosen = rng.choice(len(edges), self.walls, replace=False)
             walls = [edges[k] for k in sorted(chosen)]
-            if self._connected(walls):
-                break
+            way = self._way(walls)
+            if way:
+                return walls, way
+
+    def _world(self, rng: np.random.Generator) -> np.ndarray:
+        walls, _ = self._walls_and_way(rng)
         segments = np.array([self._segment(edge) for edge in walls] + self._border(), dtype=np.float64)
         num = len(segments)
         thickness, height = _draw(rng, self.thickness, num), _draw(rng, self.height, num)
@@ -116,11 +129,12 @@ class MazeLayout:
         beside = [(i, j, 1) for i in range(self.columns) for j in range(self.rows - 1) if i not in self.lanes]
         return ahead + beside
 
-    def _connected(self, walls: Sequence[tuple[int, int, int]]) -> bool:
+    def _way(self, walls: Sequence[tuple[int, int, int]]) -> list[tuple[int, int]]:
+        """Cells of a shortest way from the start's to the goal's; empty where none leads there."""
         closed, middle = set(walls), self.rows // 2
-        reached, front = {(0, middle)}, [(0, middle)]
-        while front:
-            i, j = front.pop()
+        before: dict[tuple[int, int], tuple[int, int] | None] = {(0, middle): None}
+        front = [(0, middle)]  # grows at its end: nearer cells come first
+        for i, j in front:
             for cell, edge in (
                 ((i + 1, j), (i, j, 0)),
                 ((i - 1, j), (i - 1, j, 0)),
@@ -128,10 +142,15 @@ class MazeLayout:
                 ((i, j - 1), (i, j - 1, 1)),
             ):
                 inside = 0 <= cell[0] < self.columns and 0 <= cell[1] < self.rows
-                if inside and edge not in closed and cell not in reached:
-                    reached.add(cell)
+                if inside and edge not in closed and cell not in before:
+                    before[cell] = (i, j)
                     front.append(cell)
-        return (self.columns - 1, middle) in reached
+        way: list[tuple[int, int]] = []
+        last = (self.columns - 1, middle) if (self.columns - 1, middle) in before else None
+        while last is not None:
+            way.append(last)
+            last = before[last]
+        return way[::-1]
 
     def _segment(self, edge: tuple[int, int, int]) -> tuple[float, float, float, float]:
         """(x, y, yaw, half length) of an edge."""

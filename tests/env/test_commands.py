@@ -161,6 +161,34 @@ class TestGoal:
         with pytest.raises(ValueError, match=message):
             GoalCommandConfig(*settings, 2.0, 1.0, SpawnConfig())
 
+    def test_a_route_is_followed_point_by_point(self):
+        config = GoalCommandConfig((4.0, 4.0), (0.0, 0.0), 0.5, 1.0, 2.0, 1.0, SpawnConfig(), route=True)
+        command = config.build(2, torch.device("cpu"), EnvRandom(0, 2))
+        start = robots([[0.0, 0.0], [0.0, 0.0]], [0.0, 0.0])
+        command.reset(torch.arange(2), start)
+        route = torch.tensor([[0.0, 0.0], [0.0, 2.0], [2.0, 2.0], [4.0, 0.0], [4.0, 0.0]])
+        command.follow(torch.arange(2), torch.stack((route, route.flip(1))), start)
+        assert command.way(start).tolist() == pytest.approx([4.0 + 8**0.5] * 2)
+        torch.testing.assert_close(command.value[:, :2], torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
+        ways = {
+            (0.0, 1.2): (0.0, 1.0),
+            (0.0, 1.4): (2.0, 0.6),  # 0.6 m before a point the next one is aimed at
+            (0.0, 0.5): (2.0, 1.5),  # and it stays so
+            (1.2, 2.0): (1.0, 0.0),
+            (3.2, 0.9): (0.8, -0.9),  # nearer to the next one
+            (4.0, 0.4): (0.0, -1.0),
+        }
+        for place, expected in ways.items():
+            where = robots([list(place), [0.0, 0.0]], [0.0, 0.0])
+            command.advance(0.02, where)
+            unit = torch.tensor(expected) / math.hypot(*expected)
+            torch.testing.assert_close(command.value[0, :2], unit, atol=1e-6, rtol=0)
+        assert command.aim.tolist() == [4, 1]
+        assert command.reached(where).tolist() == [True, False]
+        command.reset(torch.tensor([0]), start)
+        command.follow(torch.tensor([0]), route[None], start)
+        assert command.value[0, :2].tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
+
     def test_a_line_cannot_be_held(self):
         with pytest.raises(ValueError, match=r"commands\.hold_s=3"):
             GoalCommandConfig((1.0, 1.0), (0.0, 0.0), None, 1.0, 2.0, 1.0, SpawnConfig(), hold_s=3.0)

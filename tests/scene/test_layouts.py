@@ -1,5 +1,7 @@
 """Layouts: passable by an independent search, exact covers, and BARN's measures by hand."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -111,6 +113,22 @@ def test_a_maze_has_its_walls_and_a_closed_border():
         + [(x, y) for y in np.arange(-3, 3, 0.05) for x in (-1.0, 7.0)]
     )
     assert distance_to_boxes(around, table[0, 5:]).max() == 0.0
+
+
+@pytest.mark.parametrize("layout", [_MAZE, MazeLayout(walls=32, lanes=(2, 5, 7))])
+def test_the_way_through_a_maze_is_free_and_short(layout):
+    table, routes = layout.table(7, 25), layout.routes(7, 25)
+    for world, route in zip(table, routes, strict=True):
+        np.testing.assert_array_equal(route[[0, -1]], [(0.0, 0.0), layout.goal])
+        steps = np.abs(np.diff(route, axis=0))
+        assert set(steps.sum(1)) <= {2.0, 0.0}  # to the next cell, or at the goal
+        dense = np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(route)])
+        assert distance_to_boxes(dense, world).min() > 0.75
+    lengths = np.abs(np.diff(routes, axis=1)).sum((1, 2))
+    assert lengths.min() >= 18.0
+    assert lengths.max() == 2.0 * (routes.shape[1] - 1)
+    straight = MazeLayout(columns=4, rows=3, walls=0)
+    np.testing.assert_array_equal(straight.routes(0, 1)[0], [(0, 0), (2, 0), (4, 0), (6, 0)])
 
 
 def test_no_wall_stands_across_a_lane():

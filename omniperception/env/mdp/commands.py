@@ -87,6 +87,8 @@ class GoalCommandConfig:
         slow_within: at this distance (m) from the goal and nearer, speed and yaw rate fade in proportion to the
             distance, so that a robot can stay; 0: they do not.
         hold_s: the goal counts as reached only from this time (s) of an episode on, so that a robot has to stay.
+        route: whether the way leads along the route through the obstacles' world, which its layout has to give, and not
+            straight to the goal: what a planner with a map would command.
     """
 
     goal_x: Sequence[float]
@@ -98,6 +100,7 @@ class GoalCommandConfig:
     spawn: SpawnConfig
     slow_within: float = 0.0
     hold_s: float = 0.0
+    route: bool = False
 
     def __post_init__(self) -> None:
         for key in ("goal_x", "goal_y"):
@@ -112,6 +115,8 @@ class GoalCommandConfig:
                 raise ValueError(f"commands.{key}={getattr(self, key)} must not be negative")
             if getattr(self, key) > 0 and self.radius is None:
                 raise ValueError(f"commands.{key}={getattr(self, key)} needs a place to stay: give commands.radius")
+        if self.route and self.radius is None:
+            raise ValueError("commands.route leads to a place, not across a line: give commands.radius")
 
     def build(self, num_envs: int, device: torch.device, random: EnvRandom) -> GoalCommand:
         return GoalCommand(self, num_envs, device, random)
@@ -182,14 +187,25 @@ class VelocityCommand:
         self.time_left[env_ids] = self.config.resample_s
 
 
+NEAR_POINT = 0.7
+"""Distance (m) from a point of a route at which the next one is aimed at."""
+
+
 class GoalCommand:
-    """Points to the goal from wherever the robot is."""
+    """Points to the goal from wherever the robot is, or to the next point of a route there.
+
+    Attributes:
+        route_w: (num_envs, R, 2) m, points of the routes; None: straight to the goal.
+        aim: (num_envs,) int64, which point is aimed at.
+    """
 
     def __init__(self, config: GoalCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
         self.config = config
         self.value = torch.zeros(num_envs, 3, device=device)
         self.goal_w = torch.zeros(num_envs, 2, device=device)
         self.elapsed = torch.zeros(num_envs, device=device)
+        self.route_w: torch.Tensor | None = None
+        self.aim = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self._random = random
         ranges = (config.goal_x, config.goal_y)
         self._low = torch.tensor([r[0] for r in ranges], device=device)
@@ -200,10 +216,35 @@ class GoalCommand:
         self.elapsed[env_ids] = 0.0
         self.advance(0.0, kinematics)
 
+    def follow(self, env_ids: torch.Tensor, route: torch.Tensor, kinematics: Kinematics) -> None:
+        """Leads some environments (n,) along routes (n, R, 2) in m, which end at their goals; after `reset`."""
+        if self.route_w is None or self.route_w.shape[1] != route.shape[1]:
+            self.route_w = self.goal_w.new_zeros(len(self.goal_w), *route.shape[1:])
+        self.route_w[env_ids] = route.to(self.route_w.dtype)
+        self.aim[env_ids] = 0
+        self.advance(0.0, kinematics)
+
+    def way(self, kinematics: Kinematics) -> torch.Tensor:
+        """(num_envs,) m, from the robot to the goal: straight, or over all points of the route."""
+        if self.route_w is None:
+            return self._distance(kinematics)
+        legs = self.route_w.diff(dim=1).norm(dim=-1).sum(1)
+        return legs + (self.route_w[:, 0] - kinematics.base_pos_w[:, :2]).norm(dim=1)
+
+    def _target(self, kinematics: Kinematics) -> torch.Tensor:
+        """(num_envs, 2) m, where to walk: along a route to the point after the one that the robot is at or past."""
+        if self.route_w is None:
+            return self.goal_w
+        last, each = self.route_w.shape[1] - 1, torch.arange(len(self.aim), device=self.aim.device)
+        away = (self.route_w - kinematics.base_pos_w[:, None, :2]).norm(dim=-1)
+        here, beyond = away[each, self.aim], away[each, (self.aim + 1).clamp(max=last)]
+        self.aim += ((here < NEAR_POINT) | (beyond < here)) & (self.aim < last)
+        return self.route_w[each, self.aim]
+
     def advance(self, dt: float, kinematics: Kinematics) -> None:
         config = self.config
         self.elapsed += dt
-        ahead, aside = (self.goal_w - kinematics.base_pos_w[:, :2]).unbind(1)
+        ahead, aside = (self._target(kinematics) - kinematics.base_pos_w[:, :2]).unbind(1)
         if config.radius is None:
             ahead = (ahead + 1.0).clamp(min=0.5)
         bearing = torch.atan2(aside, ahead)
@@ -225,9 +266,13 @@ class GoalCommand:
         return (self.goal_w - kinematics.base_pos_w[:, :2]).norm(dim=1)
 
     def state_dict(self) -> dict:
-        return {"value": self.value, "goal_w": self.goal_w, "elapsed": self.elapsed}
+        state = {"value": self.value, "goal_w": self.goal_w, "elapsed": self.elapsed, "aim": self.aim}
+        return state if self.route_w is None else {**state, "route_w": self.route_w}
 
     def load_state_dict(self, state: dict) -> None:
         self.value.copy_(state["value"])
         self.goal_w.copy_(state["goal_w"])
         self.elapsed.copy_(state["elapsed"])
+        self.aim.copy_(state["aim"])
+        if "route_w" in state:
+            self.route_w = state["route_w"].clone()
