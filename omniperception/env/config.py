@@ -75,6 +75,10 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
             raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
+        if isinstance(self.commands, GoalCommandConfig) and self.commands.route and not self.obstacles.has_routes:
+            raise ValueError(
+                "commands.route=true leads through a maze, and these obstacles have none; use scenario=maze"
+            )
         if MOTION_TARGET in self.targets and self.rewards.avoidance.risk is None:
             raise ValueError(
                 "perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"

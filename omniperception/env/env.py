@@ -21,6 +21,7 @@ from omniperception.env.build import (
     build_sensing,
 )
 from omniperception.env.config import HEIGHT_TARGET, EnvConfig
+from omniperception.env.mdp.commands import GoalCommand
 from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.metrics import EpisodeMetrics
@@ -270,6 +271,8 @@ class OmniEnv(VecEnv):
             goal = None if self.command.goal_w is None else self.command.goal_w[env_ids]
             self.obstacles.reset(env_ids, pose[:, :2], commanded, goal)
             self._resize(self.obstacles, env_ids)
+            if isinstance(self.command, GoalCommand) and self.command.config.route:
+                self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
         self.episode_length_buf[env_ids] = 0
         if self.sensing is not None:
             self.sensing.reset(env_ids, self.state.measured)

@@ -8,7 +8,7 @@ import torch
 
 from omniperception.common.random import TrialRandom
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.commands import GoalCommandConfig
+from omniperception.env.mdp.commands import GoalCommand, GoalCommandConfig
 from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.clearance import Clearance
 from omniperception.evaluation.outcomes import CLEARANCE_CAP, GRAVITY, Episodes
@@ -68,8 +68,11 @@ class Tally:
         fresh = fresh[self._trial[fresh] < self._count]
         if isinstance(commands, GoalCommandConfig) and goal is not None:
             way = goal[fresh] - self._env.state.kinematics.base_pos_w[fresh, :2]
-            straight = way[:, 0] if commands.radius is None else way.norm(dim=1) - commands.radius
-            free = (straight.double() / commands.speed).clamp(min=commands.hold_s)
+            length = way[:, 0] if commands.radius is None else way.norm(dim=1) - commands.radius
+            command = self._env.command
+            if commands.route and isinstance(command, GoalCommand):
+                length = command.way(self._env.state.kinematics)[fresh]
+            free = (length.double() / commands.speed).clamp(min=commands.hold_s)
             self._free_time[self._trial[fresh]] = free
 
     def record(self) -> None:

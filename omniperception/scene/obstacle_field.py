@@ -119,6 +119,16 @@ class ObstacleField:
         self._follow_sizes()
 
     @property
+    def world(self) -> torch.Tensor:
+        """(num_envs, L) int64, which world of each of the L layouts an environment has."""
+        return self._poses.world
+
+    def routes(self, env_ids: torch.Tensor) -> torch.Tensor:
+        """(n, R, 2) m, ways through the worlds that environments (n,) have."""
+        assert self._poses.routes is not None
+        return self._poses.routes[self.world[env_ids, 0]]
+
+    @property
     def yaw(self) -> torch.Tensor:
         """(num_envs, P) orientation (rad) about the vertical; what a swinging part does besides is its tilt."""
         return 2 * torch.atan2(self.quat_w[..., 3], self.quat_w[..., 0])
@@ -262,7 +272,7 @@ class ObstacleField:
     def _kept(self) -> dict[str, torch.Tensor]:
         """Tensors of the state, by name."""
         kept = {"size": self.size, "velocity_w": self.velocity_w, "active": self.active, "pace": self._pace}
-        kept |= {"above_ground": self._above_ground, "yaw": self._root_yaw}
+        kept |= {"above_ground": self._above_ground, "yaw": self._root_yaw, "world": self._poses.world}
         if self.articulation is not None:
             kept |= {"root_pos_w": self.root_pos_w, "root_velocity_w": self.root_velocity_w}
             kept["root_active"] = self.root_active

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import mujoco
 
+from omniperception.scene.layouts import MazeLayout
 from omniperception.scene.obstacle_group import ObstacleGroup, checked_area
 from omniperception.scene.parts import Part
 
@@ -127,6 +128,12 @@ class ObstaclesConfig:
                     f"obstacles: approach.distance={list(approach.distance)} lets those of {name} start on the robot;"
                     f" its low end must be at least clearance + radius = {least:.2f}"
                 )
+
+    @property
+    def has_routes(self) -> bool:
+        """Tell whether the obstacles' worlds have ways through them, to be followed by `commands.route`."""
+        layouts = [group.layout for group in self.groups.values() if group.layout is not None]
+        return len(layouts) == 1 and isinstance(layouts[0], MazeLayout)
 
     @property
     def num_obstacles(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from omniperception.common.random import EnvRandom
+from omniperception.scene.layouts import MazeLayout
 from omniperception.scene.obstacles import ObstaclesConfig
 
 LAYOUT_SEEDS = {"dev": 1, "test": 2}
@@ -18,6 +19,8 @@ class Poses:
         which: (O,) bool, those with fixed poses or in a layout.
         fixed: (O,) bool, those with fixed poses.
         any: whether there are some.
+        world: (num_envs, L) int64, which world of each of the L layouts an environment has.
+        routes: (W, R, 2) m, ways through the worlds; None: they have none.
     """
 
     def __init__(self, config: ObstaclesConfig, random: EnvRandom, like: torch.Tensor) -> None:
@@ -40,6 +43,11 @@ class Poses:
                 own, part = names.index(f"obstacle_{name}_0"), part_names.index(f"obstacle_{name}_0")
                 self._columns.append((slice(own, own + group.count), slice(part, part + group.count)))
                 self._tables.append((group.layout.worlds, table))
+        self.world = torch.zeros(len(like), len(self._tables), dtype=torch.int64, device=like.device)
+        self.routes: torch.Tensor | None = None
+        for group in config.groups.values() if config.has_routes else ():
+            if isinstance(group.layout, MazeLayout):
+                self.routes = like.new_tensor(group.layout.routes(LAYOUT_SEEDS[config.split], group.layout.worlds))
 
     def draw(self, env_ids: torch.Tensor, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Poses (n, O, 3), x and y in m and yaw in rad, of environments (n,), and which of them there are (n, O).
@@ -53,7 +61,8 @@ class Poses:
         pose, there = pose.clone(), there.clone()
         u = self._random.uniform(env_ids, (len(self._tables),))
         for k, ((worlds, table), (own, parts)) in enumerate(zip(self._tables, self._columns, strict=True)):
-            rows = table[(u[:, k] * worlds).long()]
+            self.world[env_ids, k] = (u[:, k] * worlds).long()
+            rows = table[self.world[env_ids, k]]
             there[:, own] = rows[..., 0].isfinite()
             pose[:, own] = rows[..., :3].nan_to_num(0.0)
             size[:, parts] = torch.where(there[:, own, None], rows[..., 3:], size[:, parts])

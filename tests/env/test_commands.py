@@ -188,6 +188,10 @@ class TestGoal:
         command.reset(torch.tensor([0]), start)
         command.follow(torch.tensor([0]), route[None], start)
         assert command.value[0, :2].tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
+        restored = config.build(2, torch.device("cpu"), EnvRandom(0, 2))
+        restored.load_state_dict(command.state_dict())
+        restored.advance(0.02, start)
+        assert torch.equal(restored.value, command.value)
 
     def test_a_line_cannot_be_held(self):
         with pytest.raises(ValueError, match=r"commands\.hold_s=3"):

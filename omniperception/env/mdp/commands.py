@@ -214,37 +214,39 @@ class GoalCommand:
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
         self.goal_w[env_ids] = self._low + self._random.uniform(env_ids, (2,)) * (self._high - self._low)
         self.elapsed[env_ids] = 0.0
-        self.advance(0.0, kinematics)
+        self._steer(kinematics)
 
     def follow(self, env_ids: torch.Tensor, route: torch.Tensor, kinematics: Kinematics) -> None:
-        """Leads some environments (n,) along routes (n, R, 2) in m, which end at their goals; after `reset`."""
+        """Leads some environments (n,) along routes (n, R, 2) in m, from their starts to their goals; after `reset`."""
         if self.route_w is None or self.route_w.shape[1] != route.shape[1]:
             self.route_w = self.goal_w.new_zeros(len(self.goal_w), *route.shape[1:])
         self.route_w[env_ids] = route.to(self.route_w.dtype)
-        self.aim[env_ids] = 0
-        self.advance(0.0, kinematics)
+        self.aim[env_ids] = min(1, route.shape[1] - 1)
+        self._steer(kinematics)
 
     def way(self, kinematics: Kinematics) -> torch.Tensor:
         """(num_envs,) m, from the robot to the goal: straight, or over all points of the route."""
         if self.route_w is None:
-            return self._distance(kinematics)
+            return self._distance(kinematics, self.goal_w)
         legs = self.route_w.diff(dim=1).norm(dim=-1).sum(1)
-        return legs + (self.route_w[:, 0] - kinematics.base_pos_w[:, :2]).norm(dim=1)
-
-    def _target(self, kinematics: Kinematics) -> torch.Tensor:
-        """(num_envs, 2) m, where to walk: along a route to the point after the one that the robot is at or past."""
-        if self.route_w is None:
-            return self.goal_w
-        last, each = self.route_w.shape[1] - 1, torch.arange(len(self.aim), device=self.aim.device)
-        away = (self.route_w - kinematics.base_pos_w[:, None, :2]).norm(dim=-1)
-        here, beyond = away[each, self.aim], away[each, (self.aim + 1).clamp(max=last)]
-        self.aim += ((here < NEAR_POINT) | (beyond < here)) & (self.aim < last)
-        return self.route_w[each, self.aim]
+        return legs + self._distance(kinematics, self.route_w[:, 0])
 
     def advance(self, dt: float, kinematics: Kinematics) -> None:
-        config = self.config
         self.elapsed += dt
-        ahead, aside = (self._target(kinematics) - kinematics.base_pos_w[:, :2]).unbind(1)
+        if self.route_w is not None:
+            here, beyond = (self._distance(kinematics, self._point(self.aim + ahead)) for ahead in (0, 1))
+            self.aim += ((here < NEAR_POINT) | (beyond < here)) & (self.aim < self.route_w.shape[1] - 1)
+        self._steer(kinematics)
+
+    def _point(self, number: torch.Tensor) -> torch.Tensor:
+        """(num_envs, 2) m, a point of each route, by number (num_envs,); the last for larger ones."""
+        assert self.route_w is not None
+        each = torch.arange(len(number), device=number.device)
+        return self.route_w[each, number.clamp(max=self.route_w.shape[1] - 1)]
+
+    def _steer(self, kinematics: Kinematics) -> None:
+        config, target = self.config, self.goal_w if self.route_w is None else self._point(self.aim)
+        ahead, aside = (target - kinematics.base_pos_w[:, :2]).unbind(1)
         if config.radius is None:
             ahead = (ahead + 1.0).clamp(min=0.5)
         bearing = torch.atan2(aside, ahead)
@@ -253,17 +255,17 @@ class GoalCommand:
         error = torch.remainder(bearing - kinematics.yaw + math.pi, 2 * math.pi) - math.pi
         self.value[:, 2] = (config.yaw_gain * error).clamp(-config.max_ang_vel_z, config.max_ang_vel_z)
         if config.slow_within > 0:
-            self.value *= (self._distance(kinematics) / config.slow_within).clamp(max=1.0)[:, None]
+            self.value *= (self._distance(kinematics, self.goal_w) / config.slow_within).clamp(max=1.0)[:, None]
 
     def reached(self, kinematics: Kinematics) -> torch.Tensor:
         if self.config.radius is None:
             return kinematics.base_pos_w[:, 0] >= self.goal_w[:, 0]
-        near = self._distance(kinematics) <= self.config.radius
+        near = self._distance(kinematics, self.goal_w) <= self.config.radius
         return near & (self.elapsed >= self.config.hold_s) if self.config.hold_s > 0 else near
 
-    def _distance(self, kinematics: Kinematics) -> torch.Tensor:
-        """(num_envs,) m, horizontal, to the goal."""
-        return (self.goal_w - kinematics.base_pos_w[:, :2]).norm(dim=1)
+    def _distance(self, kinematics: Kinematics, point_w: torch.Tensor) -> torch.Tensor:
+        """(num_envs,) m, horizontal, from the bases to points (num_envs, 2)."""
+        return (point_w - kinematics.base_pos_w[:, :2]).norm(dim=1)
 
     def state_dict(self) -> dict:
         state = {"value": self.value, "goal_w": self.goal_w, "elapsed": self.elapsed, "aim": self.aim}
