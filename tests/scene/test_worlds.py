@@ -83,5 +83,7 @@ def test_time_limits(world):
         assert limit == pytest.approx(2.5 * way / speed)
     elif world == "hold":
         assert limit > task.commands.hold_s == 20.0
+    elif world == "barn":
+        assert limit == pytest.approx(2 * way / speed)
     elif world != "abs_hard":
         assert limit == pytest.approx(1.5 * way / speed)
