@@ -36,6 +36,8 @@ class GeometryConfig:
         slope: most that the local ground rises outwards against the plane.
         min_height, rise: returns that stand at most this (m) above the ground are ground, and by so much (m/m) more
             with the distance from the base.
+        lift: likewise (m), times the sine of the angle at which they are seen from above: range noise lifts those most
+            that lie steeply below.
         headroom: returns at least this (m) above it hang too high to matter.
         min_points: returns that make an obstacle in a sector.
         spread: returns up to this share behind the nearest are the same surface; twice what range noise spreads it.
@@ -43,7 +45,7 @@ class GeometryConfig:
 
     num_sectors: int = 72
     reach: float = 6.0
-    body: tuple[float, float, float] = (0.5, 0.36, 0.25)
+    body: tuple[float, float, float] = (0.5, 0.36, 0.32)
     near: float = 0.32
     near_share: float = 0.35
     standing: float = 0.33
@@ -55,6 +57,7 @@ class GeometryConfig:
     slope: float = 0.2
     min_height: float = 0.05
     rise: float = 0.005
+    lift: float = 0.08
     headroom: float = 0.45
     min_points: int = 1
     spread: float = 0.15
@@ -96,7 +99,7 @@ def nearest_obstacles(
     counts = ranges.isfinite() & ~own_body(in_base, config)
     is_near = ranges < config.near
     height = height_above_ground(points, counts & ~is_near, config)
-    least = config.min_height + config.rise * points[..., :2].norm(dim=-1)
+    least = config.min_height + config.rise * points[..., :2].norm(dim=-1) + config.lift * _steepness(points, attitude)
     stands = counts & (height > least) & (height < config.headroom)
     stands &= ~near_noise(points, stands & is_near, counts, attitude, config)
     return by_sector(points[..., :2], stands, config)
@@ -125,6 +128,13 @@ def own_body(points_b: torch.Tensor, config: GeometryConfig) -> torch.Tensor:
     back, front, side = config.body
     x, y = points_b[..., 0], points_b[..., 1]
     return (x > -back) & (x < front) & (y.abs() < side)
+
+
+def _steepness(points: torch.Tensor, attitude: Attitude) -> torch.Tensor:
+    """(n, R) sine of the angle at which points (n, R, 3) are seen from above; 0 from below."""
+    sensor = levelling(attitude.base_quat) @ points.new_tensor(attitude.mount_pos)
+    ray = points - sensor[:, None]
+    return (-ray[..., 2] / ray.norm(dim=-1).clamp(min=1e-6)).clamp(min=0.0)
 
 
 def near_noise(
