@@ -125,5 +125,6 @@ def build_sensing(
         distal=DISTAL_RANGE in needed,
         whole=CLOUD in needed,
         measured=MEASURED_CLOUD in needed,
+        shown=config.shows_frames,
         delivery=build_delivery(config, random),
     )

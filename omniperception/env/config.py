@@ -40,6 +40,7 @@ class EnvConfig:
         frame_history: LiDAR frames kept for the network.
         base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
+        shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
         read_besides: requirements of who acts in the task, beside those of its terms; see `state.requires`.
         log_interval: control steps between two reports of the metrics.
         initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
@@ -63,6 +64,7 @@ class EnvConfig:
     frame_history: int = 0
     base_motion: bool = False
     targets: Sequence[str] = ()
+    shows_frames: bool = True
     read_besides: Sequence[str] = ()
     log_interval: int = 24
     initial_obstacle_level: float | None = None
@@ -122,6 +124,11 @@ class EnvConfig:
         device = self.lidar.device if self.lidar is not None else None
         own = DEVICES[device].noise() if self.randomization.lidar_device and device is not None else ()
         return (*own, *self.randomization.noise)
+
+    @property
+    def casts_frames(self) -> bool:
+        """Tell whether somebody is shown what the LiDAR sees: the network, or who acts in its place."""
+        return self.shows_frames or not FROM_LIDAR.isdisjoint(self.read_besides)
 
     @property
     def uses_lidar(self) -> bool:

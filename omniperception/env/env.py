@@ -207,8 +207,9 @@ class OmniEnv(VecEnv):
                 self._frame_heights = self.state.heights
 
     def _lidar_is_awake(self) -> bool:
-        """Tell whether frames are cast: there is a LiDAR, and the curriculum has an obstacle."""
-        return self.sensing is not None and (self.obstacles is None or self.obstacles.level > 0.0)
+        """Tell whether frames are cast: there is a LiDAR, somebody to see them, and the curriculum has an obstacle."""
+        something_there = self.obstacles is None or self.obstacles.level > 0.0
+        return self.sensing is not None and self.config.casts_frames and something_there
 
     def _follow_terrain(self) -> None:
         if self.terrain_levels is not None:

@@ -111,6 +111,7 @@ class LidarSensing:
         distal: bool = False,
         whole: bool = False,
         measured: bool = False,
+        shown: bool = True,
         delivery: FrameDelivery | None = None,
     ) -> None:
         """
@@ -130,6 +131,7 @@ class LidarSensing:
             distal: whether `mean_distal_range` is read.
             whole: whether `frame` is read, the clouds of all environments.
             measured: likewise, as measured, with noise.
+            shown: whether frames are sampled for the network; otherwise it never has one.
             delivery: which frames are lost and late; None: none.
         """
         ratio = config.period_s / control_dt
@@ -157,7 +159,8 @@ class LidarSensing:
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
         )
-        outputs = _outputs(sampler is not None, sector_distance is not None, bool(obstacles), distal, whole, measured)
+        sampled = self._shown = shown and sampler is not None
+        outputs = _outputs(sampled, sector_distance is not None, bool(obstacles), distal, whole, measured)
         self.lidar = Lidar(
             config,
             pattern,
@@ -257,7 +260,7 @@ class LidarSensing:
                     self._note_sightings(envs, frame)
                 for cap, mean in self._distal_range.items():
                     mean[envs] = self._mean_distal_range(frame, cap)
-            if self.frames is not None:
+            if self._shown:
                 with timer.stage("sampling"):
                     self._sample(envs, frame, base_quat)
             if self._sectors:
@@ -266,7 +269,7 @@ class LidarSensing:
         next(slices, None)  # the frame has been cast
         self.tick, self._is_cast = self.tick + 1, True
         self.frame_tick.fill_(self.tick)
-        if self.frames is not None:
+        if self._shown:
             self._append_newest()
 
     def _place_bodies(self) -> None:

@@ -44,13 +44,16 @@ Steering = Callable[[], torch.Tensor]
 
 
 def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvConfig:
-    """The task in which a policy can be tried: with the LiDAR of the run and its clouds where the policy reads them.
+    """The task in which a policy can be tried, without what nobody reads: rewards, and frames for a blind network.
+
+    A policy that reads clouds has the LiDAR of the run.
 
     Args:
         name: of any policy.
         config: the task, of the run or of the walker.
         lidar: the run's.
     """
+    config = replace(config, rewards=replace(config.rewards, terms={}), shows_frames=name not in BASELINES)
     return replace(config, lidar=lidar, read_besides=(MEASURED_CLOUD,)) if name in ("stop", "histogram") else config
 
 
@@ -76,14 +79,11 @@ def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig
 
 
 def blind(env: OmniEnv, policy: Policy) -> Policy:
-    """The policy as it acts before its first frame: it has never had one."""
+    """The policy as it acts before its first frame: in an environment that never shows it one."""
     if env.sensing is None or env.sensing.frames is None:
         raise ValueError("this policy does not look at the LiDAR, it is blind already; leave policy=blind out")
-
-    def act(observations: TensorDict) -> torch.Tensor:
-        return policy(_without_frames(observations))
-
-    return act
+    _check_hidden(env)
+    return policy
 
 
 def oracle(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
@@ -270,7 +270,7 @@ def _avoiding(env: OmniEnv, avoidance: AvoidanceConfig, motion: Steering) -> Ste
 def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | None) -> Policy:
     """The policy with another velocity in place of V_cmd.
 
-    To a policy that sees, too, it is always before the first frame, so that it adds no avoidance of its own.
+    A policy that sees, too, must never be shown a frame, so that it adds no avoidance of its own.
 
     Args:
         env: where it walks.
@@ -285,21 +285,20 @@ def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | N
             " command alone, without history; name another gait: walker=<run directory of experiment=walk>"
         )
 
+    _check_hidden(env)
+
     def drive(observations: TensorDict) -> torch.Tensor:
         velocity = steering()
         if limits is not None:
             low, high = velocity.new_tensor(limits).unbind(1)
             velocity = velocity.clamp(low, high)
-        observations = _without_frames(observations)
+        observations = observations.clone(recurse=False)
         observations[COMMAND_GROUP] = torch.cat((velocity, env.command.value[:, 2:]), 1)
         return policy(observations)
 
     return drive
 
 
-def _without_frames(observations: TensorDict) -> TensorDict:
-    """Observations in which no frame has come yet."""
-    observations = observations.clone(recurse=False)
-    if "frame_count" in observations:
-        observations["frame_count"] = torch.zeros_like(observations["frame_count"])
-    return observations
+def _check_hidden(env: OmniEnv) -> None:
+    if env.sensing is not None and env.sensing.frames is not None and env.config.shows_frames:
+        raise ValueError("this task shows the network LiDAR frames; prepare it with EnvConfig.shows_frames=False")

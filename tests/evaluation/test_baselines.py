@@ -32,19 +32,28 @@ def walk(env, policy, steps):
 
 class TestBlind:
     def test_acts_as_before_the_first_frame(self):
-        avoider = trained("blind", "scenario=corridor")
-        env, policy = avoider.env, blind(avoider.env, avoider.policy)
+        seeing, unseeing = trained("run", "scenario=corridor"), trained("blind", "scenario=corridor")
+        env, policy = unseeing.env, blind(unseeing.env, unseeing.policy)
         walk(env, policy, 30)
+        walk(seeing.env, seeing.policy, 30)
         with torch.no_grad():
-            seen = env.get_observations()
-            before = seen.clone()
-            before["frames"], before["frame_count"] = torch.zeros_like(seen["frames"]), 0 * seen["frame_count"]
+            felt, seen = env.get_observations(), seeing.env.get_observations()
+            assert not felt["frame_count"].any() and not felt["frames"].any()
             assert (seen["frame_count"] > 0).all() and seen["frames"].any()
-            acted, seeing = policy(seen), avoider.policy(seen)
-            assert not torch.allclose(acted, seeing)
-            assert (seen["frame_count"] > 0).all()  # what the task observes is what it was
+            before = seen.clone()
+            for group in ("proprioception", "command", "action"):
+                before[group] = felt[group]
             before["frame_tick"] += 1  # the policy embeds each frame once
-            assert torch.equal(acted, avoider.policy(before))
+            assert not torch.allclose(policy(felt), seeing.policy(before))
+            before["frame_count"] = torch.zeros_like(before["frame_count"])
+            assert torch.allclose(policy(felt), seeing.policy(before), atol=1e-6)
+
+    def test_a_task_that_shows_frames_is_refused(self):
+        avoider = trained("run", "scenario=corridor")
+        with pytest.raises(ValueError, match="EnvConfig.shows_frames=False"):
+            blind(avoider.env, avoider.policy)
+        with pytest.raises(ValueError, match="EnvConfig.shows_frames=False"):
+            oracle(avoider.env, avoider.policy, CONTROLLER, None)
 
     def test_a_policy_without_a_lidar_is_blind_already(self, make_env):
         env = make_env(*BLIND, "scenario=static", "num_envs=2")
@@ -76,18 +85,17 @@ class TestOracle:
 
 
 @pytest.mark.parametrize("name", ["oracle", "histogram", "stop"])
-def test_what_the_driven_policy_perceives_itself_does_not_matter(name):
+def test_the_driven_policy_perceives_nothing_itself(name):
     avoider = trained(name, "scenario=corridor")
     env, controller = avoider.env, avoider.env.config.rewards.avoidance
     driven = baseline(name, env, avoider.policy, controller, None)
     walk(env, driven, 30)
     with torch.no_grad():
         seen = env.get_observations()
+        assert not seen["frame_count"].any() and not seen["frames"].any()
         other = seen.clone()
-        other["frames"] = torch.rand_like(other["frames"])
+        other["frames"], other["frame_tick"] = torch.rand_like(other["frames"]), other["frame_tick"] + 1
         assert torch.equal(driven(seen), driven(other))
-        other["frame_tick"] += 1  # a new frame, as the policy embeds each once
-        assert not torch.allclose(avoider.policy(seen), avoider.policy(other))
 
 
 @pytest.mark.parametrize("name", ["oracle", "histogram", "stop"])
