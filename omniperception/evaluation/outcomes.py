@@ -18,10 +18,10 @@ GRAVITY = 9.81
 
 _COLUMNS = (
     *("length_s", "outcome", "contacts", "first_contact_s", "impulse", "clearance", "energy", "path", "free_time_s"),
-    *("velocity_error", "free_velocity_error", "free_s", "yaw_rate_error"),
+    *("velocity_error", "free_velocity_error", "free_s", "yaw_rate_error", "world"),
 )
 """Fields of `Episodes` with a number for each trial."""
-_WHOLE = ("outcome", "contacts")
+_WHOLE = ("outcome", "contacts", "world")
 _DIGITS = 5
 
 
@@ -51,6 +51,7 @@ class Episodes:
         yaw_rate_error: mean error of the yaw rate (rad/s).
         has_goal: whether the commands lead to a goal.
         weight: of the robot (N).
+        world: int64 number of the world of the obstacles' layout, as in its table and scores; None without a layout.
         us_per_env_step: wall time by stage in microseconds per environment and control step; `policy` is the network,
             `measuring` what is measured here.
         tracks: ways of the robots, where asked for.
@@ -71,6 +72,7 @@ class Episodes:
     yaw_rate_error: torch.Tensor
     has_goal: bool
     weight: float
+    world: torch.Tensor | None = None
     us_per_env_step: dict[str, float] = field(default_factory=dict)
     tracks: Tracks | None = None
 

@@ -55,6 +55,8 @@ class Tally:
         self._first_contact = torch.full(n, math.inf, dtype=double, device=device)
         self._filed_contact = torch.zeros(filed, dtype=double, device=device)
         self._free_time = torch.zeros(filed, dtype=double, device=device)
+        layouts = env.obstacles.world.shape[1] if env.obstacles is not None else 0
+        self._world = torch.zeros(filed, dtype=torch.int64, device=device) if layouts == 1 else None
         self._clearance = Clearance(env) if env.config.obstacles.num_obstacles else None
         self._least = torch.full(n, CLEARANCE_CAP, device=device)
         self._filed_least = torch.zeros(filed, device=device)
@@ -66,6 +68,8 @@ class Tally:
         """Takes in the scenes of environments (n,) in which trials are about to begin."""
         commands, goal = self._env.config.commands, self._env.command.goal_w
         fresh = fresh[self._trial[fresh] < self._count]
+        if self._world is not None and self._env.obstacles is not None:
+            self._world[self._trial[fresh]] = self._env.obstacles.world[fresh, 0]
         if isinstance(commands, GoalCommandConfig) and goal is not None:
             way = goal[fresh] - self._env.state.kinematics.base_pos_w[fresh, :2]
             length = way[:, 0] if commands.radius is None else way.norm(dim=1) - commands.radius
@@ -145,6 +149,7 @@ class Tally:
             yaw_rate_error=sums["yaw_rate_error"] / steps,
             has_goal=has_goal,
             weight=float(env.world.model.body_subtreemass[env.world.base_body]) * GRAVITY,
+            world=None if self._world is None else self._world.cpu(),
             us_per_env_step=us_per_env_step,
             tracks=tracks,
         )

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from omniperception.evaluation import run_episodes
+from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.report import summary_table, times_line
 
 SHORT = "terminations.episode_length_s=0.4"  # 20 control steps
@@ -79,3 +80,20 @@ def test_stage_times_survive_the_reports_of_the_log(make_env):
     times = summary["us_per_env_step"]
     assert {"policy", "physics", "rewards", "observations"} <= set(times) and min(times.values()) > 0
     assert "success" in summary_table(summary) and "policy" in times_line(summary)
+
+
+def test_the_world_of_each_trial_is_filed(make_env):
+    env = make_env(
+        "lidar=none",
+        "rewards=walk",
+        "observations=walk",
+        "scenario=maze",
+        "terminations.episode_length_s=0.06",
+        "num_envs=2",
+    )
+    seen = []
+    env.step_hooks.append(lambda: seen.append(env.obstacles.world[:, 0].clone()))
+    episodes = run_episodes(env, stand, 6)
+    every = torch.stack(seen)[::3]  # trials of three steps each, two at a time
+    assert episodes.world.tolist() == every.flatten().tolist() and len(set(episodes.world.tolist())) > 2
+    assert Episodes.from_columns(episodes.columns()).world.tolist() == episodes.world.tolist()
