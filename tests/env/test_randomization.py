@@ -179,7 +179,7 @@ class TestLatency:
         history = [env.sim.qpos.float()]
         physics_step = env.sim.step
 
-        def recorded(target, num_steps, mocap_path):
+        def recorded(target, num_steps, *kinematic):
             for _ in range(num_steps):
                 physics_step(target)
                 history.append(env.sim.qpos.float())
