@@ -192,7 +192,7 @@ class Task:
             "weights": self.weights,
             "seed": self.composed.seed,
             "walker": shown(self.walker),
-            "walker_weights": weights_hash(self.walker),
+            "walker_weights": self.weights if self.walker == self.run_dir else weights_hash(self.walker),
             "trials": self.evaluation.trials,
             "num_envs": self.evaluation.num_envs,
             "overrides": list(self.evaluation.overrides),
@@ -242,12 +242,12 @@ class Task:
     def _contender(self) -> TrainedPolicy:
         """The policy in a fresh environment of the world."""
         run = self.assembled()
-        prepared_env = prepared(self.policy, run.env, self._own().lidar)
+        prepared_env = prepared(self.policy, run.env, self._own.lidar)
         trained = load_policy(replace(run, env=prepared_env), self.walker)
         env, policy, checkpoint = trained.env, trained.policy, trained.checkpoint
         try:
             if self.policy in BASELINES:
-                policy = baseline(self.policy, env, policy, self._own().rewards.avoidance, self._limits())
+                policy = baseline(self.policy, env, policy, self._own.rewards.avoidance, self._limits())
             if self.policy == "exported":
                 checkpoint = self.run_dir / EXPORTED
                 policy = ExportedPolicies(env, ExportedPolicy.load(checkpoint))
@@ -255,6 +255,7 @@ class Task:
             raise ConfigError(f"policy={self.policy}: {error}") from None
         return TrainedPolicy(env, policy, checkpoint)
 
+    @cached_property
     def _own(self) -> EnvConfig:
         """The run's task, whoever walks: its LiDAR and its avoidance controller."""
         return build.assemble(config.load(self.run_dir), self.evaluation.trust).env
@@ -262,7 +263,7 @@ class Task:
     def _limits(self) -> Limits | None:
         """Ranges (m/s) of what the gait has learned to follow; None where it is the run's own, made for V_avoid."""
         commands = config.read(self.walker).commands
-        own = self.walker == self.run_dir and self._own().rewards.avoidance.risk is not None
+        own = self.walker == self.run_dir and self._own.rewards.avoidance.risk is not None
         if own or "lin_vel_x" not in commands:
             return None
         return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)
