@@ -42,37 +42,11 @@ class _MujocoLidar:
         return finite_ranges(self._distances, self.scene.max_range)
 
 
-class WarpBackend(_MujocoLidar):
-    """All environments in one call; with a tree over each environment's bounds, which is refitted, or without."""
+class _Batched(_MujocoLidar):
+    """Backends that trace all environments in one call."""
 
-    def __init__(self, scene: BenchmarkScene, num_threads: int, device: str, tree: bool = True) -> None:
-        from mujoco_lidar.core_warp.mjlidar_warp import MjLidarWarp
-
-        super().__init__(scene)
-        self._lidar = MjLidarWarp(self.model, cutoff_dist=scene.max_range, device=device, use_bvh=tree)
-
-    def cast(self, frame: int) -> None:
-        pose = frame % self.scene.num_frames
-        self._distances, _ = self._lidar.trace_rays_batch(
-            self.geom_pos[pose],
-            self.geom_mat[pose],
-            self.scene.sensor_pos[pose],
-            self.sensor_mat[pose],
-            self.azimuth[pose],
-            self.elevation[pose],
-        )
-
-
-class JaxBackend(_MujocoLidar):
-    """All environments in one compiled call, every ray against every shape."""
-
-    def __init__(self, scene: BenchmarkScene, num_threads: int, device: str) -> None:
-        from mujoco_lidar.core_jax.mjlidar_jax import MjLidarJax
-
-        super().__init__(scene)
-        self._lidar = MjLidarJax(self.model)
-
-    def cast(self, frame: int) -> None:
+    def _trace(self, frame: int):
+        """Distances (m) of all rays, as the backend gives them."""
         pose = frame % self.scene.num_frames
         distances, _ = self._lidar.trace_rays_batch(
             self.geom_pos[pose],
@@ -82,7 +56,33 @@ class JaxBackend(_MujocoLidar):
             self.azimuth[pose],
             self.elevation[pose],
         )
-        self._distances = distances.block_until_ready()
+        return distances
+
+
+class WarpBackend(_Batched):
+    """All environments in one call; with a tree over each environment's bounds, which is refitted, or without."""
+
+    def __init__(self, scene: BenchmarkScene, num_threads: int, device: str, tree: bool = True) -> None:
+        from mujoco_lidar.core_warp.mjlidar_warp import MjLidarWarp
+
+        super().__init__(scene)
+        self._lidar = MjLidarWarp(self.model, cutoff_dist=scene.max_range, device=device, use_bvh=tree)
+
+    def cast(self, frame: int) -> None:
+        self._distances = self._trace(frame)
+
+
+class JaxBackend(_Batched):
+    """All environments in one compiled call, every ray against every shape."""
+
+    def __init__(self, scene: BenchmarkScene, num_threads: int, device: str) -> None:
+        from mujoco_lidar.core_jax.mjlidar_jax import MjLidarJax
+
+        super().__init__(scene)
+        self._lidar = MjLidarJax(self.model)
+
+    def cast(self, frame: int) -> None:
+        self._distances = self._trace(frame).block_until_ready()
 
 
 class _OneByOne(_MujocoLidar):
