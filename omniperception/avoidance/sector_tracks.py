@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from omniperception.common.rotations import rotate_yaw
+from omniperception.common.sectors import sector_of, sums_by
 
 _NOWHERE = 1e3
 """Coordinate (m) of what is not there."""
@@ -23,7 +24,7 @@ class TracksConfig:
         gate: a cluster is the one of the frame before that would by now be nearest to it, if within this (m).
         widest: clusters that reach farther (m) from their middle stand still: walls, whose middle moves with the view.
         gain: least gain of the velocity's filter, which starts as the straight line through all frames so far.
-        turn: a cluster this far (m) off has turned, and its filter starts anew.
+        turn: a cluster this far (m) off has turned, and its filter restarts.
         min_frames: matches before a cluster has a velocity.
         min_speed, max_speed: slower ones (m/s) stand still, faster ones move at this speed.
         look_back: frames after which a place that is taken again shows that something stands there.
@@ -152,13 +153,13 @@ class SectorTracks:
         """(n, S) bool: clusters most of whose places were taken `look_back` frames ago."""
         off = torch.cdist(clusters.place, self._past[:, 0]).amin(2)
         near = self.config.same_place + self._width(distance)
-        stood = _sums((clusters.seen & (off < near)).float(), clusters.label)
+        stood = sums_by(clusters.label, (clusters.seen & (off < near)).float(), self._sectors)
         return stood >= self.config.stands * clusters.members
 
     def _merge(self, distance: torch.Tensor, place: torch.Tensor, velocity: torch.Tensor) -> None:
         """The nearest by sector of what is seen now and what is remembered."""
         config, was, age = self.config, self._place.norm(dim=-1), self._unseen + 1
-        there = distance.gather(1, _sector(self._place, self._sectors))
+        there = distance.gather(1, sector_of(self._place, self._sectors))
         is_near = was < config.blind
         lasts = age <= torch.where(is_near, config.remember_near, config.remember)
         lasts &= torch.where(is_near, there > was + config.link, there.isinf())  # nothing is seen in its stead
@@ -187,9 +188,11 @@ class _Clusters:
         linked = seen & seen.roll(1, 1) & ~apart  # to the sector before
         label = (~linked).long().cumsum(1).clamp(max=seen.shape[1] - 1)
         self.label = torch.where(linked[:, :1] & (label == label[:, -1:]), label[:, :1], label)  # closes the ring
-        self.members = _sums(seen.float(), self.label)
+        self.members = sums_by(self.label, seen.float(), seen.shape[1])
         self.exists = self.members > 0
-        total = torch.stack([_sums(torch.where(seen, x, 0.0), self.label) for x in place.unbind(-1)], -1)
+        total = torch.stack(
+            [sums_by(self.label, torch.where(seen, x, 0.0), seen.shape[1]) for x in place.unbind(-1)], -1
+        )
         self.middle = total / self.members.clamp(min=1.0)[..., None]
         off = (place - self.middle.gather(1, _pairs(self.label))).norm(dim=-1)
         self.extent = torch.zeros_like(off).scatter_reduce_(1, self.label, torch.where(seen, off, 0.0), "amax")
@@ -213,7 +216,7 @@ def _nearest(places: torch.Tensor, distance: torch.Tensor, num_sectors: int) -> 
         num_sectors: S.
     """
     distance = torch.where(distance < 0.5 * _NOWHERE, distance, math.inf)
-    sector = _sector(places, num_sectors)
+    sector = sector_of(places, num_sectors)
     nearest = distance.new_full((len(distance), num_sectors), math.inf).scatter_reduce_(1, sector, distance, "amin")
     wins = distance.isfinite() & (distance <= nearest.gather(1, sector))
     index = torch.arange(distance.shape[1], device=distance.device)
@@ -221,17 +224,6 @@ def _nearest(places: torch.Tensor, distance: torch.Tensor, num_sectors: int) -> 
     return nearest, who.scatter_reduce_(1, sector, torch.where(wins, index, 0), "amax")
 
 
-def _sector(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
-    """(n, k) int64 azimuth sector of places (n, k, 2)."""
-    turned = (torch.atan2(places[..., 1], places[..., 0]) + math.pi) * (num_sectors / (2.0 * math.pi))
-    return turned.long().clamp(0, num_sectors - 1)
-
-
 def _pairs(index: torch.Tensor) -> torch.Tensor:
     """(n, k, 2) index of both coordinates."""
     return index[..., None].expand(-1, -1, 2)
-
-
-def _sums(values: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
-    """(n, S) sums by label."""
-    return torch.zeros_like(values).scatter_add_(1, label, values)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 
 from omniperception.common.rotations import matrix_of, yaw_of
+from omniperception.common.sectors import sector_of, sums_by
 from omniperception.perception.samplers.base import Attitude
 
 _RIDGE = 1e-3
@@ -151,8 +152,8 @@ def near_noise(
     """
     sensor = levelling(attitude.base_quat) @ points.new_tensor(attitude.mount_pos)
     sector = sector_of(points[..., :2] - sensor[:, None, :2], config.cell_sectors)
-    share = _sums(near.float(), sector, config.cell_sectors)
-    share = share / _sums(counts.float(), sector, config.cell_sectors).clamp(min=1.0)
+    share = sums_by(sector, near.float(), config.cell_sectors)
+    share = share / sums_by(sector, counts.float(), config.cell_sectors).clamp(min=1.0)
     return near & (share.gather(1, sector) < config.near_share)
 
 
@@ -178,8 +179,8 @@ def height_above_ground(points: torch.Tensor, counts: torch.Tensor, config: Geom
     low = above.new_full((len(above), num), math.inf)
     low.scatter_reduce_(1, cell, torch.where(counts, above, math.inf), "amin")
     is_low = counts & (above <= low.gather(1, cell) + config.lowest)
-    returns = _sums(is_low.float(), cell, num)
-    ground = _sums(torch.where(is_low, above, 0.0), cell, num) / returns.clamp(min=1.0)
+    returns = sums_by(cell, is_low.float(), num)
+    ground = sums_by(cell, torch.where(is_low, above, 0.0), num) / returns.clamp(min=1.0)
     ground = _outwards(ground.unflatten(1, (rings, -1)), (returns > 0).unflatten(1, (rings, -1)), config)
     return above - ground.flatten(1).gather(1, cell)
 
@@ -228,7 +229,7 @@ def by_sector(places: torch.Tensor, counts: torch.Tensor, config: GeometryConfig
         surface, returns = _nearest_surface(distance, sector, config)
         surface &= returns.gather(1, sector) >= config.min_points
         returns = torch.where(returns >= config.min_points, returns, 0.0)
-    total = [_sums(torch.where(surface, value, 0.0), sector, config.num_sectors) for value in places.unbind(-1)]
+    total = [sums_by(sector, torch.where(surface, value, 0.0), config.num_sectors) for value in places.unbind(-1)]
     place = torch.stack(total, -1) / returns.clamp(min=1.0)[..., None]
     return Nearest(torch.where(returns > 0, place.norm(dim=-1), math.inf), place, returns.long())
 
@@ -240,15 +241,4 @@ def _nearest_surface(
     nearest = distance.new_full((len(distance), config.num_sectors), math.inf)
     nearest.scatter_reduce_(1, sector, distance, "amin")
     surface = distance.isfinite() & (distance <= (1.0 + config.spread) * nearest.gather(1, sector))
-    return surface, _sums(surface.float(), sector, config.num_sectors)
-
-
-def sector_of(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
-    """(...) int64 azimuth sector of places (..., 2); sector 0 starts at -pi."""
-    turned = (torch.atan2(places[..., 1], places[..., 0]) + math.pi) * (num_sectors / (2.0 * math.pi))
-    return turned.long().clamp(0, num_sectors - 1)
-
-
-def _sums(values: torch.Tensor, index: torch.Tensor, num: int) -> torch.Tensor:
-    """(n, num) sums of values (n, R) by index (n, R)."""
-    return values.new_zeros(len(values), num).scatter_add_(1, index, values)
+    return surface, sums_by(sector, surface.float(), config.num_sectors)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from omniperception import build, config
+from omniperception.common.sectors import sector_of
 from omniperception.env.env import OmniEnv
 from omniperception.env.state import MEASURED_CLOUD
 from omniperception.lidar import Lidar
@@ -18,7 +19,6 @@ from omniperception.perception.geometry import (
     by_sector,
     height_above_ground,
     nearest_obstacles,
-    sector_of,
 )
 from omniperception.scene.rays import HitClass
 

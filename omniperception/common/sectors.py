@@ -1,0 +1,18 @@
+"""Azimuth sectors: in which one a place lies, and sums over what lies in each."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+
+def sector_of(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
+    """(...) int64 azimuth sector of places (..., 2); sector 0 starts at -pi."""
+    turned = (torch.atan2(places[..., 1], places[..., 0]) + math.pi) * (num_sectors / (2.0 * math.pi))
+    return turned.long().clamp(0, num_sectors - 1)
+
+
+def sums_by(index: torch.Tensor, values: torch.Tensor, num: int) -> torch.Tensor:
+    """(n, num) sums of values (n, k) by index (n, k)."""
+    return values.new_zeros(len(values), num).scatter_add_(1, index, values)
