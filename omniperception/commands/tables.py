@@ -1,6 +1,6 @@
 """Renders the results tables of the docs from committed files of results.
 
-    tables                # writes every table anew
+    tables                # writes every table again
     tables check=true     # says which pages differ, and writes nothing
 
 A table stands in a page between <!-- table: NAME view=... key=value ... --> and <!-- end -->; NAME is a file in `data`,

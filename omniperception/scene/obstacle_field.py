@@ -145,7 +145,7 @@ class ObstacleField:
         command_w: torch.Tensor | None = None,
         goal_w: torch.Tensor | None = None,
     ) -> None:
-        """Places the obstacles of some environments again, in sizes drawn anew.
+        """Places the obstacles of some environments again, in newly drawn sizes.
 
         Args:
             env_ids: (n,) which environments.

@@ -1,4 +1,4 @@
-"""Domain randomization: the paper's table, and errors and disturbances that a real robot meets, each absent if null."""
+"""Domain randomization: the paper's table, and errors and disturbances of a real robot, each absent if null."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class PushesConfig:
 class RandomizationConfig:
     """Ranges (low, high) drawn uniformly per environment; null leaves a row out.
 
-    The rows up to `latency_s` are drawn at every reset, and so are scale errors and biases; noise is drawn anew in
+    The rows up to `latency_s` are drawn at every reset, and so are scale errors and biases; noise is drawn in
     every control step. Errors of what is measured change `EnvState.measured` and what is computed of it (the actor's
     observations, the odometry of LiDAR frames, the levelling of clouds), never the truth that rewards, terminations
     and the critic see. What is drawn for several axes or joints is drawn for each.
@@ -139,10 +139,10 @@ class RandomizationConfig:
         velocity_scale: factor on the base's measured linear velocity: leg odometry misjudges lengths and slip.
         velocity_drift: error (m/s) of each axis of it, base frame: an estimator's bias wanders.
         gyro_bias: error (rad/s) of each axis of the measured angular velocity.
-        gyro_noise: likewise, anew in every control step.
+        gyro_noise: likewise, drawn in every control step.
         attitude_bias_deg: error (deg) of measured roll and pitch each, as of an IMU that is mounted askew.
-        attitude_noise_deg: likewise, anew in every control step.
-        joint_pos_noise: error (rad) of every measured joint position, anew in every control step.
+        attitude_noise_deg: likewise, drawn in every control step.
+        joint_pos_noise: error (rad) of every measured joint position, drawn in every control step.
         joint_vel_noise: error (rad/s) of every measured joint velocity, likewise.
         frames_lost: share of the LiDAR frames that never come, in each environment on its own.
         frames_late_s: age (s) of the scene that a LiDAR frame shows when it comes, drawn for every frame, rounded to
