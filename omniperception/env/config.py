@@ -77,9 +77,10 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
             raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
-        if isinstance(self.commands, GoalCommandConfig) and self.commands.route and not self.obstacles.has_routes:
+        on_route = isinstance(self.commands, GoalCommandConfig) and self.commands.route_ahead is not None
+        if on_route and not self.obstacles.has_routes:
             raise ValueError(
-                "commands.route=true leads through a maze, and these obstacles have none; use scenario=maze"
+                "commands.route_ahead leads through a maze, and these obstacles have none; use scenario=maze"
             )
         if MOTION_TARGET in self.targets and self.rewards.avoidance.risk is None:
             raise ValueError(

@@ -272,7 +272,7 @@ class OmniEnv(VecEnv):
             goal = None if self.command.goal_w is None else self.command.goal_w[env_ids]
             self.obstacles.reset(env_ids, pose[:, :2], commanded, goal)
             self._resize(self.obstacles, env_ids)
-            if isinstance(self.command, GoalCommand) and self.command.config.route:
+            if isinstance(self.command, GoalCommand) and self.command.config.route_ahead is not None:
                 self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
         self.episode_length_buf[env_ids] = 0
         if self.sensing is not None:

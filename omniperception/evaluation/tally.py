@@ -74,7 +74,7 @@ class Tally:
             way = goal[fresh] - self._env.state.kinematics.base_pos_w[fresh, :2]
             length = way[:, 0] if commands.radius is None else way.norm(dim=1) - commands.radius
             command = self._env.command
-            if commands.route and isinstance(command, GoalCommand):
+            if commands.route_ahead is not None and isinstance(command, GoalCommand):
                 length = command.way(self._env.state.kinematics)[fresh]
             free = (length.double() / commands.speed).clamp(min=commands.hold_s)
             self._free_time[self._trial[fresh]] = free

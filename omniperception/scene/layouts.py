@@ -16,6 +16,10 @@ ROW = 6
 """Numbers of a row of a table: x, y (m), yaw (rad) and the half extents x, y, z (m) of one box."""
 
 
+ROUTE_PIECES = 8
+"""Pieces of a route from the middle of one cell of a maze to that of the next."""
+
+
 class Layout(Protocol):
     """A generator of worlds of boxes.
 
@@ -98,12 +102,15 @@ class MazeLayout:
         return np.stack([self._world(_stream(seed, world)) for world in range(num_worlds)])
 
     def routes(self, seed: int, num_worlds: int) -> np.ndarray:
-        """(num_worlds, R, 2) m: a shortest way through the middles of cells from the robot's to the goal, which is
-        repeated up to the length of the longest."""
+        """(num_worlds, R, 2) m: a shortest way through the middles of cells from the robot's to the goal, in
+        `ROUTE_PIECES` pieces from one to the next; the goal is repeated up to the length of the longest."""
         ways = [self._walls_and_way(_stream(seed, world))[1] for world in range(num_worlds)]
         longest = max(len(way) for way in ways)
         cells = np.array([way + way[-1:] * (longest - len(way)) for way in ways], dtype=np.float64)
-        return (cells - [0, self.rows // 2]) * self.cell
+        share = np.arange(ROUTE_PIECES)[:, None] / ROUTE_PIECES
+        pieces = cells[:, :-1, None] + share * np.diff(cells, axis=1)[:, :, None]  # (num_worlds, cells, pieces, 2)
+        points = np.concatenate((pieces.reshape(num_worlds, -1, 2), cells[:, -1:]), 1)
+        return (points - [0, self.rows // 2]) * self.cell
 
     def _walls_and_way(self, rng: np.random.Generator) -> tuple[list[tuple[int, int, int]], list[tuple[int, int]]]:
         """Edges with a wall, and cells (column, row) from the start's to the goal's."""

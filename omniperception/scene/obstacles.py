@@ -131,7 +131,7 @@ class ObstaclesConfig:
 
     @property
     def has_routes(self) -> bool:
-        """Tell whether the obstacles' worlds have ways through them, to be followed by `commands.route`."""
+        """Tell whether the obstacles' worlds have ways through them, to be followed by `commands.route_ahead`."""
         layouts = [group.layout for group in self.groups.values() if group.layout is not None]
         return len(layouts) == 1 and isinstance(layouts[0], MazeLayout)
 

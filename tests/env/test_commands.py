@@ -161,37 +161,44 @@ class TestGoal:
         with pytest.raises(ValueError, match=message):
             GoalCommandConfig(*settings, 2.0, 1.0, SpawnConfig())
 
-    def test_a_route_is_followed_point_by_point(self):
-        config = GoalCommandConfig((4.0, 4.0), (0.0, 0.0), 0.5, 1.0, 2.0, 1.0, SpawnConfig(), route=True)
+    def test_a_place_ahead_on_the_route_is_aimed_at(self):
+        """Along an L and around a hairpin, in steps of 0.5 m, 1.5 m ahead."""
+        config = GoalCommandConfig((4.0, 4.0), (0.0, 0.0), 0.5, 1.0, 2.0, 1.0, SpawnConfig(), route_ahead=1.5)
         command = config.build(2, torch.device("cpu"), EnvRandom(0, 2))
         start = robots([[0.0, 0.0], [0.0, 0.0]], [0.0, 0.0])
         command.reset(torch.arange(2), start)
-        route = torch.tensor([[0.0, 0.0], [0.0, 2.0], [2.0, 2.0], [4.0, 0.0], [4.0, 0.0]])
-        command.follow(torch.arange(2), torch.stack((route, route.flip(1))), start)
-        assert command.way(start).tolist() == pytest.approx([4.0 + 8**0.5] * 2)
-        torch.testing.assert_close(command.value[:, :2], torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
-        ways = {
-            (0.0, 1.2): (0.0, 1.0),
-            (0.0, 1.4): (2.0, 0.6),  # 0.6 m before a point the next one is aimed at
-            (0.0, 0.5): (2.0, 1.5),  # and it stays so
-            (1.2, 2.0): (1.0, 0.0),
-            (3.2, 0.9): (0.8, -0.9),  # nearer to the next one
-            (4.0, 0.4): (0.0, -1.0),
-        }
-        for place, expected in ways.items():
-            where = robots([list(place), [0.0, 0.0]], [0.0, 0.0])
-            command.advance(0.02, where)
-            unit = torch.tensor(expected) / math.hypot(*expected)
-            torch.testing.assert_close(command.value[0, :2], unit, atol=1e-6, rtol=0)
-        assert command.aim.tolist() == [4, 1]
-        assert command.reached(where).tolist() == [True, False]
-        command.reset(torch.tensor([0]), start)
-        command.follow(torch.tensor([0]), route[None], start)
-        assert command.value[0, :2].tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
+        up = [[0.0, y] for y in (0.0, 0.5, 1.0, 1.5, 2.0)]
+        bend = torch.tensor(up + [[x, 2.0] for x in (0.5, 1.0, 1.5, 2.0)] + 5 * [[2.0, 2.0]])
+        down = [[0.5, y] for y in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0)]
+        hairpin = torch.tensor(up + down + 2 * [[0.5, -1.0]])
+        command.follow(torch.arange(2), torch.stack((bend, hairpin)), start)
+        assert command.way(start).tolist() == pytest.approx([4.0, 5.5])
+        steps = [  # places of the two robots, and what each aims at
+            ((0.0, 0.0), (0.0, 1.5), (0.0, 0.2), (0.0, 1.5)),
+            ((0.0, 1.0), (0.5, 2.0), (0.0, 0.9), (0.5, 2.0)),
+            ((0.3, 1.6), (1.0, 2.0), (0.45, 1.0), (0.5, 2.0)),  # beside the way back, which is farther along the route
+            ((0.0, 0.0), (1.0, 2.0), (0.0, 1.9), (0.5, 1.0)),  # going back does not undo
+            ((1.3, 2.2), (2.0, 2.0), (0.6, 1.6), (0.5, 0.0)),
+        ]
+        for at, aim, at_other, aim_other in steps:
+            where = robots([list(at), list(at_other)], [0.0, 0.0])
+            for _ in range(3):
+                command.advance(0.02, where)
+            way = torch.tensor([aim, aim_other]) - torch.tensor([at, at_other])
+            torch.testing.assert_close(command.value[:, :2], way / way.norm(dim=1, keepdim=True), atol=1e-6, rtol=0)
         restored = config.build(2, torch.device("cpu"), EnvRandom(0, 2))
         restored.load_state_dict(command.state_dict())
-        restored.advance(0.02, start)
-        assert torch.equal(restored.value, command.value)
+        restored.advance(0.02, where)
+        command.advance(0.02, where)
+        assert torch.equal(restored.value, command.value) and restored.way(where).equal(command.way(where))
+        command.reset(torch.tensor([0]), start)
+        command.follow(torch.tensor([0]), bend[None], start)
+        assert command.value[0, :2].tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
+
+    @pytest.mark.parametrize(("radius", "ahead"), [(0.5, 0.0), (None, 3.0)])
+    def test_a_route_needs_a_way_ahead_and_a_place(self, radius, ahead):
+        with pytest.raises(ValueError, match=r"commands\.route_ahead"):
+            GoalCommandConfig((4.0, 4.0), (0.0, 0.0), radius, 1.0, 2.0, 1.0, SpawnConfig(), route_ahead=ahead)
 
     def test_a_line_cannot_be_held(self):
         with pytest.raises(ValueError, match=r"commands\.hold_s=3"):

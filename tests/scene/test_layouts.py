@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from omniperception.scene.layouts import (
+    ROUTE_PIECES,
     BarnLayout,
     BlocksLayout,
     MazeLayout,
@@ -121,14 +122,14 @@ def test_the_way_through_a_maze_is_free_and_short(layout):
     for world, route in zip(table, routes, strict=True):
         np.testing.assert_array_equal(route[[0, -1]], [(0.0, 0.0), layout.goal])
         steps = np.abs(np.diff(route, axis=0))
-        assert set(steps.sum(1)) <= {2.0, 0.0}  # to the next cell, or at the goal
-        dense = np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(route)])
+        assert set(steps.sum(1)) <= {2.0 / ROUTE_PIECES, 0.0}  # towards the next cell, or at the goal
+        dense = np.concatenate([np.linspace(a, b, 3) for a, b in itertools.pairwise(route)])
         assert distance_to_boxes(dense, world).min() > 0.75
     lengths = np.abs(np.diff(routes, axis=1)).sum((1, 2))
     assert lengths.min() >= 18.0
-    assert lengths.max() == 2.0 * (routes.shape[1] - 1)
+    assert lengths.max() == 2.0 / ROUTE_PIECES * (routes.shape[1] - 1)
     straight = MazeLayout(columns=4, rows=3, walls=0)
-    np.testing.assert_array_equal(straight.routes(0, 1)[0], [(0, 0), (2, 0), (4, 0), (6, 0)])
+    np.testing.assert_array_equal(straight.routes(0, 1)[0, ::ROUTE_PIECES], [(0, 0), (2, 0), (4, 0), (6, 0)])
 
 
 def test_no_wall_stands_across_a_lane():

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
+import torch.nn.functional as F
 
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import rotate_yaw
@@ -87,8 +88,8 @@ class GoalCommandConfig:
         slow_within: at this distance (m) from the goal and nearer, speed and yaw rate fade in proportion to the
             distance, so that a robot can stay; 0: they do not.
         hold_s: the goal counts as reached only from this time (s) of an episode on, so that a robot has to stay.
-        route: whether the way leads along the route through the obstacles' world, which its layout has to give, and not
-            straight to the goal: what a planner with a map would command.
+        route_ahead: the command points to the place so far (m) ahead on the route through the obstacles' world, which
+            its layout has to give: as a planner with a coarse map commands, corners cut and all. None: to the goal.
     """
 
     goal_x: Sequence[float]
@@ -100,7 +101,7 @@ class GoalCommandConfig:
     spawn: SpawnConfig
     slow_within: float = 0.0
     hold_s: float = 0.0
-    route: bool = False
+    route_ahead: float | None = None
 
     def __post_init__(self) -> None:
         for key in ("goal_x", "goal_y"):
@@ -115,8 +116,12 @@ class GoalCommandConfig:
                 raise ValueError(f"commands.{key}={getattr(self, key)} must not be negative")
             if getattr(self, key) > 0 and self.radius is None:
                 raise ValueError(f"commands.{key}={getattr(self, key)} needs a place to stay: give commands.radius")
-        if self.route and self.radius is None:
-            raise ValueError("commands.route leads to a place, not across a line: give commands.radius")
+        if self.route_ahead is not None and self.route_ahead <= 0:
+            raise ValueError(
+                f"commands.route_ahead={self.route_ahead} must be positive, or null for straight to the goal"
+            )
+        if self.route_ahead is not None and self.radius is None:
+            raise ValueError("commands.route_ahead leads to a place, not across a line: give commands.radius")
 
     def build(self, num_envs: int, device: torch.device, random: EnvRandom) -> GoalCommand:
         return GoalCommand(self, num_envs, device, random)
@@ -187,16 +192,17 @@ class VelocityCommand:
         self.time_left[env_ids] = self.config.resample_s
 
 
-NEAR_POINT = 0.7
-"""Distance (m) from a point of a route at which the next one is aimed at."""
+ROUTE_WINDOW = 1.0
+"""How far (m) on along a route the point nearest to the robot is looked for, so that it skips no bend behind a wall."""
 
 
 class GoalCommand:
-    """Points to the goal from wherever the robot is, or to the next point of a route there.
+    """Points to the goal from wherever the robot is, or to a place ahead on a route there.
 
     Attributes:
         route_w: (num_envs, R, 2) m, points of the routes; None: straight to the goal.
-        aim: (num_envs,) int64, which point is aimed at.
+        along: (num_envs, R) m, the way along the routes to their points.
+        progress: (num_envs,) m, the way along the routes to the points nearest to the robots; never falls.
     """
 
     def __init__(self, config: GoalCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
@@ -205,7 +211,8 @@ class GoalCommand:
         self.goal_w = torch.zeros(num_envs, 2, device=device)
         self.elapsed = torch.zeros(num_envs, device=device)
         self.route_w: torch.Tensor | None = None
-        self.aim = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.along = torch.zeros(num_envs, 1, device=device)
+        self.progress = torch.zeros(num_envs, device=device)
         self._random = random
         ranges = (config.goal_x, config.goal_y)
         self._low = torch.tensor([r[0] for r in ranges], device=device)
@@ -220,33 +227,38 @@ class GoalCommand:
         """Leads some environments (n,) along routes (n, R, 2) in m, from their starts to their goals; after `reset`."""
         if self.route_w is None or self.route_w.shape[1] != route.shape[1]:
             self.route_w = self.goal_w.new_zeros(len(self.goal_w), *route.shape[1:])
+            self.along = self.goal_w.new_zeros(self.route_w.shape[:2])
         self.route_w[env_ids] = route.to(self.route_w.dtype)
-        self.aim[env_ids] = min(1, route.shape[1] - 1)
+        self.along[env_ids, 1:] = route.to(self.route_w.dtype).diff(dim=1).norm(dim=-1).cumsum(1)
+        self.progress[env_ids] = 0.0
         self._steer(kinematics)
 
     def way(self, kinematics: Kinematics) -> torch.Tensor:
         """(num_envs,) m, from the robot to the goal: straight, or over all points of the route."""
         if self.route_w is None:
             return self._distance(kinematics, self.goal_w)
-        legs = self.route_w.diff(dim=1).norm(dim=-1).sum(1)
-        return legs + self._distance(kinematics, self.route_w[:, 0])
+        return self.along[:, -1] + self._distance(kinematics, self.route_w[:, 0])
 
     def advance(self, dt: float, kinematics: Kinematics) -> None:
         self.elapsed += dt
         if self.route_w is not None:
-            here, beyond = (self._distance(kinematics, self._point(self.aim + ahead)) for ahead in (0, 1))
-            self.aim += ((here < NEAR_POINT) | (beyond < here)) & (self.aim < self.route_w.shape[1] - 1)
+            distance = (self.route_w - kinematics.base_pos_w[:, None, :2]).norm(dim=-1)
+            on = self.along - self.progress[:, None]
+            nearest = distance.masked_fill((on < 0) | (on > ROUTE_WINDOW), math.inf).argmin(1)
+            self.progress = self.along.gather(1, nearest[:, None])[:, 0]
         self._steer(kinematics)
 
-    def _point(self, number: torch.Tensor) -> torch.Tensor:
-        """(num_envs, 2) m, a point of each route, by number (num_envs,); the last for larger ones."""
-        assert self.route_w is not None
-        each = torch.arange(len(number), device=number.device)
-        return self.route_w[each, number.clamp(max=self.route_w.shape[1] - 1)]
+    def _target(self) -> torch.Tensor:
+        """(num_envs, 2) m, where the commands point to."""
+        if self.route_w is None or self.config.route_ahead is None:
+            return self.goal_w
+        last = self.route_w.shape[1] - 1
+        point = (self.along < (self.progress + self.config.route_ahead)[:, None]).sum(1).clamp(max=last)
+        return self.route_w.gather(1, point[:, None, None].expand(-1, 1, 2))[:, 0]
 
     def _steer(self, kinematics: Kinematics) -> None:
-        config, target = self.config, self.goal_w if self.route_w is None else self._point(self.aim)
-        ahead, aside = (target - kinematics.base_pos_w[:, :2]).unbind(1)
+        config = self.config
+        ahead, aside = (self._target() - kinematics.base_pos_w[:, :2]).unbind(1)
         if config.radius is None:
             ahead = (ahead + 1.0).clamp(min=0.5)
         bearing = torch.atan2(aside, ahead)
@@ -268,13 +280,13 @@ class GoalCommand:
         return (point_w - kinematics.base_pos_w[:, :2]).norm(dim=1)
 
     def state_dict(self) -> dict:
-        state = {"value": self.value, "goal_w": self.goal_w, "elapsed": self.elapsed, "aim": self.aim}
-        return state if self.route_w is None else {**state, "route_w": self.route_w}
+        state = {"value": self.value, "goal_w": self.goal_w, "elapsed": self.elapsed}
+        return state if self.route_w is None else {**state, "route_w": self.route_w, "progress": self.progress}
 
     def load_state_dict(self, state: dict) -> None:
         self.value.copy_(state["value"])
         self.goal_w.copy_(state["goal_w"])
         self.elapsed.copy_(state["elapsed"])
-        self.aim.copy_(state["aim"])
         if "route_w" in state:
-            self.route_w = state["route_w"].clone()
+            self.route_w, self.progress = state["route_w"].clone(), state["progress"].clone()
+            self.along = F.pad(self.route_w.diff(dim=1).norm(dim=-1).cumsum(1), (1, 0))
