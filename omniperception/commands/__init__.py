@@ -10,6 +10,7 @@ COMMANDS = {
     "train": "trains a policy, or goes on with a run",
     "play": "replays a run: rates over whole episodes, and a video",
     "evaluate": "evaluates runs in fixed worlds, beside baselines",
+    "robustness": "finds where a gait breaks: ranges of the randomization, and kicks",
     "tables": "renders the results tables of the docs from files of results",
     "ablate": "trains and evaluates variants of the perception over seeds",
     "export": "exports a policy for a robot or another simulator",

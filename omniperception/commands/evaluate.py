@@ -43,7 +43,9 @@ class Arguments:
 
     run: tuple[str, ...] = argument(("latest",), "run directories, or latest for the newest under outputs/")
     suite: str | None = argument(None, "file of conf/suite, such as held_out: many worlds")
-    scenario: tuple[str, ...] = argument((), "scenarios in place of a suite, or all; corridor without either")
+    scenario: tuple[str, ...] = argument(
+        (), "scenarios in place of a suite, or all of held_out; corridor without either"
+    )
     split: str = argument("dev", "obstacles and seeds for choosing, or for reporting", choices=SPLITS)
     condition: str | None = argument("ideal", "preset of conf/condition; null: the run's own randomization")
     policy: tuple[str, ...] = argument(("run",), "policies", choices=tuple(POLICIES))
@@ -89,7 +91,9 @@ def _worlds(arguments: Arguments, folders: list[Path], terrain_given: bool) -> l
     """The worlds of a suite, or the scenarios on their own terrain."""
     if arguments.suite is None:
         names = arguments.scenario or ("corridor",)
-        return [World(name) for name in (config.presets("scenario", folders) if names == ("all",) else names)]
+        if names == ("all",):
+            names = tuple(dict.fromkeys(world.name for world in suite_worlds("held_out")))
+        return [World(name) for name in names]
     if arguments.scenario:
         raise ConfigError(f"suite={arguments.suite} has its own worlds; leave scenario= out, or suite=")
     if terrain_given:

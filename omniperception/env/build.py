@@ -67,8 +67,8 @@ def build_obstacles(
     if not config.obstacles.num_obstacles:
         return None
     field = ObstacleField(config.obstacles, sim.mocap_pos, sim.mocap_quat, random, ground)
-    if config.initial_obstacle_level is not None:
-        field.level = config.initial_obstacle_level
+    if config.initial_level is not None:
+        field.level = config.initial_level
     return field
 
 

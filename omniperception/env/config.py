@@ -43,7 +43,7 @@ class EnvConfig:
         shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
         read_besides: requirements of who acts in the task, beside those of its terms; see `state.requires`.
         log_interval: control steps between two reports of the metrics.
-        initial_obstacle_level: where the obstacles' curriculum starts, 0 to 1; evaluation uses 1.
+        initial_level: where curricula of obstacles and commands start, 0 to 1; None: as they say. Evaluation uses 1.
         trials: whether episodes are trials of an evaluation: the k-th to begin is the same scene whatever the number of
             environments, on a tile that it draws; see `TrialRandom`.
     """
@@ -67,7 +67,7 @@ class EnvConfig:
     shows_frames: bool = True
     read_besides: Sequence[str] = ()
     log_interval: int = 24
-    initial_obstacle_level: float | None = None
+    initial_level: float | None = None
     trials: bool = False
 
     def __post_init__(self) -> None:

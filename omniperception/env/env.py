@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from rsl_rl.env import VecEnv
@@ -21,7 +21,7 @@ from omniperception.env.build import (
     build_sensing,
 )
 from omniperception.env.config import HEIGHT_TARGET, EnvConfig
-from omniperception.env.mdp.commands import GoalCommand
+from omniperception.env.mdp.commands import GoalCommand, VelocityCommand
 from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.metrics import EpisodeMetrics
@@ -72,6 +72,8 @@ class OmniEnv(VecEnv):
         streams = TrialRandom if config.trials else EnvRandom
         self.random: EnvRandom = streams(config.seed, self.num_envs, self.device)
         self.command = config.commands.build(self.num_envs, self.device, self.random)
+        if config.initial_level is not None and isinstance(self.command, VelocityCommand):
+            self.command.level = config.initial_level
         self.randomizer = Randomizer(config.randomization, self.sim, self.random.branch("randomization"))
         self.ground, self.terrain_levels, lookup = build_ground(config, self.sim, self.random)
         self.obstacles = build_obstacles(config, self.sim, self.random, self.ground)
@@ -245,7 +247,10 @@ class OmniEnv(VecEnv):
         self.contacts = self.state.obstacle_contact
         self.no_obstacle_near = None if self.avoidance is None else self.avoidance.no_obstacle_near()
         self.metrics.record_rewards(tuple(self.rewards.weighted.values()))
-        self.metrics.record_tracking(self.velocity_error, self.yaw_rate_error, healthy, self.no_obstacle_near)
+        calm = healthy if self.no_obstacle_near is None else healthy & self.no_obstacle_near
+        if isinstance(self.command, VelocityCommand):
+            calm = calm & self.command.settled
+        self.metrics.record_tracking(self.velocity_error, self.yaw_rate_error, healthy, calm)
         self.metrics.record_contacts(self.contacts)
         self.metrics.record_ends(self.done, self.outcomes, self.sim.failure)
 
@@ -306,12 +311,12 @@ class OmniEnv(VecEnv):
 
     def _report(self) -> dict[str, float]:
         """Metrics at the end of a log interval."""
-        config, log = self.config, {}
-        if self.obstacles is not None:
-            if config.initial_obstacle_level is None:
-                seconds = config.log_interval * self.control_dt
-                self.obstacles.raise_level(self.metrics.free_velocity_error(), seconds)
-            log["Metrics/obstacle_level"] = self.obstacles.level
+        config = self.config
+        if config.initial_level is None:
+            seconds, error = config.log_interval * self.control_dt, self.metrics.calm_velocity_error()
+            for part in self._with_level().values():
+                part.raise_level(error, seconds)
+        log: dict[str, float] = {f"Metrics/{name}_level": part.level for name, part in self._with_level().items()}
         log |= self.metrics.drain()
         log |= {f"Anomalies/{name}": count for name, count in self.sim.anomalies().items()}
         if self.terrain_levels is not None:
@@ -322,14 +327,23 @@ class OmniEnv(VecEnv):
     # ---- for runners -------------------------------------------------------------------------------------------------
 
     @property
-    def curriculum_level(self) -> float:
-        """Share of the obstacles that the curriculum has activated, 0 to 1; 1 without obstacles."""
-        return 1.0 if self.obstacles is None else self.obstacles.level
+    def curriculum_levels(self) -> tuple[float, ...]:
+        """How far the curricula of obstacles and commands are, 0 to 1, of those that there are."""
+        return tuple(part.level for part in self._with_level().values())
 
-    @curriculum_level.setter
-    def curriculum_level(self, level: float) -> None:
+    @curriculum_levels.setter
+    def curriculum_levels(self, levels: Sequence[float]) -> None:
+        for part, level in zip(self._with_level().values(), levels, strict=True):
+            part.level = level
+
+    def _with_level(self) -> dict[str, ObstacleField | VelocityCommand]:
+        """Parts with a curriculum that rises while robots walk well, by the names in the log."""
+        parts: dict[str, ObstacleField | VelocityCommand] = {}
         if self.obstacles is not None:
-            self.obstacles.level = level
+            parts["obstacle"] = self.obstacles
+        if isinstance(self.command, VelocityCommand):
+            parts["command"] = self.command
+        return parts
 
     def observation_widths(self, group: str) -> dict[str, int]:
         """Numbers of each term of an observation group, in order, per control step."""

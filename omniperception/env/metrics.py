@@ -36,14 +36,14 @@ class EpisodeMetrics:
             self._rewards += torch.stack(tuple(weighted)).mean(1)
 
     def record_tracking(
-        self, lin_error: torch.Tensor, yaw_error: torch.Tensor, healthy: torch.Tensor, free: torch.Tensor | None
+        self, lin_error: torch.Tensor, yaw_error: torch.Tensor, healthy: torch.Tensor, calm: torch.Tensor
     ) -> None:
-        """Absolute errors (m/s, rad/s) where `healthy`; `free` marks environments with no obstacle near, None: all."""
-        free = healthy if free is None else free & healthy
+        """Absolute errors (m/s, rad/s) where `healthy`; `calm` marks moments in which a good gait has hardly any: no
+        obstacle is near and the command is not new."""
         self._errors[0] += lin_error.mean()
         self._errors[1] += yaw_error.mean()
-        self._errors[2] += (lin_error * free).mean()
-        self._errors[3] += free.float().mean()
+        self._errors[2] += (lin_error * calm).mean()
+        self._errors[3] += calm.float().mean()
         self._healthy_steps += healthy.float().mean()
         self._steps += 1
 
@@ -62,8 +62,8 @@ class EpisodeMetrics:
         self._failures += (failure[:, None] == self._causes).sum(0)
         self.collided &= ~done
 
-    def free_velocity_error(self) -> float:
-        """Mean linear velocity error (m/s) away from obstacles since the last drain; inf if no robot was."""
+    def calm_velocity_error(self) -> float:
+        """Mean linear velocity error (m/s) in calm moments since the last drain; inf if there were none."""
         return float(self._errors[2] / self._errors[3]) if self._errors[3] > 0 else float("inf")
 
     def state_dict(self) -> dict:
@@ -86,7 +86,7 @@ class EpisodeMetrics:
         log = {f"Reward/{name}": value for name, value in zip(self._names, rewards, strict=True)}
         log["Metrics/velocity_error"] = errors[0] / healthy_steps
         log["Metrics/yaw_rate_error"] = errors[1] / healthy_steps
-        log["Metrics/free_velocity_error"] = errors[2] / max(errors[3], 1e-6)
+        log["Metrics/calm_velocity_error"] = errors[2] / max(errors[3], 1e-6)
         log["Metrics/contact_share"] = errors[4] / steps
         episodes = outcomes[-1]
         if episodes:

@@ -13,12 +13,14 @@ from omniperception.avoidance.true_sectors import TrueSectors
 from omniperception.avoidance.velocity import AvoidanceConfig, avoidance_velocity
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.commands import VelocityCommandConfig
 from omniperception.env.odometry import Odometry
 from omniperception.env.sensing import SensorConfig
 from omniperception.env.state import MEASURED_CLOUD
 from omniperception.evaluation.episodes import Policy
 from omniperception.perception import Attitude
 from omniperception.perception.geometry import GeometryConfig, Nearest, nearest_obstacles
+from omniperception.scene.build import FOOT_FORCE
 
 BASELINES = {
     "blind": "the run's policy as it acts before its first frame: it never has one",
@@ -54,6 +56,8 @@ def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvCon
         lidar: the run's.
     """
     config = replace(config, rewards=replace(config.rewards, terms={}), shows_frames=name not in BASELINES)
+    if isinstance(config.commands, VelocityCommandConfig):
+        config = replace(config, read_besides=(FOOT_FORCE,))  # for the figures of a gait
     return replace(config, lidar=lidar, read_besides=(MEASURED_CLOUD,)) if name in ("stop", "histogram") else config
 
 

@@ -8,9 +8,12 @@ import torch
 from tensordict import TensorDict
 
 from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.commands import VelocityCommand
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.tally import Tally
 from omniperception.evaluation.tracks import TrackRecorder
+from omniperception.evaluation.walking import WalkingTally
+from omniperception.scene.build import FOOT_FORCE
 
 Policy = Callable[[TensorDict], torch.Tensor]
 """From observations to actions (num_envs, num_actions), without exploration noise."""
@@ -42,7 +45,9 @@ def run_episodes(
         raise ValueError("run_episodes needs a freshly built environment; this one has already been stepped")
     tally, clock = Tally(env, num_trials), _StageClock(env)
     tracks = TrackRecorder(env, num_trials) if keep_tracks else None
-    recorders: list[Tally | TrackRecorder] = [tally] if tracks is None else [tally, tracks]
+    measures_walking = isinstance(env.command, VelocityCommand) and FOOT_FORCE in env.world.sensors
+    walking = WalkingTally(env, num_trials) if measures_walking else None
+    recorders = [recorder for recorder in (tally, tracks, walking) if recorder is not None]
     hooks = [recorder.record for recorder in recorders]
     env.step_hooks.extend(hooks)
     try:
@@ -61,7 +66,11 @@ def run_episodes(
     finally:
         for hook in hooks:
             env.step_hooks.remove(hook)
-    return tally.episodes(clock.us_per_env_step(), tracks.tracks() if tracks is not None else None)
+    return tally.episodes(
+        clock.us_per_env_step(),
+        tracks.tracks() if tracks is not None else None,
+        walking.columns() if walking is not None else None,
+    )
 
 
 class _StageClock:

@@ -55,6 +55,7 @@ class Episodes:
         us_per_env_step: wall time by stage in microseconds per environment and control step; `policy` is the network,
             `measuring` what is measured here.
         tracks: ways of the robots, where asked for.
+        walking: figures of a gait by name, as in `walking.COLUMNS`; None where they were not measured.
     """
 
     length_s: torch.Tensor
@@ -75,6 +76,7 @@ class Episodes:
     world: torch.Tensor | None = None
     us_per_env_step: dict[str, float] = field(default_factory=dict)
     tracks: Tracks | None = None
+    walking: dict[str, torch.Tensor] | None = None
 
     def __len__(self) -> int:
         return len(self.length_s)
@@ -163,6 +165,8 @@ class Episodes:
             values = getattr(self, name)
             if values is not None:
                 plain[name] = values.tolist() if name in _WHOLE else [_rounded(value) for value in values.tolist()]
+        if self.walking is not None:
+            plain["walking"] = {n: [_rounded(value) for value in v.tolist()] for n, v in self.walking.items()}
         return plain
 
     @classmethod
@@ -170,7 +174,8 @@ class Episodes:
         """What `columns` was made of, to `_DIGITS` digits."""
         named: dict[str, Any] = {name: _tensor(name, plain[name]) if name in plain else None for name in _COLUMNS}
         times = dict(us_per_env_step or {})
-        return cls(**named, has_goal=plain["has_goal"], weight=plain["weight"], us_per_env_step=times)
+        walking = {n: _tensor(n, v) for n, v in plain["walking"].items()} if "walking" in plain else None
+        return cls(**named, has_goal=plain["has_goal"], weight=plain["weight"], us_per_env_step=times, walking=walking)
 
 
 VERDICTS = ("success", "success, touched", "time out", "fall", "collision end", "diverged")

@@ -51,7 +51,7 @@ class Record:
     @property
     def key(self) -> tuple[str, ...]:
         """What tells it from the others of a file."""
-        return tuple(getattr(self, name) for name in _KEY)
+        return (*(getattr(self, name) for name in _KEY), *self.facts.get("overrides", ()))
 
     @property
     def place(self) -> str:

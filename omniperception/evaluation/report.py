@@ -130,10 +130,8 @@ def rate_cell(by_seed: Sequence[torch.Tensor]) -> str:
 def progress_line(record: Record) -> str:
     """One line about what has just been measured."""
     us = record.episodes.us_per_env_step
-    return (
-        f"{record.place}, {record.policy}, {record.run}: untouched {rate_cell([record.episodes.clean])} %,"
-        f" {sum(us.values()):.0f} us per environment step"
-    )
+    named = ", ".join([record.place, record.policy, record.run, *record.facts.get("overrides", ())])
+    return f"{named}: untouched {rate_cell([record.episodes.clean])} %, {sum(us.values()):.0f} us per environment step"
 
 
 def summary_table(summary: Mapping) -> str:

@@ -30,6 +30,7 @@ from omniperception.evaluation.plots import draw_worlds
 from omniperception.evaluation.records import FOLDER, Record, merge, read, write
 from omniperception.evaluation.report import progress_line, table
 from omniperception.evaluation.tracks import Tracks
+from omniperception.evaluation.walking_report import walking_table
 from omniperception.learning import CheckpointError, latest_checkpoint
 
 POLICIES = {
@@ -202,7 +203,9 @@ class Task:
     def path(self) -> Path:
         """The file of the outcomes; that of the ways has another suffix."""
         evaluation, world = self.evaluation, self.world
-        names = (evaluation.split, evaluation.condition or "own", world.name, world.terrain or "own", self.policy)
+        names = [evaluation.split, evaluation.condition or "own", world.name, world.terrain or "own", self.policy]
+        if evaluation.overrides:
+            names.append(hashlib.sha256(" ".join(evaluation.overrides).encode()).hexdigest()[:8])
         return self.run_dir / FOLDER / f"{'-'.join(names)}.json"
 
     def done(self, facts: dict) -> Record | None:
@@ -225,6 +228,7 @@ class Task:
             "what": POLICIES[self.policy],
             "checkpoint": shown(trained.checkpoint),
             "time_limit_s": env.config.terminations.episode_length_s,
+            **({} if env.ground is None else {"tile_kinds": list(env.ground.kinds)}),
             **facts,
         }
         record = Record(**named, facts=settings, episodes=replace(episodes, tracks=None))
@@ -297,9 +301,21 @@ def evaluate(evaluation: Evaluation) -> list[Record]:
     """
     if evaluation.plots:
         new_figure(1.0, 1.0)  # refuses now what would fail after hours
-    for run_dir in evaluation.runs:
-        (run_dir / FOLDER).mkdir(exist_ok=True)
     tasks = evaluation.tasks()
+    ordered = measure_all(tasks)
+    print(f"\n{(walking_table if ordered[0].episodes.walking is not None else table)(ordered)}")
+    if evaluation.plots:
+        _draw(tasks, ordered)
+    if evaluation.out is not None:
+        merge(evaluation.out, ordered)
+        print(f"added to {evaluation.out}")
+    return ordered
+
+
+def measure_all(tasks: Sequence[Task]) -> list[Record]:
+    """A record for each task: measured now, or before and kept. Prints progress and notes what is on the test split."""
+    for run_dir in {task.run_dir for task in tasks}:
+        (run_dir / FOLDER).mkdir(exist_ok=True)
     facts = provenance(tasks[0].assembled().env.sim.torch_device)
     records = {k: record for k, task in enumerate(tasks) if (record := task.done(facts)) is not None}
     if records:
@@ -307,16 +323,9 @@ def evaluate(evaluation: Evaluation) -> list[Record]:
     for k, record in _measured({k: task for k, task in enumerate(tasks) if k not in records}, facts):
         records[k] = record
         print(f"[{len(records)}/{len(tasks)}] {progress_line(record)}", flush=True)
-        if evaluation.split == "test":
-            note(log_file(evaluation), record)
-    ordered = [records[k] for k in range(len(tasks))]
-    print(f"\n{table(ordered)}")
-    if evaluation.plots:
-        _draw(tasks, ordered)
-    if evaluation.out is not None:
-        merge(evaluation.out, ordered)
-        print(f"added to {evaluation.out}")
-    return ordered
+        if tasks[k].evaluation.split == "test":
+            note(log_file(tasks[k].evaluation), record)
+    return [records[k] for k in range(len(tasks))]
 
 
 def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Record]]:

@@ -3,6 +3,7 @@
 <!-- table: before -->                                          all figures, of docs/lab/data/before.json(.gz)
 <!-- table: before view=policies condition=robot split=test --> untouched: a row for each world
 <!-- table: before view=conditions policy=run,blind -->         untouched and falls: a row for each policy
+<!-- table: gait view=walking -->                              figures of a gait: a row for each ground
 <!-- end -->
 """
 
@@ -16,6 +17,7 @@ from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.records import Record, read
 from omniperception.evaluation.report import grouped, headline, rate_cell, table
+from omniperception.evaluation.walking_report import walking_table
 
 _BLOCK = re.compile(r"^<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
 _BEGIN = re.compile(r"^<!-- table:", re.MULTILINE)
@@ -93,6 +95,7 @@ VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
     "all": table,
     "policies": by_policy,
     "conditions": by_condition,
+    "walking": walking_table,
 }
 
 

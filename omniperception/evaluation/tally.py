@@ -128,7 +128,9 @@ class Tally:
         self._first_contact.masked_fill_(env.done, math.inf)
         self._least = self._least.masked_fill(env.done, CLEARANCE_CAP)
 
-    def episodes(self, us_per_env_step: dict[str, float], tracks: Tracks | None) -> Episodes:
+    def episodes(
+        self, us_per_env_step: dict[str, float], tracks: Tracks | None, walking: dict[str, torch.Tensor] | None = None
+    ) -> Episodes:
         """All trials, in their order."""
         env, dt = self._env, self._env.control_dt
         sums = dict(zip(_SUMS, self._filed.cpu().unbind(1), strict=True))
@@ -152,4 +154,5 @@ class Tally:
             world=None if self._world is None else self._world.cpu(),
             us_per_env_step=us_per_env_step,
             tracks=tracks,
+            walking=walking,
         )

@@ -185,9 +185,10 @@ class Runner:
         return obs
 
     def _share_curriculum(self) -> None:
-        """Obstacles come in all processes at once, so that all see LiDAR frames in the same steps."""
+        """Curricula rise in all processes at once, so that all see LiDAR frames in the same steps."""
         if self.alg.is_multi_gpu:
-            self.env.curriculum_level = distributed.mean(self.env.curriculum_level, self.device)
+            levels = self.env.curriculum_levels
+            self.env.curriculum_levels = [distributed.mean(level, self.device) for level in levels]
 
     def _check_step(self, obs: TensorDict, rewards: torch.Tensor) -> None:
         """Stop on non-finite rewards or one-dimensional observations that a model reads."""

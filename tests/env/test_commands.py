@@ -8,14 +8,19 @@ import torch
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import yaw_quat
 from omniperception.env.kinematics import Kinematics
-from omniperception.env.mdp.commands import GoalCommandConfig, SpawnConfig, VelocityCommandConfig
+from omniperception.env.mdp.commands import (
+    CommandCurriculumConfig,
+    GoalCommandConfig,
+    SpawnConfig,
+    VelocityCommandConfig,
+)
 
 N = 4000
 
 
 def velocity_command(**settings):
     ranges = {"lin_vel_x": (-0.5, 1.0), "lin_vel_y": (-0.3, 0.3), "ang_vel_z": (0.2, 0.8)}
-    times = {"resample_s": 1.0, "standing": 0.0}
+    times = {"resample_s": (1.0, 1.0), "standing": 0.0}
     config = VelocityCommandConfig(**{**ranges, **times, "spawn": SpawnConfig(), **settings})
     command = config.build(N, torch.device("cpu"), EnvRandom(0, N))
     command.reset(torch.arange(N), None)
@@ -59,7 +64,7 @@ def test_a_reset_draws_for_those_environments_only():
     ("settings", "message"),
     [
         ({"lin_vel_x": (1.0, -1.0)}, r"commands\.lin_vel_x=\[1\.0, -1\.0\]"),
-        ({"resample_s": 0.0}, r"commands\.resample_s"),
+        ({"resample_s": (0.0, 1.0)}, r"commands\.resample_s"),
         ({"standing": 1.5}, r"commands\.standing"),
     ],
 )
@@ -211,3 +216,38 @@ def test_robots_start_where_the_preset_says(make_env):
     assert (pos[:, 0] == -0.5).all() and (env.state.kinematics.yaw.abs() < 1e-6).all()
     assert pos[:, 1].min() < -0.45 and pos[:, 1].max() > 0.45 and pos[:, 1].abs().max() <= 0.5
     assert torch.equal(pos[:, 2], torch.full((200,), 0.33, dtype=torch.float32).double())
+
+
+def test_times_between_draws_fill_their_range():
+    time_left = velocity_command(resample_s=(1.0, 5.0)).time_left
+    assert time_left.min() >= 1.0 and time_left.max() <= 5.0
+    assert time_left.mean().item() == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_command_is_settled_half_a_second_after_its_draw():
+    command = velocity_command()
+    settled = []
+    for _ in range(60):  # drawn again after 1 s
+        settled.append(bool(command.settled.all()))
+        command.advance(0.02, None)
+    assert settled == 25 * [False] + 25 * [True] + 10 * [False]
+
+
+def test_the_curriculum_widens_the_ranges_while_robots_walk_well():
+    curriculum = CommandCurriculumConfig(start=0.3, max_velocity_error=0.2, rise=0.1)
+    command = velocity_command(curriculum=curriculum)
+    low, high = torch.tensor([-0.5, -0.3, 0.2]), torch.tensor([1.0, 0.3, 0.8])
+    assert (command.value >= 0.3 * low).all() and (command.value <= 0.3 * high).all()
+    torch.testing.assert_close(command.value.amax(0), 0.3 * high, atol=0.01, rtol=0)
+    command.raise_level(0.21, 1.0)
+    assert command.level == 0.3
+    for _ in range(2):
+        command.raise_level(0.19, 1.0)
+    assert command.level == pytest.approx(0.5)
+    other = velocity_command(curriculum=curriculum)
+    other.load_state_dict(command.state_dict())
+    assert other.level == command.level
+    command.raise_level(0.0, 100.0)
+    assert command.level == 1.0
+    command.reset(torch.arange(N), None)
+    torch.testing.assert_close(command.value.amax(0), high, atol=0.02, rtol=0)

@@ -15,8 +15,8 @@ MakeEnv = Callable[..., OmniEnv]
 def make_env() -> MakeEnv:
     """Builds an environment of trials from command-line overrides, with all obstacles."""
 
-    def make(*overrides: str, trials: bool = True) -> OmniEnv:
+    def make(*overrides: str, trials: bool = True, read_besides: tuple[str, ...] = ()) -> OmniEnv:
         run = build.assemble(config.compose(["rewards=default", "perception=none", *overrides]))
-        return OmniEnv(replace(run.env, initial_obstacle_level=1.0, trials=trials))
+        return OmniEnv(replace(run.env, initial_level=1.0, trials=trials, read_besides=read_besides))
 
     return make

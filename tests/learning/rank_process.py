@@ -15,7 +15,7 @@ if __name__ == "__main__":
     torch.manual_seed(rank)
     np.random.seed(rank)
     env = ToyEnv(seed=rank)
-    env.curriculum_level = 0.25 + 0.5 * rank
+    env.curriculum_levels = [0.25 + 0.5 * rank] * len(env.curriculum_levels)
     runner = Runner(env, config(supervised=True), run_dir)
     if list_checkpoints(run_dir):
         runner.load(str(latest_checkpoint(run_dir)))
@@ -28,7 +28,7 @@ if __name__ == "__main__":
         "parameters": {n: dict(m.named_parameters()) for n, m in models.items()},
         "buffers": {n: dict(m.named_buffers()) for n, m in models.items()},
         "position": env.position,
-        "level": env.curriculum_level,
+        "level": env.curriculum_levels[0],
         "iteration": runner.current_learning_iteration,
     }
     torch.save(ended, f"{out}/{rank}.pt")

@@ -34,7 +34,7 @@ class ToyEnv(VecEnv):
         self.frames = torch.zeros(num_envs, history, POINTS, 3)
         self.frame_count = torch.zeros(num_envs, 1, dtype=torch.long)
 
-    curriculum_level = 1.0
+    curriculum_levels = (1.0,)
 
     def terms_not_finite(self, name, env_id):
         return []

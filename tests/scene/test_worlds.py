@@ -7,10 +7,11 @@ import yaml
 from omniperception import build, config
 from omniperception.common.random import EnvRandom
 from omniperception.env.env import OmniEnv
+from omniperception.evaluation.suite import suite_worlds
 from omniperception.scene import ObstacleField
 
 BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
-WORLDS = config.presets("scenario")
+WORLDS = sorted({world.name for world in suite_worlds("held_out")})
 
 
 def assembled(*overrides, num_envs=3):

@@ -41,6 +41,28 @@ class SpawnConfig:
 
 
 @dataclass(frozen=True)
+class CommandCurriculumConfig:
+    """Widens the ranges of commands as walking improves: fast ones from the first step on keep a gait from emerging.
+
+    Attributes:
+        start: share of the ranges from which velocities are drawn at the beginning.
+        max_velocity_error: the share rises while the error (m/s) of the linear velocity is below.
+        rise: how much it rises per second of simulated time of each environment.
+    """
+
+    start: float = 0.3
+    max_velocity_error: float = 0.25
+    rise: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not 0 < self.start <= 1:
+            raise ValueError(f"commands.curriculum.start={self.start} must be a share above 0, at most 1")
+        for key in ("max_velocity_error", "rise"):
+            if getattr(self, key) <= 0:
+                raise ValueError(f"commands.curriculum.{key}={getattr(self, key)} must be positive")
+
+
+@dataclass(frozen=True)
 class VelocityCommandConfig:
     """Velocities drawn uniformly in the base frame.
 
@@ -48,23 +70,25 @@ class VelocityCommandConfig:
         lin_vel_x: range (m/s).
         lin_vel_y: range (m/s).
         ang_vel_z: range (rad/s).
-        resample_s: time (s) between draws.
+        resample_s: range of the time (s) between two draws.
         standing: share of the draws that command to stand still.
         spawn: where the robot starts.
+        curriculum: None: the whole ranges from the first step.
     """
 
     lin_vel_x: Sequence[float]
     lin_vel_y: Sequence[float]
     ang_vel_z: Sequence[float]
-    resample_s: float
+    resample_s: Sequence[float]
     standing: float
     spawn: SpawnConfig
+    curriculum: CommandCurriculumConfig | None = None
 
     def __post_init__(self) -> None:
-        for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z"):
+        for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "resample_s"):
             object.__setattr__(self, key, _check_range(key, getattr(self, key)))
-        if self.resample_s <= 0:
-            raise ValueError(f"commands.resample_s={self.resample_s} must be positive")
+        if self.resample_s[0] <= 0:
+            raise ValueError(f"commands.resample_s={list(self.resample_s)} must be positive")
         if not 0 <= self.standing <= 1:
             raise ValueError(f"commands.standing={self.standing} must lie in [0, 1]")
 
@@ -153,14 +177,25 @@ class Command(Protocol):
     def load_state_dict(self, state: dict) -> None: ...
 
 
+SETTLE_S = 0.5
+"""Time (s) after a new command from which on a robot is held to it."""
+
+
 class VelocityCommand:
-    """Draws a new velocity at every reset and every `resample_s`."""
+    """Draws a new velocity at every reset and after every `resample_s`.
+
+    Attributes:
+        level: share of the ranges that velocities are drawn from.
+        time_left: (num_envs,) s until the next draw.
+        age: (num_envs,) s since the last one.
+    """
 
     def __init__(self, config: VelocityCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
         self.config = config
         self.value = torch.zeros(num_envs, 3, device=device)
         self.goal_w = None
-        self.time_left = torch.zeros(num_envs, device=device)
+        self.level = 1.0 if config.curriculum is None else config.curriculum.start
+        self.time_left, self.age = torch.zeros(2, num_envs, device=device).unbind(0)
         self._random = random
         ranges = (config.lin_vel_x, config.lin_vel_y, config.ang_vel_z)
         self._low = torch.tensor([r[0] for r in ranges], device=device)
@@ -171,6 +206,7 @@ class VelocityCommand:
 
     def advance(self, dt: float, kinematics: Kinematics) -> None:
         self.time_left -= dt
+        self.age += dt
         expired = (self.time_left <= 0).nonzero().flatten()
         if len(expired):
             self._draw(expired)
@@ -179,17 +215,31 @@ class VelocityCommand:
         return None
 
     def state_dict(self) -> dict:
-        return {"value": self.value, "time_left": self.time_left}
+        return {"value": self.value, "time_left": self.time_left, "age": self.age, "level": self.level}
 
     def load_state_dict(self, state: dict) -> None:
-        self.value.copy_(state["value"])
-        self.time_left.copy_(state["time_left"])
+        for name in ("value", "time_left", "age"):
+            getattr(self, name).copy_(state[name])
+        self.level = state["level"]
+
+    @property
+    def settled(self) -> torch.Tensor:
+        """(num_envs,) bool: whose command was SETTLE_S old, or older, when the control step began."""
+        return self.age > SETTLE_S - 1e-3  # sums of time steps are not exact
+
+    def raise_level(self, velocity_error: float, seconds: float) -> None:
+        """Widens the ranges if the robots have walked well for `seconds`, with this error (m/s)."""
+        curriculum = self.config.curriculum
+        if curriculum is not None and velocity_error < curriculum.max_velocity_error:
+            self.level = min(1.0, self.level + curriculum.rise * seconds)
 
     def _draw(self, env_ids: torch.Tensor) -> None:
-        u = self._random.uniform(env_ids, (4,))
-        velocity = self._low + u[:, :3] * (self._high - self._low)
-        self.value[env_ids] = velocity * (u[:, 3:] >= self.config.standing)
-        self.time_left[env_ids] = self.config.resample_s
+        u = self._random.uniform(env_ids, (5,))
+        velocity = self.level * (self._low + u[:, :3] * (self._high - self._low))
+        self.value[env_ids] = velocity * (u[:, 3:4] >= self.config.standing)
+        shortest, longest = self.config.resample_s
+        self.time_left[env_ids] = shortest + u[:, 4] * (longest - shortest)
+        self.age[env_ids] = 0.0
 
 
 ROUTE_WINDOW = 1.0

@@ -1,0 +1,80 @@
+"""Ranges are stretched as they should be, and kicks hit whom, when and where they should."""
+
+import math
+
+import pytest
+import torch
+import yaml
+
+from omniperception import config
+from omniperception.config import ConfigError
+from omniperception.evaluation.kicks import AFTER_S, KickResults, Kicks
+from omniperception.evaluation.robustness import rows_of_the_robot, stretched
+from omniperception.scene.build import FOOT_FORCE
+
+
+@pytest.mark.parametrize(
+    ("row", "value", "factor", "expected"),
+    [
+        ("latency_s", [0.005, 0.045], 3.0, [0.015, 0.135]),
+        ("motor_strength", [0.8, 1.2], 2.0, [0.6, 1.4]),
+        ("motor_strength", [0.8, 1.2], 0.0, [1.0, 1.0]),
+        ("ground_friction", [0.4, 1.0], 0.5, [0.6, 0.9]),
+        ("ground_friction", [0.4, 1.0], 3.0, [0.05, 1.4]),  # friction cannot be negative
+        ("ground_restitution", [0.0, 1.0], 2.0, [0.0, 1.0]),
+        ("velocity_scale", [0.95, 1.05], 3.0, [0.85, 1.15]),
+        ("pushes", {"every_s": [5.0, 10.0], "speed": 0.5}, 2.0, {"every_s": [5.0, 10.0], "speed": 1.0}),
+        ("velocity_drift", {"sd": 0.05, "time_s": 10.0}, 3.0, {"sd": 0.15, "time_s": 10.0}),
+        ("frames_lost", 0.05, 2.0, 0.1),
+    ],
+)
+def test_a_range_is_stretched_about_what_is_normal(row, value, factor, expected):
+    key, _, text = stretched(row, value, factor).partition("=")
+    assert key == f"randomization.{row}"
+    found = yaml.safe_load(text.replace(":", ": ").replace(",", ", "))
+    if isinstance(expected, dict):
+        assert found.keys() == expected.keys() and all(found[k] == pytest.approx(v) for k, v in expected.items())
+    else:
+        assert found == pytest.approx(expected)
+    config.compose([stretched(row, value, factor)])  # Hydra takes it
+
+
+def test_what_has_no_range_is_refused():
+    with pytest.raises(ConfigError, match=r"randomization\.lidar_device=True has no range"):
+        stretched("lidar_device", True, 2.0)
+
+
+def test_rows_of_the_robot_are_the_papers_and_the_robots_without_the_lidars():
+    rows = rows_of_the_robot("robot")
+    assert {"latency_s", "joint_offset", "motor_strength", "pushes", "gyro_bias"} <= set(rows)
+    assert not [row for row in rows if "lidar" in row or "frames" in row]
+    assert "pushes" not in rows_of_the_robot("paper") and not rows_of_the_robot("none")
+
+
+def test_a_kick_changes_one_velocity_once(make_env):
+    blind = ("lidar=none", "perception=none", "rewards=walk", "observations=walk", "num_envs=3")
+    env = make_env(*blind, "scenario=walk", "terminations.episode_length_s=8", read_besides=(FOOT_FORCE,))
+    kicks = Kicks(env, torch.tensor([[1.0, 0.0], [0.0, 0.5]]))  # the third trial has none
+    env.pushes = kicks
+    due = round(AFTER_S / env.control_dt)
+    for step in (due - 1, due, due + 1):
+        env.episode_length_buf[:] = step
+        before, yaw = env.sim.qvel[:, :2].clone(), env.state.kinematics.yaw.double()
+        kicks.advance()
+        change = env.sim.qvel[:, :2] - before
+        if step != due:
+            assert not change.any()
+            continue
+        cos, sin = yaw.cos(), yaw.sin()
+        expected = torch.stack(
+            (torch.stack((cos[0], sin[0])), 0.5 * torch.stack((-sin[1], cos[1])), torch.zeros(2).double())
+        )
+        torch.testing.assert_close(change.double(), expected, atol=1e-6, rtol=0)
+
+
+def test_shares_are_of_those_that_still_walked():
+    speed, bearing = torch.tensor([1.0, 1.0, 1.0, 1.0]), torch.tensor([0.0, math.pi, 0.0, math.pi])
+    kicked, survived = torch.tensor([True, True, False, True]), torch.tensor([True, False, False, True])
+    results = KickResults(speed, bearing, kicked, survived)
+    assert results.rate(1.0)["rate"] == pytest.approx(2 / 3)
+    assert results.shares([1.0], 2).tolist() == [[1.0, 0.5]]
