@@ -61,7 +61,7 @@ class WalkingTally:
         self._tile = torch.zeros(num_trials, 2, dtype=torch.int64, device=device)
         feet = len(env.robot.foot_geoms)
         self._left_at, self._peak = torch.zeros(2, n, feet, device=device).unbind(0)
-        self._was_down = torch.ones(n, feet, dtype=torch.bool, device=device)
+        self._was_down, self._swings = torch.zeros(2, n, feet, dtype=torch.bool, device=device).unbind(0)
         limits = [env.robot.torque_limits[name] for name in env.robot.joints]
         self._limits = torch.tensor(limits, device=device)
         self._weight = float(env.world.model.body_subtreemass[env.world.base_body]) * GRAVITY
@@ -111,12 +111,12 @@ class WalkingTally:
         """Sums over the feet in this control step."""
         state = self._env.state
         down, height = state.foot_contact, state.foot_pos_w[..., 2]
-        landed, lifted = down & ~self._was_down, ~down & self._was_down
+        landed, lifted = down & self._swings, ~down & self._was_down
         self._left_at = torch.where(lifted, height, self._left_at)
         self._peak = torch.where(lifted, height, torch.maximum(self._peak, height))
         force = state.foot_force.norm(dim=-1) / self._weight
         rise = self._peak - self._left_at
-        self._was_down = down
+        self._was_down, self._swings = down, (self._swings | lifted) & ~down
         return {
             "contact": down.sum(1),
             "slip": (state.foot_vel_w[..., :2].norm(dim=-1) * down).sum(1),
@@ -133,7 +133,7 @@ class WalkingTally:
             self._filed_fastest[self._trial[filed]] = self._fastest[filed]
         self._sums *= ~env.done[:, None]
         self._fastest *= ~env.done
-        self._was_down |= env.done[:, None]
+        self._was_down, self._swings = self._was_down & ~env.done[:, None], self._swings & ~env.done[:, None]
 
     def columns(self) -> dict[str, torch.Tensor]:
         """(num_trials,) float64 each, by the names in COLUMNS."""

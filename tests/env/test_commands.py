@@ -227,10 +227,12 @@ def test_times_between_draws_fill_their_range():
 def test_a_command_is_settled_half_a_second_after_its_draw():
     command = velocity_command()
     settled = []
-    for _ in range(60):  # drawn again after 1 s
+    for _ in range(8):  # drawn again after 1 s
         settled.append(bool(command.settled.all()))
-        command.advance(0.02, None)
-    assert settled == 25 * [False] + 25 * [True] + 10 * [False]
+        command.advance(0.125 + 2**-20, None)
+        settled.append(bool(command.settled.all()))
+        command.advance(0.125, None)
+    assert settled == 2 * (4 * [False] + 4 * [True])
 
 
 def test_the_curriculum_widens_the_ranges_while_robots_walk_well():
