@@ -20,6 +20,7 @@ from omniperception.env.mdp.randomization import Condition
 from omniperception.env.mirror import Mirror
 from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
+from omniperception.learning.estimator import EstimatorConfig
 from omniperception.learning.memory import check_fits
 from omniperception.scene import Mount, RobotConfig
 from omniperception.scene.held_out import held_out
@@ -198,6 +199,7 @@ def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
         steps_per_frame(run) if run.perception is not None else 1,
         run.env.rewards.avoidance.risk,
         Mirror(env) if run.ppo.symmetry else None,
+        estimator=EstimatorConfig(run.env.observations.estimated) if run.env.observations.estimated else None,
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 FORMAT = "omniperception-policy"
-VERSION = 1
+VERSION = 2
 FILE = "policy.json"
 
 
@@ -125,6 +125,8 @@ class Description:
         command: range of each commanded value that training drew from, by name (m/s, rad/s).
         lidar: the sensor; None for a blind policy.
         perception: what is made of its frames; None for a blind policy.
+        estimated: quantities of the robot's state that the network gives in the output `estimate` and nobody measures:
+            base_lin_vel (m/s, base frame), or none.
         files: name of the network's file by kind, "onnx" or "torchscript".
         provenance: run, checkpoint, iteration, date and versions.
     """
@@ -135,6 +137,7 @@ class Description:
     command: Mapping[str, Sequence[float]]
     lidar: Lidar | None = None
     perception: Perception | None = None
+    estimated: Sequence[str] = ()
     files: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping = field(default_factory=dict)
 
@@ -155,7 +158,10 @@ class Description:
     def write(self, folder: Path) -> None:
         """Write policy.json."""
         shapes = {name: ["batch", *shape] for name, shape in self.inputs.items()}
-        network = {"inputs": shapes, "outputs": {"actions": ["batch", len(self.joints.names)]}}
+        outputs = {"actions": ["batch", len(self.joints.names)]}
+        if self.estimated:
+            outputs["estimate"] = ["batch", 3]
+        network = {"inputs": shapes, "outputs": outputs}
         content = {"format": FORMAT, "version": VERSION, "network": network, **asdict(self)}
         (folder / FILE).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
 

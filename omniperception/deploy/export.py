@@ -104,6 +104,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         command=_command_ranges(run),
         lidar=_lidar(run.env.lidar) if run.perception is not None and run.env.lidar is not None else None,
         perception=_perception(run.perception) if run.perception is not None else None,
+        estimated=_estimated(run),
     )
 
 
@@ -133,6 +134,17 @@ def _command_ranges(run: RunConfig) -> dict[str, list[float]]:
         return {name: list(getattr(commands, name)) for name in names}
     speed, turn = commands.speed, commands.max_ang_vel_z
     return {"lin_vel_x": [-speed, speed], "lin_vel_y": [-speed, speed], "ang_vel_z": [-turn, turn]}
+
+
+def _estimated(run: RunConfig) -> tuple[str, ...]:
+    """What the policy estimates; a ConfigError unless it is what a robot can use: the base's linear velocity."""
+    group = run.env.observations.estimated
+    if group is None:
+        return ()
+    terms = list(run.env.observations.groups[group].terms.values())
+    if terms != [observations.true_base_lin_vel] or run.env.observations.groups[group].history != 1:
+        raise ConfigError(f"observations.estimated={group} cannot be exported: it must be true_base_lin_vel alone")
+    return ("base_lin_vel",)
 
 
 def _lidar(sensor: SensorConfig) -> Lidar:
@@ -181,7 +193,8 @@ def sampler_parameters(sampler: Sampler) -> dict:
 
 
 class BlindNetwork(nn.Module):
-    """Flat observations -> actions; the observations' normalisation is part of it."""
+    """Flat observations -> actions, and estimates where the actor has an estimator; the observations' normalisation is
+    part of it."""
 
     input_names: Sequence[str] = ("observations",)
 
@@ -191,10 +204,23 @@ class BlindNetwork(nn.Module):
         self.actor = copy.deepcopy(actor).cpu().eval().requires_grad_(False)
         self.output = actor.distribution.as_deterministic_output_module() if actor.distribution else nn.Identity()
         self.observation_size = actor.obs_dim
+        self.output_names = ("actions",) if self.actor.estimator is None else ("actions", "estimate")
 
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """(B, observation_size), the actor's groups in order -> (B, num_actions)."""
-        return self.output(self.actor.mlp(self.actor.obs_normalizer(observations)))
+    def forward(self, observations: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """(B, observation_size), the actor's groups in order -> (B, num_actions), and estimates (B, K), if any."""
+        latent = self.latent(observations)
+        return self.outputs(latent, latent)
+
+    def latent(self, observations: torch.Tensor) -> torch.Tensor:
+        """(B, D) what the policy's first layer reads of them."""
+        latent = self.actor.obs_normalizer(observations)
+        estimator = self.actor.estimator
+        return latent if estimator is None else torch.cat((latent, estimator(latent)), 1)
+
+    def outputs(self, latent: torch.Tensor, inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Actions from the first layer's inputs (B, ...), which begin with `latent` (B, D), and the estimates in it."""
+        actions = self.output(self.actor.mlp(inputs))
+        return (actions,) if self.actor.estimator is None else (actions, latent[:, self.observation_size :])
 
     def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
         """Random inputs."""
@@ -213,15 +239,16 @@ class PerceptiveNetwork(BlindNetwork):
 
     def forward(  # type: ignore[override]
         self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor
-    ) -> torch.Tensor:
-        """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> (B, num_actions)."""
+    ) -> tuple[torch.Tensor, ...]:
+        """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> as `BlindNetwork`."""
         features = self.actor.perception(frames, frame_count)[:, 0]
         if self.actor.read_out is not None:
             start, stop = self.command_start, self.command_start + 2
             command = observations[:, start:stop]
             command = command + self.actor.read_out.velocity(features, command) * (frame_count > 0)
             observations = torch.cat((observations[:, :start], command, observations[:, stop:]), 1)
-        return self.output(self.actor.mlp(torch.cat((self.actor.obs_normalizer(observations), features), 1)))
+        latent = self.latent(observations)
+        return self.outputs(latent, torch.cat((latent, features), 1))
 
     def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
         """Random inputs, with every number of valid frames in turn."""
@@ -276,8 +303,8 @@ def write_onnx(network: BlindNetwork, path: Path) -> tuple[Path, Callable | None
             network.examples(2),
             str(path),
             input_names=names,
-            output_names=["actions"],
-            dynamic_axes={name: {0: "batch"} for name in (*names, "actions")},
+            output_names=list(network.output_names),
+            dynamic_axes={name: {0: "batch"} for name in (*names, *network.output_names)},
             opset_version=OPSET,
             dynamo=False,
         )
@@ -287,9 +314,9 @@ def write_onnx(network: BlindNetwork, path: Path) -> tuple[Path, Callable | None
         return path, None
     session = InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
-    def run(*inputs: torch.Tensor) -> torch.Tensor:
+    def run(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         feed = {name: tensor.numpy() for name, tensor in zip(names, inputs, strict=True)}
-        return torch.from_numpy(session.run(None, feed)[0])
+        return tuple(torch.from_numpy(output) for output in session.run(None, feed))
 
     return path, run
 
@@ -303,7 +330,8 @@ def check(network: BlindNetwork, path: Path, written: Callable | None) -> None:
         return
     inputs = network.examples(23)
     with torch.no_grad():
-        error = float((written(*inputs) - network(*inputs)).abs().max())
+        pairs = zip(written(*inputs), network(*inputs), strict=True)
+        error = max(float((ours - theirs).abs().max()) for ours, theirs in pairs)
     steep = isinstance(getattr(network.actor, "read_out", None), MotionReadOut)
     if not error <= (STEEP_TOLERANCE if steep else TOLERANCE):
-        raise ConfigError(f"{path} differs from the policy by {error:.1e} in an action: not exportable")
+        raise ConfigError(f"{path} differs from the policy by {error:.1e} in an output: not exportable")

@@ -29,7 +29,7 @@ class RobotState:
         base_quat: (4,) orientation of the base in the world from the IMU, (w, x, y, z); the heading does not matter.
         base_ang_vel: (3,) angular velocity in the base frame from the gyroscope, rad/s.
         base_lin_vel: (3,) linear velocity in the base frame from a state estimator, m/s; None if the policy neither
-            observes it nor follows the base's motion.
+            observes it nor follows the base's motion, or estimates it.
     """
 
     joint_pos: ArrayLike
@@ -53,6 +53,8 @@ class ExportedPolicy:
         observation: (observation_size,) float32 that the newest action was computed from.
         frames: (history, num_points, 3) float32 sampled frames, newest last; None for a blind policy.
         frame_count: how many of the newest frames are valid.
+        base_lin_vel: (3,) float32 m/s, base frame, that the policy has estimated; None where it estimates nothing, and
+            before its first step.
     """
 
     def __init__(self, description: Description, session: InferenceSession) -> None:
@@ -111,6 +113,7 @@ class ExportedPolicy:
         for history in self._histories.values():
             history.clear()
         self.frame_count = 0
+        self.base_lin_vel: np.ndarray | None = None
         if self.frames is not None:
             self.frames = np.zeros_like(self.frames)
         if self._odometry is not None:
@@ -167,7 +170,7 @@ class ExportedPolicy:
             (num_joints,) float32 joint targets, rad, in the order of `description.joints`.
         """
         if self._odometry is not None:
-            self._odometry.advance(_quaternion(state.base_quat), _vector("base_lin_vel")(self, state, command))
+            self._odometry.advance(_quaternion(state.base_quat), self._velocity(state))
         if points is not None:
             self.see(points, state.base_quat)
         self.observation = self._observe(state, command)
@@ -175,9 +178,17 @@ class ExportedPolicy:
         if self.frames is not None:
             feed |= {"frames": self.frames[None], "frame_count": np.array([[self.frame_count]])}
         joints = self.description.joints
-        actions = self._session.run(None, feed)[0][0]
+        actions, *estimates = (output[0] for output in self._session.run(None, feed))
+        if estimates:
+            self.base_lin_vel = estimates[0]
         self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
         return self._default_pos + np.float32(joints.action_scale) * self.action
+
+    def _velocity(self, state: RobotState) -> np.ndarray:
+        """(3,) m/s, base frame: estimated at the step before, or measured."""
+        if not self.description.estimated:
+            return _vector("base_lin_vel")(self, state, ())
+        return np.zeros(3, np.float32) if self.base_lin_vel is None else self.base_lin_vel
 
     def _observe(self, state: RobotState, command: ArrayLike) -> np.ndarray:
         parts: list[np.ndarray] = []

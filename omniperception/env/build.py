@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from omniperception.avoidance.avoidance import Avoidance
     from omniperception.env.frame_delivery import FrameDelivery
     from omniperception.env.height_lookup import HeightLookup
+    from omniperception.env.mdp.curriculum import Curriculum
     from omniperception.env.mdp.pushes import Pushes
     from omniperception.env.measurement import MeasurementErrors
     from omniperception.env.sensing import LidarSensing
@@ -41,23 +42,23 @@ def build_ground(
     return ground, levels, HeightLookup(ground, sim.num_envs, sim.device)
 
 
-def build_errors(config: EnvConfig, random: EnvRandom) -> MeasurementErrors | None:
+def build_errors(config: EnvConfig, random: EnvRandom, curriculum: Curriculum) -> MeasurementErrors | None:
     """Errors of what the robot measures of itself."""
     if config.randomization.measures_exactly:
         return None
     from omniperception.env.measurement import MeasurementErrors
 
     branch, joints = random.branch("measurement"), config.robot.num_joints
-    return MeasurementErrors(config.randomization, config.num_envs, joints, config.sim.control_dt, branch)
+    return MeasurementErrors(config.randomization, config.num_envs, joints, config.sim.control_dt, branch, curriculum)
 
 
-def build_pushes(config: EnvConfig, sim: Simulator, random: EnvRandom) -> Pushes | None:
+def build_pushes(config: EnvConfig, sim: Simulator, random: EnvRandom, curriculum: Curriculum) -> Pushes | None:
     """Pushes of the robot."""
     if config.randomization.pushes is None:
         return None
     from omniperception.env.mdp.pushes import Pushes
 
-    return Pushes(config.randomization.pushes, sim, config.sim.control_dt, random.branch("pushes"))
+    return Pushes(config.randomization.pushes, sim, config.sim.control_dt, random.branch("pushes"), curriculum)
 
 
 def build_obstacles(

@@ -22,6 +22,7 @@ from omniperception.env.build import (
 )
 from omniperception.env.config import HEIGHT_TARGET, EnvConfig
 from omniperception.env.mdp.commands import GoalCommand, VelocityCommand
+from omniperception.env.mdp.curriculum import Curriculum
 from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.metrics import EpisodeMetrics
@@ -44,6 +45,7 @@ class OmniEnv(VecEnv):
 
     Attributes:
         state: what terms read.
+        difficulty: share of the randomization.
         ground, terrain_levels, obstacles, avoidance, sensing, pushes: None where the task has none.
         step_hooks: called at the end of each step, before finished environments are reset.
         healthy: (num_envs,) bool: whose physics was sound in the last step.
@@ -72,14 +74,14 @@ class OmniEnv(VecEnv):
         streams = TrialRandom if config.trials else EnvRandom
         self.random: EnvRandom = streams(config.seed, self.num_envs, self.device)
         self.command = config.commands.build(self.num_envs, self.device, self.random)
-        if config.initial_level is not None and isinstance(self.command, VelocityCommand):
-            self.command.level = config.initial_level
-        self.randomizer = Randomizer(config.randomization, self.sim, self.random.branch("randomization"))
+        self.difficulty = Curriculum(config.randomization.curriculum)
+        branch = self.random.branch("randomization")
+        self.randomizer = Randomizer(config.randomization, self.sim, branch, self.difficulty)
         self.ground, self.terrain_levels, lookup = build_ground(config, self.sim, self.random)
         self.obstacles = build_obstacles(config, self.sim, self.random, self.ground)
         self.avoidance = build_avoidance(config, self.obstacles, self.device)
         self.sensing = build_sensing(config, self.sim, self.random, self.avoidance)
-        self.pushes = build_pushes(config, self.sim, self.random)
+        self.pushes = build_pushes(config, self.sim, self.random, self.difficulty)
         self.state = EnvState(
             self.sim,
             self.control_dt,
@@ -89,8 +91,10 @@ class OmniEnv(VecEnv):
             lookup,
             self.avoidance,
             self.sensing,
-            build_errors(config, self.random),
+            build_errors(config, self.random, self.difficulty),
         )
+        if config.initial_level is not None:
+            self.curriculum_levels = (config.initial_level,) * len(self._curricula())
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._spawn = self._spawn_bounds()
@@ -314,9 +318,9 @@ class OmniEnv(VecEnv):
         config = self.config
         if config.initial_level is None:
             seconds, error = config.log_interval * self.control_dt, self.metrics.calm_velocity_error()
-            for part in self._with_level().values():
-                part.raise_level(error, seconds)
-        log: dict[str, float] = {f"Metrics/{name}_level": part.level for name, part in self._with_level().items()}
+            for curriculum in self._curricula().values():
+                curriculum.raise_level(error, seconds)
+        log: dict[str, float] = {f"Metrics/{name}_level": part.level for name, part in self._curricula().items()}
         log |= self.metrics.drain()
         log |= {f"Anomalies/{name}": count for name, count in self.sim.anomalies().items()}
         if self.terrain_levels is not None:
@@ -328,22 +332,22 @@ class OmniEnv(VecEnv):
 
     @property
     def curriculum_levels(self) -> tuple[float, ...]:
-        """How far the curricula of obstacles and commands are, 0 to 1, of those that there are."""
-        return tuple(part.level for part in self._with_level().values())
+        """How far the curricula of obstacles, commands and randomization are, 0 to 1, of those that there are."""
+        return tuple(part.level for part in self._curricula().values())
 
     @curriculum_levels.setter
     def curriculum_levels(self, levels: Sequence[float]) -> None:
-        for part, level in zip(self._with_level().values(), levels, strict=True):
+        for part, level in zip(self._curricula().values(), levels, strict=True):
             part.level = level
 
-    def _with_level(self) -> dict[str, ObstacleField | VelocityCommand]:
-        """Parts with a curriculum that rises while robots walk well, by the names in the log."""
-        parts: dict[str, ObstacleField | VelocityCommand] = {}
+    def _curricula(self) -> dict[str, ObstacleField | Curriculum]:
+        """Curricula that rise while robots walk well, by their names in the log."""
+        curricula: dict[str, ObstacleField | Curriculum] = {"randomization": self.difficulty}
         if self.obstacles is not None:
-            parts["obstacle"] = self.obstacles
+            curricula["obstacle"] = self.obstacles
         if isinstance(self.command, VelocityCommand):
-            parts["command"] = self.command
-        return parts
+            curricula["command"] = self.command.curriculum
+        return curricula
 
     def observation_widths(self, group: str) -> dict[str, int]:
         """Numbers of each term of an observation group, in order, per control step."""
@@ -389,7 +393,7 @@ class OmniEnv(VecEnv):
     def _with_state(self) -> dict:
         """Components with a state to be saved, by name."""
         names = ["sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing"]
-        names += ["pushes", "state", "metrics"]
+        names += ["pushes", "state", "metrics", "difficulty"]
         parts = {name: getattr(self, name) for name in names} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}
 

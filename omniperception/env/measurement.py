@@ -10,6 +10,7 @@ import torch
 from omniperception.common.random import Branch, EnvRandom
 from omniperception.common.rotations import multiply, rotate
 from omniperception.env.kinematics import Kinematics
+from omniperception.env.mdp.curriculum import FULL, Curriculum
 from omniperception.env.mdp.randomization import Drift, RandomizationConfig
 
 
@@ -20,7 +21,13 @@ class MeasurementErrors:
     """
 
     def __init__(
-        self, config: RandomizationConfig, num_envs: int, num_joints: int, control_dt: float, random: Branch
+        self,
+        config: RandomizationConfig,
+        num_envs: int,
+        num_joints: int,
+        control_dt: float,
+        random: Branch,
+        curriculum: Curriculum = FULL,
     ) -> None:
         """
         Args:
@@ -29,6 +36,7 @@ class MeasurementErrors:
             num_joints: of the robot.
             control_dt: s.
             random: streams to draw from, and nobody else.
+            curriculum: of the share of the errors.
         """
         biases = {"velocity_scale": 1, "gyro_bias": 3, "attitude_bias_deg": 2}
         noises = {
@@ -37,7 +45,7 @@ class MeasurementErrors:
             "joint_pos_noise": num_joints,
             "joint_vel_noise": num_joints,
         }
-        self._random = random
+        self._random, self._curriculum = random, curriculum
         self._bias = _Uniforms(config, biases, num_envs, random)
         self._noise = _Uniforms(config, noises, num_envs, random)
         self._drift = None
@@ -63,13 +71,14 @@ class MeasurementErrors:
 
     def added_to(self, state: Kinematics) -> Kinematics:
         """What is measured in a state, of all environments; its position stays true: nothing measures it."""
-        bias, noise = self._bias.rows, self._noise.rows
+        level = self._curriculum.level
+        bias, noise = self._bias.shares(level), self._noise.shares(level)
         quat, velocity_w = state.base_quat_w, state.base_lin_vel_w
         if self._tilts:
             quat = multiply(quat, _tilt(_sum(bias.get("attitude_bias_deg"), noise.get("attitude_noise_deg"))))
         if self._tilts or self._moves:
             velocity_b = state.base_lin_vel_b * bias.get("velocity_scale", 1.0)
-            velocity_w = rotate(quat, velocity_b if self._drift is None else velocity_b + self._drift.value)
+            velocity_w = rotate(quat, velocity_b if self._drift is None else velocity_b + level * self._drift.value)
         return Kinematics(
             torch.cat((state.base_pos_w, quat, _sum(state.joint_pos, noise.get("joint_pos_noise"))), 1),
             torch.cat(
@@ -111,6 +120,13 @@ class _Uniforms:
         self._low, self._span = low, high - low
         self.values = torch.zeros(num_envs, len(bounds), device=device)
         self.rows = dict(zip(there, self.values.split(list(there.values()), 1), strict=True)) if there else {}
+
+    def shares(self, level: float) -> Mapping[str, torch.Tensor]:
+        """The rows at a share of their ranges, about what is measured without errors."""
+        if level >= 1.0:
+            return self.rows
+        neutral = {"velocity_scale": 1.0}
+        return {name: (n := neutral.get(name, 0.0)) + level * (row - n) for name, row in self.rows.items()}
 
     def draw(self, env_ids: torch.Tensor) -> None:
         """Draws for environments (n,)."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import torch
 
 from omniperception.common.lazy import lazy
-from omniperception.common.rotations import rotate_yaw
+from omniperception.common.rotations import rotate, rotate_yaw
 from omniperception.env.heights import flat_heights
 from omniperception.env.kinematics import Kinematics
 from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE
@@ -119,6 +119,7 @@ class EnvState:
             errors: of what is measured.
         """
         self._errors = errors
+        self._velocity_source: Callable[[], torch.Tensor | None] | None = None
         self._sim, self._command, self._obstacles, self._height_lookup = sim, command, obstacles, height_lookup
         self.num_envs, self.device, self.control_dt = sim.num_envs, sim.device, control_dt
         self._avoidance, self._sensing = avoidance, sensing
@@ -165,6 +166,11 @@ class EnvState:
         for name in _CACHED & self.__dict__.keys():
             del self.__dict__[name]
 
+    def measure_velocity_by(self, source: Callable[[], torch.Tensor | None]) -> None:
+        """Takes the base's measured linear velocity (num_envs, 3) in m/s, base frame, from somewhere else from now on;
+        None until there is one."""
+        self._velocity_source = source
+
     def has_computed(self, name: str) -> bool:
         """Tell whether a quantity has been read since the last `invalidate`."""
         return name in self.__dict__
@@ -198,8 +204,11 @@ class EnvState:
     @lazy
     def measured(self) -> Kinematics:
         """Base and joints as the robot's sensors give them, with latency and errors where they are randomized."""
-        exact = self.kinematics if self._history is None else self._history.delayed()
-        return exact if self._errors is None else self._errors.added_to(exact)
+        measured = self.kinematics if self._history is None else self._history.delayed()
+        if self._errors is not None:
+            measured = self._errors.added_to(measured)
+        estimate = self._velocity_source() if self._velocity_source is not None else None
+        return measured if estimate is None else with_velocity(measured, estimate)
 
     @property
     def command(self) -> torch.Tensor:
@@ -330,6 +339,15 @@ def _declared(part: Part | None, name: str) -> Part:
     if part is None:
         raise ValueError(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
     return part
+
+
+def with_velocity(state: Kinematics, lin_vel_b: torch.Tensor) -> Kinematics:
+    """A state with another linear velocity (n, 3) in m/s, base frame."""
+    lin_vel_w = rotate(state.base_quat_w, lin_vel_b)
+    return Kinematics(
+        torch.cat((state.base_pos_w, state.base_quat_w, state.joint_pos), 1),
+        torch.cat((lin_vel_w, state.base_ang_vel_b, state.joint_vel), 1),
+    )
 
 
 class StateHistory:

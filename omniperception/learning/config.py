@@ -12,6 +12,7 @@ from rsl_rl.utils import resolve_nn_activation
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.env.config import HEIGHT_TARGET
+from omniperception.learning.estimator import EstimatorConfig
 from omniperception.perception import PerceptionNetwork, Sampler
 
 
@@ -223,6 +224,7 @@ class LearningConfig:
         velocity_risk: the controller of a policy that is supervised with obstacles' motion, else None.
         mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
         command_group: the group that begins with the commanded velocity (v_x, v_y).
+        estimator: of what the actor does not observe; None: it estimates nothing.
     """
 
     ppo: PPOConfig
@@ -233,3 +235,4 @@ class LearningConfig:
     velocity_risk: VelocityRisk | None = None
     mirror: Callable | None = None
     command_group: str = "command"
+    estimator: EstimatorConfig | None = None

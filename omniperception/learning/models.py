@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import torch
-from rsl_rl.models import MLPModel
 from rsl_rl.modules import HiddenState
 from tensordict import TensorDict
 from torch import nn
@@ -13,12 +12,13 @@ from torch.nn import functional
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
+from omniperception.learning.estimator import EstimatingModel
 from omniperception.learning.read_out import MotionReadOut, VelocityReadOut
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
 
 
-class PerceptionActor(MLPModel):
+class PerceptionActor(EstimatingModel):
     """An MLP on one-dimensional observation groups and the embedding of the LiDAR history.
 
     While it acts, the embedding is computed without gradients, once per LiDAR frame: as long as it is given the same
@@ -66,14 +66,14 @@ class PerceptionActor(MLPModel):
             command_group: the group that begins with the commanded velocity (v_x, v_y).
             end_to_end: whether the loss of an update reaches the perception network; otherwise it is trained by
                 supervision alone (:meth:`PerceptivePpo.train_perception`).
-            mlp_options: ``hidden_dims``, ``activation``, ``obs_normalization`` (of the one-dimensional
-                groups) and ``distribution_cfg`` of rsl_rl's ``MLPModel``.
+            mlp_options: ``estimator``, and ``hidden_dims``, ``activation``, ``obs_normalization`` (of the
+                one-dimensional groups) and ``distribution_cfg`` of rsl_rl's ``MLPModel``.
         """
         self._feature_dim = perception.feature_dim  # read by _get_latent_dim while the base class builds the MLP
         super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
         self.perception = perception
         with torch.no_grad():  # an untrained embedding is noise to the gait; it enters as its weights learn
-            self.mlp[0].weight[:, self.obs_dim :] = 0.0
+            self.mlp[0].weight[:, self.blind_dim :] = 0.0
         self.supervision = dict(supervision or {})
         self.command_group, self.end_to_end = command_group, end_to_end
         self.read_out: VelocityReadOut | MotionReadOut | None = None
@@ -176,7 +176,7 @@ class PerceptionActor(MLPModel):
         return means
 
     def _get_latent_dim(self) -> int:
-        return self.obs_dim + self._feature_dim
+        return super()._get_latent_dim() + self._feature_dim
 
     def _extend(self, embedding: torch.Tensor) -> torch.Tensor:
         return embedding if self.read_out is None else self.read_out.extend(embedding)

@@ -5,19 +5,29 @@ from __future__ import annotations
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.env import VecEnv
+from rsl_rl.extensions import Symmetry
 from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import nn
 
 from omniperception.learning.config import LearningConfig
 from omniperception.learning.distributed import average_gradients
 from omniperception.learning.divergence import DivergenceGuard
+from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.storage import PerceptiveStorage
 
 
 class RolloutTooSmall(ValueError):
     """There is too little in a rollout to learn from it."""
+
+
+class MirrorImages(Symmetry):
+    """rsl_rl's mirror images of samples, without the mirror loss, which it only reports, in a fifth of an update."""
+
+    def compute_loss(self, actor: MLPModel, batch: RolloutStorage.Batch, original_batch_size: int) -> torch.Tensor:
+        return batch.actions.new_zeros(())
 
 
 class PerceptivePpo(PPO):
@@ -35,14 +45,18 @@ class PerceptivePpo(PPO):
         num_updates: completed updates.
         learns_policy: whether PPO changes the policy.
         perception_optimizer: of the perception network and its read-out; None where PPO trains them, or there is none.
+        estimator_optimizer: of the actor's estimator; None where there is none, or it stays as it is.
     """
 
     storage: PerceptiveStorage
     perception_optimizer: torch.optim.Adam | None = None
+    estimator_optimizer: torch.optim.Adam | None = None
 
     def __init__(self, *args, **kwargs) -> None:
         """Arguments of rsl_rl's PPO."""
         super().__init__(*args, **kwargs)
+        if kwargs.get("symmetry_cfg") is not None:
+            self.symmetry: Symmetry | None = MirrorImages(**kwargs["symmetry_cfg"])
         self.num_updates = 0
         self.learns_policy = self.num_learning_epochs > 0
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
@@ -66,7 +80,15 @@ class PerceptivePpo(PPO):
                 raise ValueError(f"observations.{name} is empty; name at least one group of observations")
         distribution = {"class_name": "GaussianDistribution", "init_std": ppo.init_std}
         if perception is None:
-            actor = MLPModel(obs, groups, "actor", env.num_actions, distribution_cfg=distribution, **ppo.mlp)
+            actor = EstimatingModel(
+                obs,
+                groups,
+                "actor",
+                env.num_actions,
+                config.estimator,
+                distribution_cfg=distribution,
+                **ppo.mlp,
+            )
         elif config.mirror is not None:
             raise ValueError(
                 "ppo.symmetry works on one-dimensional observations only; with perception set ppo.symmetry=false"
@@ -82,17 +104,20 @@ class PerceptivePpo(PPO):
                 config.velocity_risk,
                 config.command_group,
                 end_to_end=perception.supervised_epochs == 0,
+                estimator=config.estimator,
                 distribution_cfg=distribution,
                 **ppo.mlp,
             )
         actor = actor.to(device)
         critic = MLPModel(obs, groups, "critic", 1, **ppo.mlp).to(device)
-        stored = sorted({*config.actor_groups, *config.critic_groups, *(perception.supervision if perception else ())})
+        stored = {*config.actor_groups, *config.critic_groups, *(perception.supervision if perception else ())}
+        if config.estimator is not None:
+            stored.add(config.estimator.group)
         storage = PerceptiveStorage(
             env.num_envs,
             ppo.num_steps_per_env,
             obs,
-            stored,
+            sorted(stored),
             env.num_actions,
             device,
             frames=perception is not None,
@@ -108,6 +133,8 @@ class PerceptivePpo(PPO):
             multi_gpu_cfg=multi_gpu,
             **ppo.algorithm,
         )
+        if config.estimator is not None and algorithm.learns_policy:
+            algorithm.fit_estimator(config.estimator)
         if perception is not None and perception.supervised_epochs > 0:
             last = perception.final_learning_rate or perception.learning_rate
             algorithm.supervise_perception(
@@ -149,6 +176,7 @@ class PerceptivePpo(PPO):
         losses = {}
         if self.learns_policy:
             losses = super().update()
+            losses |= self.train_estimator()  # afterwards: PPO saw what the policy acted on
         else:
             self.storage.clear()
         self.num_updates += 1
@@ -185,11 +213,39 @@ class PerceptivePpo(PPO):
                 self.guard.check_gradients("perception network", self._perception_parameters)
                 optimizer.step()
 
+    def fit_estimator(self, config: EstimatorConfig) -> None:
+        """Let the truth train the actor's estimator."""
+        self._estimator_epochs = config.epochs
+        self._estimator_parameters = list(self.actor.estimator.parameters())
+        self.estimator_optimizer = torch.optim.Adam(self._estimator_parameters, lr=config.learning_rate)
+
+    def train_estimator(self) -> dict[str, float]:
+        """Fit the estimates on the steps of a rollout and their mirror images; the mean squared error."""
+        optimizer = self.estimator_optimizer
+        if optimizer is None:
+            return {}
+        groups, losses = self.storage.observations.flatten(0, 1), []
+        for _ in range(self._estimator_epochs):
+            for steps in torch.randperm(len(groups), device=self.device).tensor_split(self.num_mini_batches):
+                obs = groups[steps]
+                if self.symmetry is not None:
+                    obs, _ = self.symmetry.data_augmentation_func(self.symmetry.env, obs, None)
+                loss = self.actor.estimation_error(obs)
+                optimizer.zero_grad()
+                loss.backward()
+                average_gradients(self._estimator_parameters)
+                self.guard.check_gradients("estimator", self._estimator_parameters)
+                optimizer.step()
+                losses.append(loss.detach())
+        return {"estimate": torch.stack(losses).mean().item()}
+
     def save(self) -> dict:
         """States of the networks and of the optimisers."""
         state = super().save()
         if self.perception_optimizer is not None:
             state["perception_optimizer_state_dict"] = self.perception_optimizer.state_dict()
+        if self.estimator_optimizer is not None:
+            state["estimator_optimizer_state_dict"] = self.estimator_optimizer.state_dict()
         return state | {"learning_rate": self.learning_rate, "num_updates": self.num_updates}
 
     def load(self, state: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
@@ -200,6 +256,8 @@ class PerceptivePpo(PPO):
             return False
         if self.perception_optimizer is not None:
             self.perception_optimizer.load_state_dict(state["perception_optimizer_state_dict"])
+        if self.estimator_optimizer is not None:
+            self.estimator_optimizer.load_state_dict(state["estimator_optimizer_state_dict"])
         self.learning_rate, self.num_updates = state["learning_rate"], state["num_updates"]
         return True
 

@@ -62,6 +62,9 @@ class Runner:
         distributed.connect(device)
         self.env, self.config, self.device = env, config, device
         self.alg = PerceptivePpo.build(env, config, device, distributed.multi_gpu())
+        if config.estimator is not None:
+            actor = self.alg.actor
+            env.state.measure_velocity_by(lambda: actor.estimate)
         log_dir = Path(log_dir) if log_dir is not None and distributed.rank() == 0 else None
         self.logger = Logger(log_dir, env.num_envs, device)
         self.current_learning_iteration = 0

@@ -8,6 +8,7 @@ import torch
 from rsl_rl.models import MLPModel
 
 from omniperception.learning.checkpoint import CheckpointError
+from omniperception.learning.estimator import EstimatingModel
 
 _FIRST_LAYER = "mlp.0.weight"
 _OPTIONAL = ("perception.", "read_out.")
@@ -33,7 +34,8 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
     for name in [name for name in state if perceives_alike or name not in optional]:
         own, other = state[name], weights.get(name)
         if name == _FIRST_LAYER and other is not None and len(other) == len(own):
-            shared = own.shape[1] if perceives_alike else model.obs_dim
+            blind = model.blind_dim if isinstance(model, EstimatingModel) else model.obs_dim
+            shared = own.shape[1] if perceives_alike else blind
             if other.shape[1] >= shared:
                 own[:, :shared] = other[:, :shared]
                 continue

@@ -9,11 +9,11 @@ from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import yaw_quat
 from omniperception.env.kinematics import Kinematics
 from omniperception.env.mdp.commands import (
-    CommandCurriculumConfig,
     GoalCommandConfig,
     SpawnConfig,
     VelocityCommandConfig,
 )
+from omniperception.env.mdp.curriculum import CurriculumConfig
 
 N = 4000
 
@@ -236,20 +236,20 @@ def test_a_command_is_settled_half_a_second_after_its_draw():
 
 
 def test_the_curriculum_widens_the_ranges_while_robots_walk_well():
-    curriculum = CommandCurriculumConfig(start=0.3, max_velocity_error=0.2, rise=0.1)
+    curriculum = CurriculumConfig(start=0.3, max_velocity_error=0.2, rise=0.1)
     command = velocity_command(curriculum=curriculum)
     low, high = torch.tensor([-0.5, -0.3, 0.2]), torch.tensor([1.0, 0.3, 0.8])
     assert (command.value >= 0.3 * low).all() and (command.value <= 0.3 * high).all()
     torch.testing.assert_close(command.value.amax(0), 0.3 * high, atol=0.01, rtol=0)
-    command.raise_level(0.21, 1.0)
-    assert command.level == 0.3
+    command.curriculum.raise_level(0.21, 1.0)
+    assert command.curriculum.level == 0.3
     for _ in range(2):
-        command.raise_level(0.19, 1.0)
-    assert command.level == pytest.approx(0.5)
+        command.curriculum.raise_level(0.19, 1.0)
+    assert command.curriculum.level == pytest.approx(0.5)
     other = velocity_command(curriculum=curriculum)
     other.load_state_dict(command.state_dict())
-    assert other.level == command.level
-    command.raise_level(0.0, 100.0)
-    assert command.level == 1.0
+    assert other.curriculum.level == command.curriculum.level
+    command.curriculum.raise_level(0.0, 100.0)
+    assert command.curriculum.level == 1.0
     command.reset(torch.arange(N), None)
     torch.testing.assert_close(command.value.amax(0), high, atol=0.02, rtol=0)

@@ -253,3 +253,52 @@ def test_the_devices_own_noise_reaches_the_lidar(make_config, lidar, sigma, angl
 def test_noise_of_a_sensor_without_a_maker_is_refused(make_config):
     with pytest.raises(ValueError, match=r"randomization\.lidar_device needs a sensor whose maker states its noise"):
         make_config("randomization=device", "lidar=custom")
+
+
+class TestCurriculum:
+    """All rows grow together, from a robot without randomization to the whole ranges."""
+
+    SHARE = "randomization.curriculum={start: 0.0, max_velocity_error: 0.2, rise: 0.5}"
+
+    def test_at_0_nothing_is_random(self, make_env):
+        env = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=4)
+        plain = make_env("obstacles=none", blind=True, num_envs=4)
+        for _ in range(60):  # pushes come within 10 s, the first ones sooner
+            env.step(torch.zeros(4, 12))
+        for name in MODEL_FIELDS:
+            drawn, nominal = env.sim.model_field(name), plain.sim.model_field(name)
+            torch.testing.assert_close(drawn, nominal.expand_as(drawn), atol=1e-6, rtol=1e-6)
+        assert not env.randomizer.joint_offset.any() and not env.randomizer.delay.any()
+        for name in ("joint_pos", "joint_vel", "base_ang_vel_b", "base_quat_w", "base_lin_vel_b"):
+            torch.testing.assert_close(
+                getattr(env.state.measured, name), getattr(env.state.kinematics, name), atol=1e-6, rtol=1e-6
+            )
+        assert env.state.kinematics.base_lin_vel_w[:, :2].norm(dim=1).max() < 0.3
+
+    @pytest.mark.parametrize(
+        ("row", "neutral"), [("motor_strength", 1.0), ("ground_friction", 0.8), ("added_mass", 0.0)]
+    )
+    def test_half_way_ranges_are_half_as_wide_about_what_is_normal(self, make_env, row, neutral):
+        low, high = PAPER[row]
+        overrides = (f"+randomization.{row}=[{low},{high}]", self.SHARE.replace("randomization", "+randomization", 1))
+        env = make_env(*overrides, "obstacles=none", blind=True, num_envs=N)
+        env.difficulty.level = 0.5
+        env.randomizer.reset(torch.arange(N))
+        model = env.sim.world.model
+        drawn = {
+            "motor_strength": lambda: env.sim.model_field("actuator_gainprm")[:, 0, 0] / model.actuator_gainprm[0, 0],
+            "ground_friction": lambda: env.sim.model_field("geom_friction")[:, model.geom("ground").id, 0],
+            "added_mass": lambda: env.sim.model_field("body_mass")[:, env.sim.world.base_body]
+            - model.body_mass[env.sim.world.base_body],
+        }[row]()
+        assert_fills(drawn, neutral + 0.5 * (low - neutral), neutral + 0.5 * (high - neutral))
+
+    def test_it_rises_while_robots_walk_well_and_lasts_in_a_checkpoint(self, make_env):
+        env = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=2)
+        env.difficulty.raise_level(0.3, 1.0)
+        assert env.difficulty.level == 0.0
+        env.difficulty.raise_level(0.1, 1.0)
+        other = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=2)
+        other.load_state_dict(env.state_dict())
+        assert other.difficulty.level == env.difficulty.level == 0.5
+        assert make_env("randomization=robot", "obstacles=none", blind=True, num_envs=2).difficulty.level == 1.0

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import rotate_yaw
 from omniperception.env.kinematics import Kinematics
+from omniperception.env.mdp.curriculum import Curriculum, CurriculumConfig
 
 
 def _check_range(key: str, bounds: Sequence[float]) -> tuple[float, float]:
@@ -41,28 +42,6 @@ class SpawnConfig:
 
 
 @dataclass(frozen=True)
-class CommandCurriculumConfig:
-    """Widens the ranges of commands as walking improves: fast ones from the first step on keep a gait from emerging.
-
-    Attributes:
-        start: share of the ranges from which velocities are drawn at the beginning.
-        max_velocity_error: the share rises while the error (m/s) of the linear velocity is below.
-        rise: how much it rises per second of simulated time of each environment.
-    """
-
-    start: float = 0.3
-    max_velocity_error: float = 0.25
-    rise: float = 0.01
-
-    def __post_init__(self) -> None:
-        if not 0 < self.start <= 1:
-            raise ValueError(f"commands.curriculum.start={self.start} must be a share above 0, at most 1")
-        for key in ("max_velocity_error", "rise"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"commands.curriculum.{key}={getattr(self, key)} must be positive")
-
-
-@dataclass(frozen=True)
 class VelocityCommandConfig:
     """Velocities drawn uniformly in the base frame.
 
@@ -73,7 +52,8 @@ class VelocityCommandConfig:
         resample_s: range of the time (s) between two draws.
         standing: share of the draws that command to stand still.
         spawn: where the robot starts.
-        curriculum: None: the whole ranges from the first step.
+        curriculum: of the share of the ranges that velocities are drawn from, because fast ones from the first step on
+            keep a gait from emerging; None: the whole ranges.
     """
 
     lin_vel_x: Sequence[float]
@@ -82,7 +62,7 @@ class VelocityCommandConfig:
     resample_s: Sequence[float]
     standing: float
     spawn: SpawnConfig
-    curriculum: CommandCurriculumConfig | None = None
+    curriculum: CurriculumConfig | None = None
 
     def __post_init__(self) -> None:
         for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "resample_s"):
@@ -185,7 +165,7 @@ class VelocityCommand:
     """Draws a new velocity at every reset and after every `resample_s`.
 
     Attributes:
-        level: share of the ranges that velocities are drawn from.
+        curriculum: of the share of the ranges that velocities are drawn from.
         time_left: (num_envs,) s until the next draw.
         age: (num_envs,) s since the last one.
     """
@@ -194,7 +174,7 @@ class VelocityCommand:
         self.config = config
         self.value = torch.zeros(num_envs, 3, device=device)
         self.goal_w = None
-        self.level = 1.0 if config.curriculum is None else config.curriculum.start
+        self.curriculum = Curriculum(config.curriculum)
         self.time_left, self.age = torch.zeros(2, num_envs, device=device).unbind(0)
         self._random = random
         ranges = (config.lin_vel_x, config.lin_vel_y, config.ang_vel_z)
@@ -215,27 +195,21 @@ class VelocityCommand:
         return None
 
     def state_dict(self) -> dict:
-        return {"value": self.value, "time_left": self.time_left, "age": self.age, "level": self.level}
+        return {"value": self.value, "time_left": self.time_left, "age": self.age, **self.curriculum.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
         for name in ("value", "time_left", "age"):
             getattr(self, name).copy_(state[name])
-        self.level = state["level"]
+        self.curriculum.load_state_dict(state)
 
     @property
     def settled(self) -> torch.Tensor:
         """(num_envs,) bool: whose command was SETTLE_S old, or older, when the control step began."""
         return self.age > SETTLE_S - 1e-3  # sums of time steps are not exact
 
-    def raise_level(self, velocity_error: float, seconds: float) -> None:
-        """Widens the ranges if the robots have walked well for `seconds`, with this error (m/s)."""
-        curriculum = self.config.curriculum
-        if curriculum is not None and velocity_error < curriculum.max_velocity_error:
-            self.level = min(1.0, self.level + curriculum.rise * seconds)
-
     def _draw(self, env_ids: torch.Tensor) -> None:
         u = self._random.uniform(env_ids, (5,))
-        velocity = self.level * (self._low + u[:, :3] * (self._high - self._low))
+        velocity = self.curriculum.level * (self._low + u[:, :3] * (self._high - self._low))
         self.value[env_ids] = velocity * (u[:, 3:4] >= self.config.standing)
         shortest, longest = self.config.resample_s
         self.time_left[env_ids] = shortest + u[:, 4] * (longest - shortest)

@@ -66,6 +66,12 @@ def true_proprioception(state: EnvState, joint_vel_scale: float = 1.0, ang_vel_s
     )
 
 
+@mirrors(VECTOR)
+def true_base_lin_vel(state: EnvState) -> torch.Tensor:
+    """Base linear velocity in the base frame, m/s, without latency or error: privileged."""
+    return state.kinematics.base_lin_vel_b
+
+
 @mirrors((1.0,))
 def base_height(state: EnvState) -> torch.Tensor:
     """Height (m) of the base origin above the ground, less the default pose's: privileged."""

@@ -7,6 +7,7 @@ import math
 import torch
 
 from omniperception.common.random import Branch
+from omniperception.env.mdp.curriculum import FULL, Curriculum
 from omniperception.env.mdp.randomization import PushesConfig
 from omniperception.sim import Simulator
 
@@ -18,9 +19,18 @@ class Pushes:
         countdown: (num_envs,) int64 control steps until the next push; it comes in the step that begins at 0.
     """
 
-    def __init__(self, config: PushesConfig, sim: Simulator, control_dt: float, random: Branch) -> None:
-        """Args: config: how often and how hard; sim: whom; control_dt: s; random: streams to draw from."""
-        self._config, self._sim, self._dt, self._random = config, sim, control_dt, random
+    def __init__(
+        self, config: PushesConfig, sim: Simulator, control_dt: float, random: Branch, curriculum: Curriculum = FULL
+    ) -> None:
+        """
+        Args:
+            config: how often and how hard.
+            sim: whom.
+            control_dt: s.
+            random: streams to draw from.
+            curriculum: of the share of the speed.
+        """
+        self._config, self._sim, self._dt, self._random, self._curriculum = config, sim, control_dt, random, curriculum
         self.countdown = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
         self._all_envs = torch.arange(sim.num_envs, device=sim.device)
 
@@ -29,7 +39,7 @@ class Pushes:
         u, speed, bearing = self._random.uniform(self._all_envs, (3,)).unbind(1)
         due = self.countdown == 0
         turn = 2.0 * math.pi * bearing
-        kick = self._config.speed * speed[:, None] * torch.stack((turn.cos(), turn.sin()), 1)
+        kick = self._curriculum.level * self._config.speed * speed[:, None] * torch.stack((turn.cos(), turn.sin()), 1)
         velocity = self._sim.qvel[:, :2]
         velocity.copy_(torch.where(due[:, None], velocity + kick.to(velocity.dtype), velocity))
         self.countdown.copy_(torch.where(due, self._steps(u), self.countdown) - 1)

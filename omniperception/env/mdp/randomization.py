@@ -10,6 +10,7 @@ from operator import attrgetter
 import torch
 
 from omniperception.common.random import EnvRandom
+from omniperception.env.mdp.curriculum import FULL, Curriculum, CurriculumConfig
 from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.scene.terrain import contact_solrefs
 from omniperception.sim import Simulator
@@ -148,6 +149,8 @@ class RandomizationConfig:
         frames_late_s: age (s) of the scene that a LiDAR frame shows when it comes, drawn for every frame, rounded to
             control steps.
         pushes: of the base.
+        curriculum: of the share of the ranges, but for the LiDAR's, about what is there without randomization; None:
+            the whole ranges from the first step.
     """
 
     lidar_device: bool = False
@@ -180,6 +183,7 @@ class RandomizationConfig:
     frames_lost: float | None = None
     frames_late_s: Range = None
     pushes: PushesConfig | None = None
+    curriculum: CurriculumConfig | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -215,8 +219,10 @@ class RandomizationConfig:
 class Randomizer:
     """Draws each environment's physical parameters at its resets and writes them into the simulator's model."""
 
-    def __init__(self, config: RandomizationConfig, sim: Simulator, random: EnvRandom) -> None:
-        self.config, self._sim, self._random = config, sim, random
+    def __init__(
+        self, config: RandomizationConfig, sim: Simulator, random: EnvRandom, curriculum: Curriculum = FULL
+    ) -> None:
+        self.config, self._sim, self._random, self._curriculum = config, sim, random, curriculum
         self._model = model = sim.world.model
         self._base = sim.world.base_body
         self._ground = model.geom("ground").id
@@ -227,6 +233,7 @@ class Randomizer:
             bounds = [getattr(config, name) for name, shape in self._shapes.items() for _ in range(math.prod(shape))]
             low, high = torch.tensor(bounds, dtype=torch.float64, device=sim.device).unbind(1)
             self._low, self._span = low.float(), (high - low).float()
+            self._neutral = torch.cat([self._neutral_of(name).expand(math.prod(s)) for name, s in self._shapes.items()])
         self._mass = bool(_MASSES & self._shapes.keys())
         if self._mass:
             self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
@@ -304,10 +311,18 @@ class Randomizer:
         shapes = {"motor_strength": (self._model.nu, 1), "gravity_offset": (3,), "joint_offset": (joints,)}
         return {name: shapes.get(name, ()) for name in _DRAWN if getattr(config, name) is not None}
 
+    def _neutral_of(self, name: str) -> torch.Tensor:
+        """(1,) float64: what a parameter is without randomization."""
+        terrain_friction = float(self._model.geom_friction[self._ground, 0])
+        value = {"motor_strength": 1.0, "ground_friction": terrain_friction}.get(name, 0.0)
+        return torch.tensor([value], dtype=torch.float64, device=self._sim.device)
+
     def _draw(self, env_ids: torch.Tensor) -> dict[str, torch.Tensor]:
         """All parameters of some environments, float64, at once."""
         u = self._random.uniform(env_ids, (len(self._low),))
         values = (self._low + self._span * u).double()
+        if self._curriculum.level < 1.0:
+            values = self._neutral + self._curriculum.level * (values - self._neutral)
         parts = values.split([math.prod(shape) for shape in self._shapes.values()], 1)
         shapes = self._shapes.items()
         return {name: part.reshape(-1, *shape) for (name, shape), part in zip(shapes, parts, strict=True)}

@@ -113,14 +113,15 @@ class ObservationGroup:
 
 @dataclass(frozen=True)
 class ObservationsConfig:
-    """Groups by name, and which of them the actor and the critic see."""
+    """Groups by name, which of them actor and critic see, and which one the actor estimates from what it sees."""
 
     groups: Mapping[str, ObservationGroup]
     actor: Sequence[str]
     critic: Sequence[str]
+    estimated: str | None = None
 
     def __post_init__(self) -> None:
-        used = [*self.actor, *self.critic]
+        used = [*self.actor, *self.critic, *([self.estimated] if self.estimated else [])]
         missing = [name for name in used if name not in self.groups]
         if missing:
             raise ValueError(f"observations: groups {missing} are used but not defined; defined: {list(self.groups)}")

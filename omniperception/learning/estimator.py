@@ -1,0 +1,103 @@
+"""A policy that estimates what it cannot measure: a network is fitted to the truth, and the policy reads its output."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules import MLP, HiddenState
+from tensordict import TensorDict
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """Configuration of the estimator.
+
+    Attributes:
+        group: observation group with the true values; neither actor nor robot reads it.
+        hidden_dims: hidden layers.
+        learning_rate: of its own optimiser.
+        epochs: passes over each rollout.
+    """
+
+    group: str
+    hidden_dims: Sequence[int] = (128, 64)
+    learning_rate: float = 1.0e-3
+    epochs: int = 1
+
+    def __post_init__(self) -> None:
+        if self.learning_rate <= 0 or self.epochs < 1:
+            raise ValueError(
+                f"observations.estimator: learning_rate={self.learning_rate} must be positive, epochs={self.epochs} at"
+                " least 1"
+            )
+
+
+class EstimatingModel(MLPModel):
+    """An MLP on one-dimensional observation groups and, where asked for, on estimates of what none of them has.
+
+    The estimator reads the same normalised observations, histories and all, and is fitted to the truth by a loss of its
+    own (Ji et al. 2022, 'Concurrent training of a control policy and a state estimator'); the policy's loss does not
+    reach it.
+
+    Attributes:
+        estimator: the network, or None.
+        estimated: the observation group with the truth, or None.
+        estimate: (N, K) estimates that the newest actions were computed from; None before the first.
+    """
+
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        estimator: EstimatorConfig | None = None,
+        **mlp_options,
+    ) -> None:
+        """
+        Args:
+            obs: example observations.
+            obs_groups: groups of each observation set.
+            obs_set: this model's set.
+            output_dim: number of actions.
+            estimator: None: nothing is estimated.
+            mlp_options: ``hidden_dims``, ``activation``, ``obs_normalization`` and ``distribution_cfg`` of `MLPModel`.
+        """
+        self._num_estimates = 0 if estimator is None else obs[estimator.group].shape[-1]  # read by _get_latent_dim
+        super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
+        self.estimator: MLP | None = None
+        self.estimated = None if estimator is None else estimator.group
+        if estimator is not None:
+            self.estimator = MLP(self.obs_dim, self._num_estimates, list(estimator.hidden_dims), "elu")
+        self.estimate: torch.Tensor | None = None
+
+    def get_latent(
+        self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: HiddenState = None
+    ) -> torch.Tensor:
+        """Normalised one-dimensional groups, then the estimates."""
+        latent = super().get_latent(obs, masks, hidden_state)
+        if self.estimator is None:
+            return latent
+        with torch.no_grad():
+            estimate = self.estimator(latent)
+        if not torch.is_grad_enabled():
+            self.estimate = estimate
+        return torch.cat((latent, estimate), -1)
+
+    def estimation_error(self, obs: TensorDict) -> torch.Tensor:
+        """Mean squared error of the estimates, with gradients for the estimator alone."""
+        assert self.estimator is not None  # it is asked for where something is estimated
+        with torch.no_grad():
+            latent = MLPModel.get_latent(self, obs)
+        return (self.estimator(latent) - obs[self.estimated]).square().mean()
+
+    @property
+    def blind_dim(self) -> int:
+        """Inputs of the policy's first layer that come from no perception: observations and estimates."""
+        return self.obs_dim + self._num_estimates
+
+    def _get_latent_dim(self) -> int:
+        return self.blind_dim
