@@ -192,6 +192,10 @@ def sampler_parameters(sampler: Sampler) -> dict:
     }
 
 
+Outputs = torch.Tensor | tuple[torch.Tensor, ...]
+"""Actions, or actions and estimates."""
+
+
 class BlindNetwork(nn.Module):
     """Flat observations -> actions, and estimates where the actor has an estimator; the observations' normalisation is
     part of it."""
@@ -206,7 +210,7 @@ class BlindNetwork(nn.Module):
         self.observation_size = actor.obs_dim
         self.output_names = ("actions",) if self.actor.estimator is None else ("actions", "estimate")
 
-    def forward(self, observations: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(self, observations: torch.Tensor) -> Outputs:
         """(B, observation_size), the actor's groups in order -> (B, num_actions), and estimates (B, K), if any."""
         latent = self.latent(observations)
         return self.outputs(latent, latent)
@@ -217,10 +221,10 @@ class BlindNetwork(nn.Module):
         estimator = self.actor.estimator
         return latent if estimator is None else torch.cat((latent, estimator(latent)), 1)
 
-    def outputs(self, latent: torch.Tensor, inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def outputs(self, latent: torch.Tensor, inputs: torch.Tensor) -> Outputs:
         """Actions from the first layer's inputs (B, ...), which begin with `latent` (B, D), and the estimates in it."""
         actions = self.output(self.actor.mlp(inputs))
-        return (actions,) if self.actor.estimator is None else (actions, latent[:, self.observation_size :])
+        return actions if self.actor.estimator is None else (actions, latent[:, self.observation_size :])
 
     def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
         """Random inputs."""
@@ -239,7 +243,7 @@ class PerceptiveNetwork(BlindNetwork):
 
     def forward(  # type: ignore[override]
         self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
+    ) -> Outputs:
         """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> as `BlindNetwork`."""
         features = self.actor.perception(frames, frame_count)[:, 0]
         if self.actor.read_out is not None:
@@ -314,9 +318,10 @@ def write_onnx(network: BlindNetwork, path: Path) -> tuple[Path, Callable | None
         return path, None
     session = InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
-    def run(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def run(*inputs: torch.Tensor) -> Outputs:
         feed = {name: tensor.numpy() for name, tensor in zip(names, inputs, strict=True)}
-        return tuple(torch.from_numpy(output) for output in session.run(None, feed))
+        outputs = tuple(torch.from_numpy(output) for output in session.run(None, feed))
+        return outputs if len(outputs) > 1 else outputs[0]
 
     return path, run
 
@@ -330,8 +335,8 @@ def check(network: BlindNetwork, path: Path, written: Callable | None) -> None:
         return
     inputs = network.examples(23)
     with torch.no_grad():
-        pairs = zip(written(*inputs), network(*inputs), strict=True)
-        error = max(float((ours - theirs).abs().max()) for ours, theirs in pairs)
+        sides = [out if isinstance(out, tuple) else (out,) for out in (written(*inputs), network(*inputs))]
+        error = max(float((ours - theirs).abs().max()) for ours, theirs in zip(*sides, strict=True))
     steep = isinstance(getattr(network.actor, "read_out", None), MotionReadOut)
     if not error <= (STEEP_TOLERANCE if steep else TOLERANCE):
         raise ConfigError(f"{path} differs from the policy by {error:.1e} in an output: not exportable")

@@ -91,6 +91,7 @@ class EnvState:
         actions: (num_envs, num_actions) each: those applied, the newest first, and the two before; 0 after a reset.
         before: kinematics at the start of the control step.
         default_joint_pos, joint_lower, joint_upper: (num_joints,) rad.
+        joint_torque_limit: (num_joints,) N m.
         default_base_height: m, of the default pose.
     """
 
@@ -127,6 +128,7 @@ class EnvState:
         limits = model.jnt_range[[model.joint(name).id for name in robot.joints]]
         self.joint_lower, self.joint_upper = torch.tensor(limits, dtype=torch.float32, device=self.device).unbind(1)
         self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
+        self.joint_torque_limit = torch.tensor([robot.torque_limits[n] for n in robot.joints], device=self.device)
         self.default_base_height = robot.base_height
         self._foot_geoms = tuple(model.geom(name).id for name in robot.foot_geoms)
         self.actions: tuple[torch.Tensor, ...] = (torch.zeros(self.num_envs, robot.num_joints, device=self.device),) * 3

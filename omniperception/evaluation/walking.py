@@ -62,8 +62,6 @@ class WalkingTally:
         feet = len(env.robot.foot_geoms)
         self._left_at, self._peak = torch.zeros(2, n, feet, device=device).unbind(0)
         self._was_down, self._swings = torch.zeros(2, n, feet, dtype=torch.bool, device=device).unbind(0)
-        limits = [env.robot.torque_limits[name] for name in env.robot.joints]
-        self._limits = torch.tensor(limits, device=device)
         self._weight = float(env.world.model.body_subtreemass[env.world.base_body]) * GRAVITY
         _ = env.state.joint_torque, env.state.foot_force, env.state.foot_vel_w  # recorded from now on
 
@@ -87,7 +85,7 @@ class WalkingTally:
         stands = settled & (state.command == 0).all(1)
         joint_pos, joint_speed = kinematics.joint_pos, kinematics.joint_vel.abs()
         stop = (joint_pos < state.joint_lower + AT_STOP) | (joint_pos > state.joint_upper - AT_STOP)
-        limited = state.joint_torque.abs() >= AT_LIMIT * self._limits
+        limited = state.joint_torque.abs() >= AT_LIMIT * state.joint_torque_limit
         change = env.robot.action_scale * (state.actions[0] - state.actions[1]).abs().mean(1)
         speed = kinematics.base_lin_vel_yaw.norm(dim=1)
         step = {

@@ -40,6 +40,8 @@ RECIPES = {
     "proximity_gru_no_proximal": overrides_of("proximity_gru_no_proximal"),
     "polar_rings": ("experiment=avoid", "init=unread"),
     "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
+    "estimated": ("experiment=walk", "observations=walk_without_velocity"),
+    "polar_rings_estimated": ("experiment=avoid", "init=unread", "observations=walk_without_velocity"),
     "motion_by_proximal": ("experiment=avoid", "init=unread", *overrides_of("pd_risknet_no_distal")),
 }
 ALIKE = {
@@ -55,6 +57,11 @@ ALIKE = {
 STAND = RobotState([0.0] * 12, [0.0] * 12, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3)
 
 
+def actions_of(outputs):
+    """Of a network that may give estimates beside them."""
+    return outputs[0] if isinstance(outputs, tuple) else outputs
+
+
 def stir(actor):
     """Weights and statistics as after training: nothing is zero, what is seen matters, actions stay small."""
     torch.manual_seed(0)
@@ -62,7 +69,7 @@ def stir(actor):
         for name, parameter in actor.named_parameters():
             if "std" not in name:
                 parameter.add_(torch.randn_like(parameter) * (0.3 * parameter.std() if parameter.std() > 0 else 0.05))
-        actor.mlp[0].weight[:, actor.obs_dim :] = 0.2 * torch.randn_like(actor.mlp[0].weight[:, actor.obs_dim :])
+        actor.mlp[0].weight[:, actor.blind_dim :] = 0.2 * torch.randn_like(actor.mlp[0].weight[:, actor.blind_dim :])
         actor.obs_normalizer._mean.add_(0.1 * torch.randn_like(actor.obs_normalizer._mean))
         actor.obs_normalizer._std.copy_(0.5 + torch.rand_like(actor.obs_normalizer._std))
 
@@ -91,7 +98,9 @@ def trained(run_dir, *overrides):
 
 
 def test_every_preset_is_tried():
-    assert {*config.presets("perception"), *VARIANTS} == {*RECIPES, *ALIKE} - {"motion_by_fps", "motion_by_proximal"}
+    assert {*config.presets("perception"), *VARIANTS} == {*RECIPES, *ALIKE} - {
+        *("motion_by_fps", "motion_by_proximal", "estimated", "polar_rings_estimated")
+    }
 
 
 @pytest.mark.slow
@@ -121,15 +130,20 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
                 lost += int((~env.sensing.fresh & (env.sensing.frame_count[:, 0] > 1)).sum())
                 frames += policies.robots[0].frame_count
                 inputs.append(torch.from_numpy(np.stack([robot.frames for robot in policies.robots])))
-                blind = scripted(*inputs, torch.zeros(2, 1, dtype=torch.int64))
+                blind = actions_of(scripted(*inputs, torch.zeros(2, 1, dtype=torch.int64)))
                 without_frames = max(without_frames, float((blind - expected).abs().max()))
                 inputs.append(env.sensing.frame_count)
-            torch.testing.assert_close(scripted(*inputs), expected, atol=1e-5, rtol=0.0)
+            torch.testing.assert_close(actions_of(scripted(*inputs)), expected, atol=1e-5, rtol=0.0)
+            if torch_side.policy.estimate is not None:
+                estimates = torch.from_numpy(np.stack([robot.base_lin_vel for robot in policies.robots]))
+                torch.testing.assert_close(estimates, torch_side.policy.estimate, atol=1e-5, rtol=0.0)
             if step == 28:
                 env.sim.qpos[1, 2] = 0.05
             ends += int(env.step(expected)[2].sum())
     assert ends == 3
-    assert recipe == "none" or (frames > 30 and lost > 0 and without_frames > 1e-2)  # what it sees matters
+    assert recipe in ("none", "estimated") or (
+        frames > 30 and lost > 0 and without_frames > 1e-2
+    )  # what it sees matters
 
 
 @pytest.mark.slow

@@ -288,8 +288,9 @@ class TestCurriculum:
         drawn = {
             "motor_strength": lambda: env.sim.model_field("actuator_gainprm")[:, 0, 0] / model.actuator_gainprm[0, 0],
             "ground_friction": lambda: env.sim.model_field("geom_friction")[:, model.geom("ground").id, 0],
-            "added_mass": lambda: env.sim.model_field("body_mass")[:, env.sim.world.base_body]
-            - model.body_mass[env.sim.world.base_body],
+            "added_mass": lambda: (
+                env.sim.model_field("body_mass")[:, env.sim.world.base_body] - model.body_mass[env.sim.world.base_body]
+            ),
         }[row]()
         assert_fills(drawn, neutral + 0.5 * (low - neutral), neutral + 0.5 * (high - neutral))
 

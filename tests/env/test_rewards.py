@@ -104,7 +104,9 @@ class TestTerms:
             ("link_collision", {"unit": 1.0}, [26.0, 0.0]),
             ("link_collision", {"unit": 2.0}, [6.5, 0.0]),
             ("joint_limit_violation", {}, [2.0, 0.0]),
+            ("joint_near_stop", {"margin": 0.25}, [0.35 + 0.35, 0.25 + 0.05]),
             ("joint_torque_squared", {}, [25.0, 0.0]),
+            ("joint_torque_near_limit", {"share": 0.5}, [0.25 + 0.5, 0.0]),
             ("joint_velocity_squared", {}, [5.0, 0.0]),
             ("joint_acceleration_squared", {}, [5.0, 1.0]),
             ("default_pose_deviation", {}, [1.2**2 + 0.4**2 + 0.3**2, 0.0]),
@@ -131,6 +133,7 @@ class TestTerms:
             mean_distal_range=lambda limit: tensor(limit, 0.25 * limit),
             foot_force=tensor([[30.0, 40.0, 5.0], [3.0, 4.0, -50.0], [0.0, 0.0, 0.0]], [[0.0, 0.0, 9.0]] * 3),
             link_force=tensor([[3.0, 4.0, 99.0], [0.0, 1.0, 0.0]], [[0.0, 0.0, 9.0]] * 2),
+            joint_torque_limit=torch.tensor([4.0, 4.0, 4.0]),
             joint_lower=torch.full((3,), -1.0),
             joint_upper=torch.tensor([1.2, 1.0, 1.0]),
             joint_torque=tensor([3.0, -4.0, 0.0], [0.0, 0.0, 0.0]),
@@ -142,6 +145,12 @@ class TestTerms:
             device="cpu",
         )
         assert getattr(rewards, term)(state, **settings).tolist() == pytest.approx(expected)
+
+    def test_standing_counts_where_the_command_says_so(self):
+        joint_vel = tensor([1.0, -2.0], [1.0, -2.0], [0.0, 0.0])
+        command = tensor([0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.0])
+        state = given(kinematics={"joint_vel": joint_vel}, command=command)
+        assert rewards.standing_joint_velocity_squared(state).tolist() == [5.0, 0.0, 0.0]
 
     def closing(self, pos, vel, base_vel=(0.0, 0.0), active=True):
         state = given(

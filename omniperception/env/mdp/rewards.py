@@ -122,6 +122,23 @@ def joint_limit_violation(state: EnvState) -> torch.Tensor:
     return ((joint_pos < state.joint_lower) | (joint_pos > state.joint_upper)).sum(1).float()
 
 
+def joint_near_stop(state: EnvState, margin: float) -> torch.Tensor:
+    """Sum over joints of how far (rad) they are within `margin` (rad) of the ends of their ranges, or beyond."""
+    joint_pos = state.kinematics.joint_pos
+    room = torch.minimum(joint_pos - state.joint_lower, state.joint_upper - joint_pos)
+    return (margin - room).clamp(min=0.0).sum(1)
+
+
+def joint_torque_near_limit(state: EnvState, share: float) -> torch.Tensor:
+    """Sum over joints of how far their torque exceeds `share` of its limit, as a share of the limit."""
+    return (state.joint_torque.abs() / state.joint_torque_limit - share).clamp(min=0.0).sum(1)
+
+
+def standing_joint_velocity_squared(state: EnvState) -> torch.Tensor:
+    """|qdot|^2, (rad/s)^2, while the command is to stand; 0 otherwise."""
+    return state.kinematics.joint_vel.square().sum(1) * (state.command == 0).all(1)
+
+
 def joint_torque_squared(state: EnvState) -> torch.Tensor:
     """|tau|^2, (N m)^2."""
     return state.joint_torque.square().sum(1)
