@@ -10,7 +10,7 @@ COMMANDS = {
     "train": "trains a policy, or goes on with a run",
     "play": "replays a run: rates over whole episodes, and a video",
     "evaluate": "evaluates runs in fixed worlds, beside baselines",
-    "robustness": "finds where a gait breaks: ranges of the randomization, and kicks",
+    "gait": "looks at a gait: where it breaks, which kicks it survives, when its feet are down",
     "tables": "renders the results tables of the docs from files of results",
     "ablate": "trains and evaluates variants of the perception over seeds",
     "export": "exports a policy for a robot or another simulator",

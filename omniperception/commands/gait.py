@@ -1,28 +1,31 @@
-"""Finds where a gait breaks: each row of the randomization alone over multiples of its range, and single kicks.
+"""Looks at a gait: where it breaks, which kicks it survives, when its feet are down.
 
-    robustness run=latest                                   # ranges of randomization=robot times 0.5 to 3
-    robustness run=latest rows=latency_s,joint_offset factors=1,2,4,8
-    robustness run=latest what=kicks speeds=0.5,1,1.5,2     # under condition=robot, one kick in each trial
+    gait run=latest                                   # each row of randomization=robot alone, times 0.5 to 3
+    gait run=latest rows=latency_s,joint_offset factors=1,2,4,8
+    gait run=latest what=kicks speeds=0.5,1,1.5,2     # under condition=robot, one kick in each trial
+    gait run=latest what=feet                         # a gait diagram for each of seven commands
 
-Robots follow the commands of scenario=walk on flat ground. Prints a table and draws a picture in the run's evaluation
-folder; `out` adds the trials of the ranges to a file. The same command goes on where it was stopped.
+Robots follow the commands of scenario=walk on flat ground, or one command each. Prints a table and draws a picture in
+the run's evaluation folder; `out` adds the trials of the ranges to a file. The command for the ranges goes on where it
+was stopped. Falls, errors, torques and slip on all grounds are `evaluate suite=walking`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omniperception import build, config
 from omniperception.cli import Command, argument, trust
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.common.tables import markdown
-from omniperception.config import ConfigError
 from omniperception.evaluation import robustness
+from omniperception.evaluation.footfall import COMMANDS, Footfall, draw_footfall, watch
 from omniperception.evaluation.kicks import AFTER_S, WATCHED_S, KickResults, draw_kicks, kick
 from omniperception.evaluation.records import FOLDER, merge
 from omniperception.evaluation.suite import Evaluation, World
 from omniperception.learning import CheckpointError
+from omniperception.scene.build import FOOT_FORCE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +33,7 @@ class Arguments:
     """The command's own arguments."""
 
     run: str = argument("latest", "run directory, or latest for the newest under outputs/")
-    what: str = argument("ranges", "what is tried", choices=("ranges", "kicks"))
+    what: str = argument("ranges", "what is tried", choices=("ranges", "kicks", "feet"))
     rows: tuple[str, ...] = argument((), "rows of the randomization; none: all that have a range and concern the robot")
     factors: tuple[float, ...] = argument((0.5, 1.0, 1.5, 2.0, 2.5, 3.0), "multiples of the ranges")
     preset: str = argument("robot", "preset of randomization that has the ranges")
@@ -38,7 +41,7 @@ class Arguments:
     speeds: tuple[float, ...] = argument((0.5, 1.0, 1.5, 2.0), "sizes of the kicks (m/s)")
     bearings: int = argument(16, "directions of the kicks, evenly around", least=1)
     repeats: int = argument(16, "kicks of each size and direction", least=1)
-    condition: str | None = argument("robot", "preset of conf/condition for kicks, without its pushes")
+    condition: str | None = argument("robot", "preset of conf/condition for kicks (without its pushes) and feet")
     out: Path | None = argument(None, "file (.json or .json.gz) that the trials of the ranges are added to")
     trust: tuple[str, ...] = trust()
 
@@ -46,12 +49,16 @@ class Arguments:
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Measures, prints a table and draws a picture."""
     run_dir = config.find_run(arguments.run)
-    picture = run_dir / FOLDER / f"robustness-{arguments.what}.png"
+    picture = run_dir / FOLDER / f"gait-{arguments.what}.png"
     picture.parent.mkdir(exist_ok=True)
     if arguments.what == "kicks":
         results = kicked(arguments, run_dir, overrides)
         print(kicks_table(results, arguments.speeds))
         draw_kicks(results, arguments.speeds, arguments.bearings, picture)
+    elif arguments.what == "feet":
+        footfall = watched(arguments, run_dir, overrides)
+        draw_footfall(footfall, picture)
+        print(feet_table(footfall))
     else:
         evaluation = Evaluation(
             [run_dir], [World("walk")], trials=arguments.trials, overrides=tuple(overrides), trust=arguments.trust
@@ -68,15 +75,24 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
 
 def kicked(arguments: Arguments, run_dir: Path, overrides: list[str]) -> KickResults:
     """Kicks the run's policy."""
-    given = [] if arguments.condition is None else [f"condition={arguments.condition}"]
     length = f"terminations.episode_length_s={AFTER_S + WATCHED_S}"
-    composed = config.load(run_dir, ["scenario=walk", *given, *overrides, length, "num_envs=64"])
+    trained = policy_on_free_ground(arguments, run_dir, [*overrides, length, "num_envs=64"])
+    return kick(trained.env, trained.policy, arguments.speeds, arguments.bearings, arguments.repeats)
+
+
+def watched(arguments: Arguments, run_dir: Path, overrides: list[str]) -> Footfall:
+    """Watches the feet of the run's policy."""
+    trained = policy_on_free_ground(arguments, run_dir, [*overrides, f"num_envs={len(COMMANDS)}"])
+    return watch(trained.env, trained.policy)
+
+
+def policy_on_free_ground(arguments: Arguments, run_dir: Path, overrides: list[str]) -> build.TrainedPolicy:
+    """The run's policy under the condition, without pushes."""
+    given = [] if arguments.condition is None else [f"condition={arguments.condition}"]
+    composed = config.load(run_dir, ["scenario=walk", *given, *overrides])
     composed.randomization.pushes = None
-    trained = build.load_policy(build.assemble(composed, arguments.trust), run_dir)
-    try:
-        return kick(trained.env, trained.policy, arguments.speeds, arguments.bearings, arguments.repeats)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
+    run = build.assemble(composed, arguments.trust)
+    return build.load_policy(replace(run, env=replace(run.env, read_besides=(FOOT_FORCE,))), run_dir)
 
 
 def kicks_table(results: KickResults, speeds: tuple[float, ...]) -> str:
@@ -85,6 +101,16 @@ def kicks_table(results: KickResults, speeds: tuple[float, ...]) -> str:
     cells = [f"{100 * r['rate']:.1f} [{100 * r['low']:.1f}, {100 * r['high']:.1f}]" for r in rates]
     rows = [[f"{speed:g}", cell] for speed, cell in zip(speeds, cells, strict=True)]
     return markdown(["kick, m/s", f"no fall within {WATCHED_S:g} s, %"], rows) + "\n"
+
+
+def feet_table(footfall: Footfall) -> str:
+    """Velocities, step frequencies and duty factors by command."""
+    rows = [
+        [name, *(f"{v:.2f}" for v in velocity.tolist()), f"{float(f.mean()):.2f}", f"{100 * float(d.mean()):.0f}"]
+        for name, velocity, f, d in zip(COMMANDS, footfall.velocity, footfall.frequency(), footfall.duty(), strict=True)
+    ]
+    heads = ["command", "v_x, m/s", "v_y, m/s", "yaw rate, rad/s", "steps of a foot per s", "a foot is down, %"]
+    return markdown(heads, rows) + "\n"
 
 
 command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError, PlotsUnavailable))

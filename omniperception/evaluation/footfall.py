@@ -1,0 +1,106 @@
+"""Gait diagrams: when each foot of a walking robot is on the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from omniperception.common.figures import new_figure
+from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.commands import VelocityCommand
+from omniperception.evaluation.episodes import Policy
+
+COMMANDS = {
+    "stand": (0.0, 0.0, 0.0),
+    "0.5 m/s ahead": (0.5, 0.0, 0.0),
+    "1 m/s ahead": (1.0, 0.0, 0.0),
+    "2 m/s ahead": (2.0, 0.0, 0.0),
+    "1 m/s back": (-1.0, 0.0, 0.0),
+    "1 m/s to the left": (0.0, 1.0, 0.0),
+    "1.5 rad/s to the left": (0.0, 0.0, 1.5),
+}
+"""What robots are commanded, by name: v_x, v_y (m/s), yaw rate (rad/s)."""
+SETTLES_S, SHOWN_S = 3.0, 2.0
+"""Time (s) before a diagram begins, and its length."""
+
+
+@dataclass(frozen=True)
+class Footfall:
+    """Feet of robots that each follow one command.
+
+    Attributes:
+        contact: (T, len(COMMANDS), F) bool: which feet are down in each control step.
+        velocity: (len(COMMANDS), 3) mean v_x, v_y (m/s) and yaw rate (rad/s), base frame.
+        dt: control step (s).
+        feet: names.
+    """
+
+    contact: torch.Tensor
+    velocity: torch.Tensor
+    dt: float
+    feet: Sequence[str]
+
+    def duty(self) -> torch.Tensor:
+        """(len(COMMANDS), F) share of the time that each foot is down."""
+        return self.contact.double().mean(0)
+
+    def frequency(self) -> torch.Tensor:
+        """(len(COMMANDS), F) touch-downs per second."""
+        down = self.contact[1:] & ~self.contact[:-1]
+        return down.double().sum(0) / (len(down) * self.dt)
+
+
+def watch(env: OmniEnv, policy: Policy) -> Footfall:
+    """Lets each of as many robots as there are COMMANDS follow one of them.
+
+    Args:
+        env: freshly built, with velocity commands and the sensor "foot_force".
+        policy: from observations to actions.
+    """
+    if not isinstance(env.command, VelocityCommand) or env.num_envs != len(COMMANDS):
+        raise ValueError(f"a gait diagram needs velocity commands and num_envs={len(COMMANDS)}")
+    wanted = torch.tensor(list(COMMANDS.values()), device=env.device)
+    contact, velocity = [], []
+    with torch.no_grad():
+        for step in range(round((SETTLES_S + SHOWN_S) / env.control_dt)):
+            env.command.value.copy_(wanted)
+            env.observations["command"].copy_(wanted)
+            env.step(policy(env.get_observations()))
+            if step * env.control_dt >= SETTLES_S:
+                k = env.state.kinematics
+                contact.append(env.state.foot_contact.cpu())
+                velocity.append(torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:]), 1).cpu())
+    return Footfall(torch.stack(contact), torch.stack(velocity).mean(0), env.control_dt, env.robot.foot_geoms)
+
+
+def draw_footfall(footfall: Footfall, path: Path) -> None:
+    """A panel for each command with a bar for each foot while it is down."""
+    columns = 2
+    lines = -(-len(COMMANDS) // columns)
+    figure = new_figure(9.0, 1.35 * lines + 0.5)
+    axes = figure.subplots(lines, columns, squeeze=False, sharex=True).ravel()
+    duty, frequency = footfall.duty(), footfall.frequency()
+    for k, name in enumerate(COMMANDS):
+        axis = axes[k]
+        for foot in range(len(footfall.feet)):
+            axis.broken_barh(_bars(footfall.contact[:, k, foot], footfall.dt), (-foot - 0.4, 0.8), color="#35618f")
+        axis.set_yticks([-f for f in range(len(footfall.feet))], [n.removesuffix("_foot") for n in footfall.feet])
+        axis.tick_params(labelsize=7)
+        x, y, turn = footfall.velocity[k].tolist()
+        feet = f"{frequency[k].mean():.1f} Hz, down {100 * duty[k].mean():.0f} %"
+        axis.set_title(f"{name}: {x:.2f}, {y:.2f} m/s, {turn:.2f} rad/s; {feet}", fontsize=7.5)
+    for axis in axes[len(COMMANDS) :]:
+        axis.set_axis_off()
+    for axis in axes[-columns:]:
+        axis.set_xlabel("time (s)", fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def _bars(contact: torch.Tensor, dt: float) -> list[tuple[float, float]]:
+    """(start, length) in s of the phases in which a foot (T,) bool is down."""
+    padded = torch.nn.functional.pad(contact.int(), (1, 1)).diff()
+    begins, ends = (padded == 1).nonzero().flatten(), (padded == -1).nonzero().flatten()
+    return [(float(b) * dt, float(e - b) * dt) for b, e in zip(begins, ends, strict=True)]

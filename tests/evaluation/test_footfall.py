@@ -1,0 +1,42 @@
+"""Gait diagrams, of contacts that are known."""
+
+import pytest
+import torch
+
+from omniperception.evaluation.footfall import COMMANDS, Footfall, _bars, draw_footfall, watch
+
+BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk")
+
+
+def test_shares_frequencies_and_bars_of_a_known_pattern():
+    down = torch.tensor([True, True, False, False, True, False, False, False, True, True])
+    contact = torch.zeros(10, len(COMMANDS), 2, dtype=torch.bool)
+    contact[:, 0, 0], contact[:, 1, 1] = down, True
+    footfall = Footfall(contact, torch.zeros(len(COMMANDS), 3), 0.1, ("a_foot", "b_foot"))
+    assert footfall.duty()[0].tolist() == [0.5, 0.0] and footfall.duty()[1].tolist() == [0.0, 1.0]
+    assert footfall.frequency()[0, 0].item() == pytest.approx(2 / 0.9)
+    assert footfall.frequency()[1, 1].item() == 0.0
+    bars = torch.tensor(_bars(down, 0.1))
+    torch.testing.assert_close(bars, torch.tensor([[0.0, 0.2], [0.4, 0.1], [0.8, 0.2]]))
+    assert _bars(torch.zeros(4, dtype=torch.bool), 0.1) == []
+
+
+def test_robots_that_stand_have_all_feet_down_and_each_is_commanded_its_own(make_env, tmp_path):
+    env = make_env(*BLIND, "scenario=walk", f"num_envs={len(COMMANDS)}", read_besides=("foot_force",))
+    seen = []
+
+    def stand(observations):
+        seen.append(observations["command"].clone())
+        return torch.zeros(len(COMMANDS), 12)
+
+    footfall = watch(env, stand)
+    assert all(torch.equal(command, torch.tensor(list(COMMANDS.values()))) for command in seen)
+    assert footfall.contact.shape == (100, len(COMMANDS), 4) and footfall.contact.all()
+    assert footfall.velocity.abs().max() < 0.05
+    draw_footfall(footfall, tmp_path / "feet.png")
+    assert (tmp_path / "feet.png").stat().st_size > 10_000
+
+
+def test_other_environments_are_refused(make_env):
+    with pytest.raises(ValueError, match=r"velocity commands and num_envs=7"):
+        watch(make_env(*BLIND, "scenario=static", "num_envs=2"), None)
