@@ -51,11 +51,13 @@ class Term:
         quantity: one of `omniperception.deploy.runtime.QUANTITIES`.
         size: numbers.
         scale: factor.
+        frequency: of the clock (Hz), of gait_phase alone.
     """
 
     quantity: str
     size: int
     scale: float = 1.0
+    frequency: float | None = None
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
 
 
 _QUANTITIES = ("joint_pos_offset", "joint_vel", "base_lin_vel", "base_ang_vel", "projected_gravity", "command")
-_MEASURABLE = {getattr(observations, name): name for name in (*_QUANTITIES, "previous_action")}
+_MEASURABLE = {getattr(observations, name): name for name in (*_QUANTITIES, "previous_action", "gait_phase")}
 """Observation terms that a robot can give, by function."""
 
 
@@ -118,12 +118,13 @@ def _group(name: str, env: OmniEnv) -> Group:
     terms = []
     for term_name, term in group.terms.items():
         function, options = (term.func, dict(term.keywords)) if isinstance(term, partial) else (term, {})
-        if function not in _MEASURABLE or set(options) - {"scale"}:
+        if function not in _MEASURABLE or set(options) - {"scale", "frequency"}:
             raise ConfigError(
                 f"observations.groups.{name}.terms.{term_name} cannot be exported: a robot can measure"
                 f" {', '.join(_MEASURABLE.values())}"
             )
-        terms.append(Term(_MEASURABLE[function], widths[term_name], float(options.get("scale", 1.0))))
+        scale, frequency = options.get("scale", 1.0), options.get("frequency")
+        terms.append(Term(_MEASURABLE[function], widths[term_name], scale, frequency))
     return Group(name, group.history, tuple(terms))
 
 

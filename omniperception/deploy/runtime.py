@@ -112,7 +112,7 @@ class ExportedPolicy:
         self.action = np.zeros(len(self._default_pos), np.float32)
         for history in self._histories.values():
             history.clear()
-        self.frame_count = 0
+        self.frame_count = self._steps = 0
         self.base_lin_vel: np.ndarray | None = None
         if self.frames is not None:
             self.frames = np.zeros_like(self.frames)
@@ -181,6 +181,7 @@ class ExportedPolicy:
         actions, *estimates = (output[0] for output in self._session.run(None, feed))
         if estimates:
             self.base_lin_vel = estimates[0]
+        self._steps += 1
         self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
         return self._default_pos + np.float32(joints.action_scale) * self.action
 
@@ -203,13 +204,21 @@ class ExportedPolicy:
         """(width,) the group's terms at this step."""
         values = []
         for term in group.terms:
-            value = QUANTITIES[term.quantity](self, state, command)
+            if term.frequency is None:
+                value = QUANTITIES[term.quantity](self, state, command)
+            else:
+                value = self._phase(term.frequency, command)
             if value.shape != (term.size,):
                 raise DeployError(f"{term.quantity}: shape ({term.size},) was expected, {value.shape} given")
             if not np.isfinite(value).all():
                 raise DeployError(f"{term.quantity}: finite numbers were expected, {value} given")
             values.append(value * np.float32(term.scale))
         return np.concatenate(values)
+
+    def _phase(self, frequency: float, command: ArrayLike) -> np.ndarray:
+        """(2,) sine and cosine of the clock since the last reset; 0 while the command is to stand."""
+        angle = 2 * np.pi * frequency * self._steps * self.description.control_period_s
+        return np.array([np.sin(angle), np.cos(angle)], np.float32) * bool(np.any(command))
 
     def _perception(self) -> tuple[Lidar, CloudSampler, np.ndarray]:
         """The sensor, the sampler and the history of frames of a policy that sees."""
@@ -220,7 +229,7 @@ class ExportedPolicy:
     def _check_network(self) -> None:
         """The network and its description belong together."""
         for term in (term for group in self.description.observations for term in group.terms):
-            if term.quantity not in QUANTITIES:
+            if term.quantity not in QUANTITIES and term.frequency is None:
                 raise DeployError(f"observation '{term.quantity}' is unknown; known: {', '.join(QUANTITIES)}")
         given = {item.name: tuple(item.shape[1:]) for item in self._session.get_inputs()}
         if given != self.description.inputs:

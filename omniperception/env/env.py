@@ -74,6 +74,7 @@ class OmniEnv(VecEnv):
         streams = TrialRandom if config.trials else EnvRandom
         self.random: EnvRandom = streams(config.seed, self.num_envs, self.device)
         self.command = config.commands.build(self.num_envs, self.device, self.random)
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self.difficulty = Curriculum(config.randomization.curriculum)
         branch = self.random.branch("randomization")
         self.randomizer = Randomizer(config.randomization, self.sim, branch, self.difficulty)
@@ -92,11 +93,11 @@ class OmniEnv(VecEnv):
             self.avoidance,
             self.sensing,
             build_errors(config, self.random, self.difficulty),
+            self.episode_length_buf,
         )
         if config.initial_level is not None:
             self.curriculum_levels = (config.initial_level,) * len(self._curricula())
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
-        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._spawn = self._spawn_bounds()
         self._sized = self._find_sized()
         self._frame_heights: torch.Tensor | None = None  # at the newest frame, where only supervision reads heights

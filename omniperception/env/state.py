@@ -106,6 +106,7 @@ class EnvState:
         avoidance: Avoidance | None = None,
         sensing: LidarSensing | None = None,
         errors: MeasurementErrors | None = None,
+        episode_steps: torch.Tensor | None = None,
     ) -> None:
         """
         Args:
@@ -118,8 +119,11 @@ class EnvState:
             avoidance: source of V_avoid.
             sensing: the LiDAR.
             errors: of what is measured.
+            episode_steps: (num_envs,) int64 control steps since the episodes began, the environment's own.
         """
         self._errors = errors
+        steps = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
+        self._episode_steps = steps if episode_steps is None else episode_steps
         self._velocity_source: Callable[[], torch.Tensor | None] | None = None
         self._sim, self._command, self._obstacles, self._height_lookup = sim, command, obstacles, height_lookup
         self.num_envs, self.device, self.control_dt = sim.num_envs, sim.device, control_dt
@@ -211,6 +215,11 @@ class EnvState:
             measured = self._errors.added_to(measured)
         estimate = self._velocity_source() if self._velocity_source is not None else None
         return measured if estimate is None else with_velocity(measured, estimate)
+
+    @property
+    def time_s(self) -> torch.Tensor:
+        """(num_envs,) s since the episode began."""
+        return self._episode_steps * self.control_dt
 
     @property
     def command(self) -> torch.Tensor:

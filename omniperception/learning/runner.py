@@ -87,7 +87,7 @@ class Runner:
         last = first + num_learning_iterations
         if init_at_random_ep_len and first == 0:
             lengths = self.env.episode_length_buf
-            self.env.episode_length_buf = torch.randint_like(lengths, high=int(self.env.max_episode_length))
+            lengths.copy_(torch.randint_like(lengths, high=int(self.env.max_episode_length)))
         obs = self.env.get_observations().to(self.device)
         self.alg.train_mode()
         if self.alg.is_multi_gpu:

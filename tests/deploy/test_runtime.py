@@ -40,6 +40,7 @@ RECIPES = {
     "proximity_gru_no_proximal": overrides_of("proximity_gru_no_proximal"),
     "polar_rings": ("experiment=avoid", "init=unread"),
     "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
+    "clock": ("experiment=walk", "observations=gait"),
     "estimated": ("experiment=walk", "observations=walk_without_velocity"),
     "polar_rings_estimated": ("experiment=avoid", "init=unread", "observations=walk_without_velocity"),
     "motion_by_proximal": ("experiment=avoid", "init=unread", *overrides_of("pd_risknet_no_distal")),
@@ -99,7 +100,7 @@ def trained(run_dir, *overrides):
 
 def test_every_preset_is_tried():
     assert {*config.presets("perception"), *VARIANTS} == {*RECIPES, *ALIKE} - {
-        *("motion_by_fps", "motion_by_proximal", "estimated", "polar_rings_estimated")
+        *("motion_by_fps", "motion_by_proximal", "clock", "estimated", "polar_rings_estimated")
     }
 
 
@@ -141,7 +142,7 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
                 env.sim.qpos[1, 2] = 0.05
             ends += int(env.step(expected)[2].sum())
     assert ends == 3
-    assert recipe in ("none", "estimated") or (
+    assert recipe in ("none", "clock", "estimated") or (
         frames > 30 and lost > 0 and without_frames > 1e-2
     )  # what it sees matters
 

@@ -189,6 +189,17 @@ class TestFeet:
         )
         assert rewards.foot_clearance(state, target=0.1).item() == pytest.approx(0.08**2 * 0.5, rel=1e-4)
 
+    def test_timing_by_the_clock(self):
+        """At 2 Hz and 0.1 s the clock is at 0.2 of its period, a foot half a period later at 0.7."""
+        contact = torch.tensor([[True, False], [True, True], [True, True]])
+        command = tensor([0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+        state = given(time_s=torch.tensor([0.1, 0.1, 0.1]), foot_contact=contact, command=command, device="cpu")
+        settings = {"frequency": 2.0, "offsets": [0.0, 0.5], "duty": 0.5}
+        assert rewards.foot_timing(state, **settings).tolist() == [1.0, 0.5, 1.0]  # the last one stands, as it should
+        assert rewards.foot_timing(state, **settings | {"duty": 0.8}).tolist() == [0.5, 1.0, 1.0]
+        state.time_s = torch.tensor([0.35, 0.35, 0.35])  # half a period later
+        assert rewards.foot_timing(state, **settings).tolist() == [0.0, 0.5, 1.0]
+
     def test_slip_is_of_feet_in_contact(self):
         state = given(foot_vel_w=tensor([[0.3, 0.4, 5.0], [2.0, 0.0, 0.0]]), foot_contact=torch.tensor([[True, False]]))
         assert rewards.foot_slip(state).item() == pytest.approx(0.25)

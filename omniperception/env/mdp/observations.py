@@ -50,6 +50,17 @@ def previous_action(state: EnvState) -> torch.Tensor:
     return state.actions[0]
 
 
+@mirrors((-1.0, -1.0))
+def gait_phase(state: EnvState, frequency: float) -> torch.Tensor:
+    """Sine and cosine of a clock of `frequency` (Hz) that starts with the episode; 0 while the command is to stand.
+
+    Its mirror image is half a period off, as the feet of a trot are.
+    """
+    angle = 2 * torch.pi * frequency * state.time_s
+    moves = (state.command != 0).any(1)
+    return torch.stack((angle.sin(), angle.cos()), 1) * moves[:, None]
+
+
 @mirrors(JOINTS, JOINTS, VECTOR, ROTATION, VECTOR)
 def true_proprioception(state: EnvState, joint_vel_scale: float = 1.0, ang_vel_scale: float = 1.0) -> torch.Tensor:
     """The 33 proprioceptive values without latency or noise: privileged."""

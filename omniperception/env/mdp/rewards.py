@@ -6,6 +6,8 @@ lists the eleven of `rewards=paper`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from omniperception.env.state import EnvState, requires
@@ -91,6 +93,19 @@ def closing_speed(state: EnvState, horizon: float, margin: float) -> torch.Tenso
     closest = (pos + rel_vel * time[..., None]).norm(dim=-1) - radius
     danger = (1 - closest.clamp(min=0.0) / margin).clamp(min=0.0) * (1 - time / horizon)
     return (danger * active).amax(1)
+
+
+@requires("foot_force")
+def foot_timing(state: EnvState, frequency: float, offsets: Sequence[float], duty: float) -> torch.Tensor:
+    """Share of the feet that are down or up as a clock says; all should be down while the command is to stand.
+
+    A foot should be down during the first `duty` of its period, which begins `offsets` of a period after the clock's,
+    that of the observation `gait_phase` of the same `frequency` (Hz).
+    """
+    phase = frequency * state.time_s[:, None] - torch.tensor(offsets, device=state.device)
+    down = torch.remainder(phase, 1.0) < duty
+    down = down | (state.command == 0).all(1, keepdim=True)
+    return (down == state.foot_contact).float().mean(1)
 
 
 @requires("foot_force")
