@@ -39,6 +39,7 @@ NOTHING = {
     "frames_lost": None,
     "frames_late_s": None,
     "pushes": None,
+    "curriculum": None,
 }
 PAPER = NOTHING | {
     "lidar_mask": {"ratio": 0.1, "low": 0.0, "high": 0.3},

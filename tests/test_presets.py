@@ -20,7 +20,6 @@ COMPANIONS = {
     "commands/corridor": ["obstacles=corridor"],
     "obstacles/corridor": ["commands=corridor"],
     "lidar/none": BLIND,
-    "experiment/gait": ["init=unread"],
 }
 """What a preset needs beside it."""
 QUICK = ["perception=none", "lidar.selection=every_kth"]
@@ -29,7 +28,7 @@ LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
 
 
 def test_no_preset_is_missed():
-    assert len(PRESETS) == 97
+    assert len(PRESETS) == 103
     groups = {preset.split("/")[0] for preset in PRESETS}
     assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()} - {"suite"}
     assert set(COMPANIONS) <= set(PRESETS)
