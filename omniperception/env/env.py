@@ -320,7 +320,7 @@ class OmniEnv(VecEnv):
         if config.initial_level is None:
             seconds, error = config.log_interval * self.control_dt, self.metrics.calm_velocity_error()
             for curriculum in self._curricula().values():
-                curriculum.raise_level(error, seconds)
+                curriculum.follow(error, seconds)
         log: dict[str, float] = {f"Metrics/{name}_level": part.level for name, part in self._curricula().items()}
         log |= self.metrics.drain()
         log |= {f"Anomalies/{name}": count for name, count in self.sim.anomalies().items()}
@@ -342,7 +342,7 @@ class OmniEnv(VecEnv):
             part.level = level
 
     def _curricula(self) -> dict[str, ObstacleField | Curriculum]:
-        """Curricula that rise while robots walk well, by their names in the log."""
+        """Curricula that follow how well robots walk, by their names in the log."""
         curricula: dict[str, ObstacleField | Curriculum] = {"randomization": self.difficulty}
         if self.obstacles is not None:
             curricula["obstacle"] = self.obstacles

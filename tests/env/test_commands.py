@@ -241,15 +241,15 @@ def test_the_curriculum_widens_the_ranges_while_robots_walk_well():
     low, high = torch.tensor([-0.5, -0.3, 0.2]), torch.tensor([1.0, 0.3, 0.8])
     assert (command.value >= 0.3 * low).all() and (command.value <= 0.3 * high).all()
     torch.testing.assert_close(command.value.amax(0), 0.3 * high, atol=0.01, rtol=0)
-    command.curriculum.raise_level(0.21, 1.0)
-    assert command.curriculum.level == 0.3
-    for _ in range(2):
-        command.curriculum.raise_level(0.19, 1.0)
+    command.curriculum.follow(0.21, 1.0)
+    assert command.curriculum.level == 0.3  # never below its start
+    for error in (0.19, 0.19, 0.19, 0.21):
+        command.curriculum.follow(error, 1.0)
     assert command.curriculum.level == pytest.approx(0.5)
     other = velocity_command(curriculum=curriculum)
     other.load_state_dict(command.state_dict())
     assert other.curriculum.level == command.curriculum.level
-    command.curriculum.raise_level(0.0, 100.0)
+    command.curriculum.follow(0.0, 100.0)
     assert command.curriculum.level == 1.0
     command.reset(torch.arange(N), None)
     torch.testing.assert_close(command.value.amax(0), high, atol=0.02, rtol=0)

@@ -296,9 +296,9 @@ class TestCurriculum:
 
     def test_it_rises_while_robots_walk_well_and_lasts_in_a_checkpoint(self, make_env):
         env = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=2)
-        env.difficulty.raise_level(0.3, 1.0)
+        env.difficulty.follow(0.3, 1.0)
         assert env.difficulty.level == 0.0
-        env.difficulty.raise_level(0.1, 1.0)
+        env.difficulty.follow(0.1, 1.0)
         other = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=2)
         other.load_state_dict(env.state_dict())
         assert other.difficulty.level == env.difficulty.level == 0.5

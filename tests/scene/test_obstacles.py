@@ -99,13 +99,13 @@ class TestCurriculum:
         field = field_of(2, curriculum=CurriculumConfig(0.2, max_velocity_error=0.3, rise=0.1))
         levels = [field.level]
         for error in (0.29, 0.19, 0.3, 0.29, *[0.1] * 20):  # 0.29 is good enough to go on, not to start
-            field.raise_level(error, 1.0)
+            field.follow(error, 1.0)
             levels.append(field.level)
         assert levels[:5] == pytest.approx([0.0, 0.0, 0.1, 0.1, 0.2]) and levels[-1] == 1.0
 
     def test_without_a_curriculum_everything_is_there(self):
         field = field_of(2)
-        field.raise_level(0.0, 100.0)
+        field.follow(0.0, 100.0)
         assert field.level == 1.0
         reset(field, torch.zeros(2, 2))
         assert field.active.all()

@@ -1,4 +1,4 @@
-"""Curricula: shares of what is asked of a robot, which rise while it walks well."""
+"""Curricula: shares of what is asked of a robot, which rise while it walks well and fall while it does not."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CurriculumConfig:
-    """When a share rises, and how fast.
+    """When a share rises or falls, and how fast.
 
     Attributes:
-        start: the share at the beginning.
-        max_velocity_error: it rises while the error (m/s) of the linear velocity in calm moments is below.
-        rise: how much it rises per second of simulated time of each environment.
+        start: the share at the beginning, and the least.
+        max_velocity_error: it rises while the error (m/s) of the linear velocity in calm moments is below, and falls as
+            fast while it is above, so that robots learn at the edge of what they can do.
+        rise: how much it changes per second of simulated time of each environment.
     """
 
     start: float
@@ -28,7 +29,7 @@ class CurriculumConfig:
 
 
 class Curriculum:
-    """A share that rises while robots walk well.
+    """A share that rises while robots walk well, and falls while they do not.
 
     Attributes:
         level: the share, 0 to 1; 1 from the beginning without a curriculum.
@@ -38,11 +39,12 @@ class Curriculum:
         self._config = config
         self.level = 1.0 if config is None else config.start
 
-    def raise_level(self, velocity_error: float, seconds: float) -> None:
-        """Raises it if robots have walked well for `seconds`, with this error (m/s)."""
+    def follow(self, velocity_error: float, seconds: float) -> None:
+        """Takes in how robots have walked for `seconds`: with this error (m/s)."""
         config = self._config
-        if config is not None and velocity_error < config.max_velocity_error:
-            self.level = min(1.0, self.level + config.rise * seconds)
+        if config is not None:
+            change = config.rise * seconds * (1.0 if velocity_error < config.max_velocity_error else -1.0)
+            self.level = min(max(self.level + change, config.start), 1.0)
 
     def state_dict(self) -> dict:
         return {"level": self.level}
