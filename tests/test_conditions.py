@@ -70,7 +70,7 @@ ROBOT = PAPER | {
     "frames_late_s": (0.0, 0.1),
     "pushes": {"every_s": (5.0, 10.0), "speed": 0.5},
 }
-FROZEN = {"ideal": (1, NOTHING), "paper": (1, PAPER), "robot": (1, ROBOT)}
+FROZEN = {"ideal": (1, NOTHING), "paper": (2, PAPER), "robot": (2, ROBOT)}
 """Version and values of each condition. Results under one name and version are compared with each other."""
 
 
@@ -143,11 +143,11 @@ class TestRunDirectories:
 
     def test_a_run_records_its_condition(self, run_dir):
         run = build.assemble(config.load(run_dir))
-        assert run.condition == Condition("robot", 1) and values(run.env.randomization) == ROBOT
+        assert run.condition == Condition("robot", 2) and values(run.env.randomization) == ROBOT
 
     def test_another_condition_replaces_it(self, run_dir):
         run = build.assemble(config.load(run_dir, ["scenario=rod", "condition=paper"]))
-        assert run.condition == Condition("paper", 1) and values(run.env.randomization) == PAPER
+        assert run.condition == Condition("paper", 2) and values(run.env.randomization) == PAPER
 
     @pytest.mark.parametrize("change", ["randomization=lidar", "randomization.frames_lost=0.2"])
     def test_another_randomization_is_no_condition(self, run_dir, change):

@@ -2,10 +2,11 @@
 
 from dataclasses import fields
 
+import mujoco
 import pytest
 import torch
 
-from omniperception.env.mdp.randomization import RandomizationConfig
+from omniperception.env.mdp.randomization import RandomizationConfig, ground_solrefs
 from omniperception.lidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
 
 N = 300
@@ -117,15 +118,32 @@ def test_ground_friction(one_row):
 
 
 def test_ground_restitution(one_row):
-    """Stiffness stays; damping falls from critical (e = 0) to none (e = 1)."""
+    """Stiffness stays; damping falls from critical (e = 0) to that of a contact with e = 0.5 (ground 1, robot 0)."""
     env, half = one_row("ground_restitution", 0, 1), one_row("ground_restitution", 0.5, 0.5, num_envs=1)
     solref, of_half = (
         each.sim.model_field("geom_solref")[:, env.world.model.geom("ground").id] for each in (env, half)
     )
     assert (solref[:, 0] == -2500.0).all()
-    assert -100.0 <= solref[:, 1].min() < -50 and -2 < solref[:, 1].max() <= 0.0
-    # -ln(0.5) / hypot(pi, ln(0.5)) = 0.2154537
-    assert of_half[0, 1].item() == pytest.approx(-100 * 0.2154537, rel=1e-5)
+    # -ln(e) / hypot(pi, ln(e)): 0.2154537 of e = 0.5 and 0.4037127 of e = 0.25
+    assert -100.0 <= solref[:, 1].min() < -80 and -23 < solref[:, 1].max() <= -100 * 0.2154537
+    assert of_half[0, 1].item() == pytest.approx(-100 * 0.4037127, rel=1e-5)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+def test_restitution_leaves_the_friction(restitution):
+    """A block at 1 m/s is stopped by a friction of 0.8 after 0.13 s, whatever the ground's restitution."""
+    stiffness, damping = ground_solrefs(torch.tensor(restitution, dtype=torch.float64)).tolist()
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
+        <geom type="plane" size="9 9 1" friction="0.8" solref="{stiffness} {damping}" priority="1"/>
+        <body pos="0 0 0.1"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="4" friction="0.8"/></body>
+        </worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 400)
+    data.qvel[0] = 1.0
+    mujoco.mj_step(model, data, 40)
+    assert abs(data.qvel[0]) < 0.1 and 0.05 < data.qpos[0] < 0.12  # by Coulomb's law 0.064 m
 
 
 def test_no_restitution_throws_a_standing_robot(one_row):

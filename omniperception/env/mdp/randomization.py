@@ -131,7 +131,7 @@ class RandomizationConfig:
         payload_mass: mass (kg) carried at `payload_position`.
         com_x, com_y, com_z: displacement (m) of the base's centre of mass.
         ground_friction: sliding friction coefficient.
-        ground_restitution: coefficient of restitution.
+        ground_restitution: coefficient of restitution of the ground; see `ground_solrefs`.
         motor_strength: factor on the PD torque; the torque limit stays.
         joint_offset: calibration error (rad) of every joint, added to the joint targets.
         gravity_offset: acceleration (m/s^2) added to each axis of gravity.
@@ -216,6 +216,16 @@ class RandomizationConfig:
         return tuple(model for model in models if not isinstance(model, bool | None))
 
 
+def ground_solrefs(restitution: torch.Tensor) -> torch.Tensor:
+    """(..., 2) `geom_solref` of grounds with coefficients of restitution (...).
+
+    A contact has the mean of the ground's coefficient and the robot's own, which is 0, as PhysX has by default (and so
+    the paper's simulator). Contacts with coefficients beyond a half would have no friction left: with MuJoCo's
+    pyramidal cones what damps the rebound is also what slows down a sliding foot.
+    """
+    return contact_solrefs(0.5 * restitution)
+
+
 class Randomizer:
     """Draws each environment's physical parameters at its resets and writes them into the simulator's model."""
 
@@ -267,7 +277,7 @@ class Randomizer:
         if "ground_friction" in drawn:
             self._write("geom_friction", env_ids, drawn["ground_friction"], self._ground, 0)
         if "ground_restitution" in drawn:
-            self._write("geom_solref", env_ids, contact_solrefs(drawn["ground_restitution"]), self._ground)
+            self._write("geom_solref", env_ids, ground_solrefs(drawn["ground_restitution"]), self._ground)
         if "motor_strength" in drawn:
             for name in ("actuator_gainprm", "actuator_biasprm"):
                 self._write(name, env_ids, self._nominal_of(name) * drawn["motor_strength"])
