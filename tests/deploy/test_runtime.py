@@ -41,8 +41,8 @@ RECIPES = {
     "polar_rings": ("experiment=avoid", "init=unread"),
     "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
     "clock": ("experiment=walk", "observations=gait"),
-    "estimated": ("experiment=walk", "observations=walk_without_velocity"),
-    "polar_rings_estimated": ("experiment=avoid", "init=unread", "observations=walk_without_velocity"),
+    "estimated": ("experiment=walk", "observations=gait_without_velocity"),
+    "polar_rings_estimated": ("experiment=avoid", "init=unread", "observations=gait_without_velocity"),
     "motion_by_proximal": ("experiment=avoid", "init=unread", *overrides_of("pd_risknet_no_distal")),
 }
 ALIKE = {

@@ -1,5 +1,6 @@
 """Tables of the docs: from outcomes of trials, and those that stand there are those of the files."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -107,3 +108,15 @@ def test_a_figure_changed_by_hand_and_a_changed_file_are_found(data, capsys):
 def test_the_tables_of_the_docs_are_those_of_the_files():
     pages = (ROOT / "README.md", ROOT / "docs")
     main(Arguments(pages=pages, data=ROOT / "docs" / "lab" / "data", check=True))
+
+
+def test_every_result_on_the_test_split_is_noted():
+    names = ("run", "weights", "policy", "world", "terrain", "condition", "condition_version", "seed", "commit")
+    lab = ROOT / "docs" / "lab"
+    lines = [json.loads(line) for line in (lab / "evaluations.jsonl").read_text().splitlines()]
+    noted = {tuple(line[name] for name in names) for line in lines}
+    for path in (lab / "data").iterdir():
+        for record in read(path):
+            plain = record.plain()
+            if record.split == "test":
+                assert tuple(plain[name] for name in names) in noted, record.key

@@ -11,7 +11,7 @@ from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
 GROUPS = {"actor": ["state"]}
 SMALL = (
     "experiment=walk",
-    "observations=walk_without_velocity",
+    "observations=gait_without_velocity",
     "num_envs=16",
     "ppo.hidden_dims=[16]",
     "sim.num_threads=1",
@@ -66,7 +66,7 @@ def test_a_run_learns_estimates_and_measures_by_them():
     run = build.assemble(config.compose([*SMALL, "randomization=robot", "ppo.symmetry=true"]))
     runner = build.build_runner(run, None)
     actor, env = runner.alg.actor, runner.env
-    assert actor.obs_dim == env.get_observations()["proprioception"].shape[1] + 3 + 12
+    assert actor.obs_dim == env.get_observations()["proprioception"].shape[1] + 3 + 12 + 2
     weights = [p.detach().clone() for p in actor.estimator.parameters()]
     runner.learn(2)
     assert all((p != before).any() for p, before in zip(actor.estimator.parameters(), weights, strict=True))
