@@ -126,7 +126,7 @@ LINES = [
     ("train robot.mounts.head.exclude_geoms=[nose]", "nose"),
     ("train init=nowhere", "init=nowhere"),
     ("train suite=held_out", "suite=held_out is unknown"),
-    ("train experiment=gait", "init=<run of experiment=walk> does not exist; give a run directory or init=latest"),
+    ("train experiment=avoid init=nowhere", "init=nowhere does not exist; give a run directory or init=latest"),
     ("train experiment=walk ppo.num_learning_epochs=0", "ppo.num_learning_epochs=0 keeps the policy as it is"),
     ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape,weight:1.0}", "has shape (3, 5), expected (2,)"),
     ("train +rewards.terms.mine={func:wrong_input_terms.not_a_tensor,weight:1.0}", "rewards.terms.mine"),

@@ -265,7 +265,7 @@ def test_wrong_points_are_named(exported_run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 99}, "format version 99, this program reads 1"),
+        ({"version": 99}, "format version 99, this program reads 2"),
         ({"format": "something"}, "describes no exported policy"),
         ({"joints": None}, "is incomplete"),
         ({"observations": []}, "the network's inputs are"),

@@ -64,7 +64,7 @@ class TestOverlay:
 
     def test_every_scenario_has_a_seed_of_its_own(self):
         seeds = [config.compose([f"scenario={name}"]).seed for name in config.presets("scenario")]
-        assert len(set(seeds)) == len(seeds) == 19
+        assert len(set(seeds)) == len(seeds) == 21
 
 
 class TestScenes:
