@@ -67,10 +67,7 @@ def build_obstacles(
     """The obstacles, where there are some."""
     if not config.obstacles.num_obstacles:
         return None
-    field = ObstacleField(config.obstacles, sim.mocap_pos, sim.mocap_quat, random, ground)
-    if config.initial_level is not None:
-        field.level = config.initial_level
-    return field
+    return ObstacleField(config.obstacles, sim.mocap_pos, sim.mocap_quat, random, ground)
 
 
 def build_avoidance(config: EnvConfig, field: ObstacleField | None, device: torch.device) -> Avoidance | None:

@@ -58,7 +58,9 @@ def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvCon
     config = replace(config, rewards=replace(config.rewards, terms={}), shows_frames=name not in BASELINES)
     if isinstance(config.commands, VelocityCommandConfig):
         config = replace(config, read_besides=(FOOT_FORCE,))  # for the figures of a gait
-    return replace(config, lidar=lidar, read_besides=(MEASURED_CLOUD,)) if name in ("stop", "histogram") else config
+    if name in ("stop", "histogram"):
+        config = replace(config, lidar=lidar, read_besides=(*config.read_besides, MEASURED_CLOUD))
+    return config
 
 
 def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:

@@ -67,6 +67,7 @@ def watch(env: OmniEnv, policy: Policy) -> Footfall:
     with torch.no_grad():
         for step in range(round((SETTLES_S + SHOWN_S) / env.control_dt)):
             env.command.value.copy_(wanted)
+            env.command.time_left.fill_(torch.inf)  # none is drawn, so that what follows from the command stays, too
             env.observations["command"].copy_(wanted)
             env.step(policy(env.get_observations()))
             if step * env.control_dt >= SETTLES_S:

@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, cast
+
+from omegaconf import OmegaConf
 
 from omniperception import config
 from omniperception.common.figures import new_figure
@@ -78,14 +81,14 @@ def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors:
         rows: of it.
         factors: of the ranges.
     """
-    values = config.compose([f"randomization={preset}"])["randomization"]
+    values = _rows(preset)
     unknown = [row for row in rows if row not in values]
     if unknown:
         raise ConfigError(f"rows={','.join(unknown)} are unknown; {config.suggest(unknown[0], tuple(values))}")
     parts = [("", 0.0)] + [(row, factor) for row in rows for factor in factors if factor > 0]
     found = []
     for row, factor in parts:
-        override = (stretched(row, _plain(values[row]), factor),) if row else ()
+        override = (stretched(row, values[row], factor),) if row else ()
         changed = replace(
             evaluation, condition=None, overrides=(*evaluation.overrides, "randomization=none", *override)
         )
@@ -95,10 +98,10 @@ def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors:
 
 def rows_of_the_robot(preset: str) -> tuple[str, ...]:
     """Rows of a preset that are there and change the robot, its ground or what it measures of itself."""
-    values = config.compose([f"randomization={preset}"])["randomization"]
+    values = _rows(preset)
     others = ("payload_position", "frames_lost", "frames_late_s")
     chosen = [row for row in values if not row.startswith("lidar_") and row not in others and values[row] is not None]
-    return tuple(map(str, chosen))
+    return tuple(chosen)
 
 
 def measure(measurements: Sequence[Stretch]) -> list[tuple[Stretch, Record]]:
@@ -129,7 +132,7 @@ def draw(measured: Sequence[tuple[Stretch, Record]], path: Path) -> None:
     figure = new_figure(2.6 * columns, 2.0 * lines + 0.4)
     axes = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for axis, row in zip(axes, rows, strict=False):
-        points = sorted((s.factor, r) for s, r in measured if s.row in (row, ""))
+        points = sorted(((s.factor, r) for s, r in measured if s.row in (row, "")), key=lambda point: point[0])
         at = [factor for factor, _ in points]
         falls = [rate(_part(record).fell) for _, record in points]
         middle = [100 * fall["rate"] for fall in falls]
@@ -162,7 +165,6 @@ def _cell(record: Record | None) -> str:
     return "–" if record is None else f"{rate_cell([_part(record).fell])} / {_error(record):.2f}"
 
 
-def _plain(value: object) -> object:
-    from omegaconf import OmegaConf
-
-    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+def _rows(preset: str) -> dict[str, Any]:
+    """The rows of a preset of `randomization`, as plain data."""
+    return cast(dict, OmegaConf.to_container(config.compose([f"randomization={preset}"])["randomization"]))

@@ -303,7 +303,7 @@ def evaluate(evaluation: Evaluation) -> list[Record]:
         new_figure(1.0, 1.0)  # refuses now what would fail after hours
     tasks = evaluation.tasks()
     ordered = measure_all(tasks)
-    print(f"\n{(walking_table if ordered[0].episodes.walking is not None else table)(ordered)}")
+    print(f"\n{(walking_table if all(record.episodes.walking for record in ordered) else table)(ordered)}")
     if evaluation.plots:
         _draw(tasks, ordered)
     if evaluation.out is not None:

@@ -253,7 +253,7 @@ class GoalCommand:
             self.route_w = self.goal_w.new_zeros(len(self.goal_w), *route.shape[1:])
             self.along = self.goal_w.new_zeros(self.route_w.shape[:2])
         self.route_w[env_ids] = route.to(self.route_w.dtype)
-        self.along[env_ids, 1:] = route.to(self.route_w.dtype).diff(dim=1).norm(dim=-1).cumsum(1)
+        self.along[env_ids] = _along(self.route_w[env_ids])
         self.progress[env_ids] = 0.0
         self._steer(kinematics)
 
@@ -313,4 +313,9 @@ class GoalCommand:
         self.elapsed.copy_(state["elapsed"])
         if "route_w" in state:
             self.route_w, self.progress = state["route_w"].clone(), state["progress"].clone()
-            self.along = F.pad(self.route_w.diff(dim=1).norm(dim=-1).cumsum(1), (1, 0))
+            self.along = _along(self.route_w)
+
+
+def _along(route: torch.Tensor) -> torch.Tensor:
+    """(n, R) m, the way along routes (n, R, 2) from their starts to their points."""
+    return F.pad(route.diff(dim=1).norm(dim=-1).cumsum(1), (1, 0))
