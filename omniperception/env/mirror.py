@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.terms import JOINTS, ROTATION, VECTOR
+from omniperception.env.mdp.terms import JOINT_MAGNITUDES, JOINTS, ROTATION, VECTOR
 from omniperception.scene import RobotConfig
 
 
@@ -109,9 +109,11 @@ def _parts(
             f"ppo.symmetry=true: {name} does not say how it looks in the mirror; declare it with @mirrors(...), or set"
             " ppo.symmetry=false"
         )
+    index, _ = joints
+    of_joints = {JOINTS: joints, JOINT_MAGNITUDES: (index, np.ones(len(index), np.float32))}
     parts = []
     for part in declared:
-        parts.append(joints if part == JOINTS else (np.arange(len(part)), np.asarray(part, np.float32)))
+        parts.append(of_joints[part] if part in of_joints else (np.arange(len(part)), np.asarray(part, np.float32)))
     total = sum(len(index) for index, _ in parts)
     if len(parts) == 1 and width % total == 0:
         parts, total = parts * (width // total), width

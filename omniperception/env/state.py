@@ -93,6 +93,7 @@ class EnvState:
         default_joint_pos, joint_lower, joint_upper: (num_joints,) rad.
         joint_torque_limit: (num_joints,) N m.
         default_base_height: m, of the default pose.
+        drawn_physics: (num_envs, W) what randomization drew; see `Randomizer.drawn`.
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class EnvState:
             sim: the physics.
             control_dt: s.
             command: source of the commands.
-            randomizer: tells how late `measured` is.
+            randomizer: of the physics; tells how late `measured` is.
             obstacles: None without any.
             height_lookup: heights above ground that is not flat; None on a plane at 0.
             avoidance: source of V_avoid.
@@ -136,6 +137,7 @@ class EnvState:
         self.default_base_height = robot.base_height
         self._foot_geoms = tuple(model.geom(name).id for name in robot.foot_geoms)
         self.actions: tuple[torch.Tensor, ...] = (torch.zeros(self.num_envs, robot.num_joints, device=self.device),) * 3
+        self.drawn_physics = randomizer.drawn
         self._history = None if randomizer.delay is None else StateHistory(sim, randomizer)
         self._foot_times: ContactTimes | None = None
         self.before = self.kinematics
@@ -290,15 +292,20 @@ class EnvState:
 
     # ---- feet, in the order of robot.foot_geoms ----------------------------------------------------------------------
 
-    @lazy
+    @property
     def foot_pos_w(self) -> torch.Tensor:
         """(num_envs, F, 3) m, environment frame: centres of the foot geoms."""
-        return self._sim.geom_poses(self._foot_geoms)[0]
+        return self.foot_motion[0]
 
-    @lazy
+    @property
     def foot_vel_w(self) -> torch.Tensor:
         """(num_envs, F, 3) m/s, environment frame: of the same points."""
-        return self._sim.geom_velocities(self._foot_geoms)
+        return self.foot_motion[1]
+
+    @lazy
+    def foot_motion(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """`foot_pos_w` and `foot_vel_w`, which the simulator has at once."""
+        return self._sim.geom_motion(self._foot_geoms)
 
     @lazy
     def foot_contact(self) -> torch.Tensor:

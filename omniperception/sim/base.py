@@ -111,8 +111,8 @@ class Simulator(Protocol):
     def geom_poses(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions (num_envs, n, 3) (m) and rotation matrices (num_envs, n, 3, 3) of geoms, likewise."""
 
-    def geom_velocities(self, geoms: tuple[int, ...]) -> torch.Tensor:
-        """Linear velocities (num_envs, n, 3) (m/s, world) of the centres of geoms at the current state, float32."""
+    def geom_motion(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions (m) and linear velocities (m/s), (num_envs, n, 3) each, of the centres of geoms, likewise."""
 
     def resize(self, geoms: tuple[int, ...], env_ids: torch.Tensor, sizes: torch.Tensor) -> None:
         """Gives geoms, k of them, sizes of their own in environments `env_ids` (n,), and contacts follow.

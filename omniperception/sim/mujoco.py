@@ -255,16 +255,17 @@ class MujocoSimulator:
         pos, mat = (field[:, index].astype(np.float32) for field in self._geom_poses)
         return torch.from_numpy(pos), torch.from_numpy(mat.reshape(*pos.shape, 3))
 
-    def geom_velocities(self, geoms: tuple[int, ...]) -> torch.Tensor:
+    def geom_motion(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         if self._velocities is None:
             self._velocities = tuple(self.batch.bind(name) for name in ("geom_xpos", "cvel", "subtree_com"))
         self.batch.forward(stage=_STAGE_VEL)
         index, model = np.asarray(geoms), self.world.model
         body = model.geom_bodyid[index]
         pos, velocity, centre = self._velocities
-        offset = pos[:, index] - centre[:, model.body_rootid[body]]  # velocities are those at the tree's centre of mass
+        here = pos[:, index]
+        offset = here - centre[:, model.body_rootid[body]]  # velocities are those at the tree's centre of mass
         linear = velocity[:, body, 3:] + np.cross(velocity[:, body, :3], offset)
-        return torch.from_numpy(linear.astype(np.float32))
+        return torch.from_numpy(here.astype(np.float32)), torch.from_numpy(linear.astype(np.float32))
 
     def resize(self, geoms: tuple[int, ...], env_ids: torch.Tensor, sizes: torch.Tensor) -> None:
         """The engine derives from size and box what else bounds a geom and its body."""

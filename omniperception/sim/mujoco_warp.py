@@ -231,14 +231,15 @@ class MujocoWarpSimulator:
         index = self._index(geoms)
         return self._geom_pos[:, index], self._geom_mat[:, index]
 
-    def geom_velocities(self, geoms: tuple[int, ...]) -> torch.Tensor:
+    def geom_motion(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         self._launch("velocities", self._kinematics_and_velocities)
         model = self.world.model
         index, body = self._index(geoms), self._index(tuple(int(b) for b in model.geom_bodyid[list(geoms)]))
         root = self._index(tuple(int(b) for b in model.body_rootid[model.geom_bodyid[list(geoms)]]))
         velocity, centre = wp.to_torch(self.data.cvel)[:, body], wp.to_torch(self.data.subtree_com)[:, root]
-        offset = self._geom_pos[:, index] - centre  # velocities are those at the tree's centre of mass
-        return velocity[..., 3:] + torch.linalg.cross(velocity[..., :3], offset)
+        pos = self._geom_pos[:, index]
+        offset = pos - centre  # velocities are those at the tree's centre of mass
+        return pos, velocity[..., 3:] + torch.linalg.cross(velocity[..., :3], offset)
 
     def resize(self, geoms: tuple[int, ...], env_ids: torch.Tensor, sizes: torch.Tensor) -> None:
         if geoms not in self._sized:

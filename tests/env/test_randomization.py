@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from omniperception.env.mdp.randomization import RandomizationConfig, ground_solrefs
+from omniperception.env.mirror import Mirror
 from omniperception.lidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
 
 N = 300
@@ -271,6 +272,34 @@ def test_the_devices_own_noise_reaches_the_lidar(make_config, lidar, sigma, angl
 def test_noise_of_a_sensor_without_a_maker_is_refused(make_config):
     with pytest.raises(ValueError, match=r"randomization\.lidar_device needs a sensor whose maker states its noise"):
         make_config("randomization=device", "lidar=custom")
+
+
+def test_the_critic_sees_what_was_drawn(make_env):
+    """As the model that the physics has now tells, and mirrored as bodies are."""
+    env = make_env("experiment=gait", "terrain=flat", "randomization=paper", num_envs=6)
+    sim, model, body = env.sim, env.world.model, env.world.base_body
+    seen = env.get_observations()["physics"].double()
+    friction, restitution, strength, gravity, offset, late, masses, centre = seen.split([1, 1, 12, 3, 12, 1, 2, 3], 1)
+    torch.testing.assert_close(friction[:, 0], sim.model_field("geom_friction")[:, model.geom("ground").id, 0])
+    solrefs = sim.model_field("geom_solref")[:, model.geom("ground").id]
+    torch.testing.assert_close(ground_solrefs(restitution[:, 0]), solrefs)
+    torch.testing.assert_close(
+        strength, sim.model_field("actuator_gainprm")[:, :, 0] / torch.tensor(model.actuator_gainprm[:, 0])
+    )
+    torch.testing.assert_close(gravity, sim.model_field("opt.gravity") - torch.tensor(model.opt.gravity))
+    torch.testing.assert_close(offset.float(), env.randomizer.joint_offset)
+    assert ((late[:, 0] / 0.005).round().long() == env.randomizer.delay).all()
+    torch.testing.assert_close(masses.sum(1) + model.body_mass[body], sim.model_field("body_mass")[:, body])
+    share = (masses[:, :1] + model.body_mass[body]) / sim.model_field("body_mass")[:, body, None]
+    both = share * (torch.tensor(model.body_ipos[body]) + centre) + (1 - share) * torch.tensor([0.0, 0.0, 0.1])
+    torch.testing.assert_close(sim.model_field("body_ipos")[:, body], both.double(), atol=1e-6, rtol=1e-6)
+
+    image = Mirror(env)(env, env.get_observations().select("physics"), None)[0]["physics"][6:].double()
+    joints = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
+    sides = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+    hips = torch.tensor([-1.0, 1.0, 1.0] * 4, dtype=torch.float64)
+    mirrored = (friction, restitution, strength[:, joints], gravity * sides, offset[:, joints] * hips, late, masses)
+    assert torch.equal(image, torch.cat((*mirrored, centre * sides), 1))
 
 
 class TestCurriculum:

@@ -94,6 +94,8 @@ class TestTerms:
             ("velocity_tracking_with_avoidance", {"beta": 4.0}, [1.0, math.exp(-4 * (0.04 + 0.16))]),
             ("velocity_tracking", {"beta": 2.0}, [math.exp(-0.5), math.exp(-2 * (0.04 + 0.09))]),
             ("yaw_rate_tracking", {"beta": 2.0}, [math.exp(-0.5), 1.0]),
+            ("velocity_error", {}, [0.5, math.sqrt(0.04 + 0.09)]),
+            ("yaw_rate_error", {}, [0.5, 0.0]),
             ("capped_ray_distance", {"max_distance": 8.0}, [1.0, 0.25]),
             ("vertical_velocity_squared", {}, [0.25, 1.0]),
             ("roll_pitch_rate_squared", {}, [0.25, 0.0]),

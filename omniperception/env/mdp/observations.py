@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from omniperception.env.mdp.terms import JOINTS, ROTATION, VECTOR, mirrors
+from omniperception.env.mdp.terms import JOINT_MAGNITUDES, JOINTS, ROTATION, VECTOR, mirrors
 from omniperception.env.state import EnvState, requires
 
 
@@ -87,6 +87,13 @@ def true_base_lin_vel(state: EnvState) -> torch.Tensor:
 def base_height(state: EnvState) -> torch.Tensor:
     """Height (m) of the base origin above the ground, less the default pose's: privileged."""
     return state.base_height[:, None] - state.default_base_height
+
+
+# in the order of randomization.DRAWN
+@mirrors((1.0, 1.0), JOINT_MAGNITUDES, VECTOR, JOINTS, (1.0, 1.0, 1.0), VECTOR)
+def drawn_physics(state: EnvState) -> torch.Tensor:
+    """What randomization drew for the physics and the actuation; see `Randomizer.drawn`: privileged."""
+    return state.drawn_physics
 
 
 def heights(state: EnvState) -> torch.Tensor:

@@ -18,7 +18,7 @@ from omniperception.sim import Simulator
 Range = Sequence[float] | None
 
 _MASSES = {"added_mass", "payload_mass", "com_x", "com_y", "com_z"}
-_DRAWN = (
+DRAWN = (
     "ground_friction",
     "ground_restitution",
     "motor_strength",
@@ -239,7 +239,13 @@ class Randomizer:
         self._nominal: dict[str, torch.Tensor] = {}  # of what is randomized, when it is first drawn
         self._check_mass()
         self._shapes = self._drawn_shapes()
+        widths = [math.prod(shape) for shape in self._all_shapes().values()]
+        self.drawn = torch.zeros(sim.num_envs, sum(widths), device=sim.device)
+        """(num_envs, W) what was drawn, in the order of DRAWN and in its own units: a number for each joint of motor
+        strength and joint offset, three of gravity, one of every other row; 0 where not randomized."""
         if self._shapes:
+            every = torch.arange(sum(widths), device=sim.device).split(widths)
+            self._columns = torch.cat([c for name, c in zip(DRAWN, every, strict=True) if name in self._shapes])
             bounds = [getattr(config, name) for name, shape in self._shapes.items() for _ in range(math.prod(shape))]
             low, high = torch.tensor(bounds, dtype=torch.float64, device=sim.device).unbind(1)
             self._low, self._span = low.float(), (high - low).float()
@@ -292,12 +298,12 @@ class Randomizer:
 
     def state_dict(self) -> dict:
         """Parameters that live outside the physics model."""
-        return {"joint_offset": self.joint_offset, "delay": self.delay}
+        return {"drawn": self.drawn, "joint_offset": self.joint_offset, "delay": self.delay}
 
     def load_state_dict(self, state: dict) -> None:
-        for mine, saved in ((self.joint_offset, state["joint_offset"]), (self.delay, state["delay"])):
+        for name, mine in self.state_dict().items():
             if mine is not None:
-                mine.copy_(saved)
+                mine.copy_(state[name])
 
     def _write(self, field: str, env_ids: torch.Tensor, values: torch.Tensor, *index: int) -> None:
         """Writes float64 values into a model field of some environments, at an index, in the engine's precision."""
@@ -317,9 +323,13 @@ class Randomizer:
 
     def _drawn_shapes(self) -> dict[str, tuple[int, ...]]:
         """Parameters and shapes that are drawn for one environment, in the order of the draws."""
-        joints, config = self._sim.world.robot.num_joints, self.config
-        shapes = {"motor_strength": (self._model.nu, 1), "gravity_offset": (3,), "joint_offset": (joints,)}
-        return {name: shapes.get(name, ()) for name in _DRAWN if getattr(config, name) is not None}
+        return {name: shape for name, shape in self._all_shapes().items() if getattr(self.config, name) is not None}
+
+    def _all_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Likewise of all that could be drawn."""
+        joints = self._sim.world.robot.num_joints
+        shapes = {"motor_strength": (joints, 1), "gravity_offset": (3,), "joint_offset": (joints,)}
+        return {name: shapes.get(name, ()) for name in DRAWN}
 
     def _neutral_of(self, name: str) -> torch.Tensor:
         """(1,) float64: what a parameter is without randomization."""
@@ -333,6 +343,7 @@ class Randomizer:
         values = (self._low + self._span * u).double()
         if self._curriculum.level < 1.0:
             values = self._neutral + self._curriculum.level * (values - self._neutral)
+        self.drawn[env_ids[:, None], self._columns] = values.float()
         parts = values.split([math.prod(shape) for shape in self._shapes.values()], 1)
         shapes = self._shapes.items()
         return {name: part.reshape(-1, *shape) for (name, shape), part in zip(shapes, parts, strict=True)}

@@ -32,6 +32,16 @@ def yaw_rate_tracking(state: EnvState, beta: float) -> torch.Tensor:
     return torch.exp(-beta * error.square())
 
 
+def velocity_error(state: EnvState) -> torch.Tensor:
+    """|v_xy - v_cmd|, m/s: unlike `velocity_tracking` as steep far from the command as near it."""
+    return (state.kinematics.base_lin_vel_yaw - state.command[:, :2]).norm(dim=1)
+
+
+def yaw_rate_error(state: EnvState) -> torch.Tensor:
+    """|w_z - w_cmd|, rad/s."""
+    return (state.kinematics.base_ang_vel_b[:, 2] - state.command[:, 2]).abs()
+
+
 @requires("distal_range")
 def capped_ray_distance(state: EnvState, max_distance: float) -> torch.Tensor:
     """r_rays = sum_i min(d_i, d_max) / (n d_max) over the distal LiDAR rays; a miss counts as d_max."""

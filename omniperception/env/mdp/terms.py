@@ -48,6 +48,8 @@ def build_term(term: Term) -> Callable[[EnvState], torch.Tensor]:
 
 JOINTS = "joints"
 """A part of a term that has a number for each joint."""
+JOINT_MAGNITUDES = "joint magnitudes"
+"""Likewise, of numbers without a direction, such as strengths."""
 VECTOR = (1.0, -1.0, 1.0)
 """Signs of x, y, z under the reflection that maps left to right."""
 ROTATION = (-1.0, 1.0, -1.0)
@@ -55,8 +57,8 @@ ROTATION = (-1.0, 1.0, -1.0)
 
 
 def mirrors(*parts: str | Sequence[float]) -> Callable[[Marked], Marked]:
-    """Declares how an observation term looks in the mirror: JOINTS, or signs, part by part. A part that is the only one
-    is repeated as often as the term is wide."""
+    """Declares how an observation term looks in the mirror: JOINTS, JOINT_MAGNITUDES or signs, part by part. A part
+    that is the only one is repeated as often as the term is wide."""
 
     def mark(term: Marked) -> Marked:
         term.mirror = parts  # type: ignore[attr-defined]  # functions and classes take attributes
