@@ -120,8 +120,8 @@ class PPOConfig:
         hidden_dims: hidden layers of the actor and of the critic.
         init_std: initial standard deviation of the actions.
         obs_normalization: whether observations are normalised by running statistics.
-        mixed_precision: whether updates multiply matrices in bfloat16; None where the CPU has units for it (AMX), on
-            a GPU not.
+        mixed_precision: whether updates multiply matrices in bfloat16; None where the CPU has units for it (AMX, or
+            AVX-512 BF16), on a GPU not.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
         The others are rsl_rl's PPO arguments.
     """
@@ -189,9 +189,13 @@ class PPOConfig:
     @property
     def algorithm(self) -> dict[str, Any]:
         """Arguments of rsl_rl's `PPO`."""
-        amx = getattr(torch.cpu, "_is_amx_tile_supported", bool)()
-        mixed = amx if self.mixed_precision is None else self.mixed_precision
+        mixed = _cpu_multiplies_bfloat16() if self.mixed_precision is None else self.mixed_precision
         return {name: getattr(self, name) for name in _RSL_RL} | {"use_mixed_precision": mixed}
+
+
+def _cpu_multiplies_bfloat16() -> bool:
+    """Tell whether the CPU has units for bfloat16; older versions of PyTorch know of fewer kinds."""
+    return any(getattr(torch.cpu, f"_is_{kind}_supported", bool)() for kind in ("amx_tile", "avx512_bf16"))
 
 
 _RSL_RL = (
