@@ -186,7 +186,7 @@ def _value(field: dataclasses.Field, hint: Any, text: str) -> Any:
         return _single(field, hint, text)
     parts = text.strip("[]").split(",")
     values = tuple(_single(field, hint.__args__[0], part.strip()) for part in parts)
-    if len(set(values)) < len(values):
+    if hint.__args__[0] is str and len(set(values)) < len(values):
         raise ConfigError(f"{field.name}={text} names one twice")
     return values
 

@@ -48,7 +48,7 @@ FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
 def blocks() -> dict[str, str]:
     """The blocks of Python of the LiDAR's page, by what is in and out of them."""
     found = re.findall(r"```python\n(.*?)```", LIDAR.read_text(), flags=re.DOTALL)
-    return dict(zip(("numpy", "torch", "mujoco", "simulators", "mesh", "sizes", "table"), found, strict=True))
+    return dict(zip(("numpy", "torch", "mujoco", "simulators", "mesh", "sizes", "table", "files"), found, strict=True))
 
 
 @pytest.fixture
@@ -226,3 +226,11 @@ def test_a_scan_table(run):
     np.testing.assert_allclose(torch.linalg.vector_norm(first[:, :2], dim=1), radius, rtol=1e-4)
     steps = torch.atan2(second[:, 1], second[:, 0]) - torch.atan2(first[:, 1], first[:, 0])
     np.testing.assert_allclose(np.mod(steps.numpy() + 1e-3, 2 * np.pi), 1e-3, atol=1e-4)  # 1000 points are a turn
+
+
+def test_files(run, capsys):
+    names = run("files")
+    told = capsys.readouterr().out.strip()
+    assert f"print(frame)  # {told}" in LIDAR.read_text()
+    torch.testing.assert_close(names["again"].points_w, names["frame"].points_w[1:], equal_nan=True, rtol=0.0, atol=0.0)
+    assert set(names["table"].names) == {"x", "y", "z", "ranges", "class_id"}

@@ -31,6 +31,7 @@ EXTRAS = {
     "onnx": "export",
     "onnxruntime": "deploy",
     "trimesh": "meshes",
+    **dict.fromkeys(("laspy", "mcap", "mcap_ros2", "pypcd4", "rosbags"), "clouds"),
 }
 """Extra of this package that brings each library."""
 

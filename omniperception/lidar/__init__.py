@@ -48,23 +48,27 @@ from .patterns import (
 )
 
 if TYPE_CHECKING:
+    from .clouds import PointTable, read_points, read_scans, write_points, write_scans
+    from .frame import OUTPUTS, LidarFrame
     from .heightfield import HeightField
     from .meshes import TriangleMesh
     from .motion import PoseTrack
     from .mujoco import GeomShapes, MujocoScene, geom_shapes
     from .scene import RayHits, RayScene
     from .sectors import SectorDistances, sector_distances
-    from .sensor import OUTPUTS, Lidar, LidarConfig, LidarFrame, env_slices, quat_from_rpy, ray_bytes
+    from .sensor import Lidar, LidarConfig, env_slices, quat_from_rpy, ray_bytes
     from .shapes import Shape, ShapeKind
 
 _LOADED_WHEN_USED = {
+    "clouds": ("PointTable", "read_points", "read_scans", "write_points", "write_scans"),
+    "frame": ("OUTPUTS", "LidarFrame"),
     "heightfield": ("HeightField",),
     "meshes": ("TriangleMesh",),
     "motion": ("PoseTrack",),
     "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
     "scene": ("RayHits", "RayScene"),
     "sectors": ("SectorDistances", "sector_distances"),
-    "sensor": ("OUTPUTS", "Lidar", "LidarConfig", "LidarFrame", "env_slices", "quat_from_rpy", "ray_bytes"),
+    "sensor": ("Lidar", "LidarConfig", "env_slices", "quat_from_rpy", "ray_bytes"),
     "shapes": ("Shape", "ShapeKind"),
 }
 
@@ -86,6 +90,7 @@ __all__ = [
     "MixedPixels",
     "MujocoScene",
     "Noise",
+    "PointTable",
     "PoseTrack",
     "RayHits",
     "RayScene",
@@ -117,12 +122,16 @@ __all__ = [
     "ouster",
     "quat_from_rpy",
     "ray_bytes",
+    "read_points",
+    "read_scans",
     "sector_distances",
     "select_rows",
     "spinning",
     "tele15",
     "vlp16",
     "vlp32c",
+    "write_points",
+    "write_scans",
     "xt16",
     "xt32",
 ]

@@ -70,15 +70,48 @@ class TriangleMesh:
         """A mesh in any format that trimesh reads (extra ``meshes``), all its parts together, times ``scale``.
 
         Raises:
+            FileNotFoundError: There is no such file.
             ImportError: trimesh is not installed.
+            ValueError: It is no mesh.
         """
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"mesh {path} does not exist")
         try:
             import trimesh
         except ImportError:
             raise ImportError(f"reading {path} needs trimesh: pip install 'omniperception[meshes]'") from None
-        mesh = trimesh.load(path, force="mesh", process=False)
-        assert isinstance(mesh, trimesh.Trimesh)  # forced
+        try:
+            mesh = trimesh.load(path, force="mesh", process=False)
+        except Exception as error:  # trimesh raises whatever its parsers meet
+            raise ValueError(f"mesh {path} cannot be read: {str(error).splitlines()[0]}") from error
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            raise ValueError(f"mesh {path} holds no triangles")
         return cls(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces)
+
+    @cached_property
+    def is_closed(self) -> bool:
+        """Whether each edge belongs to two triangles that run along it in opposite ways: there is an inside."""
+        _, number = np.unique(self.vertices, axis=0, return_inverse=True)  # corners in one place are one corner
+        corners = number.reshape(-1)[self.triangles]
+        edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+        one_way, count = np.unique(edges, axis=0, return_counts=True)
+        return (
+            len(edges) > 0 and bool((count == 1).all()) and np.array_equal(one_way, np.unique(edges[:, ::-1], axis=0))
+        )
+
+    def encloses(self, point: np.ndarray) -> bool:
+        """Whether a point, (3,), lies inside: the triangles' solid angles around it add up to 4 pi.
+
+        False for a mesh that is not closed. The solid angle is that of van Oosterom and Strackee (1983).
+        """
+        if not self.is_closed:
+            return False
+        a, b, c = np.moveaxis(self.vertices[self.triangles].astype(np.float64) - point, 1, 0)
+        la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+        dots = [np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (a, c), (b, c))]
+        angle = 2.0 * np.arctan2(volume, la * lb * lc + dots[0] * lc + dots[1] * lb + dots[2] * la)
+        return abs(float(angle.sum())) > 2.0 * np.pi
 
     @property
     def half_extents(self) -> tuple[float, float, float]:

@@ -4,13 +4,14 @@ import itertools
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
 import torch
 import warp as wp
 
+from .frame import INTEGERS, OUTPUTS, VECTORS, LidarFrame
 from .kernels.march_block import BLOCK
 from .kernels.motion import Track
 from .kernels.noise import noise_parameters
@@ -109,62 +110,6 @@ class LidarConfig:
         return self.mount_quat or quat_from_rpy(*(self.mount_rpy or (0.0, 0.0, 0.0)))
 
 
-@dataclass(frozen=True)
-class LidarFrame:
-    """One scan of every environment. The tensors are the sensor's own and are overwritten by the next cast.
-
-    A field that was not asked for is None: it is neither computed nor stored. Noise disturbs ``ranges``, and with it
-    ``valid`` and the points; everything else describes the surface that the ray really hit.
-
-    Attributes:
-        ranges: Measured distance along each ray with noise, metres, ``inf`` for a miss, (num_envs, N).
-        true_ranges: The same without noise; the very tensor ``ranges`` when no noise is configured.
-        valid: Whether the ray measured a distance, (num_envs, N) bool.
-        points_s: Measured points in the sensor's frame, metres, NaN for a miss, (num_envs, N, 3).
-        points_b: The same in the frame of the body that carries the sensor, (num_envs, N, 3). With motion
-            distortion, each point is in the sensor's and the body's frame at its own time, as a device reports it.
-        points_w: The same in the environment's frame, from the sensor's pose at each point's time, (num_envs, N, 3).
-        normals_w: Outward unit normal of the surface in the environment's frame, zero for a miss, (num_envs, N, 3).
-        incidence: Angle between the ray and the surface's normal, rad in [0, pi/2], NaN for a miss, (num_envs, N).
-        intensity: reflectivity * cos(incidence) * (reference_range / true range)^2, Lambert's law for a beam that the
-            surface catches whole; 1 is a white wall seen perpendicularly at ``config.reference_range``, 0 a miss,
-            (num_envs, N).
-        body_id: Body that carries the shape that was hit, -1 for a fixed shape, -2 for a miss, (num_envs, N) int32.
-        shape_id: Index of that shape, -1 for a miss, (num_envs, N) int32.
-        class_id: Class of that shape, -1 for a miss, (num_envs, N) int32.
-        time_s: When each ray was emitted after the frame's start at ``time_s - period_s``, s, (num_envs, N).
-        directions_s: Unit direction of each ray in the sensor frame, (num_envs, N, 3).
-        elevation: Angle theta of each ray in the sensor frame, rad, (num_envs, N).
-        azimuth: Angle phi of each ray in the sensor frame, rad in [0, 2 pi), (num_envs, N).
-        row: Row of the scan pattern, (num_envs, N) int32.
-    """
-
-    ranges: torch.Tensor | None = None
-    true_ranges: torch.Tensor | None = None
-    valid: torch.Tensor | None = None
-    points_s: torch.Tensor | None = None
-    points_b: torch.Tensor | None = None
-    points_w: torch.Tensor | None = None
-    normals_w: torch.Tensor | None = None
-    incidence: torch.Tensor | None = None
-    intensity: torch.Tensor | None = None
-    body_id: torch.Tensor | None = None
-    shape_id: torch.Tensor | None = None
-    class_id: torch.Tensor | None = None
-    time_s: torch.Tensor | None = None
-    directions_s: torch.Tensor | None = None
-    elevation: torch.Tensor | None = None
-    azimuth: torch.Tensor | None = None
-    row: torch.Tensor | None = None
-
-
-OUTPUTS = tuple(field.name for field in fields(LidarFrame))
-"""Outputs that a LiDAR can report, by the names of ``LidarFrame``'s fields."""
-
-_VECTORS = ("points_s", "points_b", "points_w", "normals_w", "directions_s")
-_INTEGERS = ("body_id", "shape_id", "class_id", "row")
-
-
 class Lidar:
     """Casts one LiDAR per environment along its scan pattern.
 
@@ -220,6 +165,11 @@ class Lidar:
             envs_at_once: Environments whose frames exist at the same time; None for all. With fewer, ``cast_slices``
                 takes the place of ``cast``.
         """
+        if isinstance(mount_body, str):
+            raise ValueError(
+                f"lidar.mount_body={mount_body!r} must be a body's index: of a MujocoScene, "
+                f"scene.body_names.index({mount_body!r})"
+            )
         if not -1 <= mount_body < scene.num_bodies:
             raise ValueError(
                 f"lidar.mount_body={mount_body} must be in 0..{scene.num_bodies - 1}, or -1 (fixed sensor)"
@@ -343,9 +293,9 @@ class Lidar:
         def tensor(name: str) -> torch.Tensor:
             if name == "valid":
                 return torch.zeros(shape, dtype=torch.bool, device=device)
-            if name in _INTEGERS:
+            if name in INTEGERS:
                 return torch.zeros(shape, dtype=torch.int32, device=device)
-            return torch.zeros(*shape, 3, device=device) if name in _VECTORS else torch.zeros(shape, device=device)
+            return torch.zeros(*shape, 3, device=device) if name in VECTORS else torch.zeros(shape, device=device)
 
         tensors = {name: tensor(name) for name in self.outputs}
         if not self._noise and {"ranges", "true_ranges"} <= self.outputs:
@@ -485,13 +435,13 @@ class Lidar:
         arrays.first_env = first_env
         for name in written:
             tensor = getattr(self.frame, name)
-            setattr(arrays, name, wp.from_torch(tensor, dtype=wp.vec3) if name in _VECTORS else wp.from_torch(tensor))
+            setattr(arrays, name, wp.from_torch(tensor, dtype=wp.vec3) if name in VECTORS else wp.from_torch(tensor))
         return arrays
 
 
 def ray_bytes(outputs: Collection[str]) -> int:
     """Memory for one ray of a frame with these outputs, bytes."""
-    return sum(1 if name == "valid" else 12 if name in _VECTORS else 4 for name in outputs)
+    return sum(1 if name == "valid" else 12 if name in VECTORS else 4 for name in outputs)
 
 
 def env_slices(num_envs: int, most: int) -> tuple[slice, ...]:

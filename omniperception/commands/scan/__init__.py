@@ -2,9 +2,11 @@
 
     scan lidar=avia rays=20000 lidar.max_range=30
     scan lidar=mid360,avia,os0_128,vlp16        # each of them, and comparison.png
+    scan mesh=hall.stl scale=0.001 at=12,3,0    # in a mesh of your own, z up
 
 The room holds people, thin rods, a shelf without legs, a rock, rubble and the robot, which carries the sensor. Writes
-pattern.png, scan.png and scan.ply; the pictures need the extra `plots`.
+pattern.png, scan.png and the points; the pictures need the extra `plots`, a mesh `meshes`, other files than .ply and
+.npz `clouds`.
 """
 
 from __future__ import annotations
@@ -15,10 +17,11 @@ from pathlib import Path
 from omniperception import build, config
 from omniperception.cli import Command, argument
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
-from omniperception.commands.scan.room import demo_scene
+from omniperception.commands.scan.room import DemoScene, demo_scene, mesh_scene
 from omniperception.common.figures import PlotsUnavailable
+from omniperception.lidar import TriangleMesh
+from omniperception.scene import RobotConfig
 
-FILES = ("pattern.png", "scan.png", "scan.ply")
 NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
 """A sensor is looked at, no task is run."""
 
@@ -32,7 +35,11 @@ class Arguments:
     seed: int = argument(0, "seed of the moment at which the scan starts, and of random choices", least=0)
     rays: int | None = argument(None, "how many of the points are kept; null: all", least=1)
     seconds: float | None = argument(None, "how long the sensor measures; null: one frame of the preset", positive=True)
-    colour: str = argument("class", "of the points in scan.ply", choices=("class", "height"))
+    colour: str = argument("class", "of the points in the file", choices=("class", "height"))
+    cloud: str = argument("ply", "format of the points' file", choices=("ply", "pcd", "las", "npz", "mcap"))
+    mesh: Path | None = argument(None, "file of a mesh in place of the demonstration room, z up; null: the room")
+    scale: float = argument(1.0, "metres to which a unit of the mesh corresponds", positive=True)
+    at: tuple[float, ...] = argument((0.0, 0.0, 0.0), "where in the mesh the robot's feet stand (m)")
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
@@ -44,16 +51,28 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         composed = config.compose([*NO_TASK, f"lidar={name}", *overrides])
         env = build.assemble(composed).env
         assert env.lidar is not None  # only lidar=none has none
-        demo = demo_scene(env.robot)
+        demo = _surroundings(arguments, env.robot)
         scans.append(take_scan(name, env.lidar, demo, arguments.seconds, arguments.rays, arguments.seed))
         folder = out if arguments.out and len(arguments.lidar) == 1 else out / name
-        write_scan(scans[-1], env.lidar, demo, folder, arguments.colour)
-        print(f"{summary(scans[-1])}\nwritten: {', '.join(str(folder / file) for file in FILES)}", flush=True)
+        if demo.mesh is not None and demo.mesh.encloses(scans[-1].sensor_w):
+            print(f"{name}: the sensor is inside {arguments.mesh}, a closed surface, and sees it from within")
+        write_scan(scans[-1], env.lidar, demo, folder, arguments.colour, arguments.cloud)
+        files = ("pattern.png", "scan.png", f"scan.{arguments.cloud}")
+        print(f"{summary(scans[-1])}\nwritten: {', '.join(str(folder / file) for file in files)}", flush=True)
     if len(scans) > 1:
         draw_comparison(scans, demo, out / "comparison.png")
         print(f"written: {out / 'comparison.png'}")
 
 
+def _surroundings(arguments: Arguments, robot: RobotConfig) -> DemoScene:
+    if arguments.mesh is None:
+        return demo_scene(robot)
+    if len(arguments.at) != 3:
+        raise config.ConfigError(f"at={','.join(map(str, arguments.at))} must be three numbers, x,y,z in metres")
+    x, y, z = arguments.at
+    return mesh_scene(robot, TriangleMesh.from_file(arguments.mesh, arguments.scale), (x, y, z))
+
+
 command = Command(
-    main, Arguments, __doc__, "of the sensor's preset", (PlotsUnavailable, ModuleNotFoundError, ValueError)
+    main, Arguments, __doc__, "of the sensor's preset", (PlotsUnavailable, ImportError, FileNotFoundError, ValueError)
 )

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from omniperception.commands.scan.ply import write_ply
-from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, ROOM, DemoClass, DemoScene
+from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene
 from omniperception.common.figures import new_figure
 from omniperception.env.sensing import SensorConfig
-from omniperception.lidar import Lidar, ScanPattern
+from omniperception.lidar import Lidar, ScanPattern, write_points
+from omniperception.lidar.clouds import table_of
 
 DURATIONS_S = (0.1, 0.5, 1.0)
 CAMERA, TARGET, FOCAL = (-4.3, -6.2, 5.0), (0.85, -0.35, 0.15), 1.34
@@ -111,14 +111,18 @@ def take_scan(
     )
 
 
-def write_scan(scan: Scan, sensor: SensorConfig, demo: DemoScene, out: Path, colour: str = "class") -> None:
-    """Writes ``pattern.png``, ``scan.png`` and ``scan.ply`` (coloured by "class" or by "height") into ``out``."""
+def write_scan(
+    scan: Scan, sensor: SensorConfig, demo: DemoScene, out: Path, colour: str = "class", suffix: str = "ply"
+) -> None:
+    """Writes ``pattern.png``, ``scan.png`` and the points, coloured by "class" or by "height", into ``out``."""
     out.mkdir(parents=True, exist_ok=True)
     draw_pattern(scan.name, sensor.scan_pattern(), out / "pattern.png")
     draw_scan(scan, demo, out / "scan.png")
-    rgb = _class_colours(scan) if colour == "class" else _height_colours(scan)
-    fields = {"class_id": scan.class_id, "intensity": scan.intensity, "time_s": scan.time_s}
-    write_ply(out / "scan.ply", scan.points_w, (255.0 * rgb).round().astype(np.uint8), **fields)
+    rgb = _class_colours(scan) if colour == "class" else _height_colours(scan, demo)
+    columns = dict(zip("xyz", scan.points_w.T, strict=True))
+    columns |= dict(zip(("red", "green", "blue"), (255.0 * rgb).round().astype(np.uint8).T, strict=True))
+    columns |= {"class_id": scan.class_id, "intensity": scan.intensity, "time_s": scan.time_s}
+    write_points(out / f"scan.{suffix}", table_of(columns, "points_w"))
 
 
 def summary(scan: Scan) -> str:
@@ -167,10 +171,13 @@ def draw_scan(scan: Scan, demo: DemoScene, path: Path) -> None:
     """The points in the room from outside, as the sensor sees them, and from above."""
     figure = new_figure(14.0, 11.6)
     (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.55, 1.0))
-    _draw_outside(upper.subplots(), scan, demo, _picture(demo), mark_area=60_000.0)
+    if demo.mesh is None:
+        _draw_outside(upper.subplots(), scan, demo, _picture(demo), mark_area=60_000.0)
+    else:
+        _draw_points(upper.subplots(subplot_kw={"projection": "3d"}), scan)
     seen, above = lower.subplots(1, 2, width_ratios=(1.25, 1.0))
     _draw_ranges(seen, scan)
-    _draw_from_above(above, scan)
+    _draw_from_above(above, scan, demo)
     figure.set_layout_engine("constrained", w_pad=0.12)
     figure.suptitle(
         f"{scan.name}: one scan of {scan.seconds:g} s, {len(scan.ranges):,} of {scan.num_rays:,} rays hit", fontsize=14
@@ -182,9 +189,14 @@ def draw_comparison(scans: Sequence[Scan], demo: DemoScene, path: Path) -> None:
     """Several sensors' points in the room from outside, two beside each other."""
     rows = math.ceil(len(scans) / 2)
     figure = new_figure(14.0, 4.2 * rows)
-    panels, picture = figure.subplots(rows, 2, squeeze=False).ravel(), _picture(demo)
+    picture = _picture(demo) if demo.mesh is None else None
+    kind = None if demo.mesh is None else {"projection": "3d"}
+    panels = figure.subplots(rows, 2, squeeze=False, subplot_kw=kind).ravel()
     for axis, scan in zip(panels, scans, strict=False):
-        _draw_outside(axis, scan, demo, picture, mark_area=16_000.0)
+        if picture is None:
+            _draw_points(axis, scan)
+        else:
+            _draw_outside(axis, scan, demo, picture, mark_area=16_000.0)
         axis.set_title(f"{scan.name}, {scan.seconds:g} s: {len(scan.ranges):,} of {scan.num_rays:,} rays hit")
     for axis in panels[len(scans) :]:
         axis.set_axis_off()
@@ -212,6 +224,15 @@ def _draw_outside(axis, scan: Scan, demo: DemoScene, picture: np.ndarray, mark_a
     axis.text(0.01, 0.01, note, transform=axis.transAxes, fontsize=8, color="#555555")
 
 
+def _draw_points(axis, scan: Scan) -> None:
+    """Points by height, where no picture of the surroundings is drawn."""
+    x, y, z = scan.points_w.T
+    marks = axis.scatter(x, y, z, s=_dot(scan), c=z, cmap="viridis", linewidths=0)
+    axis.plot(*scan.sensor_w[:, None], "*", color="red", markersize=11)
+    axis.set(xlabel="x, m", ylabel="y, m", zlabel="z, m", aspect="equal")
+    axis.figure.colorbar(marks, ax=axis, label="height, m", shrink=0.7)
+
+
 def _draw_ranges(axis, scan: Scan) -> None:
     marks = axis.scatter(scan.across, scan.along, s=_dot(scan), c=scan.ranges, cmap="turbo", linewidths=0)
     axis.set(title="what the sensor sees", xlabel=scan.labels[0], ylabel=scan.labels[1])
@@ -220,16 +241,17 @@ def _draw_ranges(axis, scan: Scan) -> None:
     axis.figure.colorbar(marks, ax=axis, label="range, m")
 
 
-def _draw_from_above(axis, scan: Scan) -> None:
-    (left, right), (back, front), top = ROOM
+def _draw_from_above(axis, scan: Scan, demo: DemoScene) -> None:
+    (left, right), (back, front), top = demo.extent
     order = scan.points_w[:, 2].argsort()
     order = order[scan.points_w[order, 2] < top - 0.01]
     points = scan.points_w[order]
+    heights = {"vmin": 0.0, "vmax": 2.0} if demo.mesh is None else {}
     marks = axis.scatter(
-        points[:, 0], points[:, 1], s=_dot(scan), c=points[:, 2], cmap="viridis", vmin=0.0, vmax=2.0, linewidths=0
+        points[:, 0], points[:, 1], s=_dot(scan), c=points[:, 2], cmap="viridis", linewidths=0, **heights
     )
     axis.plot(*scan.sensor_w[:2], "*", color="red", markeredgecolor="white", markersize=12, label="sensor")
-    axis.set(title="from above, without the ceiling", xlabel="x, m", ylabel="y, m")
+    axis.set(title="from above, without the highest centimetre", xlabel="x, m", ylabel="y, m")
     axis.set(xlim=(left - 0.3, right + 0.3), ylim=(back - 0.3, front + 0.3), aspect="equal")
     axis.legend(loc="lower left", fontsize=8)
     axis.figure.colorbar(marks, ax=axis, label="height, m")
@@ -291,9 +313,9 @@ def _class_colours(scan: Scan) -> np.ndarray:
     return np.array([_rgb(COLOURS[kind]) for kind in DemoClass])[scan.class_id]
 
 
-def _height_colours(scan: Scan) -> np.ndarray:
-    """Blue on the floor over green to red at the ceiling."""
-    share = (scan.points_w[:, 2:] / ROOM[2]).clip(0.0, 1.0)
+def _height_colours(scan: Scan, demo: DemoScene) -> np.ndarray:
+    """Blue at the robot's feet over green to red at the ceiling."""
+    share = (scan.points_w[:, 2:] / max(demo.extent[2], 1e-6)).clip(0.0, 1.0)
     hue = np.array([0.0, 2.0, 4.0]) + 4.0 * (1.0 - share)  # sixths of the colour circle from red
     return (np.abs((hue + np.array([0.0, 2.0, -2.0])) % 6.0 - 3.0) - 1.0).clip(0.0, 1.0)
 

@@ -1,4 +1,4 @@
-"""A room to look at LiDARs in: people, thin rods, an overhanging shelf, stones, and the robot with the sensor."""
+"""What LiDARs are looked at in: a room with people, rods, a shelf, stones and the robot; or a mesh of one's own."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ class DemoClass(IntEnum):
     PERSON = 4
     STONE = 5
     ROBOT = 6
+    MESH = 7
 
 
 COLOURS = {
@@ -39,6 +40,7 @@ COLOURS = {
     DemoClass.PERSON: "#e8a317",
     DemoClass.STONE: "#3f9142",
     DemoClass.ROBOT: "#1d1d29",
+    DemoClass.MESH: "#4f79b5",
 }
 REFLECTIVITY = {
     DemoClass.FLOOR: 0.3,
@@ -48,41 +50,67 @@ REFLECTIVITY = {
     DemoClass.PERSON: 0.4,
     DemoClass.STONE: 0.35,
     DemoClass.ROBOT: 0.1,
+    DemoClass.MESH: 0.5,
 }
 """Reflectivity of matt surfaces; rough values, chosen by eye."""
 
 
 @dataclass(frozen=True)
 class DemoScene:
-    """The room in a ray scene.
+    """The room, or a mesh, in a ray scene.
 
     Attributes:
         scene: One environment with the robot's bodies where its default pose has them.
         mount_body: The robot's base.
         robot_geoms: Index of each of the robot's shapes by the name of its geom.
         open_side: Shapes that a picture of the room from outside leaves out: the ceiling and two of the walls.
+        extent: Of the room or the mesh along x and y, and its highest point, metres.
+        mesh: The mesh; None: it is the room.
     """
 
     scene: RayScene
     mount_body: int
     robot_geoms: dict[str, int]
     open_side: tuple[int, ...]
+    extent: tuple[tuple[float, float], tuple[float, float], float]
+    mesh: TriangleMesh | None = None
 
 
 def demo_scene(robot: RobotConfig, num_threads: int | None = None) -> DemoScene:
     """The room with a robot in its default pose; lengths in metres, the floor at z = 0."""
+    open_side, walls = _room()
+    shapes = [*open_side, *walls, *_furniture(), *_people(), *_stones()]
+    return _with_robot(shapes, robot, (0.0, 0.0, 0.0), tuple(range(len(open_side))), ROOM, num_threads=num_threads)
+
+
+def mesh_scene(robot: RobotConfig, mesh: TriangleMesh, at: Vector = (0.0, 0.0, 0.0)) -> DemoScene:
+    """A mesh with a robot in its default pose whose feet stand ``at`` a place of it, metres, z up."""
+    corners = mesh.vertices[mesh.triangles].reshape(-1, 3).astype(float)
+    low, high = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+    shape = Shape(ShapeKind.MESH, asset=mesh, class_id=DemoClass.MESH)
+    extent = ((low[0], high[0]), (low[1], high[1]), high[2])
+    return _with_robot([shape], robot, at, (), extent, mesh)
+
+
+def _with_robot(
+    shapes: list[Shape],
+    robot: RobotConfig,
+    at: Vector,
+    open_side: tuple[int, ...],
+    extent: tuple[tuple[float, float], tuple[float, float], float],
+    mesh: TriangleMesh | None = None,
+    num_threads: int | None = None,
+) -> DemoScene:
     model = robot.spec().compile()
     found = geom_shapes(model)
     data = mujoco.MjData(model)
-    data.qpos[2] = robot.base_height
+    data.qpos[:3] = np.add(at, (0.0, 0.0, robot.base_height))
     for name, angle in robot.default_joint_pos.items():
         data.joint(name).qpos = angle
     mujoco.mj_kinematics(model, data)
 
-    open_side, walls = _room()
-    shapes = [*open_side, *walls, *_furniture(), *_people(), *_stones()]
     first = len(shapes)
-    shapes += [replace(shape, class_id=DemoClass.ROBOT) for shape in found.shapes]
+    shapes = shapes + [replace(shape, class_id=DemoClass.ROBOT) for shape in found.shapes]
     scene = RayScene(shapes, num_envs=1, num_bodies=len(found.body_ids), num_threads=num_threads)
     scene.body_pos.copy_(torch.from_numpy(data.xpos[list(found.body_ids)]))
     scene.body_quat.copy_(torch.from_numpy(data.xquat[list(found.body_ids)]))
@@ -90,7 +118,9 @@ def demo_scene(robot: RobotConfig, num_threads: int | None = None) -> DemoScene:
         scene=scene,
         mount_body=found.body_ids.index(model.body(robot.base).id),
         robot_geoms={model.geom(k).name: first + i for i, k in enumerate(found.geom_ids)},
-        open_side=tuple(range(len(open_side))),
+        open_side=open_side,
+        extent=extent,
+        mesh=mesh,
     )
 
 
