@@ -220,7 +220,7 @@ class Thinning:
 
 def latency(run_dir: Path, steps: int) -> Table:
     """Percentiles of a control step of an exported policy, with and without a frame, ms."""
-    policy = ExportedPolicy.load(run_dir / FOLDER)
+    policy = ExportedPolicy.load(run_dir / FOLDER, safety=None)
     run = build.assemble(config.load(run_dir, ["num_envs=1"]))
 
     def readings(whole_frames: bool):

@@ -75,7 +75,7 @@ class TrainedRun:
             raise config.ConfigError(
                 f"runs: {self.path} has not been exported; python scripts/export.py run={self.path}"
             )
-        return ExportedPolicy.load(folder)
+        return ExportedPolicy.load(folder, safety=None)
 
     def facts(self) -> dict[str, float]:
         """Weights of the actor, and how long its training took."""

@@ -16,7 +16,8 @@ weights, and each result is noted in `log`. Policies:
     stop       follows V_cmd, which falls to zero while something is near in its direction
     histogram  follows V_cmd + V_avoid, by the run's avoidance controller from the raw cloud by geometry
     oracle     follows V_cmd + V_avoid, by the run's avoidance controller from ground truth
-    exported   the run's as the export command wrote it, on raw points, joint states and IMU
+    exported   the run's as the export command wrote it, on raw points, joint states and IMU, with the limits of its
+               runtime
 
 `stop`, `histogram` and `oracle` drive the gait of `walker`, or without one the run's own, which then sees no frame.
 

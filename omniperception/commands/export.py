@@ -7,6 +7,7 @@ Writes into exported/ in the run directory, or into `out`:
     policy.onnx    the network as ONNX: observations, sampled frames and their number -> actions
     policy.pt      the same as TorchScript
     policy.json    names, scales, rates, layout of the observations, sampling, mount of the sensor, provenance
+    deploy.yaml    what of it unitree_rl_lab's form has a place for; of a Go2
 
 omniperception.deploy.ExportedPolicy runs it, with sampling and history, from raw points, joint states and IMU.
 """

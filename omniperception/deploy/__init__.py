@@ -2,5 +2,6 @@
 
 from omniperception.deploy.description import DeployError, Description
 from omniperception.deploy.runtime import ExportedPolicy, RobotState
+from omniperception.deploy.safety import SafetyConfig, SafetyStop
 
-__all__ = ["DeployError", "Description", "ExportedPolicy", "RobotState"]
+__all__ = ["DeployError", "Description", "ExportedPolicy", "RobotState", "SafetyConfig", "SafetyStop"]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 FORMAT = "omniperception-policy"
-VERSION = 2
+VERSION = 3
 FILE = "policy.json"
+FINGERPRINT = "omniperception-description"
+"""Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
 
 
 class DeployError(ValueError):
@@ -28,7 +31,7 @@ class Joints:
         kp: gain of the position controller that follows the targets, N m / rad.
         kd: its damping, N m s / rad.
         torque_limits: N m.
-        lower: joint limits, rad; the targets are not clipped to them.
+        lower: joint limits, rad; the runtime clips targets to them, training does not.
         upper: rad.
     """
 
@@ -130,6 +133,7 @@ class Description:
         estimated: quantities of the robot's state that the network gives in the output `estimate` and nobody measures:
             base_lin_vel (m/s, base frame), or none.
         files: name of the network's file by kind, "onnx" or "torchscript".
+        checksums: SHA-256 of each of these files.
         provenance: run, checkpoint, iteration, date and versions.
     """
 
@@ -141,6 +145,7 @@ class Description:
     perception: Perception | None = None
     estimated: Sequence[str] = ()
     files: Mapping[str, str] = field(default_factory=dict)
+    checksums: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping = field(default_factory=dict)
 
     @property
@@ -156,6 +161,12 @@ class Description:
             shapes["frames"] = (self.perception.history, self.perception.num_points, 3)
             shapes["frame_count"] = (1,)
         return shapes
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of everything that the network depends on: all but its files and where it comes from."""
+        content = {key: value for key, value in asdict(self).items() if key not in ("files", "checksums", "provenance")}
+        return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
     def write(self, folder: Path) -> None:
         """Write policy.json."""
@@ -199,3 +210,8 @@ class Description:
         for name, kind in (("lidar", Lidar), ("perception", Perception)):
             parts[name] = kind(**parts[name]) if parts[name] is not None else None
         return cls(observations=tuple(groups), **parts)
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

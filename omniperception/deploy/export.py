@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,18 @@ from omniperception import build, config
 from omniperception.build import RunConfig
 from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
-from omniperception.deploy.description import Description, Group, Joints, Lidar, Perception, Term
+from omniperception.deploy.deploy_yaml import FILE as DEPLOY_YAML
+from omniperception.deploy.deploy_yaml import deploy_yaml
+from omniperception.deploy.description import (
+    FINGERPRINT,
+    Description,
+    Group,
+    Joints,
+    Lidar,
+    Perception,
+    Term,
+    checksum,
+)
 from omniperception.env.env import MAX_ACTION, OmniEnv
 from omniperception.env.mdp import observations
 from omniperception.env.mdp.commands import VelocityCommandConfig
@@ -79,8 +91,23 @@ def export(
     folder.mkdir(parents=True, exist_ok=True)
     for name, file in described.files.items():
         check(network, *_WRITERS[name](network, folder / file))
+    if "onnx" in described.files:
+        _stamp(folder / described.files["onnx"], described.fingerprint)
+    described = replace(described, checksums={name: checksum(folder / file) for name, file in described.files.items()})
     described.write(folder)
+    text = deploy_yaml(described)
+    if text is not None:
+        (folder / DEPLOY_YAML).write_text(text)
     return described
+
+
+def _stamp(path: Path, fingerprint: str) -> None:
+    """Write into an ONNX file which description belongs to it."""
+    import onnx
+
+    model = onnx.load(str(path))
+    onnx.helper.set_model_props(model, {FINGERPRINT: fingerprint})
+    onnx.save(model, str(path))
 
 
 def describe(run: RunConfig, env: OmniEnv) -> Description:
@@ -301,7 +328,7 @@ def write_onnx(network: BlindNetwork, path: Path) -> tuple[Path, Callable | None
             "ONNX export needs onnx: pip install 'omniperception[export]', or give formats=torchscript"
         ) from None
     names = list(network.input_names)
-    with torch.no_grad(), warnings.catch_warnings():
+    with torch.no_grad(), warnings.catch_warnings(), _plain_scatter():
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
@@ -327,17 +354,41 @@ def write_onnx(network: BlindNetwork, path: Path) -> tuple[Path, Callable | None
     return path, run
 
 
+@contextmanager
+def _plain_scatter() -> Iterator[None]:
+    """Lets `scatter_reduce` become one ScatterElements.
+
+    torch's own rule wraps it in branches for tensors without axes, whose declared shapes are those of the traced batch.
+    """
+    from torch.onnx import register_custom_op_symbolic, unregister_custom_op_symbolic
+
+    reductions = {"amin": "min", "amax": "max", "sum": "add", "prod": "mul"}
+
+    @torch.onnx.symbolic_helper.parse_args("v", "i", "v", "v", "s", "b")
+    def scatter_reduce(g, base, dim, index, source, reduce, include_self):  # type: ignore[no-untyped-def]
+        assert include_self and reduce in reductions
+        kept = {"axis_i": dim, "reduction_s": reductions[reduce]}
+        return g.op("ScatterElements", base, index, source, **kept).setType(base.type())
+
+    register_custom_op_symbolic("aten::scatter_reduce", scatter_reduce, OPSET)
+    try:
+        yield
+    finally:
+        unregister_custom_op_symbolic("aten::scatter_reduce", OPSET)
+
+
 _WRITERS = {"onnx": write_onnx, "torchscript": write_torchscript}
 
 
 def check(network: BlindNetwork, path: Path, written: Callable | None) -> None:
-    """A written network gives the actions of the one it was written from, for another batch size, too."""
+    """A written network gives the actions of the one it was written from, for other batch sizes, too."""
     if written is None:
         return
-    inputs = network.examples(23)
-    with torch.no_grad():
-        sides = [out if isinstance(out, tuple) else (out,) for out in (written(*inputs), network(*inputs))]
-        error = max(float((ours - theirs).abs().max()) for ours, theirs in zip(*sides, strict=True))
     steep = isinstance(getattr(network.actor, "read_out", None), MotionReadOut)
-    if not error <= (STEEP_TOLERANCE if steep else TOLERANCE):
-        raise ConfigError(f"{path} differs from the policy by {error:.1e} in an output: not exportable")
+    for batch in (1, 23):
+        inputs = network.examples(batch)
+        with torch.no_grad():
+            sides = [out if isinstance(out, tuple) else (out,) for out in (written(*inputs), network(*inputs))]
+        error = max(float((ours - theirs).abs().max()) for ours, theirs in zip(*sides, strict=True))
+        if not error <= (STEEP_TOLERANCE if steep else TOLERANCE):
+            raise ConfigError(f"{path} differs from the policy by {error:.1e} in an output: not exportable")

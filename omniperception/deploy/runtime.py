@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from omniperception.deploy.description import DeployError, Description, Group, Lidar
+from omniperception.deploy.description import FILE, FINGERPRINT, DeployError, Description, Group, Lidar, checksum
 from omniperception.deploy.odometry import Odometry
+from omniperception.deploy.safety import Safety, SafetyConfig, SafetyStop, Sight
 from omniperception.deploy.sampling import Attitude, CloudSampler, make_sampler
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ class RobotState:
         base_ang_vel: (3,) angular velocity in the base frame from the gyroscope, rad/s.
         base_lin_vel: (3,) linear velocity in the base frame from a state estimator, m/s; None if the policy neither
             observes it nor follows the base's motion, or estimates it.
+        joint_torque: (num_joints,) N m, measured; None: torques are not checked.
     """
 
     joint_pos: ArrayLike
@@ -37,6 +39,10 @@ class RobotState:
     base_quat: ArrayLike
     base_ang_vel: ArrayLike
     base_lin_vel: ArrayLike | None = None
+    joint_torque: ArrayLike | None = None
+
+
+DEFAULT_SAFETY = SafetyConfig()
 
 
 class ExportedPolicy:
@@ -47,9 +53,15 @@ class ExportedPolicy:
     frame, in metres, in the order of their measurement, without a correction for the robot's motion. Rows that are not
     finite or zero are misses.
 
+    Unless `safety` is None, commands are limited to the ranges of training and targets to the limits and a rate of the
+    joints;
+    without good frames the robot slows down and stands, blind; and :meth:`step` raises :class:`SafetyStop` when it
+    leans too far, a joint or torque is where it cannot be, or a number is not finite.
+
     Attributes:
         description: names, scales and rates.
-        action: (num_joints,) float32, the newest action.
+        safety: limits and what they did; None: none are applied, as in training.
+        action: (num_joints,) float32, the newest action, before its target is limited, as in training.
         observation: (observation_size,) float32 that the newest action was computed from.
         frames: (history, num_points, 3) float32 sampled frames, newest last; None for a blind policy.
         frame_count: how many of the newest frames are valid.
@@ -57,9 +69,12 @@ class ExportedPolicy:
             before its first step.
     """
 
-    def __init__(self, description: Description, session: InferenceSession) -> None:
-        """Args: description: of the policy; session: its network."""
+    def __init__(
+        self, description: Description, session: InferenceSession, safety: SafetyConfig | None = DEFAULT_SAFETY
+    ) -> None:
+        """Args: description: of the policy; session: its network; safety: limits, None for none."""
         self.description, self._session = description, session
+        self.safety = Safety(description, safety) if safety is not None else None
         joints, perception = description.joints, description.perception
         self._default_pos = np.asarray(joints.default_pos, np.float32)
         self._sampler = make_sampler(perception.sampler) if perception is not None else None
@@ -71,17 +86,21 @@ class ExportedPolicy:
             self.frames = np.zeros((perception.history, perception.num_points, 3), np.float32)
         follows = perception is not None and perception.base_motion
         self._odometry = Odometry(description.control_period_s) if follows else None
+        self._rays = _rays_of_points(description.lidar) if description.lidar is not None else np.zeros(0, np.int64)
         self.observation = np.zeros(description.observation_size, np.float32)
         self._check_network()
         self.reset()
 
     @classmethod
-    def load(cls, folder: str | Path, num_threads: int = 1) -> ExportedPolicy:
+    def load(
+        cls, folder: str | Path, num_threads: int = 1, safety: SafetyConfig | None = DEFAULT_SAFETY
+    ) -> ExportedPolicy:
         """The policy in a folder that `scripts/export.py` wrote.
 
         Args:
             folder: with policy.json and the ONNX file.
             num_threads: CPU threads of the network.
+            safety: limits; None for none.
         """
         folder = Path(folder)
         description = Description.read(folder)
@@ -95,17 +114,20 @@ class ExportedPolicy:
             raise DeployError(f"{folder} has no ONNX file; write it: python scripts/export.py run=... formats=onnx")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = num_threads, 1
-        options.log_severity_level = 3  # errors: it warns in every step of shapes that the exporter has guessed
-        path = str(folder / description.files["onnx"])
+        path = folder / description.files["onnx"]
         try:
-            session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own exceptions have no common base
             raise DeployError(f"{path} cannot be loaded ({str(error).splitlines()[0][:160]}); export again") from None
-        return cls(description, session)
+        policy = cls(description, session, safety)
+        belongs = session.get_modelmeta().custom_metadata_map.get(FINGERPRINT)
+        if belongs != description.fingerprint or checksum(path) != description.checksums["onnx"]:
+            raise DeployError(f"{path} and {FILE} are not from the same export, or were changed; export again")
+        return policy
 
     def another(self) -> ExportedPolicy:
         """The same policy for another robot, which shares the network and nothing else."""
-        return ExportedPolicy(self.description, self._session)
+        return ExportedPolicy(self.description, self._session, self.safety.config if self.safety else None)
 
     def reset(self) -> None:
         """Clears all histories, as at the start of an episode: the next step's observation fills them."""
@@ -114,21 +136,43 @@ class ExportedPolicy:
             history.clear()
         self.frame_count = self._steps = 0
         self.base_lin_vel: np.ndarray | None = None
+        if self.safety is not None:
+            self.safety.reset()
         if self.frames is not None:
             self.frames = np.zeros_like(self.frames)
         if self._odometry is not None:
             self._odometry = Odometry(self.description.control_period_s)
 
-    def thin(self, points: np.ndarray) -> np.ndarray:
-        """The points of a device's whole frame (n, 3), misses zero or left out, that training would have kept."""
+    def thin(self, points: np.ndarray, offsets_s: ArrayLike | None = None) -> np.ndarray:
+        """The points of a device's frame that training would have kept, by the time of their measurement.
+
+        Args:
+            points: (n, 3) m; misses are zero, or left out.
+            offsets_s: (n,) seconds of each point since the frame began; None: row k is the k-th that the device
+                measured, so none may have been left out.
+
+        Returns:
+            (num_rays, 3), zeros where a ray hit nothing or its point is lacking.
+        """
         lidar = self._perception()[0]
-        if lidar.keep_every is not None:
-            return points[:: lidar.keep_every][: lidar.num_rays]
-        count = min(len(points), -(-len(points) * lidar.num_rays // lidar.points_per_frame))
-        return points[np.arange(count) * len(points) // max(count, 1)]
+        if offsets_s is None:
+            if len(points) < 0.95 * lidar.points_per_frame:
+                raise DeployError(
+                    f"points: a whole frame of {lidar.points_per_frame} was expected, {len(points)} given; where misses"
+                    " are left out, give the points' times: thin(points, offsets_s)"
+                )
+            numbers = np.arange(len(points))
+        else:
+            numbers = np.rint(np.asarray(offsets_s) * (lidar.points_per_frame / lidar.period_s)).astype(np.int64)
+        rays = self._rays
+        inside = (numbers >= 0) & (numbers < len(rays))
+        rows = rays[numbers[inside]]
+        kept = np.zeros((lidar.num_rays, 3), np.float32)
+        kept[rows[rows >= 0]] = np.asarray(points, np.float32)[inside][rows >= 0]
+        return kept
 
     def see(self, points: np.ndarray, base_quat: ArrayLike) -> None:
-        """Appends a LiDAR frame to the history; :meth:`step` does it for points that it is given.
+        """Appends a LiDAR frame to the history, unless it holds too few hits; :meth:`step` does it for its points.
 
         Args:
             points: (n, 3) m in the sensor frame, in the order of measurement.
@@ -138,6 +182,8 @@ class ExportedPolicy:
         points = np.asarray(points, np.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
+        if self.safety is not None and not self.safety.frame_is_good(points):
+            return self.miss()
         attitude = Attitude(_quaternion(base_quat), lidar.mount_pos, lidar.mount_quat)
         frames[:-1] = frames[1:]
         frames[-1, : sampler.num_points] = sampler(points, attitude)
@@ -168,22 +214,47 @@ class ExportedPolicy:
 
         Returns:
             (num_joints,) float32 joint targets, rad, in the order of `description.joints`.
+
+        Raises:
+            SafetyStop: the joints must be damped now.
         """
+        command = np.asarray(command, np.float32)
+        if self.safety is not None:
+            self._check(state, command, self.safety)
         if self._odometry is not None:
             self._odometry.advance(_quaternion(state.base_quat), self._velocity(state))
         if points is not None:
             self.see(points, state.base_quat)
+        if self.safety is not None:
+            command = self.safety.limit_command(command)
         self.observation = self._observe(state, command)
         feed = {"observations": self.observation[None]}
         if self.frames is not None:
-            feed |= {"frames": self.frames[None], "frame_count": np.array([[self.frame_count]])}
+            blind = self.safety is not None and self.safety.sight is Sight.STOPPED
+            feed |= {"frames": self.frames[None], "frame_count": np.array([[0 if blind else self.frame_count]])}
         joints = self.description.joints
         actions, *estimates = (output[0] for output in self._session.run(None, feed))
         if estimates:
             self.base_lin_vel = estimates[0]
         self._steps += 1
         self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
-        return self._default_pos + np.float32(joints.action_scale) * self.action
+        targets = self._default_pos + np.float32(joints.action_scale) * self.action
+        if self.safety is None:
+            return targets
+        return self.safety.limit_targets(targets, np.asarray(state.joint_pos, np.float32))
+
+    def _check(self, state: RobotState, command: np.ndarray, safety: Safety) -> None:
+        """Raises SafetyStop where the state is no state to walk in, or a number is not finite."""
+        for name in ("joint_pos", "joint_vel", "base_quat", "base_ang_vel"):
+            if not np.isfinite(np.asarray(getattr(state, name), np.float64)).all():
+                raise SafetyStop(f"{name}: finite numbers were expected, {getattr(state, name)} given")
+        joint_pos, joint_vel = (np.asarray(value, np.float32) for value in (state.joint_pos, state.joint_vel))
+        if joint_pos.shape == joint_vel.shape == self._default_pos.shape:  # otherwise the observation names it
+            safety.check_state(-float(_projected_gravity(self, state, command)[2]), joint_pos, joint_vel)
+        if state.joint_torque is not None:
+            safety.check_torque(np.asarray(state.joint_torque, np.float32))
+        if command.shape != (3,) or not np.isfinite(command).all():
+            raise SafetyStop(f"command: 3 finite numbers were expected, {command} given")
 
     def _velocity(self, state: RobotState) -> np.ndarray:
         """(3,) m/s, base frame: estimated at the step before, or measured."""
@@ -244,6 +315,16 @@ class ExportedPolicy:
                 f"the sampler and the base's motion give {rows} rows, the network reads {self.frames.shape[1]}; export"
                 " again"
             )
+
+
+def _rays_of_points(lidar: Lidar) -> np.ndarray:
+    """(points_per_frame,) which of training's rays each point of a device's frame is, -1: none."""
+    count = np.arange(lidar.num_rays)
+    evenly = count * lidar.points_per_frame // lidar.num_rays
+    kept = evenly if lidar.keep_every is None else count * lidar.keep_every
+    rays = np.full(lidar.points_per_frame, -1)
+    rays[kept] = count
+    return rays
 
 
 Quantity = Callable[[ExportedPolicy, RobotState, ArrayLike], np.ndarray]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from omniperception.deploy import DeployError, ExportedPolicy, RobotState
+from omniperception.deploy import DeployError, ExportedPolicy, RobotState, SafetyStop
 from omniperception.deploy.latency import Reading
 from omniperception.env.env import OmniEnv
 from omniperception.lidar import Lidar, LidarFrame
@@ -31,15 +31,18 @@ class ExportedPolicies:
         self._tick = 0
 
     def __call__(self, observations: TensorDict) -> torch.Tensor:
-        """(num_envs, num_actions) for the environment's present state; the observations are not read."""
+        """(num_envs, num_actions) for the environment's present state; the observations are not read.
+
+        What a robot's safety limits is limited here, and a robot that it stops is damped: its targets are where the
+        joints are.
+        """
         env = self._env
         if env.step_count:
             for index in env.done.nonzero().flatten().tolist():
                 self.robots[index].reset()
         states, commands, clouds = robot_states(env), env.command.value.cpu().numpy(), self._new_clouds()
-        for robot, state, command, cloud in zip(self.robots, states, commands, clouds, strict=True):
-            robot.step(state, command, cloud)
-        return torch.from_numpy(np.stack([robot.action for robot in self.robots])).to(env.device)
+        given = zip(self.robots, states, commands, clouds, strict=True)
+        return torch.from_numpy(np.stack([_action(*each) for each in given])).to(env.device)
 
     def _new_clouds(self) -> list[np.ndarray | None]:
         """Points of the frame that has just come; None without one, or where the episode has just begun."""
@@ -54,6 +57,18 @@ class ExportedPolicies:
                 robot.miss()
         new = (env.sensing.fresh & (env.sensing.frame_count[:, 0] > 0)).tolist()
         return [cloud if is_new else None for cloud, is_new in zip(raw_points(frame), new, strict=True)]
+
+
+def _action(robot: ExportedPolicy, state: RobotState, command: np.ndarray, cloud: np.ndarray | None) -> np.ndarray:
+    """(num_actions,) the action whose target is the robot's."""
+    joints = robot.description.joints
+    try:
+        targets = robot.step(state, command, cloud)
+    except SafetyStop:
+        targets = np.asarray(state.joint_pos, np.float32)
+    if robot.safety is None:
+        return robot.action
+    return (targets - np.asarray(joints.default_pos, np.float32)) / np.float32(joints.action_scale)
 
 
 def robot_states(env: OmniEnv) -> list[RobotState]:

@@ -5,12 +5,14 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from omniperception import build, config
 from omniperception.build import build_runner, load_policy
@@ -24,6 +26,7 @@ pytest.importorskip("onnxruntime", reason="extra deploy")
 pytest.importorskip("onnx", reason="extra export")
 
 from omniperception.deploy import DeployError, Description, ExportedPolicy, RobotState
+from omniperception.deploy.deploy_yaml import deploy_yaml
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
 from omniperception.evaluation.exported import ExportedPolicies, raw_points, record
 
@@ -55,7 +58,8 @@ ALIKE = {
     "polar_rings_no_proximal": "polar_rings",
 }
 """Presets that differ from a recipe's in sizes, or lack a part."""
-STAND = RobotState([0.0] * 12, [0.0] * 12, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3)
+DEFAULT_POS = [0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5]
+STAND = RobotState(DEFAULT_POS, [0.0] * 12, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3)
 
 
 def actions_of(outputs):
@@ -93,6 +97,11 @@ def exported_run(tmp_path_factory):
     return make
 
 
+def plain(run_dir):
+    """The exported policy without limits, which training does not have."""
+    return ExportedPolicy.load(run_dir / "exported", safety=None)
+
+
 def trained(run_dir, *overrides):
     """Torch's policy in a fresh environment."""
     return load_policy(build.assemble(config.load(run_dir, overrides)), run_dir)
@@ -111,7 +120,7 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
     run_dir = exported_run(recipe)
     given = ("randomization=robot", "randomization.frames_lost=0.3", "randomization.pushes=null")
     torch_side = trained(run_dir, "num_envs=2", "terminations.episode_length_s=0.5", *given)
-    env, policies = torch_side.env, ExportedPolicies(torch_side.env, ExportedPolicy.load(run_dir / "exported"))
+    env, policies = torch_side.env, ExportedPolicies(torch_side.env, plain(run_dir))
     scripted = torch.jit.load(str(run_dir / "exported" / "policy.pt"))
     ends, frames, lost, without_frames = 0, 0, 0, 0.0
     with torch.no_grad():
@@ -155,7 +164,7 @@ def test_the_evaluation_result_is_that_of_torch(exported_run):
     expected = trained(run_dir, *overrides)
     expected = run_episodes(expected.env, expected.policy, 8)
     env = trained(run_dir, *overrides).env
-    got = run_episodes(env, ExportedPolicies(env, ExportedPolicy.load(run_dir / "exported")), 8)
+    got = run_episodes(env, ExportedPolicies(env, plain(run_dir)), 8)
     for name in ("outcome", "contacts", "length_s"):
         assert torch.equal(getattr(got, name), getattr(expected, name)), name
     for name in ("clearance", "path", "velocity_error", "yaw_rate_error", "free_s"):
@@ -167,7 +176,7 @@ def test_a_robot_in_plain_mujoco_goes_where_the_training_environment_goes(export
     """Its own mj_step loop with the exported joint targets; only obstacles and points come from the environment."""
     run_dir = exported_run("pd_risknet")
     side = trained(run_dir, "num_envs=1")
-    env, policy = side.env, ExportedPolicy.load(run_dir / "exported")
+    env, policy = side.env, plain(run_dir)
     model = env.world.model
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = env.sim.qpos[0].numpy(), env.sim.qvel[0].numpy()
@@ -189,7 +198,7 @@ def test_a_robot_in_plain_mujoco_goes_where_the_training_environment_goes(export
 
 
 def test_histories_are_filled_by_the_first_observation_and_then_move(exported_run):
-    policy = ExportedPolicy.load(exported_run("none") / "exported").another()
+    policy = plain(exported_run("none")).another()
     described = policy.description
     assert [group.name for group in described.observations] == ["proprioception", "command", "action"]
     width, history = described.observations[0].width, described.observations[0].history
@@ -198,7 +207,7 @@ def test_histories_are_filled_by_the_first_observation_and_then_move(exported_ru
     first = policy.observation
     assert first[history * width : history * width + 3].tolist() == pytest.approx([0.1, 0.2, 0.3])
     assert first[-12:].tolist() == [0.0] * 12
-    assert first[:12].tolist() == pytest.approx([-x for x in described.joints.default_pos])
+    assert first[:12].tolist() == pytest.approx([0.0] * 12)
     assert first[30:33].tolist() == [0.0, 0.0, -1.0]
     assert targets.tolist() == pytest.approx(
         [
@@ -218,7 +227,7 @@ def test_histories_are_filled_by_the_first_observation_and_then_move(exported_ru
 def test_thinning_keeps_what_training_kept(exported_run):
     """Of the whole frame of 20,000 points, the 1000 that the environment's own LiDAR measured."""
     run_dir = exported_run("pd_risknet")
-    policy = ExportedPolicy.load(run_dir / "exported")
+    policy = plain(run_dir)
     whole = record(trained(run_dir, "num_envs=1").env, policy, 6, whole_frames=True)
     kept = record(trained(run_dir, "num_envs=1").env, policy, 6, whole_frames=False)
     frames = [(a.points, b.points) for a, b in zip(whole, kept, strict=True) if a.points is not None]
@@ -265,9 +274,11 @@ def test_wrong_points_are_named(exported_run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 99}, "format version 99, this program reads 2"),
+        ({"version": 99}, "format version 99, this program reads 3"),
         ({"format": "something"}, "describes no exported policy"),
         ({"joints": None}, "is incomplete"),
+        ({"control_period_s": 0.03}, "policy.onnx and policy.json are not from the same export"),
+        ({"checksums": {"onnx": "0" * 64}}, "policy.onnx and policy.json are not from the same export"),
         ({"observations": []}, "the network's inputs are"),
     ],
 )
@@ -289,7 +300,8 @@ def test_a_robot_needs_neither_torch_nor_warp_nor_hydra(exported_run):
         "import sys\n"
         "from omniperception.deploy import DeployError, ExportedPolicy, RobotState\n"
         f"policy = ExportedPolicy.load({str(folder)!r})\n"
-        "policy.step(RobotState([0]*12, [0]*12, [1,0,0,0], [0]*3, [0]*3), [0]*3)\n"
+        "pose = policy.description.joints.default_pos\n"
+        "policy.step(RobotState(pose, [0]*12, [1,0,0,0], [0]*3, [0]*3), [0]*3)\n"
         "assert not {'torch', 'warp', 'hydra', 'mujoco', 'rsl_rl'} & set(sys.modules)\n"
         "sys.modules['onnxruntime'] = None\n"
         "try:\n"
@@ -312,7 +324,7 @@ def test_the_commands(exported_run, tmp_path):
 
     done = call("export.py", f"run={run_dir}", f"out={tmp_path / 'there'}", "formats=torchscript")
     assert done.returncode == 0 and "wrote" in done.stdout, done.stderr
-    assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["policy.json", "policy.pt"]
+    assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["deploy.yaml", "policy.json", "policy.pt"]
     shutil.copytree(tmp_path / "there", tmp_path / "run" / "exported")
     shutil.copy(run_dir / "config.yaml", tmp_path / "run")
     done = call("benchmark_env.py", "what=inference", f"run={tmp_path / 'run'}")
@@ -321,6 +333,52 @@ def test_the_commands(exported_run, tmp_path):
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((tmp_path / "latency.json").read_text())["rows"]
     assert row["case"] == "as trained" and row["step"] == "without frame" and 0 < row["p50_ms"] < 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_declared_shapes_are_those_of_every_batch(exported_run, recipe, capfd):
+    """onnxruntime, which compares each tensor with its declared shape, has nothing to say."""
+    import onnxruntime
+
+    path = exported_run(recipe) / "exported" / "policy.onnx"
+    capfd.readouterr()
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    for batch in (1, 2, 7):
+        feed = {}
+        for given in session.get_inputs():
+            assert given.shape[0] == "batch"
+            feed[given.name] = np.ones((batch, *given.shape[1:]), np.int64 if "int64" in given.type else np.float32)
+        outputs = session.run(None, feed)
+        assert [list(out.shape) for out in outputs] == [[batch, *out.shape[1:]] for out in session.get_outputs()]
+    assert capfd.readouterr().err == ""
+
+
+def test_deploy_yaml_has_the_motors_order(exported_run):
+    """Keys and types of unitree_rl_lab's own `deploy/robots/g1/config/policy/velocity/v0/params/deploy.yaml`."""
+    read = yaml.safe_load((exported_run("estimated") / "exported" / "deploy.yaml").read_text())
+    keys = ["joint_ids_map", "step_dt", "stiffness", "damping", "default_joint_pos", "commands", "actions"]
+    assert [*read] == [*keys, "observations"]
+    assert read["joint_ids_map"] == [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]  # FL FR RL RR are motors of legs 1 0 3 2
+    assert read["step_dt"] == 0.02 and read["stiffness"] == [25.0] * 12 and read["damping"] == [0.6] * 12
+    assert read["default_joint_pos"] == DEFAULT_POS
+    assert read["commands"]["base_velocity"]["ranges"]["lin_vel_x"] == [-0.5, 1.0]
+    action = read["actions"]["JointPositionAction"]
+    assert action["offset"] == DEFAULT_POS and action["scale"] == [0.25] * 12
+    assert action["clip"][2] == [-2.7227, -0.83776]
+    terms = read["observations"]
+    assert {"joint_pos_rel", "joint_vel_rel", "base_ang_vel", "projected_gravity", "velocity_commands"} <= {*terms}
+    assert "base_lin_vel" not in terms and terms["base_ang_vel"]["scale"] == [1.0] * 3
+    assert {"params", "clip", "scale", "history_length"} == {*terms["joint_pos_rel"]}
+
+
+def test_deploy_yaml_names_what_it_has_no_place_for(exported_run):
+    text = (exported_run("polar_rings_estimated") / "exported" / "deploy.yaml").read_text()
+    assert "# It also reads 'frames' and 'frame_count'" in text
+    described = Description.read(exported_run("none") / "exported")
+    assert "base_lin_vel is no observation of unitree_rl_lab's controller" in deploy_yaml(described)
+    other = replace(described.joints, names=[f"leg_{k}" for k in range(12)])
+    assert deploy_yaml(replace(described, joints=other)) is None
 
 
 def test_what_cannot_be_exported_is_named(exported_run, tmp_path):

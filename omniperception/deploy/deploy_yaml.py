@@ -1,0 +1,90 @@
+"""The description of an exported policy in the form of unitree_rl_lab's deploy.yaml."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import yaml
+
+from omniperception.deploy.description import Description, Group, Term
+from omniperception.deploy.go2 import MOTORS
+
+FILE = "deploy.yaml"
+
+_NAMES = {
+    "joint_pos_offset": "joint_pos_rel",
+    "joint_vel": "joint_vel_rel",
+    "base_lin_vel": "base_lin_vel",
+    "base_ang_vel": "base_ang_vel",
+    "projected_gravity": "projected_gravity",
+    "command": "velocity_commands",
+    "previous_action": "last_action",
+    "gait_phase": "gait_phase",
+}
+"""Isaac Lab's name of each quantity."""
+
+
+def deploy_yaml(description: Description) -> str | None:
+    """Text of deploy.yaml; None for a robot whose joints are not a Go2's, of which the motors' order is not known here.
+
+    As there, `stiffness` and `damping` are in the motors' order, everything else in the policy's; joint k of the policy
+    is motor `joint_ids_map[k]`. What unitree_rl_lab's controller cannot give is named in comments at the top.
+    """
+    joints = description.joints
+    if set(joints.names) != set(MOTORS):
+        return None
+    count = len(joints.names)
+    content = {
+        "joint_ids_map": [MOTORS.index(name) for name in joints.names],
+        "step_dt": description.control_period_s,
+        "stiffness": [joints.kp] * count,
+        "damping": [joints.kd] * count,
+        "default_joint_pos": _plain(joints.default_pos),
+        "commands": {"base_velocity": {"ranges": {**_ranges(description), "heading": None}}},
+        "actions": {
+            "JointPositionAction": {
+                "clip": [_plain(pair) for pair in zip(joints.lower, joints.upper, strict=True)],
+                "joint_names": [".*"],
+                "scale": [joints.action_scale] * count,
+                "offset": _plain(joints.default_pos),
+                "joint_ids": None,
+            }
+        },
+        "observations": {_NAMES[term.quantity]: _term(group, term) for group, term in _terms(description)},
+    }
+    comments = "".join(f"# {line}\n" for line in _caveats(description))
+    return comments + yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
+
+
+def _terms(description: Description) -> list[tuple[Group, Term]]:
+    return [(group, term) for group in description.observations for term in group.terms]
+
+
+def _term(group: Group, term: Term) -> dict:
+    params: dict[str, float | str] = {}
+    if term.quantity == "command":
+        params = {"command_name": "base_velocity"}
+    if term.frequency is not None:
+        params = {"period": 1.0 / term.frequency}
+    return {"params": params, "clip": None, "scale": [term.scale] * term.size, "history_length": group.history}
+
+
+def _ranges(description: Description) -> dict[str, list[float]]:
+    return {name: _plain(limits) for name, limits in description.command.items()}
+
+
+def _caveats(description: Description) -> list[str]:
+    """What a controller that reads this file alone would do otherwise than training."""
+    lines = ["Written beside policy.json, which says more; the network's input is named 'observations'."]
+    if description.perception is not None:
+        lines.append("It also reads 'frames' and 'frame_count' of a LiDAR, which this form has no place for.")
+    if any(group.history > 1 and len(group.terms) > 1 for group in description.observations):
+        lines.append("History is by time: all terms of the oldest step first, where Isaac Lab goes term by term.")
+    if any(term.quantity == "base_lin_vel" for _, term in _terms(description)):
+        lines.append("base_lin_vel is no observation of unitree_rl_lab's controller; a state estimator must give it.")
+    return lines
+
+
+def _plain(values: Sequence[float]) -> list[float]:
+    """Numbers with 6 digits: more are float32's rounding."""
+    return [float(f"{value:.6g}") for value in values]

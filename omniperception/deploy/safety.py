@@ -1,0 +1,179 @@
+"""What keeps an exported policy from harm: limits on its inputs and targets, and reasons to stop."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter
+from dataclasses import dataclass, fields
+from enum import StrEnum
+
+import numpy as np
+
+from omniperception.deploy.description import DeployError, Description
+
+log = logging.getLogger("omniperception.deploy")
+
+
+class SafetyStop(DeployError):
+    """The policy must not move the robot any longer; the message says why. Let the joints be damped."""
+
+
+class Sight(StrEnum):
+    """Whether a policy sees well enough to walk."""
+
+    FRESH = "fresh"
+    SLOWING = "slowing"
+    STOPPED = "stopped"
+
+
+@dataclass(frozen=True)
+class SafetyConfig:
+    """Limits of :class:`Safety`. The robot's own (joints, torques, commands) come from its description.
+
+    Attributes:
+        frame_age_s: the robot slows down when its newest good frame is older.
+        slow_down_s: time in which the command then falls to 0, and in which it comes back.
+        min_hits: least hits of a good frame, as a share of the rays that training used. A frame with fewer is empty
+            or covered, not free space: a sensor on a robot always sees some ground.
+        max_tilt_deg: most that the base may lean.
+        joint_margin: most that a joint may be beyond its limits, rad; noise and play.
+        max_joint_vel: most that a joint may turn, rad/s; the Go2's turn at up to 30.
+        target_rate: most that a joint target may change, rad/s.
+        torque_s: longest that a joint may give its whole torque, where torques are measured.
+    """
+
+    frame_age_s: float = 0.35
+    slow_down_s: float = 0.3
+    min_hits: float = 0.05
+    max_tilt_deg: float = 50.0
+    joint_margin: float = 0.2
+    max_joint_vel: float = 50.0
+    target_rate: float = 40.0
+    torque_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not (math.isfinite(value) and value > 0):
+                raise DeployError(f"safety.{item.name}={value}: a number above 0 was expected")
+
+
+class Safety:
+    """Limits of one robot with their memory; :class:`~omniperception.deploy.ExportedPolicy` calls it in every step.
+
+    Attributes:
+        config: the limits.
+        counts: how often each limit has acted since the start, by name.
+        sight: whether frames are fresh; always for a blind policy.
+    """
+
+    def __init__(self, description: Description, config: SafetyConfig) -> None:
+        """Args: description: of the policy; config: its limits."""
+        self.config, self._dt = config, description.control_period_s
+        joints, lidar = description.joints, description.lidar
+        self._names = tuple(joints.names)
+        self._lower, self._upper = (np.asarray(side, np.float32) for side in (joints.lower, joints.upper))
+        self._torque_limits = np.asarray(joints.torque_limits, np.float32)
+        ranges = np.array([description.command[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")], np.float32)
+        self._command_low, self._command_high = ranges.T
+        self._min_cos = math.cos(math.radians(config.max_tilt_deg))
+        self._sees = lidar is not None and description.perception is not None
+        self._min_hits = config.min_hits * lidar.num_rays if lidar is not None else 0.0
+        self._max_range = lidar.max_range if lidar is not None else 0.0
+        self.counts: Counter[str] = Counter()
+        self.reset()
+
+    def reset(self) -> None:
+        """As at the start of an episode; the counts stay."""
+        self.sight, self._age, self._pace = Sight.FRESH, 0.0, 1.0
+        self._targets: np.ndarray | None = None
+        self._strained = np.zeros(len(self._names), np.int64)
+
+    def frame_is_good(self, points: np.ndarray) -> bool:
+        """Whether a frame (n, 3), m, holds enough hits; counts and names it otherwise."""
+        square = np.einsum("ij,ij->i", points, points)
+        hits = int(np.count_nonzero((square > 0.0) & (square <= self._max_range**2)))
+        if hits >= self._min_hits and hits:
+            self._age = 0.0
+            return True
+        self._count(
+            logging.WARNING, "frames refused", f"a frame has {hits} hits, at least {self._min_hits:.0f} were expected"
+        )
+        return False
+
+    def limit_command(self, command: np.ndarray) -> np.ndarray:
+        """(3,) the command within the ranges of training, slowed down while no good frame comes; once per step."""
+        limited = np.clip(command, self._command_low, self._command_high)
+        if (limited != command).any():
+            self._count(
+                logging.INFO, "commands limited", f"command {command.tolist()} is beyond training's: {limited.tolist()}"
+            )
+        self._look()
+        return limited * np.float32(self._pace)
+
+    def check_state(self, cos_tilt: float, joint_pos: np.ndarray, joint_vel: np.ndarray) -> None:
+        """Raises SafetyStop where the robot has fallen or its joints are where they cannot be.
+
+        Args:
+            cos_tilt: cosine of the angle between the base's and the world's vertical.
+            joint_pos: (num_joints,) rad.
+            joint_vel: (num_joints,) rad/s.
+        """
+        if not cos_tilt >= self._min_cos:
+            tilt = math.degrees(math.acos(min(1.0, max(-1.0, cos_tilt))))
+            raise SafetyStop(f"the base leans by {tilt:.0f} degrees, {self.config.max_tilt_deg:g} are allowed")
+        beyond = np.maximum(self._lower - joint_pos, joint_pos - self._upper)
+        if not beyond.max() <= self.config.joint_margin:
+            worst = int(beyond.argmax())
+            raise SafetyStop(
+                f"{self._names[worst]} is at {joint_pos[worst]:.2f} rad, {beyond[worst]:.2f} beyond its limit"
+            )
+        if not abs(joint_vel).max() <= self.config.max_joint_vel:
+            worst = int(abs(joint_vel).argmax())
+            raise SafetyStop(f"{self._names[worst]} turns at {joint_vel[worst]:.0f} rad/s")
+
+    def check_torque(self, torque: np.ndarray) -> None:
+        """Raises SafetyStop where a joint has given its whole torque (num_joints,), N m, for too long."""
+        if not np.isfinite(torque).all():
+            raise SafetyStop(f"joint_torque: finite numbers were expected, {torque} given")
+        self._strained = np.where(abs(torque) >= 0.98 * self._torque_limits, self._strained + 1, 0)
+        if self._strained.max() > self.config.torque_s / self._dt:
+            worst = int(self._strained.argmax())
+            raise SafetyStop(f"{self._names[worst]} has given {torque[worst]:.1f} N m for {self.config.torque_s:g} s")
+
+    def limit_targets(self, targets: np.ndarray, joint_pos: np.ndarray) -> np.ndarray:
+        """(num_joints,) joint targets within the joints' limits and the rate; the first within reach of the joints."""
+        if not np.isfinite(targets).all():
+            raise SafetyStop(f"the policy's targets are not finite: {targets}")
+        before = joint_pos if self._targets is None else self._targets
+        step = np.float32(self.config.target_rate * self._dt)
+        limited = np.clip(targets, before - step, before + step)
+        limited = np.clip(limited, self._lower, self._upper)
+        if (limited != targets).any():
+            self.counts["targets limited"] += 1
+        self._targets = limited
+        return limited
+
+    def _look(self) -> None:
+        """One control step without or with a frame: how fast the robot may go."""
+        if not self._sees:
+            return
+        fresh = self._age <= self.config.frame_age_s
+        change = np.clip(self._dt / self.config.slow_down_s, 0.0, 1.0)
+        self._pace = min(1.0, self._pace + change) if fresh else max(0.0, self._pace - change)
+        sight = Sight.FRESH if fresh else Sight.SLOWING if self._pace > 0.0 else Sight.STOPPED
+        if sight is not self.sight:
+            age = f"no good frame for {self._age:.2f} s"
+            log.warning(
+                {Sight.FRESH: "frames are back", Sight.SLOWING: f"{age}: slowing down"}.get(sight, f"{age}: standing")
+            )
+            self.counts["stops for want of frames"] += sight is Sight.SLOWING
+            self.sight = sight
+        self._age += self._dt
+
+    def _count(self, level: int, what: str, why: str) -> None:
+        """Counts, and logs the first of each kind."""
+        self.counts[what] += 1
+        if self.counts[what] == 1:
+            log.log(level, "%s: %s", what, why)
