@@ -122,6 +122,7 @@ class PPOConfig:
         obs_normalization: whether observations are normalised by running statistics.
         mixed_precision: whether updates multiply matrices in bfloat16; None where the CPU has units for it (AMX, or
             AVX-512 BF16), on a GPU not.
+        final_entropy_coef: entropy_coef at the last iteration, to which it changes evenly; None: it stays as it is.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
         The others are rsl_rl's PPO arguments.
     """
@@ -148,6 +149,7 @@ class PPOConfig:
     init_std: float
     obs_normalization: bool
     mixed_precision: bool | None = False
+    final_entropy_coef: float | None = None
     symmetry: bool = False
 
     def __post_init__(self) -> None:

@@ -58,6 +58,7 @@ class PerceptivePpo(PPO):
         if kwargs.get("symmetry_cfg") is not None:
             self.symmetry: Symmetry | None = MirrorImages(**kwargs["symmetry_cfg"])
         self.num_updates = 0
+        self._entropy = (self.entropy_coef, self.entropy_coef, 1)
         self.learns_policy = self.num_learning_epochs > 0
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)  # rsl_rl's is not fused
@@ -133,6 +134,8 @@ class PerceptivePpo(PPO):
             multi_gpu_cfg=multi_gpu,
             **ppo.algorithm,
         )
+        if ppo.final_entropy_coef is not None:
+            algorithm.anneal_entropy(ppo.final_entropy_coef, ppo.max_iterations)
         if config.estimator is not None and algorithm.learns_policy:
             algorithm.fit_estimator(config.estimator)
         if perception is not None and perception.supervised_epochs > 0:
@@ -169,6 +172,8 @@ class PerceptivePpo(PPO):
     def update(self) -> dict[str, float]:
         """Learn from a full rollout; mean losses, among them those of the supervised targets."""
         self.guard.start(self.num_updates)
+        first, last, num_updates = self._entropy
+        self.entropy_coef = first + (last - first) * min(self.num_updates / num_updates, 1.0)
         if self.perception_optimizer is not None:
             acted_on = self._embed_rollout() if self.learns_policy else None
             self.train_perception()
@@ -212,6 +217,10 @@ class PerceptivePpo(PPO):
                 average_gradients(self._perception_parameters)
                 self.guard.check_gradients("perception network", self._perception_parameters)
                 optimizer.step()
+
+    def anneal_entropy(self, final: float, num_updates: int) -> None:
+        """Let the entropy coefficient change evenly to `final` within `num_updates` updates."""
+        self._entropy = (self.entropy_coef, final, num_updates)
 
     def fit_estimator(self, config: EstimatorConfig) -> None:
         """Let the truth train the actor's estimator."""

@@ -114,3 +114,14 @@ def test_symmetry_and_frames_are_refused():
         PerceptivePpo.build(ToyEnv(4), replace(config(), mirror=lambda **_: None), "cpu")
     with pytest.raises(ValueError, match="observations.actor is empty"):
         PerceptivePpo.build(ToyEnv(4), replace(config(), actor_groups=()), "cpu")
+
+
+def test_the_entropy_coefficient_falls():
+    env = ToyEnv(4, frames=False)
+    alg, seen = algorithm(env, frames=False, entropy_coef=0.01, final_entropy_coef=0.002, max_iterations=4), []
+    for _ in range(6):
+        collect(alg, env, 8)
+        alg.update()
+        seen.append(alg.entropy_coef)
+    assert seen == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002, 0.002])
+    assert algorithm(env, frames=False, entropy_coef=0.01).entropy_coef == 0.01
