@@ -123,6 +123,9 @@ def _sensor(preset: object, robot: RobotConfig, trust: Sequence[str] | None) -> 
         raise ConfigError(f"lidar.mount={mount} is unknown; robot.mounts has {', '.join(robot.mounts) or 'none'}")
     mount = robot.mounts[mount] if isinstance(mount, str) else make(Mount, mount, "lidar.mount", trust)
     mounted = {"mount_pos": mount.pos, "mount_rpy": mount.rpy, "exclude_geoms": mount.exclude_geoms}
+    if mount.body is not None:
+        place = robot.place(mount)
+        mounted |= {"mount_pos": place.pos, "mount_rpy": None, "mount_quat": place.quat, "mount_body": place.body}
     for name in settings.keys() & mounted.keys():
         raise ConfigError(f"lidar.{name} is unknown; a mount has it: lidar.mount=... or robot.mounts.<name>=...")
     return make(SensorConfig, settings | mounted, "lidar", trust)

@@ -146,7 +146,8 @@ def contact_pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
         child = any(bodies[x] != 0 and bodies[x] == parents[bodies[y]] for x, y in ((a, b), (b, a)))
         return bool((types & affinities[::-1]).any()) and bodies[a] != bodies[b] and not child
 
-    return [pair for pair in combinations(range(model.ngeom), 2) if may_touch(*pair)]
+    explicit = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+    return [*(pair for pair in combinations(range(model.ngeom), 2) if may_touch(*pair)), *explicit]
 
 
 def _physics(env: OmniEnv) -> dict[str, str]:

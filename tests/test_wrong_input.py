@@ -122,7 +122,7 @@ LINES = [
     ("train commands=corridor obstacles=corridor obstacles.free_path=3", "free_path"),
     ("train robot.base=trunk", "robot.base=trunk"),
     ("train robot.joints=[a,b]", "robot.joints"),
-    ("train robot.mjcf=nowhere.xml", "robot.mjcf=nowhere.xml"),
+    ("train robot.file=nowhere.xml", "robot.file=nowhere.xml"),
     ("train robot.mounts.head.exclude_geoms=[nose]", "nose"),
     ("train init=nowhere", "init=nowhere"),
     ("train suite=held_out", "suite=held_out is unknown"),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import yaml
 
-from omniperception.deploy.description import Description, Group, Term
+from omniperception.deploy.description import Description, Group, Joints, Term
 from omniperception.deploy.go2 import MOTORS
 
 FILE = "deploy.yaml"
@@ -33,19 +33,18 @@ def deploy_yaml(description: Description) -> str | None:
     joints = description.joints
     if set(joints.names) != set(MOTORS):
         return None
-    count = len(joints.names)
     content = {
         "joint_ids_map": [MOTORS.index(name) for name in joints.names],
         "step_dt": description.control_period_s,
-        "stiffness": [joints.kp] * count,
-        "damping": [joints.kd] * count,
+        "stiffness": _by_motor(joints, joints.kp),
+        "damping": _by_motor(joints, joints.kd),
         "default_joint_pos": _plain(joints.default_pos),
         "commands": {"base_velocity": {"ranges": {**_ranges(description), "heading": None}}},
         "actions": {
             "JointPositionAction": {
                 "clip": [_plain(pair) for pair in zip(joints.lower, joints.upper, strict=True)],
                 "joint_names": [".*"],
-                "scale": [joints.action_scale] * count,
+                "scale": _each(joints.action_scale, len(joints.names)),
                 "offset": _plain(joints.default_pos),
                 "joint_ids": None,
             }
@@ -54,6 +53,16 @@ def deploy_yaml(description: Description) -> str | None:
     }
     comments = "".join(f"# {line}\n" for line in _caveats(description))
     return comments + yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
+
+
+def _each(value: float | Sequence[float], count: int) -> list[float]:
+    return [value] * count if isinstance(value, int | float) else _plain(value)
+
+
+def _by_motor(joints: Joints, value: float | Sequence[float]) -> list[float]:
+    """A number of all joints, or one of each, in the order of the motors."""
+    by_name = dict(zip(joints.names, _each(value, len(joints.names)), strict=True))
+    return [by_name[name] for name in MOTORS]
 
 
 def _terms(description: Description) -> list[tuple[Group, Term]]:

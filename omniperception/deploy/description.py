@@ -26,24 +26,24 @@ class Joints:
     Attributes:
         names: of the joints.
         default_pos: default pose, rad.
-        action_scale: joint target = default_pos + action_scale * action, rad.
+        action_scale: joint target = default_pos + action_scale * action, rad; of all joints, or of each.
         action_limit: actions are clipped to +- this.
-        kp: gain of the position controller that follows the targets, N m / rad.
-        kd: its damping, N m s / rad.
+        kp: gain of the position controller that follows the targets, N m / rad, likewise.
+        kd: its damping, N m s / rad, likewise.
         torque_limits: N m.
-        lower: joint limits, rad; the runtime clips targets to them, training does not.
+        lower: joint limits, rad; None without; the runtime clips targets to them, training does not.
         upper: rad.
     """
 
     names: Sequence[str]
     default_pos: Sequence[float]
-    action_scale: float
+    action_scale: float | Sequence[float]
     action_limit: float
-    kp: float
-    kd: float
+    kp: float | Sequence[float]
+    kd: float | Sequence[float]
     torque_limits: Sequence[float]
-    lower: Sequence[float]
-    upper: Sequence[float]
+    lower: Sequence[float | None]
+    upper: Sequence[float | None]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -39,6 +40,7 @@ from omniperception.learning.config import PerceptionConfig
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.read_out import MotionReadOut
 from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler
+from omniperception.scene import RobotConfig
 
 FOLDER = "exported"
 """Folder of a run directory for an exported policy."""
@@ -115,14 +117,14 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
     robot = run.env.robot
     joints = Joints(
         names=robot.joints,
-        default_pos=[robot.default_joint_pos[name] for name in robot.joints],
-        action_scale=robot.action_scale,
+        default_pos=list(robot.by_joint("default_joint_pos")),
+        action_scale=_of_joints(robot, "action_scale"),
         action_limit=MAX_ACTION,
-        kp=robot.kp,
-        kd=robot.kv,
-        torque_limits=[robot.torque_limits[name] for name in robot.joints],
-        lower=env.state.joint_lower.tolist(),
-        upper=env.state.joint_upper.tolist(),
+        kp=_of_joints(robot, "kp"),
+        kd=_of_joints(robot, "kv"),
+        torque_limits=list(robot.by_joint("torque_limits")),
+        lower=_limits(env.state.joint_lower),
+        upper=_limits(env.state.joint_upper),
     )
     return Description(
         control_period_s=env.control_dt,
@@ -133,6 +135,16 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         perception=_perception(run.perception) if run.perception is not None else None,
         estimated=_estimated(run),
     )
+
+
+def _of_joints(robot: RobotConfig, name: str) -> float | list[float]:
+    """One number where all joints have the same."""
+    values = list(robot.by_joint(name))
+    return values if len(set(values)) > 1 else values[0]
+
+
+def _limits(limits: torch.Tensor) -> list[float | None]:
+    return [limit if math.isfinite(limit) else None for limit in limits.tolist()]
 
 
 _QUANTITIES = ("joint_pos_offset", "joint_vel", "base_lin_vel", "base_ang_vel", "projected_gravity", "command")
@@ -176,6 +188,11 @@ def _estimated(run: RunConfig) -> tuple[str, ...]:
 
 
 def _lidar(sensor: SensorConfig) -> Lidar:
+    if sensor.mount_body is not None:
+        raise ConfigError(
+            f"a LiDAR on {sensor.mount_body}, which moves against the base, cannot be exported: the runtime knows the"
+            " attitude of the base alone; mount it on the base (lidar.mount=...)"
+        )
     pattern = sensor.scan_pattern()
     every_kth = sensor.selection == "every_kth"
     return Lidar(

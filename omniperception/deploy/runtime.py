@@ -238,7 +238,7 @@ class ExportedPolicy:
             self.base_lin_vel = estimates[0]
         self._steps += 1
         self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
-        targets = self._default_pos + np.float32(joints.action_scale) * self.action
+        targets = self._default_pos + np.asarray(joints.action_scale, np.float32) * self.action
         if self.safety is None:
             return targets
         return self.safety.limit_targets(targets, np.asarray(state.joint_pos, np.float32))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 
@@ -73,7 +74,7 @@ class Safety:
         self.config, self._dt = config, description.control_period_s
         joints, lidar = description.joints, description.lidar
         self._names = tuple(joints.names)
-        self._lower, self._upper = (np.asarray(side, np.float32) for side in (joints.lower, joints.upper))
+        self._lower, self._upper = _or(joints.lower, -math.inf), _or(joints.upper, math.inf)
         self._torque_limits = np.asarray(joints.torque_limits, np.float32)
         ranges = np.array([description.command[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")], np.float32)
         self._command_low, self._command_high = ranges.T
@@ -177,3 +178,7 @@ class Safety:
         self.counts[what] += 1
         if self.counts[what] == 1:
             log.log(level, "%s: %s", what, why)
+
+
+def _or(limits: Sequence[float | None], without: float) -> np.ndarray:
+    return np.array([without if limit is None else limit for limit in limits], np.float32)

@@ -39,7 +39,7 @@ def build_ground(
     ground = Ground(config.terrain, sim.world.model, sim.ground_pos, config.sim.num_threads or None)
     max_steps = round(config.terminations.episode_length_s / config.sim.control_dt)
     levels = TerrainLevels(ground, random, config.sim.control_dt, max_steps, config.trials)
-    return ground, levels, HeightLookup(ground, sim.num_envs, sim.device)
+    return ground, levels, HeightLookup(ground, sim.num_envs, sim.device, config.robot.footprint)
 
 
 def build_errors(config: EnvConfig, random: EnvRandom, curriculum: Curriculum) -> MeasurementErrors | None:

@@ -29,9 +29,6 @@ from omniperception.env.metrics import EpisodeMetrics
 from omniperception.env.state import CONTACT_SENSORS, EnvState
 from omniperception.scene import ObstacleField, build_world
 
-FOOTING = 0.35
-"""Distance (m) from the base within which no ground is higher than the feet when a robot starts."""
-
 MAX_ACTION = 100.0
 """Actions beyond this magnitude are clipped and counted; a policy that gets here has diverged."""
 
@@ -159,7 +156,7 @@ class OmniEnv(VecEnv):
 
     def _advance_physics(self, actions: torch.Tensor) -> None:
         self.state.begin_step(actions)
-        target = self.state.default_joint_pos + self.robot.action_scale * actions
+        target = self.state.default_joint_pos + self.state.action_scale * actions
         if self.randomizer.joint_offset is not None:
             target = target + self.randomizer.joint_offset
         path = turn = None
@@ -267,10 +264,10 @@ class OmniEnv(VecEnv):
         height = torch.full((len(env_ids), 1), self.robot.base_height, device=self.device)
         if self.ground is not None and self.terrain_levels is not None:
             self.terrain_levels.start(env_ids, pose[:, :2], self._completed(env_ids))
-            height = height + self.ground.highest(pose[:, :2], FOOTING, env_ids)[:, None]
+            height = height + self.ground.highest(pose[:, :2], self.robot.footing, env_ids)[:, None]
         joints = self.state.default_joint_pos.expand(len(env_ids), -1)
         qpos = torch.cat((pose[:, :2], height, yaw_quat(pose[:, 2]), joints), 1)
-        qvel = torch.zeros(len(env_ids), self.sim.qvel.shape[1], device=self.device)
+        qvel = torch.zeros(len(env_ids), 6 + self.num_actions, device=self.device)
         self.sim.reset(env_ids, qpos, qvel)
         self.randomizer.reset(env_ids)
         if self.pushes is not None:

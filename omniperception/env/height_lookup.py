@@ -15,9 +15,10 @@ from omniperception.scene.ground_kernels import base_heights, heights_around
 class HeightLookup:
     """Heights of the robots above the ground around them, each kind in one launch over all environments."""
 
-    def __init__(self, ground: Ground, num_envs: int, device: torch.device) -> None:
+    def __init__(self, ground: Ground, num_envs: int, device: torch.device, footprint: tuple[float, float]) -> None:
+        """`footprint`: half length and half width (m) of what the base's height is measured from."""
         self._ground, self._num_envs = ground, num_envs
-        self._grid, self._footprint = height_grid(device), footprint_grid(device)
+        self._grid, self._footprint = height_grid(device), footprint_grid(*footprint, device)
         self._base_pos_w, self._yaw = torch.zeros(num_envs, 3, device=device), torch.zeros(num_envs, device=device)
         self._base_height = torch.zeros(num_envs, device=device)
         self._heights = torch.zeros(num_envs, NUM_HEIGHTS, device=device)

@@ -17,9 +17,11 @@ def height_grid(device: torch.device | str = "cpu") -> torch.Tensor:
     return torch.stack(torch.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
 
 
-def footprint_grid(device: torch.device | str = "cpu") -> torch.Tensor:
-    """(5, 2) points (m) in the yaw-aligned frame whose ground the base's height is measured from: origin and hips."""
-    return torch.tensor([[0.0, 0.0], [0.2, 0.1], [0.2, -0.1], [-0.2, 0.1], [-0.2, -0.1]], device=device)
+def footprint_grid(half_x: float, half_y: float, device: torch.device | str = "cpu") -> torch.Tensor:
+    """(5, 2) points (m) in the yaw-aligned frame whose ground the base's height is measured from: the origin and the
+    corners of a rectangle around it."""
+    corners = [[x, y] for x in (half_x, -half_x) for y in (half_y, -half_y)]
+    return torch.tensor([[0.0, 0.0], *corners], device=device)
 
 
 def flat_heights(base_height: torch.Tensor) -> torch.Tensor:

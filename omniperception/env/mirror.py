@@ -69,14 +69,15 @@ def mirrored_joints(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: a joint has no mirror image, or the default pose is not its own.
     """
-    model = robot.spec().compile()
+    model = robot.compiled()
     data = mujoco.MjData(model)
-    data.qpos[:] = 0
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
+    for name in robot.joints:
+        data.joint(name).qpos = 0
     mujoco.mj_kinematics(model, data)
     ids = [model.joint(name).id for name in robot.joints]
     anchor, axis = data.xanchor[ids] - data.body(robot.base).xpos, data.xaxis[ids]
-    default = np.array([robot.default_joint_pos[name] for name in robot.joints])
+    default = np.array(robot.by_joint("default_joint_pos"))
     index, sign = np.zeros(len(ids), np.int64), np.zeros(len(ids), np.float32)
     for j, name in enumerate(robot.joints):
         there = np.linalg.norm(anchor - anchor[j] * VECTOR, axis=1) < _SAME

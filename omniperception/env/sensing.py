@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from omniperception.common.rotations import multiply
 from omniperception.common.timing import StageTimer
 from omniperception.env.frame_delivery import FrameDelivery, PastPoses
 from omniperception.env.kinematics import Kinematics
@@ -38,6 +39,7 @@ class SensorConfig(LidarConfig):
     Attributes:
         pattern: makes the scan pattern; None: the device's.
         exclude_geoms: geoms of the robot that its rays pass through: the housing around the sensor.
+        mount_body: link that carries the sensor and moves against the base; None: the base.
         device: name in `omniperception.lidar.DEVICES` of the sensor whose own noise `randomization.lidar_device` puts
             on, or None.
         distal_below_deg: rays whose elevation in the sensor frame is below this count for `capped_ray_distance`.
@@ -47,6 +49,7 @@ class SensorConfig(LidarConfig):
 
     pattern: Callable[[], ScanPattern] | None = None
     exclude_geoms: Sequence[str] = ()
+    mount_body: str | None = None
     device: str | None = None
     distal_below_deg: float = 20.0
     cloud_mb: float = 1000.0
@@ -84,8 +87,13 @@ class LidarSensing:
       what is known of poses (true sectors, heights, targets of supervision by these) is of the moment of the tick, so
       that a network learns what is there now.
 
+    A sensor on a link that moves against the base (`config.mount_body`): a sampler that levels points does so in the
+    heading of that link and around its origin, with the attitude that the base's measured one and the joints give.
+    Sector distances are the base's.
+
     Attributes:
         base: index of the robot's base among the bodies of the ray scene.
+        carrier: index of the body that carries the sensor, usually the base.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
             newest last, with `base_motion` one row more: how the base moved since the frame before; None without a
             sampler.
@@ -153,8 +161,10 @@ class LidarSensing:
             )
         self._sim, self.sampler, self.whole = sim, sampler, whole or measured
         self.config, pattern = config, config.scan_pattern()
-        shapes = ray_shapes(sim.world, config.exclude_geoms)
+        shapes = ray_shapes(sim.world, config.exclude_geoms, config.mount_body)
         self._bodies, self.base = shapes.bodies, shapes.base
+        body = config.mount_body
+        self.carrier = self.base if body is None else shapes.bodies.index(sim.world.model.body(body).id)
         self._shape_of = {name: k for k, name in enumerate(shapes.geom_names)}
         self.scene = RayScene(
             shapes.shapes, sim.num_envs, len(shapes.bodies), device=str(sim.device), num_threads=num_threads
@@ -165,7 +175,7 @@ class LidarSensing:
             config,
             pattern,
             self.scene,
-            mount_body=self.base,
+            mount_body=self.carrier,
             noise=tuple(noise),
             seed=seed,
             outputs=outputs,
@@ -252,6 +262,7 @@ class LidarSensing:
             if self._delivery is not None:
                 self._delivery.draw()
             self._place_bodies()
+        attitude = self._attitude(base_quat)
         slices = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
             with timer.stage("rays"):
@@ -262,7 +273,7 @@ class LidarSensing:
                     mean[envs] = self._mean_distal_range(frame, cap)
             if self._shown:
                 with timer.stage("sampling"):
-                    self._sample(envs, frame, base_quat)
+                    self._sample(envs, frame, attitude)
             if self._sectors:
                 with timer.stage("sectors"):
                     self._sectors[index]()
@@ -271,6 +282,14 @@ class LidarSensing:
         self.frame_tick.fill_(self.tick)
         if self._shown:
             self._append_newest()
+
+    def _attitude(self, base_quat: torch.Tensor) -> torch.Tensor:
+        """(num_envs, 4) attitude of the body that carries the sensor, by the base's as measured and the joints."""
+        if self.carrier == self.base:
+            return base_quat
+        quat = self.scene.body_quat.float()
+        back = quat[:, self.base] * quat.new_tensor([1.0, -1.0, -1.0, -1.0])
+        return multiply(base_quat, multiply(back, quat[:, self.carrier]))
 
     def _place_bodies(self) -> None:
         """Where they are now, or where they were when a late frame was taken."""
@@ -291,11 +310,11 @@ class LidarSensing:
             seen = torch.where(self.fresh[envs, None], seen, unseen == 0)
         self.unseen[envs] = torch.where(seen, 0, unseen + 1)
 
-    def _sample(self, envs: slice, frame: LidarFrame, base_quat: torch.Tensor) -> None:
+    def _sample(self, envs: slice, frame: LidarFrame, quat: torch.Tensor) -> None:
         assert self.sampler is not None and frame.ranges is not None and frame.directions_s is not None
         assert frame.elevation is not None and frame.azimuth is not None
         sensor, points = self.config, self._newest[envs, : self.sampler.num_points]
-        attitude = Attitude(base_quat[envs].contiguous(), sensor.mount_pos, sensor.quat)
+        attitude = Attitude(quat[envs].contiguous(), sensor.mount_pos, sensor.quat)
         self.sampler(frame.ranges, frame.directions_s, frame.elevation, frame.azimuth, points, attitude)
 
     def _append_newest(self) -> None:
@@ -394,6 +413,8 @@ class LidarSensing:
                 num_sectors=out.shape[1],
                 num_threads=num_threads,
                 out=out[envs],
+                body_pos=self.scene.body_pos[envs],
+                carrier=self.carrier,
             )
             launches.append(launch)
         return launches

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 
 from omniperception.common.lazy import lazy
@@ -90,7 +92,8 @@ class EnvState:
     Attributes:
         actions: (num_envs, num_actions) each: those applied, the newest first, and the two before; 0 after a reset.
         before: kinematics at the start of the control step.
-        default_joint_pos, joint_lower, joint_upper: (num_joints,) rad.
+        default_joint_pos, joint_lower, joint_upper: (num_joints,) rad; joints without limits have infinite ones.
+        action_scale: (num_joints,) rad.
         joint_torque_limit: (num_joints,) N m.
         default_base_height: m, of the default pose.
         drawn_physics: (num_envs, W) what randomization drew; see `Randomizer.drawn`.
@@ -130,12 +133,16 @@ class EnvState:
         self.num_envs, self.device, self.control_dt = sim.num_envs, sim.device, control_dt
         self._avoidance, self._sensing = avoidance, sensing
         robot, model = sim.world.robot, sim.world.model
-        limits = model.jnt_range[[model.joint(name).id for name in robot.joints]]
+        ids = [model.joint(name).id for name in robot.joints]
+        limits = np.where(model.jnt_limited[ids, None], model.jnt_range[ids], (-math.inf, math.inf))
         self.joint_lower, self.joint_upper = torch.tensor(limits, dtype=torch.float32, device=self.device).unbind(1)
-        self.default_joint_pos = torch.tensor([robot.default_joint_pos[n] for n in robot.joints], device=self.device)
-        self.joint_torque_limit = torch.tensor([robot.torque_limits[n] for n in robot.joints], device=self.device)
+        self.default_joint_pos, self.joint_torque_limit, self.action_scale = (
+            torch.tensor(robot.by_joint(name), dtype=torch.float32, device=self.device)
+            for name in ("default_joint_pos", "torque_limits", "action_scale")
+        )
         self.default_base_height = robot.base_height
-        self._foot_geoms = tuple(model.geom(name).id for name in robot.foot_geoms)
+        self._foot_geoms = tuple(model.geom(name).id for foot in robot.feet for name in foot)
+        self._foot_of = _membership([len(foot) for foot in robot.feet], self.device)
         self.actions: tuple[torch.Tensor, ...] = (torch.zeros(self.num_envs, robot.num_joints, device=self.device),) * 3
         self.drawn_physics = randomizer.drawn
         self._history = None if randomizer.delay is None else StateHistory(sim, randomizer)
@@ -263,7 +270,8 @@ class EnvState:
     def foot_force(self) -> torch.Tensor:
         """(num_envs, F, 3) N, environment frame: of each foot on what it touches, so that a foot that stands pushes
         down. Requires "foot_force"."""
-        return self._contact_force(FOOT_FORCE)
+        force = self._contact_force(FOOT_FORCE)
+        return force if self._foot_of is None else self._foot_of @ force
 
     @lazy
     def link_force(self) -> torch.Tensor:
@@ -294,7 +302,7 @@ class EnvState:
 
     @property
     def foot_pos_w(self) -> torch.Tensor:
-        """(num_envs, F, 3) m, environment frame: centres of the foot geoms."""
+        """(num_envs, F, 3) m, environment frame: centres of the foot geoms, and the mean of a foot of several."""
         return self.foot_motion[0]
 
     @property
@@ -305,7 +313,11 @@ class EnvState:
     @lazy
     def foot_motion(self) -> tuple[torch.Tensor, torch.Tensor]:
         """`foot_pos_w` and `foot_vel_w`, which the simulator has at once."""
-        return self._sim.geom_motion(self._foot_geoms)
+        motion = self._sim.geom_motion(self._foot_geoms)
+        if self._foot_of is None:
+            return motion
+        mean = self._foot_of / self._foot_of.sum(1, keepdim=True)
+        return mean @ motion[0], mean @ motion[1]
 
     @lazy
     def foot_contact(self) -> torch.Tensor:
@@ -350,6 +362,14 @@ class EnvState:
 
 
 _CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance(value, lazy))
+
+
+def _membership(sizes: Sequence[int], device: torch.device) -> torch.Tensor | None:
+    """(F, G) float32: which of G geoms in a row belong to which of F feet; None where each foot has one."""
+    if all(size == 1 for size in sizes):
+        return None
+    foot = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
+    return (foot == torch.arange(len(sizes))[:, None]).float().to(device)
 
 
 def _declared(part: Part | None, name: str) -> Part:

@@ -163,6 +163,10 @@ class _Clouds:
     def __init__(self, env: OmniEnv) -> None:
         if env.sensing is None:
             raise ValueError("this policy needs a LiDAR, but the run has none; use lidar=mid360")
+        if env.sensing.carrier != env.sensing.base:
+            raise ValueError(
+                f"this policy needs the LiDAR on the base, but lidar.mount has it on {env.sensing.config.mount_body}"
+            )
         self._env, self._sensing, self._tick = env, env.sensing, -1
 
     @property

@@ -35,7 +35,8 @@ class Clearance:
     def __init__(self, env: OmniEnv) -> None:
         assert env.obstacles is not None  # from which there is a distance
         model, names = env.world.model, [part.name for part in env.obstacles.parts]
-        robot = np.flatnonzero(model.body_rootid[model.geom_bodyid] == env.world.base_body)
+        own = model.body_rootid[model.geom_bodyid] == env.world.base_body
+        robot = np.flatnonzero(own & (model.geom_conaffinity != 0))
         self._robot = Geoms(model, robot.tolist(), env.num_envs, env.device)
         self._obstacles = Geoms(model, [model.geom(name).id for name in names], env.num_envs, env.device)
         self._sim, self._field = env.sim, env.obstacles

@@ -74,7 +74,7 @@ def watch(env: OmniEnv, policy: Policy) -> Footfall:
                 k = env.state.kinematics
                 contact.append(env.state.foot_contact.cpu())
                 velocity.append(torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:]), 1).cpu())
-    return Footfall(torch.stack(contact), torch.stack(velocity).mean(0), env.control_dt, env.robot.foot_geoms)
+    return Footfall(torch.stack(contact), torch.stack(velocity).mean(0), env.control_dt, env.robot.foot_names)
 
 
 def draw_footfall(footfall: Footfall, path: Path) -> None:

@@ -157,12 +157,12 @@ class Recorder:
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         hit = frame.ranges[self._id].isfinite()
         points_s = frame.directions_s[self._id, hit] * frame.ranges[self._id, hit, None]
-        points_b = _rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
+        points_c = _rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
         at, turned = (
-            sensing.scene.body_pos[self._id, sensing.base],
-            sensing.scene.body_quat[self._id, sensing.base],
+            sensing.scene.body_pos[self._id, sensing.carrier],
+            sensing.scene.body_quat[self._id, sensing.carrier],
         )
-        return _rotate(turned, points_b) + at, frame.elevation[self._id, hit] > self._split
+        return _rotate(turned, points_c) + at, frame.elevation[self._id, hit] > self._split
 
     def _interest(self) -> float:
         """Score of a picture: the robot walks ahead, and its LiDAR sees obstacles."""

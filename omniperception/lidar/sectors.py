@@ -34,6 +34,8 @@ class SectorDistances:
         num_sectors: int = 36,
         num_threads: int | None = None,
         out: torch.Tensor | None = None,
+        body_pos: torch.Tensor | None = None,
+        carrier: int | None = None,
     ) -> None:
         """Records the launch.
 
@@ -43,13 +45,15 @@ class SectorDistances:
             class_id: Class that each ray hit, -1 for a miss, (num_envs, N) int32.
             body_quat: Orientations of bodies in the world, (w, x, y, z), (num_envs, num_bodies, 4) float32.
             base: Which body is the base.
-            mount_pos: Sensor position in the base frame, metres.
-            mount_quat: Sensor orientation in the base frame, (w, x, y, z).
+            mount_pos: Sensor position in the frame of the body that carries it, metres.
+            mount_quat: Sensor orientation likewise, (w, x, y, z).
             obstacle_class: The class that counts.
             max_distance: Value of a sector without such a hit, and the most that is reported, metres.
             num_sectors: n, the number of sectors.
             num_threads: CPU threads; None for all cores.
             out: Memory for ``distances``; None allocates it.
+            body_pos: Positions of bodies, metres, (num_envs, num_bodies, 3) float32; needed for a ``carrier``.
+            carrier: Which body carries the sensor; None for the base.
         """
         num_envs, num_rays = true_ranges.shape
         if num_sectors < 1:
@@ -60,6 +64,8 @@ class SectorDistances:
             raise ValueError(
                 f"body_quat must be ({num_envs}, bodies, 4) with bodies > base={base}, got {tuple(body_quat.shape)}"
             )
+        if carrier is not None and (body_pos is None or body_pos.shape[:2] != body_quat.shape[:2]):
+            raise ValueError(f"carrier={carrier} needs body_pos of the same bodies as body_quat")
         if out is not None and out.shape != (num_envs, num_sectors):
             raise ValueError(f"out must be ({num_envs}, {num_sectors}), got {tuple(out.shape)}")
         out = torch.empty(num_envs, num_sectors, device=true_ranges.device) if out is None else out
@@ -70,8 +76,10 @@ class SectorDistances:
             wp.from_torch(true_ranges),
             wp.from_torch(directions_s, dtype=wp.vec3),
             wp.from_torch(class_id),
+            wp.from_torch(body_quat[..., 1:].contiguous() if body_pos is None else body_pos, dtype=wp.vec3),
             wp.from_torch(body_quat, dtype=wp.vec4),
             base,
+            base if carrier is None else carrier,
             wp.vec3(*mount_pos),
             wp.vec4(*mount_quat),
             obstacle_class,

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import mujoco
+import numpy as np
 
 from omniperception.scene.obstacles import ObstaclesConfig
 from omniperception.scene.robot import RobotConfig
+from omniperception.scene.robot_file import collides, compile_robot, drop_unseen
 from omniperception.scene.terrain import GROUND, TerrainConfig
 from omniperception.scene.tiled_terrain import TiledTerrainConfig
 
@@ -45,10 +47,22 @@ class World:
         return self.model.body(self.robot.base).id
 
     @cached_property
-    def joint_order(self) -> tuple[int, ...] | None:
-        """For each of `robot.joints` its place among the model's joints after the base; None where the orders agree."""
-        order = tuple(int(self.model.joint(name).qposadr[0]) - 7 for name in self.robot.joints)
-        return None if order == tuple(range(len(order))) else order
+    def joint_columns(self) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
+        """Where the base and each of `robot.joints` stand in positions and in velocities; None where that is their
+        order and there is nothing else."""
+        joints = [self.model.joint(name) for name in self.robot.joints]
+        positions = (*range(7), *(int(joint.qposadr[0]) for joint in joints))
+        velocities = (*range(6), *(int(joint.dofadr[0]) for joint in joints))
+        as_they_are = positions == tuple(range(self.model.nq)) and velocities == tuple(range(self.model.nv))
+        return None if as_they_are else (positions, velocities)
+
+    @cached_property
+    def rest_positions(self) -> np.ndarray:
+        """(nq,) positions with passive joints where the default pose has them, or else the file."""
+        rest = self.model.qpos0.copy()
+        for name, angle in self.robot.default_joint_pos.items():
+            rest[self.model.joint(name).qposadr[0]] = angle
+        return rest
 
     @property
     def ground_mocap(self) -> int | None:
@@ -73,45 +87,59 @@ def build_world(
     obstacles: ObstaclesConfig,
     sensors: Collection[str] = (),
 ) -> World:
-    """Compiles one environment: the robot touches the ground and the obstacles, nothing else touches anything.
+    """Compiles one environment: the robot touches the ground and the obstacles, and itself where its preset says so.
+
+    Of the robot those geoms touch something that can be touched according to its file (contype or conaffinity), with
+    contacts of three dimensions (condim 3); the ground decides the friction.
 
     Raises:
         ValueError: the preset names a part that the robot does not have, or the base does not float.
     """
     spec = robot.spec()
     _check_geoms(spec, robot)
+    drop_unseen(spec, robot.ray_groups)
     for geom in spec.geoms:
-        geom.contype, geom.conaffinity, geom.condim = 0, 1, 3
+        geom.contype, geom.conaffinity, geom.condim = 0, int(collides(geom)), 3
     terrain.add_to(spec)
     obstacles.add_to(spec)
     _add_contact_sensors(spec, robot, obstacles, frozenset(sensors))
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    model = spec.compile()
+    model = compile_robot(spec, robot.file)
     _check_joints(model, robot)
     return World(model, robot, terrain, obstacles, frozenset(sensors))
 
 
 def _check_geoms(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
-    known = [geom.name for geom in spec.geoms]
-    for key in ("foot_geoms", "penalized_geoms"):
-        unknown = sorted(set(getattr(robot, key)) - set(known))
+    known = {geom.name: geom for geom in spec.geoms}
+    named = {"foot_geoms": [name for foot in robot.feet for name in foot], "penalized_geoms": robot.penalized_geoms}
+    for key, names in named.items():
+        unknown = sorted(set(names) - known.keys())
         if unknown:
-            raise ValueError(f"robot.{key} names {', '.join(unknown)}; known: {', '.join(filter(None, known))}")
+            raise ValueError(f"robot.{key} names {', '.join(unknown)}; known: {', '.join(known)}")
+        untouchable = sorted(name for name in names if not collides(known[name]))
+        if untouchable:
+            raise ValueError(
+                f"robot.{key} names {', '.join(untouchable)}, which nothing can touch (contype=0 conaffinity=0 in"
+                f" {robot.file}); name geoms that collide"
+            )
 
 
 def _check_joints(model: mujoco.MjModel, robot: RobotConfig) -> None:
-    """Base at qpos[0:7] and every other joint in the list, one number each: what states are made of."""
-    types = {model.joint(k).name: model.jnt_type[k] for k in range(model.njnt)}
+    """Base at qpos[0:7] and joints of one number each: what states are made of."""
     floating = [model.body(model.jnt_bodyid[k]).name for k in range(model.njnt) if model.jnt_type[k] == _FREE]
     if floating != [robot.base] or model.jnt_type[0] != _FREE:
         raise ValueError(
-            f"robot.base={robot.base} must be the first body of {robot.mjcf} with a joint, and the only one with a free"
+            f"robot.base={robot.base} must be the first body of {robot.file} with a joint, and the only one with a free"
             f" joint; bodies with a free joint: {', '.join(floating) or 'none'}"
         )
-    missing = [name for name, kind in types.items() if kind != _FREE and name not in robot.joints]
-    if missing:
-        raise ValueError(f"robot.joints must name every joint of {robot.mjcf}; missing: {', '.join(missing)}")
-    balls = [name for name in robot.joints if types[name] == mujoco.mjtJoint.mjJNT_BALL]
+    known = [model.joint(k).name for k in range(1, model.njnt)]
+    unknown = sorted(set(robot.default_joint_pos) - set(known))
+    if unknown:
+        raise ValueError(
+            f"robot.default_joint_pos names {', '.join(unknown)}, which {robot.file} does not have; known:"
+            f" {', '.join(known)}"
+        )
+    balls = [name for name in robot.default_joint_pos if model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_BALL]
     if balls:
         raise ValueError(f"robot.joints names {', '.join(balls)}: joints must be hinges or slides, not balls")
 
@@ -120,7 +148,7 @@ def _add_contact_sensors(
     spec: mujoco.MjSpec, robot: RobotConfig, obstacles: ObstaclesConfig, kinds: frozenset[str]
 ) -> None:
     geoms = {
-        FOOT_FORCE: (robot.foot_geoms, _FORCE),
+        FOOT_FORCE: (tuple(geom for foot in robot.feet for geom in foot), _FORCE),
         LINK_FORCE: (robot.penalized_geoms, _FORCE),
         OBSTACLE_CONTACT: (obstacles.geom_names(), _FOUND),
         OBSTACLE_FORCE: (obstacles.geom_names(), _FORCE),

@@ -6,9 +6,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
+import mujoco
+
 from omniperception.lidar import Shape
 from omniperception.lidar.mujoco import geom_shapes
 from omniperception.scene.build import World
+from omniperception.scene.robot import RobotConfig
 from omniperception.scene.terrain import GROUND
 
 
@@ -41,10 +44,24 @@ class RayShapes:
         return tuple(self.geom_names.index(name) for name in geom_names)
 
 
-def ray_shapes(world: World, exclude_geoms: Collection[str] = ()) -> RayShapes:
-    """Exact shapes of all geoms of the environment but `exclude_geoms`; what cannot move has no pose.
+def robot_geoms(model: mujoco.MjModel, robot: RobotConfig) -> list[int]:
+    """Ids of the robot's geoms that rays can hit; `model` is the robot alone or in its world."""
+    root = model.body(robot.base).id
+    own = [k for k in range(model.ngeom) if model.body_rootid[model.geom_bodyid[k]] == root]
+    if robot.ray_groups is not None:
+        return [k for k in own if model.geom_group[k] in robot.ray_groups]
+    return [k for k in own if model.geom_contype[k] or model.geom_conaffinity[k]]
+
+
+def ray_shapes(world: World, exclude_geoms: Collection[str] = (), carrier: str | None = None) -> RayShapes:
+    """Exact shapes of terrain, obstacles and `robot_geoms` but `exclude_geoms`; what cannot move has no pose.
 
     Of an obstacle that is a mesh the convex hull is taken, which is what the robot touches.
+
+    Args:
+        world: the environment.
+        exclude_geoms: geoms that rays pass through.
+        carrier: body that is among `bodies` whether it has a shape or not, beside the base.
 
     Raises:
         ValueError: `exclude_geoms` names a geom that does not exist.
@@ -54,10 +71,13 @@ def ray_shapes(world: World, exclude_geoms: Collection[str] = ()) -> RayShapes:
     unknown = sorted(set(exclude_geoms) - set(known))
     if unknown:
         raise ValueError(f"robot.mounts: exclude_geoms names {', '.join(unknown)}; known: {', '.join(known)}")
-    kept = [k for k, name in enumerate(known) if name not in exclude_geoms]
+    root, seen = world.base_body, set(robot_geoms(model, world.robot))
+    unseen = {k for k in range(model.ngeom) if model.body_rootid[model.geom_bodyid[k]] == root} - seen
+    kept = [k for k, name in enumerate(known) if name not in exclude_geoms and k not in unseen]
     obstacles = set(world.obstacles.geom_names())
     found = geom_shapes(model, geoms=kept, hulls=[k for k in kept if known[k] in obstacles])
-    bodies = tuple(dict.fromkeys((*found.body_ids, world.base_body)))
+    carriers = (world.base_body,) if carrier is None else (world.base_body, model.body(carrier).id)
+    bodies = tuple(dict.fromkeys((*found.body_ids, *carriers)))
 
     def hit_class(name: str, shape: Shape) -> HitClass:
         if name in obstacles:

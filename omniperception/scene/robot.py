@@ -1,4 +1,4 @@
-"""The robot preset: its MJCF, default pose, PD gains, and which of its parts play which role."""
+"""The robot preset: its file, default pose, gains, and which of its parts play which role."""
 
 from __future__ import annotations
 
@@ -8,96 +8,251 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
+import numpy as np
+
+from omniperception.scene.robot_file import FRAME, collides, compile_robot, drop_unseen, read_robot, rigid_geoms
+
+ByJoint = float | Mapping[str, float]
+"""One number for all joints, or one for each by name."""
 
 
 @dataclass(frozen=True)
 class Mount:
-    """A place for a LiDAR on the base.
+    """A place for a LiDAR on the robot.
 
     Attributes:
-        pos: (x, y, z) of the sensor in the base frame (m).
-        rpy: orientation of the sensor in the base frame: roll, pitch, yaw about fixed axes (rad).
+        pos: (x, y, z) of the sensor in the frame of `body` (m).
+        rpy: orientation of the sensor in that frame: roll, pitch, yaw about fixed axes (rad).
         exclude_geoms: geoms of the robot that the rays pass through: the housing around the sensor.
+        body: link that carries the sensor; None: the base.
     """
 
     pos: Sequence[float]
     rpy: Sequence[float] = (0.0, 0.0, 0.0)
     exclude_geoms: Sequence[str] = ()
+    body: str | None = None
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a sensor is.
+
+    Attributes:
+        body: the moving link that carries it, of the compiled model; None: the base, or what is fixed to it.
+        pos: m, in that link's frame.
+        quat: (w, x, y, z), likewise.
+    """
+
+    body: str | None
+    pos: tuple[float, float, float]
+    quat: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class RobotConfig:
     """A legged robot.
 
+    Parts of the file that have no name are called after their body: the first geom without a name of body `calf` is
+    `calf_geom_0`.
+
     Attributes:
-        mjcf: a file in `omniperception/scene/assets`, or a path to a user's own MJCF without actuators.
+        file: MJCF or URDF: one of `omniperception/scene/assets`, or a path. Its actuators, sensors and keyframes are
+            not used; the root link of a URDF floats.
         base: name of the free-floating base body.
-        joints: all joints but the base's free one, in the order of actions, joint observations and the exported policy;
-            the file may have them in any order.
-        default_joint_pos: joint angle (rad) of the default pose, by joint name.
+        joints: joints that are actuated, in the order of actions, joint observations and the exported policy; the file
+            may have them in any order. All others but the base's are passive: nothing drives or observes them.
+        default_joint_pos: joint angle (rad) of the default pose, by joint name; passive joints may be named, too, and
+            otherwise start as in the file.
         base_height: height (m) of the base origin above the ground in the default pose.
         kp: proportional gain (N m / rad) of the joint position actuators.
         kv: derivative gain (N m s / rad).
-        torque_limits: torque limit (N m), by joint name.
+        torque_limits: torque limit (N m).
         action_scale: joint target = default + action_scale * action (rad).
-        foot_geoms: geoms that carry the robot.
+        foot_geoms: geoms that carry the robot; a foot of several is a list of them.
         penalized_geoms: links whose contact forces the link-collision reward penalises.
-        frictionloss: dry friction (N m) of every joint.
+        footprint: half length and half width (m) of the rectangle around the base at whose corners, and in whose
+            middle, the ground is looked up from which the base's height is measured.
+        footing: distance (m) from the base within which no ground is higher than the feet when a robot starts.
+        min_base_height: height (m) of the base origin above the ground below which the robot has fallen.
+        frictionloss: dry friction (N m) of the actuated joints; None: as in the file.
+        armature: rotor inertia (kg m^2) of the actuated joints, seen from the joint; None: as in the file.
+        damping: viscous friction (N m s / rad) of the actuated joints; None: as in the file.
+        self_collision: pairs of bodies that can touch each other, with what is fixed to them. Others pass through each
+            other; none: the robot never touches itself.
+        ray_groups: geom groups of the file that LiDAR rays can hit; None: the geoms that can be touched.
         mounts: places for a LiDAR, by name.
     """
 
-    mjcf: str
+    file: str
     base: str
     joints: tuple[str, ...]
     default_joint_pos: Mapping[str, float]
     base_height: float
-    kp: float
-    kv: float
-    torque_limits: Mapping[str, float]
-    action_scale: float
-    foot_geoms: tuple[str, ...]
+    kp: ByJoint
+    kv: ByJoint
+    torque_limits: ByJoint
+    action_scale: ByJoint
+    foot_geoms: tuple[str | tuple[str, ...], ...]
     penalized_geoms: tuple[str, ...]
-    frictionloss: float = 0.0
+    footprint: tuple[float, float]
+    footing: float
+    min_base_height: float
+    frictionloss: ByJoint | None = None
+    armature: ByJoint | None = None
+    damping: ByJoint | None = None
+    self_collision: tuple[tuple[str, str], ...] = ()
+    ray_groups: tuple[int, ...] | None = None
     mounts: Mapping[str, Mount] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("joints", "foot_geoms", "penalized_geoms"):
+        for name in ("joints", "penalized_geoms"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        for name in ("base_height", "kp", "action_scale"):
+        feet = tuple(foot if isinstance(foot, str) else tuple(foot) for foot in self.foot_geoms)
+        object.__setattr__(self, "foot_geoms", feet)
+        if not all(feet):
+            raise ValueError("robot.foot_geoms has an empty list; a foot needs at least one geom")
+        for name in ("base_height", "footing"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"robot.{name}={getattr(self, name)} must be positive")
-        if self.kv < 0 or self.frictionloss < 0:
-            raise ValueError(f"robot.kv={self.kv} and robot.frictionloss={self.frictionloss} must not be negative")
+        if self.min_base_height < 0 or min(self.footprint) < 0:
+            raise ValueError(
+                f"robot.min_base_height={self.min_base_height} and robot.footprint={list(self.footprint)} must not be"
+                " negative"
+            )
         if len(set(self.joints)) != len(self.joints):
             twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
             raise ValueError(f"robot.joints names {', '.join(twice)} more than once")
-        for name in ("default_joint_pos", "torque_limits"):
-            missing = set(self.joints) ^ set(getattr(self, name))
-            if missing:
-                raise ValueError(f"robot.{name} must name exactly robot.joints; differing: {sorted(missing)}")
+        missing = sorted(set(self.joints) - set(self.default_joint_pos))
+        if missing:
+            raise ValueError(f"robot.default_joint_pos must name all of robot.joints; missing: {missing}")
+        for name in ("kp", "torque_limits", "action_scale"):
+            self._check_by_joint(name, positive=True)
+        for name in ("kv", "frictionloss", "armature", "damping"):
+            self._check_by_joint(name, positive=False)
+
+    def _check_by_joint(self, name: str, positive: bool) -> None:
+        given = getattr(self, name)
+        if isinstance(given, Mapping):
+            differing = sorted(set(self.joints) ^ set(given))
+            if differing:
+                raise ValueError(f"robot.{name} must name exactly robot.joints, or be a number; differing: {differing}")
+        for value in given.values() if isinstance(given, Mapping) else () if given is None else (given,):
+            if value < 0 or (positive and value == 0):
+                raise ValueError(f"robot.{name}={value} must {'be positive' if positive else 'not be negative'}")
 
     @property
     def num_joints(self) -> int:
         return len(self.joints)
 
+    @property
+    def feet(self) -> tuple[tuple[str, ...], ...]:
+        """The geoms of each foot."""
+        return tuple((foot,) if isinstance(foot, str) else foot for foot in self.foot_geoms)
+
+    @property
+    def foot_names(self) -> tuple[str, ...]:
+        """Each foot by its first geom."""
+        return tuple(foot[0] for foot in self.feet)
+
+    def by_joint(self, name: str) -> tuple[float, ...]:
+        """`kp`, `kv`, `torque_limits`, `action_scale` or `default_joint_pos` of each of `joints`, in their order."""
+        given = getattr(self, name)
+        return tuple(given[joint] if isinstance(given, Mapping) else given for joint in self.joints)
+
     def spec(self) -> mujoco.MjSpec:
-        """The robot's MJCF with position actuators (PD with torque limit) added in the order of `joints`."""
-        spec = mujoco.MjSpec.from_file(str(self._mjcf_path()))
-        for name in self.joints:
+        """The robot's file with position actuators (PD with torque limit) in the order of `joints`."""
+        spec = read_robot(self.path())
+        gains = zip(*(self.by_joint(name) for name in ("kp", "kv", "torque_limits")), strict=True)
+        for name, (kp, kv, limit) in zip(self.joints, gains, strict=True):
             joint = spec.joint(name)
             if joint is None:
                 known = ", ".join(joint.name for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE)
-                raise ValueError(f"robot.joints names {name}, which {self.mjcf} does not have; known: {known}")
-            joint.frictionloss = self.frictionloss
+                raise ValueError(f"robot.joints names {name}, which {self.file} does not have; known: {known}")
+            self._set_joint(joint)
             actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            actuator.set_to_position(kp=self.kp, kv=self.kv)
-            limit = self.torque_limits[name]
+            actuator.set_to_position(kp=kp, kv=kv)
             actuator.forcerange = [-limit, limit]
+        self._add_self_collision(spec)
         return spec
 
-    def _mjcf_path(self) -> Path:
-        asset = importlib.resources.files("omniperception.scene") / "assets" / self.mjcf
-        path = Path(str(asset)) if asset.is_file() else Path(self.mjcf)
+    def compiled(self) -> mujoco.MjModel:
+        """The robot alone, without geoms that nothing touches and no ray hits."""
+        spec = self.spec()
+        drop_unseen(spec, self.ray_groups)
+        return compile_robot(spec, self.file)
+
+    def _set_joint(self, joint: mujoco.MjsJoint) -> None:
+        for name in ("frictionloss", "armature", "damping"):
+            given = getattr(self, name)
+            if given is not None:
+                value = given[joint.name] if isinstance(given, Mapping) else given
+                setattr(joint, name, [value, 0.0, 0.0] if name == "damping" else value)
+
+    def _add_self_collision(self, spec: mujoco.MjSpec) -> None:
+        for first, second in self.self_collision:
+            bodies = [spec.body(name) for name in (first, second)]
+            for name, body in zip((first, second), bodies, strict=True):
+                if body is None:
+                    known = ", ".join(body.name for body in spec.bodies[1:])
+                    raise ValueError(
+                        f"robot.self_collision names {name}, which {self.file} does not have; known: {known}"
+                    )
+            touching = [[geom.name for geom in rigid_geoms(body) if collides(geom)] for body in bodies]
+            for geom in touching[0]:
+                for other in touching[1]:
+                    spec.add_pair(geomname1=geom, geomname2=other)
+
+    def place(self, mount: Mount) -> Place:
+        """A mount in the frame of the moving link that carries it."""
+        pos, quat = np.array(mount.pos, np.float64), np.empty(4)
+        mujoco.mju_euler2Quat(quat, np.array(mount.rpy, np.float64), "XYZ")
+        if mount.body is None or mount.body == self.base:
+            return Place(None, _vector(pos), _quaternion(quat))
+        model = self.compiled()
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        link, link_pos, link_quat = _frame(model, data, mount.body, self.file)
+        base = model.body(self.base).id
+        carrier = base if model.body_weldid[link] == model.body_weldid[base] else int(model.body_weldid[link])
+        back, turn, at, moved = np.empty(4), np.empty(4), np.empty(3), np.empty(4)
+        mujoco.mju_negQuat(back, data.xquat[carrier])
+        mujoco.mju_mulQuat(turn, back, link_quat)
+        mujoco.mju_rotVecQuat(at, link_pos - data.xpos[carrier], back)
+        mujoco.mju_rotVecQuat(pos, pos.copy(), turn)
+        mujoco.mju_mulQuat(moved, turn, quat)
+        return Place(None if carrier == base else model.body(carrier).name, _vector(at + pos), _quaternion(moved))
+
+    def path(self) -> Path:
+        """The robot's file; a packaged one by its name alone."""
+        asset = importlib.resources.files("omniperception.scene") / "assets" / self.file
+        path = Path(str(asset)) if asset.is_file() else Path(self.file).expanduser()
         if not path.is_file():
-            raise ValueError(f"robot.mjcf={self.mjcf} is neither a packaged asset nor a file")
+            raise ValueError(f"robot.file={self.file} is neither a packaged asset nor a file")
         return path
+
+
+def _frame(model: mujoco.MjModel, data: mujoco.MjData, link: str, file: str) -> tuple[int, np.ndarray, np.ndarray]:
+    """Body, position (m) and quaternion of a link, which may have been fused into another."""
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link)
+    if body > 0:
+        return body, data.xpos[body], data.xquat[body]
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, FRAME + link)
+    if site < 0:
+        fused = [
+            model.site(k).name.removeprefix(FRAME) for k in range(model.nsite) if model.site(k).name.startswith(FRAME)
+        ]
+        known = dict.fromkeys((*(model.body(k).name for k in range(1, model.nbody)), *fused))
+        raise ValueError(f"robot.mounts: body={link} is no link of {file}; known: {', '.join(known)}")
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, data.site_xmat[site])
+    return int(model.site_bodyid[site]), data.site_xpos[site], quat
+
+
+def _vector(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _quaternion(values: np.ndarray) -> tuple[float, float, float, float]:
+    w, x, y, z = values.tolist()
+    return w, x, y, z

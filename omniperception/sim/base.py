@@ -42,10 +42,10 @@ class Simulator(Protocol):
     num_envs: int
     device: torch.device
     qpos: torch.Tensor
-    """(num_envs, 7 + num_joints): base position (m, environment frame), quaternion (wxyz), joints (rad) in the order
-    of the robot's file; `robot_state` has them in the order of `robot.joints`."""
+    """(num_envs, nq): base position (m, environment frame), quaternion (wxyz), joints (rad) in the order of the
+    robot's file, passive ones among them; `robot_state` has `robot.joints` in their order."""
     qvel: torch.Tensor
-    """(num_envs, 6 + num_joints): base linear velocity (m/s, world), angular velocity (rad/s, base), joints."""
+    """(num_envs, nv): base linear velocity (m/s, world), angular velocity (rad/s, base), joints likewise."""
     mocap_pos: torch.Tensor
     """(num_envs, num_parts, 3): positions (m) of the kinematic bodies."""
     mocap_quat: torch.Tensor
@@ -60,11 +60,12 @@ class Simulator(Protocol):
         """(num_envs,) bool: simulations with a failure since their last reset."""
 
     def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Copies of `qpos` and `qvel`, float32, with the joints in the order of `robot.joints`."""
+        """(num_envs, 7 + num_joints) and (num_envs, 6 + num_joints), float32: copies of `qpos` and `qvel` with
+        `robot.joints` in their order."""
 
     def recorded_states(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """(num_envs, num_steps, nq) and (num_envs, num_steps, nv): positions and velocities after each physics step of
-        the last call of `step`, joints likewise, of a simulator that records states; valid until the next call."""
+        """(num_envs, num_steps, 7 + num_joints) and (num_envs, num_steps, 6 + num_joints): `robot_state` after each
+        physics step of the last call of `step`, of a simulator that records states; valid until the next call."""
 
     def step(
         self,
@@ -84,7 +85,8 @@ class Simulator(Protocol):
         """
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        """Puts environments `env_ids` (n,) into states (n, nq) and (n, nv), joints in the order of `robot.joints`."""
+        """Puts environments `env_ids` (n,) into states (n, 7 + num_joints) and (n, 6 + num_joints), joints in the order
+        of `robot.joints`; passive joints rest in the default pose."""
 
     def joint_torque(self) -> torch.Tensor:
         """(num_envs, num_joints) actuator torque (N m) of the last physics step.
@@ -173,24 +175,32 @@ class SizedGeoms:
         return sizes, self.shapes.half_extents(sizes)
 
 
-class JointOrder:
-    """The order of `robot.joints` and that of the robot's file; nothing is moved where they agree."""
+class JointColumns:
+    """The order of `robot.joints` and that of the robot's file, which may have passive joints besides; nothing is
+    moved where they agree."""
 
     def __init__(self, world: World, device: torch.device) -> None:
-        self._from_file: torch.Tensor | None = None
-        if world.joint_order is not None:
-            self._from_file = torch.tensor(world.joint_order, device=device)
-            self._to_file = self._from_file.argsort()
+        self._columns: tuple[torch.Tensor, ...] | None = None
+        if world.joint_columns is not None:
+            positions, velocities = (torch.tensor(columns, device=device) for columns in world.joint_columns)
+            self._columns = positions, velocities
+            self._rest = torch.tensor(world.rest_positions, device=device)
+            self._num_velocities = world.model.nv
 
-    def from_file(self, state: torch.Tensor) -> torch.Tensor:
-        """The engine's positions (..., 7 + num_joints) or velocities (..., 6 + num_joints) reordered."""
-        return state if self._from_file is None else _reorder(state, self._from_file)
+    def state(self, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The engine's positions (..., nq) and velocities (..., nv) as (..., 7 + num_joints) and (..., 6 +
+        num_joints)."""
+        if self._columns is None:
+            return qpos, qvel
+        positions, velocities = self._columns
+        return qpos[..., positions], qvel[..., velocities]
 
-    def to_file(self, state: torch.Tensor) -> torch.Tensor:
-        """The inverse of `from_file`."""
-        return state if self._from_file is None else _reorder(state, self._to_file)
-
-
-def _reorder(state: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
-    base, joints = state[..., : -len(order)], state[..., -len(order) :]
-    return torch.cat((base, joints[..., order]), -1)
+    def engine_state(self, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The inverse of `state` for (n, ...) states, with passive joints at rest in the default pose."""
+        if self._columns is None:
+            return qpos, qvel
+        positions, velocities = self._columns
+        full_qpos = self._rest.to(qpos.dtype).repeat(len(qpos), 1)
+        full_qvel = qvel.new_zeros(len(qvel), self._num_velocities)
+        full_qpos[:, positions], full_qvel[:, velocities] = qpos, qvel
+        return full_qpos, full_qvel

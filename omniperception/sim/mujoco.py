@@ -10,7 +10,7 @@ import torch
 from mujoco.batch import Batch, SimulationError
 
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, Simulator, SizedGeoms
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointColumns, Simulator, SizedGeoms
 
 _INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -95,7 +95,7 @@ class MujocoSimulator:
         if world.ground_mocap is not None:
             self.ground_pos = self.mocap_pos[:, 0]
             self.mocap_pos, self.mocap_quat = self.mocap_pos[:, 1:], self.mocap_quat[:, 1:]
-        self._order = JointOrder(world, self.device)
+        self._joints = JointColumns(world, self.device)
         self.failure = torch.zeros(num_envs, dtype=torch.int64)
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
         self._record = (("sensordata",) if world.sensors else ()) + (("qpos", "qvel") if record_states else ())
@@ -125,11 +125,11 @@ class MujocoSimulator:
         return self.failure > Failure.NONE
 
     def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self._order.from_file(self.qpos.float()), self._order.from_file(self.qvel.float())
+        return self._joints.state(self.qpos.float(), self.qvel.float())
 
     def recorded_states(self) -> tuple[torch.Tensor, torch.Tensor]:
         qpos, qvel = (torch.from_numpy(self._records[name]) for name in ("qpos", "qvel"))
-        return self._order.from_file(qpos), self._order.from_file(qvel)
+        return self._joints.state(qpos, qvel)
 
     def step(
         self,
@@ -205,8 +205,7 @@ class MujocoSimulator:
         self.batch.reset(env_ids.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for poses, before in zip(self._kinematic, kept, strict=True):
             poses[env_ids] = before
-        self.qpos[env_ids] = self._order.to_file(qpos.double())
-        self.qvel[env_ids] = self._order.to_file(qvel.double())
+        self.qpos[env_ids], self.qvel[env_ids] = self._joints.engine_state(qpos.double(), qvel.double())
         self.failure[env_ids] = Failure.NONE
         for values in self._records.values():
             values[env_ids.numpy()] = 0.0

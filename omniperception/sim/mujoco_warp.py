@@ -15,7 +15,7 @@ import warp as wp
 
 from omniperception.lidar.launch import wp_device
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointOrder, SizedGeoms
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointColumns, SizedGeoms
 from omniperception.sim.kernels import move_kinematic, record, turn_kinematic
 from omniperception.sim.mujoco import SimConfig, apply_options
 
@@ -97,6 +97,7 @@ class Capacity:
         tiled = world.ground_mocap is not None
         ground = sum(_MANY if tiled else _GROUND_CONTACTS.get(int(model.geom_type[k]), _MANY) for k in robot)
         pairs = _PAIRS_PER_OBSTACLE * min(len(world.obstacles.parts()), _OBSTACLES_AT_ONCE)
+        pairs += min(model.npair, len(robot))  # of the robot with itself
         contacts = config.contacts_per_env or ground + _CONTACTS_PER_PAIR * pairs
         limits = int(model.jnt_limited.sum()) + int((model.dof_frictionloss > 0).sum())
         rows = config.rows_per_env or limits + _ROWS_PER_CONTACT[config.cone] * contacts
@@ -143,7 +144,7 @@ class MujocoWarpSimulator:
         if world.ground_mocap is not None:
             self.ground_pos = self.mocap_pos[:, 0]
             self.mocap_pos, self.mocap_quat = self.mocap_pos[:, 1:], self.mocap_quat[:, 1:]
-        self._order = JointOrder(world, self.device)
+        self._joints = JointColumns(world, self.device)
         self.failure = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.overflow = wp.to_torch(data.overflow)
         self._torque = wp.to_torch(data.actuator_force)
@@ -163,11 +164,11 @@ class MujocoWarpSimulator:
         return self.failure > Failure.NONE
 
     def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self._order.from_file(self.qpos.clone()), self._order.from_file(self.qvel.clone())
+        return self._joints.state(self.qpos.clone(), self.qvel.clone())
 
     def recorded_states(self) -> tuple[torch.Tensor, torch.Tensor]:
         qpos, qvel = (self._records[name] for name in ("qpos", "qvel"))
-        return self._order.from_file(qpos), self._order.from_file(qvel)
+        return self._joints.state(qpos, qvel)
 
     def step(
         self,
@@ -202,8 +203,7 @@ class MujocoWarpSimulator:
         self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        self.qpos[env_ids] = self._order.to_file(qpos.float())
-        self.qvel[env_ids] = self._order.to_file(qvel.float())
+        self.qpos[env_ids], self.qvel[env_ids] = self._joints.engine_state(qpos.float(), qvel.float())
         self.failure[env_ids] = int(Failure.NONE)
         for values in (*self._forgotten, *self._records.values()):
             values[env_ids] = 0.0

@@ -12,6 +12,7 @@ import torch
 
 from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene
 from omniperception.common.figures import new_figure
+from omniperception.common.rotations import rotate
 from omniperception.env.sensing import SensorConfig
 from omniperception.lidar import Lidar, ScanPattern, write_points
 from omniperception.lidar.clouds import table_of
@@ -82,11 +83,12 @@ def take_scan(
     unknown = sorted(set(sensor.exclude_geoms) - set(demo.robot_geoms))
     if unknown:
         raise ValueError(f"robot.mounts: exclude_geoms names {unknown}; known: {', '.join(demo.robot_geoms)}")
+    carrier = demo.bodies[sensor.mount_body or demo.base]
     lidar = Lidar(
         config,
         pattern,
         demo.scene,
-        demo.mount_body,
+        carrier,
         exclude_shapes=[demo.robot_geoms[geom] for geom in sensor.exclude_geoms],
         seed=seed,
         outputs=OUTPUTS,
@@ -98,12 +100,12 @@ def take_scan(
     values = {key: getattr(frame, key)[0][hit].numpy() for key in OUTPUTS if key != "valid"}
     across, along, labels = _coordinates(pattern)
     rows = values.pop("row")
-    base = demo.scene.body_pos[0, demo.mount_body].numpy()
+    at, turn = demo.scene.body_pos[0, carrier], demo.scene.body_quat[0, carrier]
     return Scan(
         name,
         seconds,
         config.num_rays,
-        base + np.array(config.mount_pos),
+        (at + rotate(turn[None], at.new_tensor([config.mount_pos]))[0]).numpy(),
         **values,
         across=across[rows],
         along=along[rows],

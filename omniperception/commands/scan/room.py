@@ -12,6 +12,7 @@ import torch
 
 from omniperception.lidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh, geom_shapes
 from omniperception.scene import RobotConfig
+from omniperception.scene.rays import robot_geoms
 
 Vector = tuple[float, float, float]
 
@@ -61,7 +62,8 @@ class DemoScene:
 
     Attributes:
         scene: One environment with the robot's bodies where its default pose has them.
-        mount_body: The robot's base.
+        bodies: Index of each of the robot's links by name.
+        base: The base's name.
         robot_geoms: Index of each of the robot's shapes by the name of its geom.
         open_side: Shapes that a picture of the room from outside leaves out: the ceiling and two of the walls.
         extent: Of the room or the mesh along x and y, and its highest point, metres.
@@ -69,7 +71,8 @@ class DemoScene:
     """
 
     scene: RayScene
-    mount_body: int
+    bodies: dict[str, int]
+    base: str
     robot_geoms: dict[str, int]
     open_side: tuple[int, ...]
     extent: tuple[tuple[float, float], tuple[float, float], float]
@@ -101,8 +104,9 @@ def _with_robot(
     mesh: TriangleMesh | None = None,
     num_threads: int | None = None,
 ) -> DemoScene:
-    model = robot.spec().compile()
-    found = geom_shapes(model)
+    model = robot.compiled()
+    found = geom_shapes(model, geoms=robot_geoms(model, robot))
+    bodies = tuple(dict.fromkeys((*found.body_ids, *range(1, model.nbody))))
     data = mujoco.MjData(model)
     data.qpos[:3] = np.add(at, (0.0, 0.0, robot.base_height))
     for name, angle in robot.default_joint_pos.items():
@@ -111,12 +115,13 @@ def _with_robot(
 
     first = len(shapes)
     shapes = shapes + [replace(shape, class_id=DemoClass.ROBOT) for shape in found.shapes]
-    scene = RayScene(shapes, num_envs=1, num_bodies=len(found.body_ids), num_threads=num_threads)
-    scene.body_pos.copy_(torch.from_numpy(data.xpos[list(found.body_ids)]))
-    scene.body_quat.copy_(torch.from_numpy(data.xquat[list(found.body_ids)]))
+    scene = RayScene(shapes, num_envs=1, num_bodies=len(bodies), num_threads=num_threads)
+    scene.body_pos.copy_(torch.from_numpy(data.xpos[list(bodies)]))
+    scene.body_quat.copy_(torch.from_numpy(data.xquat[list(bodies)]))
     return DemoScene(
         scene=scene,
-        mount_body=found.body_ids.index(model.body(robot.base).id),
+        bodies={model.body(k).name: i for i, k in enumerate(bodies)},
+        base=robot.base,
         robot_geoms={model.geom(k).name: first + i for i, k in enumerate(found.geom_ids)},
         open_side=open_side,
         extent=extent,

@@ -7,11 +7,16 @@ from .rotations import to_quat
 
 
 @wp.func
+def without_yaw(base_quat: wp.vec4):
+    """The turn from the world to the base's yaw-aligned frame."""
+    forward = wp.quat_rotate(to_quat(base_quat), wp.vec3(1.0, 0.0, 0.0))
+    return wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -wp.atan2(forward[1], forward[0]))
+
+
+@wp.func
 def levelled(base_quat: wp.vec4):
     """The base's orientation without its yaw."""
-    q_base = to_quat(base_quat)
-    forward = wp.quat_rotate(q_base, wp.vec3(1.0, 0.0, 0.0))
-    return wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -wp.atan2(forward[1], forward[0])) * q_base
+    return without_yaw(base_quat) * to_quat(base_quat)
 
 
 @wp.func
@@ -28,8 +33,10 @@ def sector_minima(
     ranges: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.vec3),
     class_id: wp.array2d(dtype=wp.int32),
-    base_quat: wp.array2d(dtype=wp.vec4),
+    body_pos: wp.array2d(dtype=wp.vec3),
+    body_quat: wp.array2d(dtype=wp.vec4),
     base: int,
+    carrier: int,
     mount_pos: wp.vec3,
     mount_quat: wp.vec4,
     wanted_class: int,
@@ -44,8 +51,11 @@ def sector_minima(
     thread, lane = wp.tid()
     env = thread + env_offset
     num_sectors = distances.shape[1]
-    level = levelled(base_quat[env, base])
+    unturn = without_yaw(body_quat[env, base])
+    level = unturn * to_quat(body_quat[env, carrier])
     offset = wp.quat_rotate(level, mount_pos)
+    if carrier != base:
+        offset += wp.quat_rotate(unturn, body_pos[env, carrier] - body_pos[env, base])
     turn = wp.quat_to_matrix(level * to_quat(mount_quat))
     for ray in range(lane, ranges.shape[1], num_lanes):
         if class_id[env, ray] == wanted_class:

@@ -1,0 +1,238 @@
+"""Reads a robot's file, MJCF or URDF, into a MuJoCo specification whose parts all have names."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from pathlib import Path
+
+import mujoco
+
+FRAME = "frame:"
+"""Prefix of the sites that mark the frames of fixed links, which are still found when they are fused into others."""
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_READABLE = (".stl", ".obj", ".msh")
+_LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+
+
+def read_robot(path: Path) -> mujoco.MjSpec:
+    """The robot of a file: its own actuators, sensors and keyframes are left out; a URDF's root link floats.
+
+    Raises:
+        ValueError: one line that names the file, what is wrong with which element, and what to do.
+    """
+    spec = parse(path)
+    _check(spec, path)
+    for thing in (*spec.actuators, *spec.sensors, *spec.keys):
+        spec.delete(thing)
+    _name_all(spec)
+    return spec
+
+
+def parse(path: Path) -> mujoco.MjSpec:
+    """Everything that a file says. A URDF's links keep their visual shapes; its fixed joints fuse them."""
+    try:
+        root = ElementTree.parse(path).getroot()
+        if root.tag == "robot":
+            return _parse_urdf(root, path)
+        return mujoco.MjSpec.from_file(str(path))
+    except ElementTree.ParseError as error:
+        raise ValueError(f"robot.file={path} is not XML: {error}") from None
+    except ValueError as error:
+        raise _of(path, error) from None
+
+
+def compile_robot(spec: mujoco.MjSpec, path: str | Path) -> mujoco.MjModel:
+    """The compiled model; what MuJoCo refuses is a ValueError in one line with the file's name."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise _of(path, error) from None
+
+
+def collides(geom: mujoco.MjsGeom) -> bool:
+    """Tell whether a geom of the file is there to be touched, not only looked at."""
+    return bool(geom.contype or geom.conaffinity)
+
+
+def drop_unseen(spec: mujoco.MjSpec, ray_groups: Iterable[int] | None) -> None:
+    """Takes out the geoms that nothing touches, no ray hits and no mass comes from, and the meshes that only they use.
+
+    Args:
+        spec: the robot.
+        ray_groups: geom groups that rays can hit; None: what collides.
+    """
+    seen = set() if ray_groups is None else set(ray_groups)
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    for geom in list(spec.geoms):
+        if not (collides(geom) or geom.group in seen or geom.name in paired or _has_mass(spec, geom)):
+            spec.delete(geom)
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in list(spec.meshes):
+        if (mesh.name or Path(mesh.file).stem) not in used:
+            spec.delete(mesh)
+
+
+def _has_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
+    """Tell whether the compiler takes a body's mass from a geom of it."""
+    inferred = spec.compiler.inertiafromgeom != mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    if geom.parent.explicitinertial:
+        inferred = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    weightless = geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0)
+    return inferred and not weightless
+
+
+def rigid_geoms(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:
+    """Geoms of a body and of all that is fixed to it."""
+    fixed = [child for child in body.bodies if not child.joints]
+    return [*body.geoms, *(geom for child in fixed for geom in rigid_geoms(child))]
+
+
+def _of(path: str | Path, error: ValueError) -> ValueError:
+    text = " ".join(str(error).split())
+    if text.startswith("robot."):
+        return error
+    hint = ""
+    if "mass and inertia of moving bodies" in text:
+        hint = "; give that link a mass and an inertia (<inertial>), or fix its joint"
+    elif "could not open" in text.lower() or "Error opening file" in text:
+        hint = "; put the mesh where the file says, or name another place there"
+    elif "repeated name" in text:
+        hint = "; rename one of the two"
+    return ValueError(f"robot.file={path}: {text}{hint}")
+
+
+# --- MJCF and URDF ----------------------------------------------------------------------------------------------------
+
+
+def _check(spec: mujoco.MjSpec, path: Path) -> None:
+    """Refuses what the simulation could only get wrong."""
+    for geom in spec.worldbody.geoms:
+        raise ValueError(
+            f"robot.file={path}: geom {geom.name or 'without a name'} stands in the world, which terrain and obstacles"
+            " make; name the robot's own file, not a scene with it"
+        )
+    for tendon in spec.tendons:
+        raise ValueError(
+            f"robot.file={path}: tendon {tendon.name} is not supported; take it out of the file, or drive its joints"
+        )
+    for equality in spec.equalities:
+        if equality.type in _LOOPS:
+            raise ValueError(
+                f"robot.file={path}: the {'weld' if equality.type == _LOOPS[1] else 'connect'} of {equality.name1} and"
+                f" {equality.name2} closes a loop of links, which is not supported; take it out of the file"
+            )
+    for joint in spec.joints:
+        low, high = joint.range
+        if low > high or (low == high != 0):
+            raise ValueError(
+                f"robot.file={path}: joint {joint.name} has a range from {low:g} to {high:g}; give it a low and a high"
+                " end, or take it out"
+            )
+    floating = [body.name for body in spec.bodies if any(joint.type == _FREE for joint in body.joints)]
+    if not floating:
+        roots = ", ".join(body.name for body in spec.worldbody.bodies) or "no body at all"
+        raise ValueError(
+            f"robot.file={path}: no body floats (bodies with a free joint: none); put <freejoint/> into the body of the"
+            f" base: {roots}"
+        )
+
+
+def _name_all(spec: mujoco.MjSpec) -> None:
+    """Gives names to what has none, and every link that is fixed to another a site where its frame is."""
+    bodies = [body for body in spec.bodies if body.name != "world"]
+    _name("body", bodies)
+    joints, geoms = {joint.name for joint in spec.joints}, {geom.name for geom in spec.geoms}
+    for body in bodies:
+        _name(f"{body.name}_joint", body.joints, joints)
+        _name(f"{body.name}_geom", body.geoms, geoms)
+    for body in bodies:
+        if not body.joints:
+            body.add_site(name=FRAME + body.name, group=5)
+
+
+def _name(stem: str, things: Iterable, taken: set[str] | None = None) -> None:
+    things = list(things)
+    taken = {thing.name for thing in things} if taken is None else taken
+    count = 0
+    for thing in things:
+        if not thing.name:
+            while f"{stem}_{count}" in taken:
+                count += 1
+            thing.name = f"{stem}_{count}"
+            taken.add(thing.name)
+
+
+# --- URDF -------------------------------------------------------------------------------------------------------------
+
+
+def _parse_urdf(robot: ElementTree.Element, path: Path) -> mujoco.MjSpec:
+    """A URDF whose meshes are found, whose visual shapes stay and whose root link floats."""
+    _check_ranges(robot, path)
+    _drop_unreadable_visuals(robot)
+    for mesh in robot.iter("mesh"):
+        mesh.set("filename", str(_mesh_file(mesh.get("filename", ""), path)))
+    extension = robot.find("mujoco")
+    if extension is None:
+        extension = ElementTree.SubElement(robot, "mujoco")
+    compiler = extension.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.SubElement(extension, "compiler")
+    for key, value in (("strippath", "false"), ("discardvisual", "false"), ("fusestatic", "true")):
+        compiler.set(key, value)
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
+    for body in spec.worldbody.bodies:
+        if not body.joints:
+            body.add_freejoint(name=f"{body.name}_free")
+    return spec
+
+
+def _check_ranges(robot: ElementTree.Element, path: Path) -> None:
+    """MuJoCo takes a range from 0 to 0 for no limit at all."""
+    for joint in robot.iter("joint"):
+        if joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        limit = joint.find("limit")
+        low, high = (float(limit.get(key, 0)) if limit is not None else 0.0 for key in ("lower", "upper"))
+        if not low < high:
+            raise ValueError(
+                f"robot.file={path}: joint {joint.get('name')} has limits from {low:g} to {high:g}; give it a range, or"
+                " make it fixed or continuous"
+            )
+
+
+def _drop_unreadable_visuals(robot: ElementTree.Element) -> None:
+    """Takes out visual meshes in formats that MuJoCo does not read; they are for looks, and rays see what collides."""
+    for link in robot.iter("link"):
+        for visual in link.findall("visual"):
+            mesh = visual.find("geometry/mesh")
+            if mesh is not None and Path(mesh.get("filename", "")).suffix.lower() not in _READABLE:
+                link.remove(visual)
+
+
+def _mesh_file(name: str, path: Path) -> Path:
+    """Where a mesh lies that a URDF names as a path, file://, package:// or model://.
+
+    A package is looked for in the folder of the URDF and in those above it, by its name or as that folder itself.
+    """
+    scheme, _, rest = name.rpartition("://")
+    if not scheme or scheme == "file":
+        found = path.resolve().parent / rest
+        candidates = [found]
+    else:
+        folders = path.resolve().parents
+        inside = rest.partition("/")[2]
+        candidates = [folder / part for folder in folders for part in (rest, inside)]
+    for candidate in candidates:
+        if candidate.is_file():
+            if candidate.suffix.lower() not in _READABLE:
+                raise ValueError(
+                    f"robot.file={path}: mesh {name} is not of a format that MuJoCo reads ({', '.join(_READABLE)});"
+                    " convert it"
+                )
+            return candidate
+    raise ValueError(
+        f"robot.file={path}: mesh {name} is missing; looked for {candidates[0]}"
+        + (f" and in the folders above, down to {candidates[-1]}" if len(candidates) > 1 else "")
+    )
