@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import yaml
@@ -42,7 +43,7 @@ def deploy_yaml(description: Description) -> str | None:
         "commands": {"base_velocity": {"ranges": {**_ranges(description), "heading": None}}},
         "actions": {
             "JointPositionAction": {
-                "clip": [_plain(pair) for pair in zip(joints.lower, joints.upper, strict=True)],
+                "clip": [_clip(low, high) for low, high in zip(joints.lower, joints.upper, strict=True)],
                 "joint_names": [".*"],
                 "scale": _each(joints.action_scale, len(joints.names)),
                 "offset": _plain(joints.default_pos),
@@ -53,6 +54,10 @@ def deploy_yaml(description: Description) -> str | None:
     }
     comments = "".join(f"# {line}\n" for line in _caveats(description))
     return comments + yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
+
+
+def _clip(low: float | None, high: float | None) -> list[float]:
+    return _plain((-math.inf if low is None else low, math.inf if high is None else high))
 
 
 def _each(value: float | Sequence[float], count: int) -> list[float]:
