@@ -1,0 +1,232 @@
+"""LiDAR messages of drivers, and frames that are cut out of a stream of points by their times."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omniperception.deploy.description import DeployError
+from omniperception.deploy.sampling import rotation_matrix
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points with the time of their measurement.
+
+    Attributes:
+        points: (n, 3) float32 m; misses are zero.
+        times_ns: (n,) int64, on the sensor's or driver's clock.
+    """
+
+    points: np.ndarray
+    times_ns: np.ndarray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a sensor measured within one period.
+
+    Attributes:
+        points: (n, 3) float32 m, sensor frame; misses are zero or left out.
+        offsets_s: (n,) since `start_ns`.
+        start_ns: beginning of the period.
+    """
+
+    points: np.ndarray
+    offsets_s: np.ndarray
+    start_ns: int
+
+
+@dataclass(frozen=True)
+class Extrinsic:
+    """Where a driver says that the sensor is: it has given rotation * point + translation; undone before use.
+
+    Attributes:
+        pos: m.
+        quat: (w, x, y, z).
+    """
+
+    pos: Sequence[float] = (0.0, 0.0, 0.0)
+    quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
+
+    def undo(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3) float32 in the sensor's own frame; a point that is zero was no point, and a moved zero becomes one."""
+        miss = ~points.any(axis=1)
+        turn = rotation_matrix(self.quat)
+        own = ((points - np.asarray(self.pos)) @ turn).astype(np.float32)
+        own[miss | (np.linalg.norm(own, axis=1) < 1e-4)] = 0.0
+        return own
+
+
+def without_noise(points: np.ndarray, tags: np.ndarray) -> np.ndarray:
+    """(n, 3) with points that the sensor itself calls noise with high confidence made misses.
+
+    A Livox tag holds two bits each for noise by position (edges) and by intensity (rain, fog, dust); 01 is the highest
+    confidence that a point is none.
+    """
+    noise = ((tags & 3) == 1) | ((tags >> 2 & 3) == 1)
+    return np.where(noise[:, None], np.float32(0.0), points)
+
+
+class FrameCutter:
+    """Cuts frames out of points by their times, whatever the messages are in which they come.
+
+    A frame is given out when a point has come that is `slack_s` younger than its end, so that messages may overtake
+    each other by as much. Where time jumps, cutting starts again.
+
+    Attributes:
+        late: points that came after their frame had been given out.
+        jumps: how often the time of points jumped, backwards or ahead by more than a second.
+    """
+
+    def __init__(self, period_s: float, slack_s: float = 0.002) -> None:
+        """Args: period_s: of a frame; slack_s: by which messages may be out of order."""
+        self._period, self._slack = round(period_s * 1e9), round(slack_s * 1e9)
+        self.late = self.jumps = 0
+        self._start: int | None = None
+        self._held: list[Points] = []
+
+    def add(self, given: Points) -> list[Frame]:
+        """Frames that are complete, oldest first; a period without any point gives none."""
+        if not len(given.times_ns):
+            return []
+        first, last = int(given.times_ns.min()), int(given.times_ns.max())
+        if self._start is not None and not self._start - 10**9 < first <= last < self._start + self._period + 10**9:
+            self.jumps += 1
+            self._start, self._held = None, []
+        if self._start is None:
+            self._start = first
+        self.late += int((given.times_ns < self._start).sum())
+        self._held.append(given)
+        frames = []
+        while last >= self._start + self._period + self._slack:
+            frames += self._cut()
+        return frames
+
+    def _cut(self) -> list[Frame]:
+        assert self._start is not None
+        points = np.concatenate([held.points for held in self._held])
+        times = np.concatenate([held.times_ns for held in self._held])
+        start, end = self._start, self._start + self._period
+        now, rest = (times >= start) & (times < end), times >= end
+        self._start, self._held = end, [Points(points[rest], times[rest])]
+        if not now.any():
+            return []
+        order = np.argsort(times[now], kind="stable")
+        return [Frame(points[now][order], (times[now][order] - start) * 1e-9, start)]
+
+
+class _Cdr:
+    """Reads little-endian CDR after its four bytes of header."""
+
+    def __init__(self, data: bytes, name: str) -> None:
+        if data[:2] != b"\x00\x01":
+            raise DeployError(f"{name}: little-endian CDR was expected, {data[:4].hex()} given")
+        self.data, self.at = memoryview(data)[4:], 0
+
+    def read(self, kind: str) -> int:
+        size = struct.calcsize(kind)
+        self.at = -(-self.at // size) * size
+        (value,) = struct.unpack_from("<" + kind, self.data, self.at)
+        self.at += size
+        return value
+
+    def text(self) -> str:
+        return bytes(self.bytes()).rstrip(b"\0").decode("utf-8", "replace")
+
+    def bytes(self) -> memoryview:
+        length = self.read("I")
+        part = self.data[self.at : self.at + length]
+        if len(part) != length:
+            raise struct.error("cut off")
+        self.at += length
+        return part
+
+
+_FIELD_TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
+"""sensor_msgs/PointField's datatypes."""
+_TIME_FIELDS = ("timestamp", "offset_time", "time", "t")
+_CUSTOM_POINT = np.dtype(
+    {
+        "names": ["offset_time", "xyz", "tag"],
+        "formats": ["<u4", ("<f4", 3), "u1"],
+        "offsets": [0, 4, 17],
+        "itemsize": 20,
+    }
+)
+"""A point of livox_ros_driver2's CustomMsg in CDR: reflectivity, tag and line follow xyz."""
+
+
+def read_point_cloud2(data: bytes) -> Points:
+    """Points of a sensor_msgs/PointCloud2, in which every point has a time; nan becomes a miss.
+
+    `timestamp` is livox_ros_driver2's: float64 nanoseconds. Integer `offset_time` or `t` are nanoseconds, float `time`
+    seconds, after the header's stamp.
+
+    Raises:
+        DeployError: the message is cut off, big-endian, or lacks x, y, z or a time.
+    """
+    try:
+        return _point_cloud2(data)
+    except (struct.error, ValueError) as error:
+        raise DeployError(f"PointCloud2: {error}") from None
+
+
+def _point_cloud2(data: bytes) -> Points:
+    cdr = _Cdr(data, "PointCloud2")
+    stamp = cdr.read("i") * 10**9 + cdr.read("I")
+    cdr.text()
+    height, width = cdr.read("I"), cdr.read("I")
+    fields = {}
+    for _ in range(cdr.read("I")):
+        name, offset, kind, _ = cdr.text(), cdr.read("I"), cdr.read("B"), cdr.read("I")
+        fields[name] = (_FIELD_TYPES.get(kind, "V"), offset)
+    big_endian, step, _ = cdr.read("B"), cdr.read("I"), cdr.read("I")
+    time_field = next((name for name in _TIME_FIELDS if name in fields), None)
+    if big_endian or not {"x", "y", "z"} <= set(fields) or time_field is None:
+        raise DeployError(
+            f"PointCloud2: little-endian fields x, y, z and one of {', '.join(_TIME_FIELDS)} were expected,"
+            f" {', '.join(fields) or 'none'} given; frames are cut by the points' times"
+        )
+    names = ["x", "y", "z", time_field, *(["tag"] if "tag" in fields else [])]
+    dtype = np.dtype(
+        {
+            "names": names,
+            "formats": [fields[name][0] for name in names],
+            "offsets": [fields[name][1] for name in names],
+            "itemsize": step,
+        }
+    )
+    rows = np.frombuffer(cdr.bytes(), dtype, width * height)
+    points = np.nan_to_num(np.stack([rows[axis].astype(np.float32) for axis in "xyz"], 1), posinf=0.0, neginf=0.0)
+    times = rows[time_field]
+    if time_field == "timestamp":
+        times_ns = times.astype(np.int64)
+    elif times.dtype.kind == "f":
+        times_ns = stamp + np.rint(times.astype(np.float64) * 1e9).astype(np.int64)
+    else:
+        times_ns = stamp + times.astype(np.int64)
+    return Points(without_noise(points, rows["tag"].astype(np.uint8)) if "tag" in fields else points, times_ns)
+
+
+def read_custom_msg(data: bytes) -> Points:
+    """Points of a livox_ros_driver2/CustomMsg."""
+    try:
+        cdr = _Cdr(data, "CustomMsg")
+        cdr.read("i"), cdr.read("I"), cdr.text()
+        base = cdr.read("Q")
+        cdr.read("I")
+        cdr.at += 4  # lidar_id, rsvd[3]
+        count = cdr.read("I")
+        part = bytes(cdr.data[cdr.at :])
+        if len(part) < 20 * count - 1:
+            raise DeployError("CustomMsg: cut off")
+        rows = np.frombuffer(part.ljust(20 * count, b"\0"), _CUSTOM_POINT, count)
+    except (struct.error, ValueError) as error:
+        raise DeployError(f"CustomMsg: {error}") from None
+    return Points(
+        without_noise(rows["xyz"].astype(np.float32), rows["tag"]), base + rows["offset_time"].astype(np.int64)
+    )

@@ -1,0 +1,61 @@
+"""Leg kinematics of a Go2, and the base's velocity from feet that stand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_HIP = np.array([[0.1934, -0.0465, 0], [0.1934, 0.0465, 0], [-0.1934, -0.0465, 0], [-0.1934, 0.0465, 0]])
+"""Hips of FR, FL, RR, RL in the base, m; this and the lengths below as in Unitree's description (scene/assets/go2.xml)."""
+_THIGH = np.array([[0, -0.0955, 0], [0, 0.0955, 0], [0, -0.0955, 0], [0, 0.0955, 0]])
+_CALF, _FOOT = np.array([0.0, 0.0, -0.213]), np.array([-0.002, 0.0, -0.213])
+_STANDING_BAND = 0.015
+"""A foot so little above the lowest one (m, along gravity) counts as standing."""
+
+
+def feet(joint_pos: np.ndarray, joint_vel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position (4, 3) m and velocity (4, 3) m/s of the feet in the base, relative to it.
+
+    Args:
+        joint_pos: (12,) rad, in the motors' order.
+        joint_vel: (12,) rad/s.
+    """
+    hip, thigh, calf = joint_pos.reshape(4, 3).T
+    hip_rate, thigh_rate, calf_rate = joint_vel.reshape(4, 3).T
+    shank = _about_y(thigh + calf, _FOOT)
+    leg = _about_y(thigh, _CALF) + shank
+    from_hip = _about_x(hip, _THIGH + leg)
+    lateral = _about_x(hip, np.array([0.0, 1.0, 0.0]))
+    velocity = (
+        hip_rate[:, None] * np.cross([1.0, 0.0, 0.0], from_hip)
+        + thigh_rate[:, None] * np.cross(lateral, _about_x(hip, leg))
+        + calf_rate[:, None] * np.cross(lateral, _about_x(hip, shank))
+    )
+    return _HIP + from_hip, velocity
+
+
+def base_velocity(joint_pos: np.ndarray, joint_vel: np.ndarray, ang_vel: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """(3,) m/s in the base: minus what the standing feet, which do not slip, do relative to it.
+
+    Args:
+        joint_pos: (12,) rad, in the motors' order.
+        joint_vel: (12,) rad/s.
+        ang_vel: (3,) rad/s of the base, in the base.
+        down: (3,) unit vector of gravity in the base.
+    """
+    at, velocity = feet(joint_pos, joint_vel)
+    depth = at @ down
+    standing = depth >= depth.max() - _STANDING_BAND
+    return -(velocity[standing] + np.cross(ang_vel, at[standing])).mean(0)
+
+
+def _about_x(angle: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """(4, 3) vectors (4, 3) or (3,) turned by angles (4,)."""
+    x, y, z = np.broadcast_to(vectors, (4, 3)).T
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack((x, cos * y - sin * z, sin * y + cos * z), 1)
+
+
+def _about_y(angle: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    x, y, z = vector
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack((cos * x + sin * z, np.full(4, y), -sin * x + cos * z), 1)

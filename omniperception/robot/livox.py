@@ -1,0 +1,282 @@
+"""The Mid-360's own packets (Livox SDK2 protocol): finding it, pointing it at this machine, and its points.
+
+Layouts and ports are those of Livox-SDK2's `livox_lidar_def.h`, `sdk_protocol.h` and `build_request.cpp`; that points
+of a packet are `time_interval` / `dot_num` apart is livox_ros_driver2's reading.
+"""
+
+from __future__ import annotations
+
+import binascii
+import contextlib
+import ipaddress
+import socket
+import struct
+import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from omniperception.deploy.description import DeployError
+
+DETECTION_PORT, COMMAND_PORT, POINT_PORT = 56000, 56100, 56300
+"""Of the sensor: discovery, control, and where points come from."""
+HOST_COMMAND_PORT, HOST_POINT_PORT = 56101, 56301
+"""Of this machine: where answers and points go to."""
+MID360 = 9
+"""Device type."""
+POINTS_PER_PACKET = 96
+SEARCH, CONFIGURE = 0x0000, 0x0100
+_POINT_TYPE_KEY, _POINT_HOST_KEY, _WORK_MODE_KEY = 0x0000, 0x0006, 0x001A
+_CARTESIAN_MM, _CARTESIAN_CM, _SAMPLING = 1, 2, 1
+_COMMAND = struct.Struct("<BBHIHBB6sHI")
+_POINTS = struct.Struct("<BHHHHBBB12sIQ")
+_DETECTION = struct.Struct("<BB16s4sH")
+_KINDS = {
+    _CARTESIAN_MM: (np.dtype([("xyz", "<i4", 3), ("reflectivity", "u1"), ("tag", "u1")]), 1e-3),
+    _CARTESIAN_CM: (np.dtype([("xyz", "<i2", 3), ("reflectivity", "u1"), ("tag", "u1")]), 1e-2),
+}
+
+
+@dataclass(frozen=True)
+class Packet:
+    """Points of one UDP packet.
+
+    Attributes:
+        points: (n, 3) float32 m, sensor frame; a miss is zero.
+        times_ns: (n,) int64 on the sensor's clock.
+        tags: (n,) uint8: noise by position in bits 0 and 1, by intensity in 2 and 3; 0 is a normal point.
+        number: counts packets, modulo 65536.
+    """
+
+    points: np.ndarray
+    times_ns: np.ndarray
+    tags: np.ndarray
+    number: int
+
+
+def read_points(data: bytes) -> Packet | None:
+    """A packet of points; None for what is none of Cartesian points, or is cut off."""
+    if len(data) < _POINTS.size:
+        return None
+    _, length, interval, count, number, _, kind, _, _, _, time_ns = _POINTS.unpack_from(data)
+    if kind not in _KINDS:
+        return None
+    dtype, metres = _KINDS[kind]
+    if length != len(data) or len(data) != _POINTS.size + count * dtype.itemsize or not count:
+        return None
+    rows = np.frombuffer(data, dtype, count, _POINTS.size)
+    times = time_ns + np.arange(count, dtype=np.int64) * (interval * 100) // count
+    return Packet((rows["xyz"] * metres).astype(np.float32), times, rows["tag"], number)
+
+
+def write_points(points: np.ndarray, time_ns: int, number: int, interval_ns: int) -> bytes:
+    """The packet that a Mid-360 sends for points (n, 3), m; interval_ns: from the first point to the next packet's."""
+    rows = np.zeros(len(points), _KINDS[_CARTESIAN_MM][0])
+    rows["xyz"] = np.rint(np.asarray(points) * 1e3)
+    body = struct.pack("<Q", time_ns) + rows.tobytes()
+    length = _POINTS.size - 8 + len(body)
+    head = (
+        0,
+        length,
+        interval_ns // 100,
+        len(points),
+        number & 0xFFFF,
+        0,
+        _CARTESIAN_MM,
+        0,
+        bytes(12),
+        zlib.crc32(body),
+    )
+    return _POINTS.pack(*head, time_ns) + body[8:]
+
+
+@dataclass(frozen=True)
+class Message:
+    """A control command or its answer."""
+
+    command: int
+    number: int
+    is_answer: bool
+    data: bytes
+
+
+def write_message(message: Message, from_sensor: bool = False) -> bytes:
+    """Bytes of a command (to the sensor) or an answer."""
+    length = _COMMAND.size + len(message.data)
+    parts = (0xAA, 0, length, message.number, message.command, int(message.is_answer), int(from_sensor), bytes(6))
+    head = _COMMAND.pack(*parts, 0, 0)[:18]
+    checksum = zlib.crc32(message.data) if message.data else 0
+    return head + struct.pack("<HI", binascii.crc_hqx(head, 0xFFFF), checksum) + message.data
+
+
+def read_message(data: bytes) -> Message | None:
+    """A command or answer; None where length or a checksum is wrong."""
+    if len(data) < _COMMAND.size:
+        return None
+    start, version, length, number, command, kind, _, _, head_crc, data_crc = _COMMAND.unpack_from(data)
+    body = data[_COMMAND.size :]
+    expected = zlib.crc32(body) if body else 0
+    if (start, version, length) != (0xAA, 0, len(data)) or data_crc != expected:
+        return None
+    if head_crc != binascii.crc_hqx(data[:18], 0xFFFF):
+        return None
+    return Message(command, number, bool(kind), body)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A Mid-360 that has answered: address, port of its control, serial number."""
+
+    address: str
+    command_port: int
+    serial: str
+
+
+def discovery_answer(sensor: Sensor, number: int) -> Message:
+    """What a sensor answers to SEARCH."""
+    packed = ipaddress.IPv4Address(sensor.address).packed
+    data = _DETECTION.pack(0, MID360, sensor.serial.encode()[:15], packed, sensor.command_port)
+    return Message(SEARCH, number, True, data)
+
+
+def read_discovery(message: Message) -> Sensor | None:
+    """The Mid-360 that has answered; None for another device or command."""
+    if message.command != SEARCH or not message.is_answer or len(message.data) < _DETECTION.size:
+        return None
+    failed, kind, serial, address, port = _DETECTION.unpack_from(message.data)
+    if failed or kind != MID360:
+        return None
+    return Sensor(str(ipaddress.IPv4Address(address)), port, serial.rstrip(b"\0").decode("ascii", "replace"))
+
+
+def configuration(host: str, point_port: int = HOST_POINT_PORT) -> bytes:
+    """Data of CONFIGURE: Cartesian points in mm, to this host, and sampling."""
+    address = ipaddress.IPv4Address(host).packed
+    values = (
+        (_POINT_TYPE_KEY, bytes([_CARTESIAN_MM])),
+        (_POINT_HOST_KEY, address + struct.pack("<HH", point_port, POINT_PORT)),
+        (_WORK_MODE_KEY, bytes([_SAMPLING])),
+    )
+    return struct.pack("<HH", len(values), 0) + b"".join(struct.pack("<HH", k, len(v)) + v for k, v in values)
+
+
+def read_configuration(data: bytes) -> dict[int, bytes]:
+    """Values by key of a CONFIGURE's data."""
+    (count, _), at, values = struct.unpack_from("<HH", data), 4, {}
+    for _ in range(count):
+        key, length = struct.unpack_from("<HH", data, at)
+        values[key] = data[at + 4 : at + 4 + length]
+        at += 4 + length
+    return values
+
+
+class Mid360:
+    """A Mid-360 on the network; :meth:`packets` gives what has come since the call before.
+
+    Attributes:
+        sensor: which one has answered; None where it was configured before and only listened to.
+        lost: packets that never came, by their numbers.
+        doubled: packets that came twice.
+        other: datagrams that were no packets of points.
+    """
+
+    def __init__(self, host: str, point_port: int = HOST_POINT_PORT) -> None:
+        """Args: host: this machine's address in the sensor's network; point_port: where points come to."""
+        self.host = host
+        self.sensor: Sensor | None = None
+        self.lost = self.doubled = self.other = 0
+        self._recent: list[int] = []
+        self._socket = _socket(host, point_port)
+        self.point_port = self._socket.getsockname()[1]
+
+    def find(self, broadcast: str = "255.255.255.255", port: int = DETECTION_PORT, timeout_s: float = 5.0) -> Sensor:
+        """Search, and point the first Mid-360 that answers at this machine.
+
+        Raises:
+            DeployError: none has answered, or it has refused.
+        """
+        with _socket(self.host, HOST_COMMAND_PORT if port == DETECTION_PORT else 0) as own:
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            for answer in _ask(own, Message(SEARCH, 1, False, b""), (broadcast, port), timeout_s):
+                sensor = read_discovery(answer)
+                if sensor is not None:
+                    self._configure(own, sensor, timeout_s)
+                    self.sensor = sensor
+                    return sensor
+        raise DeployError(
+            f"no Mid-360 has answered at {broadcast} within {timeout_s:g} s; host={self.host} must be this machine's"
+            " address in the sensor's network (usually 192.168.1.x)"
+        )
+
+    def _configure(self, own: socket.socket, sensor: Sensor, timeout_s: float) -> None:
+        request = Message(CONFIGURE, 2, False, configuration(self.host, self.point_port))
+        for answer in _ask(own, request, (sensor.address, sensor.command_port), timeout_s):
+            if answer.command == CONFIGURE and answer.is_answer and len(answer.data) >= 3:
+                failed, key = struct.unpack_from("<BH", answer.data)
+                if failed:
+                    raise DeployError(f"the Mid-360 {sensor.serial} refuses key 0x{key:04x} (code {failed})")
+                return
+        raise DeployError(f"the Mid-360 {sensor.serial} at {sensor.address} has not answered to its configuration")
+
+    def packets(self) -> Iterator[Packet]:
+        """Every packet that waits, in the order of arrival, doubled ones left out."""
+        while True:
+            try:
+                data = self._socket.recv(2048)
+            except BlockingIOError:
+                return
+            packet = read_points(data)
+            if packet is None:
+                self.other += 1
+            elif packet.number in self._recent:
+                self.doubled += 1
+            else:
+                self._note(packet.number)
+                yield packet
+
+    def _note(self, number: int) -> None:
+        """Counts gaps in the packets' numbers; one that comes late after all is no gap."""
+        if self._recent:
+            ahead = (number - self._recent[-1]) & 0xFFFF
+            if 1 <= ahead < 0x8000:
+                self.lost += ahead - 1
+            else:
+                self.lost = max(0, self.lost - 1)
+                self._recent.insert(-1, number)
+                return
+        self._recent = [*self._recent[-31:], number]
+
+    def close(self) -> None:
+        """Ends listening."""
+        self._socket.close()
+
+
+def _socket(host: str, port: int) -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    made.setblocking(False)
+    try:
+        made.bind((host, port))
+    except OSError as error:
+        made.close()
+        raise DeployError(f"host={host}: port {port} cannot be listened to ({error.strerror})") from None
+    return made
+
+
+def _ask(own: socket.socket, request: Message, to: tuple[str, int], timeout_s: float) -> Iterator[Message]:
+    """Answers that come, while the request is repeated once a second."""
+    end, again = time.monotonic() + timeout_s, 0.0
+    while time.monotonic() < end:
+        if time.monotonic() >= again:
+            again = time.monotonic() + 1.0
+            with contextlib.suppress(OSError):  # a network that is still down
+                own.sendto(write_message(request), to)
+        try:
+            answer = read_message(own.recv(2048))
+        except BlockingIOError:
+            time.sleep(0.005)
+            continue
+        if answer is not None:
+            yield answer

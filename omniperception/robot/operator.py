@@ -1,0 +1,154 @@
+"""Where commands come from: the remote's sticks, datagrams, the keyboard, or one command for good."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from omniperception.deploy.description import DeployError
+from omniperception.robot.machine import Request
+from omniperception.robot.messages import Remote
+
+_NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+_STALE_S = 0.5
+
+
+class Operator(Protocol):
+    """Somebody who commands."""
+
+    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+        """(3,) v_x, v_y (m/s), yaw rate (rad/s), and what has been asked for since the call before."""
+
+    def close(self) -> None:
+        """Ends it."""
+
+
+def make_operator(text: str, ranges: Mapping[str, Sequence[float]]) -> Operator:
+    """Of `commands=remote`, `keyboard`, `udp:PORT` or `V_X,V_Y,YAW_RATE`; ranges: of the policy's training."""
+    if text == "remote":
+        return Sticks(ranges)
+    if text == "keyboard":
+        return Keyboard(ranges)
+    if text.startswith("udp:") and text[4:].isdigit():
+        return Datagrams(int(text[4:]))
+    with contextlib.suppress(ValueError):
+        numbers = [float(part) for part in text.split(",")]
+        if len(numbers) == 3:
+            return Constant(numbers)
+    raise DeployError(f"commands={text}: remote, keyboard, udp:PORT or V_X,V_Y,YAW_RATE was expected")
+
+
+def scaled(shares: Sequence[float], ranges: Mapping[str, Sequence[float]]) -> np.ndarray:
+    """(3,) command of shares -1 to 1 of each range, 0 being 0."""
+    limits = [ranges[name] for name in _NAMES]
+    return np.array([s * (high if s > 0 else -low) for s, (low, high) in zip(shares, limits, strict=True)])
+
+
+class Sticks:
+    """The remote: left stick ahead and aside, right stick turns. The guard reads its buttons."""
+
+    def __init__(self, ranges: Mapping[str, Sequence[float]]) -> None:
+        self._ranges = ranges
+
+    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+        shares = [0.0 if abs(s) < 0.05 else s for s in (remote.ly, -remote.lx, -remote.rx)]
+        return scaled(shares, self._ranges), []
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+class Constant:
+    """One command; standing up and walking are asked for by the remote."""
+
+    def __init__(self, command: Sequence[float]) -> None:
+        self._command = np.array(command)
+
+    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+        return self._command, []
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+class Datagrams:
+    """Text to a UDP port of this machine: 'V_X V_Y YAW_RATE', or stand, walk, lie, damp, stop. Commands hold for 0.5 s."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind(("127.0.0.1", port))
+        except OSError as error:
+            self._socket.close()
+            raise DeployError(f"commands=udp:{port}: the port cannot be listened to ({error.strerror})") from None
+        self._command, self._since = np.zeros(3), -1e9
+
+    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+        asked = []
+        while True:
+            try:
+                words = self._socket.recv(256).decode("ascii", "replace").split()
+            except BlockingIOError:
+                break
+            if len(words) == 1 and words[0] in tuple(Request):
+                asked.append(Request(words[0]))
+                continue
+            with contextlib.suppress(ValueError):
+                command = np.array([float(word) for word in words])
+                if command.shape == (3,) and np.isfinite(command).all():
+                    self._command, self._since = command, time.monotonic()
+        is_fresh = time.monotonic() - self._since < _STALE_S
+        return self._command if is_fresh else np.zeros(3), asked
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class Keyboard:
+    """w s ahead, a d aside, q e turn, by a fifth each; space stops; 1 stand, 2 walk, 3 lie, 0 damp, Escape e-stop."""
+
+    _STEPS = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "q": (2, 1), "e": (2, -1)}
+    _REQUESTS = {
+        "1": Request.STAND,
+        "2": Request.WALK,
+        "3": Request.LIE,
+        "0": Request.DAMP,
+        "\x1b": Request.STOP,
+    }
+
+    def __init__(self, ranges: Mapping[str, Sequence[float]]) -> None:
+        if not sys.stdin.isatty():
+            raise DeployError("commands=keyboard needs a terminal")
+        import termios
+        import tty
+
+        self._ranges, self._shares = ranges, np.zeros(3)
+        self._before = termios.tcgetattr(sys.stdin)
+        tty.setcbreak(sys.stdin)
+
+    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+        asked = []
+        while select.select([sys.stdin], [], [], 0.0)[0]:
+            for key in os.read(sys.stdin.fileno(), 64).decode("ascii", "replace"):
+                if key in self._REQUESTS:
+                    asked.append(self._REQUESTS[key])
+                elif key in self._STEPS:
+                    axis, sign = self._STEPS[key]
+                    self._shares[axis] = np.clip(self._shares[axis] + 0.2 * sign, -1.0, 1.0)
+                elif key == " ":
+                    self._shares[:] = 0.0
+        return scaled(self._shares.tolist(), self._ranges), asked
+
+    def close(self) -> None:
+        import termios
+
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)

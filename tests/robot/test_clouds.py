@@ -1,0 +1,134 @@
+"""Frames by the points' times, and drivers' messages as bytes laid out by hand."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from omniperception.deploy import DeployError
+from omniperception.robot.clouds import (
+    Extrinsic,
+    FrameCutter,
+    Points,
+    read_custom_msg,
+    read_point_cloud2,
+    without_noise,
+)
+
+MS = 10**6
+
+
+def at(*times_ms):
+    """Points at these times, each with its time as x."""
+    times = np.array(times_ms, float)
+    points = np.stack((times, np.zeros_like(times), np.zeros_like(times)), 1).astype(np.float32)
+    return Points(points, np.rint(times * MS).astype(np.int64))
+
+
+class TestFrames:
+    """Periods of 100 ms that begin with the first point."""
+
+    def test_points_go_into_the_period_of_their_time(self):
+        cutter = FrameCutter(0.1)
+        assert cutter.add(at(1000, 1050)) == []
+        assert cutter.add(at(1099, 1101)) == []  # within the 2 ms that messages may be out of order
+        (frame,) = cutter.add(at(1103))
+        assert frame.points[:, 0].tolist() == [1000, 1050, 1099] and frame.start_ns == 1000 * MS
+        assert frame.offsets_s.tolist() == pytest.approx([0.0, 0.05, 0.099])
+        (frame,) = cutter.add(at(1205))
+        assert frame.points[:, 0].tolist() == [1101, 1103] and frame.start_ns == 1100 * MS
+
+    def test_messages_may_overtake_each_other(self):
+        cutter = FrameCutter(0.1)
+        cutter.add(at(1000)), cutter.add(at(1090)), cutter.add(at(1101)), cutter.add(at(1095))
+        (frame,) = cutter.add(at(1102))
+        assert frame.points[:, 0].tolist() == [1000, 1090, 1095] and cutter.late == 0
+        cutter.add(at(1099))
+        assert cutter.late == 1
+        assert cutter.add(at(1202))[0].points[:, 0].tolist() == [1101, 1102]
+
+    def test_a_period_without_points_gives_no_frame(self):
+        cutter = FrameCutter(0.1)
+        frames = [*cutter.add(at(1000)), *cutter.add(at(1350)), *cutter.add(at(1402))]
+        assert [frame.start_ns // MS for frame in frames] == [1000, 1300]
+
+    @pytest.mark.parametrize("jump", [-5000, 20000])
+    def test_a_jump_of_the_clock_starts_again(self, jump):
+        cutter = FrameCutter(0.1)
+        cutter.add(at(10000, 10050))
+        assert cutter.add(at(10000 + jump)) == [] and cutter.jumps == 1
+        assert [f.start_ns // MS for f in cutter.add(at(10102 + jump))] == [10000 + jump]
+
+    def test_a_message_of_several_periods(self):
+        frames = FrameCutter(0.1).add(at(*range(0, 320, 10)))
+        assert [len(frame.points) for frame in frames] == [10, 10, 10]
+
+
+def test_an_extrinsic_is_undone_and_misses_stay_misses():
+    """A quarter turn to the left and 1 m up: what the driver calls (0, 2, 1) is 2 m ahead of the sensor."""
+    half = np.sqrt(0.5)
+    extrinsic = Extrinsic((0.0, 0.0, 1.0), (half, 0.0, 0.0, half))
+    given = np.array([[0.0, 2.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(extrinsic.undo(given), [[2, 0, 0], [0, 0, 0], [0, 0, 0]], atol=1e-6)
+
+
+def test_points_that_the_sensor_calls_noise_are_misses():
+    """Bits 0, 1 and 2, 3 of a tag: 01 is high confidence of noise, 10 and 11 lower; higher bits are not about noise."""
+    tags = np.array([0b0000, 0b0001, 0b0100, 0b0010, 0b1100, 0b110000], np.uint8)
+    assert without_noise(np.ones((6, 3), np.float32), tags)[:, 0].tolist() == [1, 0, 0, 1, 1, 1]
+
+
+def text(value):
+    data = value.encode() + b"\0"
+    return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
+
+
+def point_cloud2(fields, rows, width, frame="livox"):
+    """As ROS 2 sends it: header 12.000000007 s, one row."""
+    body = struct.pack("<iI", 12, 7) + text(frame) + struct.pack("<II", 1, width) + struct.pack("<I", len(fields))
+    for name, offset, kind in fields:
+        body += text(name) + struct.pack("<IB3xI", offset, kind, 1)
+    body += struct.pack("<B3xII", 0, len(rows) // width, len(rows)) + struct.pack("<I", len(rows)) + rows + b"\1"
+    return b"\0\1\0\0" + body
+
+
+XYZ = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
+LIVOX = [*XYZ, ("intensity", 12, 7), ("tag", 16, 2), ("line", 17, 2), ("timestamp", 18, 8)]
+
+
+def test_livox_ros_driver2s_point_cloud():
+    """Its format 0: 26 bytes per point, times as float64 nanoseconds; nan is a miss."""
+    rows = struct.pack("<ffffBBd", 1.0, 2.0, 3.0, 9.0, 0, 1, 5e9) + struct.pack(
+        "<ffffBBd", *[np.nan] * 3, 9.0, 0, 1, 6e9
+    )
+    read = read_point_cloud2(point_cloud2(LIVOX, rows, 2, "some_frame"))
+    assert read.points.tolist() == [[1, 2, 3], [0, 0, 0]] and read.times_ns.tolist() == [5 * 10**9, 6 * 10**9]
+
+
+def test_times_after_the_header():
+    rows = struct.pack("<ffff", 1.0, 2.0, 3.0, 0.25)
+    assert read_point_cloud2(point_cloud2([*XYZ, ("time", 12, 7)], rows, 1)).times_ns.tolist() == [12_250_000_007]
+    rows = struct.pack("<fffI", 1.0, 2.0, 3.0, 250)
+    assert read_point_cloud2(point_cloud2([*XYZ, ("t", 12, 6)], rows, 1)).times_ns.tolist() == [12_000_000_257]
+
+
+def test_a_cloud_without_times_or_cut_off_is_refused():
+    rows = struct.pack("<fff", 1.0, 2.0, 3.0)
+    with pytest.raises(DeployError, match="one of timestamp, offset_time, time, t were expected, x, y, z given"):
+        read_point_cloud2(point_cloud2(XYZ, rows, 1))
+    with pytest.raises(DeployError, match="PointCloud2"):
+        read_point_cloud2(point_cloud2(LIVOX, bytes(52), 2)[:-30])
+    with pytest.raises(DeployError, match="little-endian CDR"):
+        read_point_cloud2(b"\0\0\0\0" + bytes(100))
+
+
+def test_livox_ros_driver2s_custom_message():
+    """Its format 1; the 64-bit base of time is aligned to 8, and the last point is 19 bytes."""
+    body = struct.pack("<iI", 12, 7) + text("livox_frame") + bytes(4)  # 8 + 4 + 12 = 24: aligned already
+    body = body[:24] + struct.pack("<QIB3xI", 5 * 10**9, 2, 0, 2)
+    body += struct.pack("<IfffBBBx", 0, 1.0, 2.0, 3.0, 9, 0, 1) + struct.pack("<IfffBBB", 480, 4.0, 5.0, 6.0, 9, 1, 1)
+    read = read_custom_msg(b"\0\1\0\0" + body)
+    assert read.points.tolist() == [[1, 2, 3], [0, 0, 0]]  # the second is noise
+    assert read.times_ns.tolist() == [5 * 10**9, 5 * 10**9 + 480]
+    with pytest.raises(DeployError, match="CustomMsg: cut off"):
+        read_custom_msg(b"\0\1\0\0" + body[:-5])
