@@ -36,7 +36,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omniperception.config import ConfigError, UnknownKey, one_line
+from omniperception.common.errors import ConfigError, UnknownKey, one_line
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false"}
 

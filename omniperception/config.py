@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import importlib.util
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+
+from omniperception.common.errors import ConfigError, UnknownKey, one_line, suggest
 
 _SHIPPED = Path(__file__).resolve().parent / "conf"
 CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"
@@ -51,30 +52,6 @@ def _device_figure(name: str, figure: str) -> float:
 
 
 OmegaConf.register_new_resolver("device", _device_figure, replace=True)
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot run; the message is one line that says what to change."""
-
-
-class UnknownKey(ConfigError):
-    """A key that nothing takes.
-
-    Attributes:
-        given: the override or key.
-        known: the keys that could have been meant.
-    """
-
-    def __init__(self, given: str, known: Iterable[str], name: str = "") -> None:
-        self.given, self.known = given, tuple(known)
-        self.name = name or given.lstrip("+~").partition("=")[0].rpartition(".")[2]
-        super().__init__(f"{given} is unknown; {suggest(self.name, self.known)}")
-
-
-def suggest(name: str, known: Sequence[str]) -> str:
-    """The known name that is most similar, or all of them."""
-    near = difflib.get_close_matches(name, known, 1)
-    return f"did you mean {near[0]}?" if near else f"known: {', '.join(sorted(known))}"
 
 
 def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
@@ -363,9 +340,3 @@ def find_run(name: str, key: str = "run") -> Path:
     if not runs:
         raise ConfigError(f"{key}=latest finds no run under outputs/; train one first")
     return runs[-1].parent
-
-
-def one_line(error: BaseException) -> str:
-    """The message of an error without line breaks."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return " ".join(lines) or type(error).__name__

@@ -74,7 +74,7 @@ def test_the_console_command_lists_and_explains_all_commands(capsys):
         assert f"\n  {name} " in listed
         main([name, "--help"])
         shown = capsys.readouterr().out
-        module = importlib.import_module(f"omniperception.commands.{name}")
+        module = importlib.import_module(f"omniperception.commands.{name.replace('-', '_')}")
         assert shown.startswith(f"usage: omniperception {name} ") and module.__doc__.splitlines()[0] in shown
     with pytest.raises(SystemExit, match="2"):
         main(["trian"])

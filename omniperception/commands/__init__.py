@@ -14,6 +14,8 @@ COMMANDS = {
     "tables": "renders the results tables of the docs from files of results",
     "ablate": "trains and evaluates variants of the perception over seeds",
     "export": "exports a policy for a robot or another simulator",
+    "robot": "runs an exported policy on a Go2, or on a simulated one",
+    "robot-sim": "simulates a Go2 and its LiDAR on the robot's own wire",
     "publish": "makes a small run directory, fit for a repository",
     "scan": "draws what a LiDAR sees",
     "plan": "lists what a configuration consists of and what was left out",
@@ -30,6 +32,7 @@ EXTRAS = {
     "matplotlib": "plots",
     "onnx": "export",
     "onnxruntime": "deploy",
+    "cyclonedds": "robot",
     "trimesh": "meshes",
     **dict.fromkeys(("laspy", "mcap", "mcap_ros2", "pypcd4", "rosbags"), "clouds"),
 }
@@ -48,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if name not in COMMANDS:
         _fail(f"{name} is unknown; known: {', '.join(COMMANDS)}")
     try:
-        command = importlib.import_module(f"omniperception.commands.{name}").command
+        command = importlib.import_module(f"omniperception.commands.{name.replace('-', '_')}").command
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         if library not in EXTRAS:

@@ -247,7 +247,7 @@ class LidarSensing:
     def record_motion(self, step: int) -> None:
         """Notes where the bodies are in control step number `step` within a frame, where a segment of motion ends."""
         if self._steps_per_segment < self.period_steps and step % self._steps_per_segment == 0:
-            self._place_bodies()
+            self.place_bodies()
             self.lidar.record_poses()
 
     def take_frame(self, time_s: float, base_quat: torch.Tensor, timer: StageTimer) -> None:
@@ -261,7 +261,7 @@ class LidarSensing:
         with timer.stage("rays"):
             if self._delivery is not None:
                 self._delivery.draw()
-            self._place_bodies()
+            self.place_bodies()
         attitude = self._attitude(base_quat)
         slices = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
@@ -291,7 +291,7 @@ class LidarSensing:
         back = quat[:, self.base] * quat.new_tensor([1.0, -1.0, -1.0, -1.0])
         return multiply(base_quat, multiply(back, quat[:, self.carrier]))
 
-    def _place_bodies(self) -> None:
+    def place_bodies(self) -> None:
         """Where they are now, or where they were when a late frame was taken."""
         if self._past is None or self._delivery is None:
             pos, quat = self._sim.body_poses(self._bodies)

@@ -41,6 +41,7 @@ class Network:
 
     Attributes:
         interface: network interface; "lo": this machine alone, without multicast.
+        participant: cyclonedds' own.
     """
 
     def __init__(self, interface: str = "lo", domain: int = 0) -> None:
@@ -52,28 +53,32 @@ class Network:
         self.interface = interface
         try:
             self._domain = Domain(domain, _LOOPBACK if interface == "lo" else _NETWORK.format(interface))
-            self._participant: DomainParticipant = DomainParticipant(domain)
+            self.participant: DomainParticipant = DomainParticipant(domain)
         except DDSException as error:
             raise DeployError(f"interface={interface}: CycloneDDS cannot use it ({error})") from None
 
     def reader(self, topic: str, kind: Struct | str, depth: int = 1) -> Reader:
         """What others write on a topic; kind: its type."""
-        return Reader(self._participant, topic, kind, depth)
+        return Reader(self, topic, kind, depth)
 
     def writer(self, topic: str, kind: Struct | str) -> Writer:
         """A topic to write on."""
-        return Writer(self._participant, topic, kind)
+        return Writer(self, topic, kind)
 
 
 class Reader:
     """The newest samples of a topic, best effort."""
 
-    def __init__(self, participant: DomainParticipant, topic: str, kind: Struct | str, depth: int) -> None:
+    def __init__(self, network: Network, topic: str, kind: Struct | str, depth: int) -> None:
         from cyclonedds.core import Policy, Qos
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
 
-        self.name, self._depth = topic, depth
+        self._network, self._depth = (
+            network,
+            depth,
+        )  # a participant ends with its last reference, and its readers with it
+        participant = network.participant
         qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(depth))
         self._reader = DataReader(participant, Topic(participant, topic, _type(kind)), qos=qos)
 
@@ -86,26 +91,22 @@ class Reader:
 class Writer:
     """Samples to a topic."""
 
-    def __init__(self, participant: DomainParticipant, topic: str, kind: Struct | str) -> None:
+    def __init__(self, network: Network, topic: str, kind: Struct | str) -> None:
         from cyclonedds.core import Policy, Qos
         from cyclonedds.pub import DataWriter
         from cyclonedds.topic import Topic
         from cyclonedds.util import duration
 
-        self._type = _type(kind)
+        self._network, self._type = network, _type(kind)
+        participant = network.participant
         qos = Qos(Policy.Reliability.Reliable(duration(milliseconds=1)), Policy.History.KeepLast(1))
         self._writer = DataWriter(participant, Topic(participant, topic, self._type), qos=qos)
 
     def write(self, cdr: bytes) -> None:
         """One sample."""
-        sample = object.__new__(self._type)
+        sample: Any = object.__new__(self._type)
         sample.cdr = cdr
         self._writer.write(sample)
-
-    @property
-    def readers(self) -> int:
-        """How many listen."""
-        return len(self._writer.get_matched_subscriptions())
 
 
 @cache
@@ -114,8 +115,8 @@ def _type(kind: Struct | str) -> Any:
     made = _of_struct(kind) if isinstance(kind, Struct) else _variable()[kind]
 
     def deserialize(cls: type, data: bytes, *_: Any, **__: Any) -> Any:
-        sample = object.__new__(cls)
-        sample.cdr = data  # type: ignore[attr-defined]
+        sample: Any = object.__new__(cls)
+        sample.cdr = data
         return sample
 
     made.serialize = lambda self, *_, **__: self.cdr
@@ -125,8 +126,7 @@ def _type(kind: Struct | str) -> Any:
 
 @cache
 def _of_struct(kind: Struct) -> Any:
-    from cyclonedds.idl import types
-
+    types = _idl_types()
     scalars = {
         "u1": types.uint8,
         "u2": types.uint16,
@@ -143,6 +143,13 @@ def _of_struct(kind: Struct) -> Any:
     return _make(kind.name, {name: annotation(field, length) for name, field, length in kind.fields})
 
 
+def _idl_types() -> Any:
+    """cyclonedds' `types`, whose arrays and sequences of a type are annotations that it reads itself."""
+    from cyclonedds.idl import types
+
+    return types
+
+
 def _make(name: str, fields: dict[str, Any]) -> Any:
     """An IDL type that others may not extend: @final, as Unitree's and ROS 2's are."""
     from cyclonedds.idl import annotations, make_idl_struct
@@ -154,8 +161,7 @@ def _make(name: str, fields: dict[str, Any]) -> Any:
 @cache
 def _variable() -> dict[str, Any]:
     """ROS 2's types of variable size that are read here."""
-    from cyclonedds.idl import types
-
+    types = _idl_types()
     stamp = _make("builtin_interfaces.msg.dds_.Time_", {"sec": types.int32, "nanosec": types.uint32})
     header = _make("std_msgs.msg.dds_.Header_", {"stamp": stamp, "frame_id": str})
     field_types = {"name": str, "offset": types.uint32, "datatype": types.uint8, "count": types.uint32}

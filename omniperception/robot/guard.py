@@ -2,8 +2,8 @@
 
     python -m omniperception.robot.guard SETTINGS FD
 
-`robot` starts it. Targets and requests come through the socket FD; the robot's state it reads itself. When the other end
-falls silent or closes, the robot lies down, its joints are damped for a while, and the process ends.
+`robot` starts it. Targets and requests come through the socket FD; the robot's state it reads itself. When the other
+end falls silent or closes, the robot lies down, its joints are damped for a while, and the process ends.
 """
 
 from __future__ import annotations
@@ -145,6 +145,11 @@ class Link:
                 return
             self.mode, self.reason = MODES[said[0]], said[1:].decode("utf-8", "replace")
 
+    def close(self) -> None:
+        """Leaves the guard alone: it lays the robot down and ends."""
+        self._end.close()
+        self.is_closed = True
+
     def _send(self, data: bytes) -> None:
         try:
             self._end.send(data)
@@ -170,12 +175,11 @@ class Guard:
         machine: its modes.
     """
 
-    def __init__(self, config: GuardConfig, link: socket.socket) -> None:
-        """Args: config: what it needs; link: the policy's socket."""
+    def __init__(self, config: GuardConfig, link: socket.socket, network: Network) -> None:
+        """Args: config: what it needs; link: the policy's socket; network: of DDS."""
         self._config, self._link = config, link
         link.setblocking(False)
         self.machine = Machine(config.machine)
-        network = Network(config.interface, config.domain)
         self._states = StateReader(network.reader(LOW_STATE_TOPIC, LOW_STATE, 4), config.check_crc)
         self._refuse_others(network)
         self._writer = network.writer(LOW_CMD_TOPIC, LOW_CMD)
@@ -259,7 +263,7 @@ def main(argv: list[str], exit_with: Callable[[int], None] = sys.exit) -> None:
     """The process."""
     config, link = GuardConfig.from_json(argv[0]), socket.socket(fileno=int(argv[1]))
     try:
-        guard = Guard(config, link)
+        guard = Guard(config, link, Network(config.interface, config.domain))
     except DeployError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         return exit_with(2)

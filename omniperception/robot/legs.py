@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 _HIP = np.array([[0.1934, -0.0465, 0], [0.1934, 0.0465, 0], [-0.1934, -0.0465, 0], [-0.1934, 0.0465, 0]])
-"""Hips of FR, FL, RR, RL in the base, m; this and the lengths below as in Unitree's description (scene/assets/go2.xml)."""
+"""Hips of FR, FL, RR, RL in the base, m; as the lengths below from Unitree's description (scene/assets/go2.xml)."""
 _THIGH = np.array([[0, -0.0955, 0], [0, 0.0955, 0], [0, -0.0955, 0], [0, 0.0955, 0]])
 _CALF, _FOOT = np.array([0.0, 0.0, -0.213]), np.array([-0.002, 0.0, -0.213])
 _STANDING_BAND = 0.015

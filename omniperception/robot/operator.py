@@ -7,7 +7,6 @@ import os
 import select
 import socket
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
@@ -24,7 +23,7 @@ _STALE_S = 0.5
 class Operator(Protocol):
     """Somebody who commands."""
 
-    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
         """(3,) v_x, v_y (m/s), yaw rate (rad/s), and what has been asked for since the call before."""
 
     def close(self) -> None:
@@ -32,7 +31,7 @@ class Operator(Protocol):
 
 
 def make_operator(text: str, ranges: Mapping[str, Sequence[float]]) -> Operator:
-    """Of `commands=remote`, `keyboard`, `udp:PORT` or `V_X,V_Y,YAW_RATE`; ranges: of the policy's training."""
+    """Of `steer=remote`, `keyboard`, `udp:PORT` or `V_X,V_Y,YAW_RATE`; ranges: of the policy's training."""
     if text == "remote":
         return Sticks(ranges)
     if text == "keyboard":
@@ -43,7 +42,7 @@ def make_operator(text: str, ranges: Mapping[str, Sequence[float]]) -> Operator:
         numbers = [float(part) for part in text.split(",")]
         if len(numbers) == 3:
             return Constant(numbers)
-    raise DeployError(f"commands={text}: remote, keyboard, udp:PORT or V_X,V_Y,YAW_RATE was expected")
+    raise DeployError(f"steer={text}: remote, keyboard, udp:PORT or V_X,V_Y,YAW_RATE was expected")
 
 
 def scaled(shares: Sequence[float], ranges: Mapping[str, Sequence[float]]) -> np.ndarray:
@@ -58,7 +57,7 @@ class Sticks:
     def __init__(self, ranges: Mapping[str, Sequence[float]]) -> None:
         self._ranges = ranges
 
-    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
         shares = [0.0 if abs(s) < 0.05 else s for s in (remote.ly, -remote.lx, -remote.rx)]
         return scaled(shares, self._ranges), []
 
@@ -72,7 +71,7 @@ class Constant:
     def __init__(self, command: Sequence[float]) -> None:
         self._command = np.array(command)
 
-    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
         return self._command, []
 
     def close(self) -> None:
@@ -80,7 +79,7 @@ class Constant:
 
 
 class Datagrams:
-    """Text to a UDP port of this machine: 'V_X V_Y YAW_RATE', or stand, walk, lie, damp, stop. Commands hold for 0.5 s."""
+    """Text to a UDP port of this machine: 'V_X V_Y YAW_RATE' (holds for 0.5 s), or stand, walk, lie, damp, stop."""
 
     def __init__(self, port: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -89,10 +88,10 @@ class Datagrams:
             self._socket.bind(("127.0.0.1", port))
         except OSError as error:
             self._socket.close()
-            raise DeployError(f"commands=udp:{port}: the port cannot be listened to ({error.strerror})") from None
+            raise DeployError(f"steer=udp:{port}: the port cannot be listened to ({error.strerror})") from None
         self._command, self._since = np.zeros(3), -1e9
 
-    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
         asked = []
         while True:
             try:
@@ -105,8 +104,8 @@ class Datagrams:
             with contextlib.suppress(ValueError):
                 command = np.array([float(word) for word in words])
                 if command.shape == (3,) and np.isfinite(command).all():
-                    self._command, self._since = command, time.monotonic()
-        is_fresh = time.monotonic() - self._since < _STALE_S
+                    self._command, self._since = command, now
+        is_fresh = now - self._since < _STALE_S
         return self._command if is_fresh else np.zeros(3), asked
 
     def close(self) -> None:
@@ -127,7 +126,7 @@ class Keyboard:
 
     def __init__(self, ranges: Mapping[str, Sequence[float]]) -> None:
         if not sys.stdin.isatty():
-            raise DeployError("commands=keyboard needs a terminal")
+            raise DeployError("steer=keyboard needs a terminal")
         import termios
         import tty
 
@@ -135,7 +134,7 @@ class Keyboard:
         self._before = termios.tcgetattr(sys.stdin)
         tty.setcbreak(sys.stdin)
 
-    def poll(self, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
         asked = []
         while select.select([sys.stdin], [], [], 0.0)[0]:
             for key in os.read(sys.stdin.fileno(), 64).decode("ascii", "replace"):

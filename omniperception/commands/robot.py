@@ -1,0 +1,77 @@
+"""Runs an exported policy on a Go2 with a Mid-360, or on `robot-sim`.
+
+    robot policy=exported interface=eth0 host=192.168.1.50
+    robot policy=exported points=packets host=127.0.0.1 steer=udp:9000      # with robot-sim on this machine
+
+Read docs/guide/robot.md first: it says what was never tried on hardware. Two processes: the guard owns rt/lowcmd,
+stands the robot up and lays it down, and damps its joints when something is wrong; this one gives it the policy's
+targets.
+The remote, always: L2+A stands up, start walks, L2+X lies down, L2+Y damps, L2+B is an e-stop until the program is
+started again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from omniperception.cli import Command, argument
+from omniperception.deploy.description import DeployError
+from omniperception.robot.clouds import Extrinsic
+from omniperception.robot.control import RobotConfig, run
+from omniperception.robot.lidar import KINDS, LidarSource
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's arguments."""
+
+    policy: Path = argument(Path("exported"), "folder that export has written")
+    interface: str = argument("lo", "network interface of the robot's DDS; lo: this machine, with robot-sim")
+    domain: int = argument(0, "of DDS", least=0)
+    points: str = argument(
+        "mid360",
+        "where points come from: the sensor's packets after a search, or without one, or a driver's topic",
+        choices=(*KINDS, "none"),
+    )
+    host: str = argument("192.168.1.50", "this machine's address in the sensor's network")
+    point_port: int = argument(56301, "UDP port that points come to", least=1)
+    topic: str = argument("rt/livox/lidar", "topic of PointCloud2 or CustomMsg")
+    extrinsic: str | None = argument(None, "x,y,z,qw,qx,qy,qz that the driver has applied to the points; undone")
+    steer: str = argument("remote", "remote, keyboard, udp:PORT, or v_x,v_y,yaw_rate")
+    crc: bool = argument(True, "whether states with a wrong checksum are refused; simulators that fill none need false")
+    seconds: float | None = argument(None, "how long; null: until it is interrupted", positive=True)
+
+
+def main(arguments: Arguments) -> None:
+    """Runs, and prints what was measured."""
+    source = LidarSource(
+        kind=arguments.points,
+        topic=arguments.topic,
+        host=arguments.host,
+        point_port=arguments.point_port,
+        extrinsic=_extrinsic(arguments.extrinsic),
+    )
+    config = RobotConfig(
+        policy=arguments.policy,
+        interface=arguments.interface,
+        domain=arguments.domain,
+        lidar=None if arguments.points == "none" else source,
+        steer=arguments.steer,
+        check_crc=arguments.crc,
+        seconds=arguments.seconds,
+    )
+    print(run(config))
+
+
+def _extrinsic(text: str | None) -> Extrinsic:
+    try:
+        numbers = [float(part) for part in (text or "0,0,0,1,0,0,0").split(",")]
+        if len(numbers) != 7:
+            raise ValueError
+    except ValueError:
+        raise DeployError(f"extrinsic={text}: 7 numbers were expected, x,y,z,qw,qx,qy,qz") from None
+    return Extrinsic(numbers[:3], numbers[3:])
+
+
+command = Command(main, Arguments, __doc__, errors=(DeployError,))

@@ -1,0 +1,60 @@
+"""Simulates a Go2 with a Mid-360 on the robot's own wire, in real time.
+
+    robot-sim run=pretrained/avoider scenario=moving condition=robot
+    robot-sim run=pretrained/avoider scenario=corridor steer_to=9000    # and in another terminal:
+    robot policy=exported points=packets host=127.0.0.1 steer=udp:9000
+
+MuJoCo steps of 2 ms; rt/lowstate at 500 Hz; LiDAR packets of 96 points, cast every 10 ms while the robot moves. The
+robot lies on the ground until it is told to stand up; the world stands still until it does. With steer_to the
+simulation plays the operator: it asks to stand and to walk, and sends the world's command.
+
+The physics of a condition are there, and the LiDAR's noise; what it adds to readings (latency, errors) is not: the
+wire has its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from omniperception import build, config
+from omniperception.cli import Command, argument, trust
+from omniperception.deploy.description import DeployError
+from omniperception.env.env import OmniEnv
+from omniperception.robot.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's arguments."""
+
+    run: str = argument("latest", "run directory, for the robot, its LiDAR and the world")
+    interface: str = argument("lo", "network interface of DDS")
+    domain: int = argument(0, "of DDS", least=0)
+    crc: bool = argument(True, "whether states carry a checksum and commands without theirs are refused")
+    point_to: int = argument(56301, "UDP port of this machine that LiDAR packets go to", least=1)
+    detection_port: int | None = argument(None, "UDP port on which it answers to searches; null: none")
+    steer_to: int | None = argument(None, "UDP port that the world's commands are sent to; null: none are")
+    hold_last: bool = argument(True, "whether motors go on with the last command when none comes")
+    seconds: float | None = argument(None, "simulated time; null: until the goal or an interrupt", positive=True)
+    trust: tuple[str, ...] = trust()
+
+
+def main(arguments: Arguments, overrides: list[str]) -> None:
+    """Simulates, and prints what became of the robot."""
+    steps = [f"sim.timestep={STEP_S}", f"sim.decimation={CONTROL_STEPS}", "sim.num_threads=1", "num_envs=1"]
+    composed = config.load(config.find_run(arguments.run), [*overrides, *steps])
+    env = OmniEnv(build.assemble(composed, arguments.trust).env)
+    wire = SimulatedConfig(
+        interface=arguments.interface,
+        domain=arguments.domain,
+        crc=arguments.crc,
+        detection_port=arguments.detection_port,
+        point_to=None if arguments.detection_port is not None else ("127.0.0.1", arguments.point_to),
+        steer_to=arguments.steer_to,
+        hold_last=arguments.hold_last,
+        seconds=arguments.seconds,
+    )
+    print(run(env, wire))
+
+
+command = Command(main, Arguments, __doc__, overrides="of the run's configuration", errors=(DeployError,))

@@ -1,0 +1,36 @@
+"""Errors that are for the user: one line that says what to change."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot run; the message is one line that says what to change."""
+
+
+class UnknownKey(ConfigError):
+    """A key that nothing takes.
+
+    Attributes:
+        given: the override or key.
+        known: the keys that could have been meant.
+    """
+
+    def __init__(self, given: str, known: Iterable[str], name: str = "") -> None:
+        self.given, self.known = given, tuple(known)
+        self.name = name or given.lstrip("+~").partition("=")[0].rpartition(".")[2]
+        super().__init__(f"{given} is unknown; {suggest(self.name, self.known)}")
+
+
+def suggest(name: str, known: Sequence[str]) -> str:
+    """The known name that is most similar, or all of them."""
+    near = difflib.get_close_matches(name, known, 1)
+    return f"did you mean {near[0]}?" if near else f"known: {', '.join(sorted(known))}"
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error without line breaks."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines) or type(error).__name__

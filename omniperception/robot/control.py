@@ -1,0 +1,223 @@
+"""A policy's own process: what the robot and its LiDAR say -> joint targets to the guard."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from omniperception.deploy import DeployError, ExportedPolicy, RobotState, SafetyStop
+from omniperception.deploy.description import Description
+from omniperception.deploy.go2 import MOTORS
+from omniperception.robot.dds import LOW_STATE_TOPIC, Network
+from omniperception.robot.guard import GuardConfig, Link, StateReader, start
+from omniperception.robot.legs import base_velocity
+from omniperception.robot.lidar import Frames, LidarSource
+from omniperception.robot.machine import MachineConfig, Mode, Request
+from omniperception.robot.messages import LOW_STATE, remote
+from omniperception.robot.operator import Operator, make_operator
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """What runs on a robot.
+
+    Attributes:
+        policy: folder of an exported policy.
+        interface: network interface of DDS; "lo" for a simulated robot on this machine.
+        domain: of DDS.
+        lidar: where points come from; None for a blind policy.
+        steer: see `operator.make_operator`.
+        check_crc: whether states with another checksum than theirs are refused.
+        seconds: how long it runs; None: until it is ended.
+    """
+
+    policy: Path
+    interface: str = "lo"
+    domain: int = 0
+    lidar: LidarSource | None = None
+    steer: str = "remote"
+    check_crc: bool = True
+    seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a run of the policy's process has measured.
+
+    Attributes:
+        steps: control steps.
+        late: of them, begun more than half a period after their time.
+        step_ms: (steps,) duration of each, ms.
+        counts: what the limits and the LiDAR have counted, by name.
+    """
+
+    steps: int
+    late: int
+    step_ms: np.ndarray
+    counts: dict[str, int]
+
+    def __str__(self) -> str:
+        if not self.steps:
+            return "no state has come from the robot"
+        p50, p99 = np.percentile(self.step_ms, (50, 99))
+        counts = ", ".join(f"{value} {name}" for name, value in self.counts.items() if value) or "nothing else to tell"
+        return f"{self.steps} steps, {self.late} late; p50 {p50:.2f} ms, p99 {p99:.2f} ms; {counts}"
+
+
+def motor_order(description: Description) -> np.ndarray:
+    """(12,) motor of each joint of the policy.
+
+    Raises:
+        DeployError: the policy moves another robot.
+    """
+    names = description.joints.names
+    if set(names) != set(MOTORS) or len(names) != len(MOTORS):
+        other = sorted(set(names) ^ set(MOTORS))
+        raise DeployError(f"the policy moves another robot than a Go2: {', '.join(other[:4])} ...")
+    return np.array([MOTORS.index(name) for name in names])
+
+
+def machine_config(description: Description) -> MachineConfig:
+    """The guard's machine for a policy: its gains, its default pose to stand in, its limits, in the motors' order."""
+    joints, motors = description.joints, motor_order(description)
+
+    def in_motors_order(values: object) -> list[float]:
+        ordered = np.zeros(len(MOTORS))
+        ordered[motors] = np.asarray(values)
+        return ordered.tolist()
+
+    stand, lower, upper = (in_motors_order(values) for values in (joints.default_pos, joints.lower, joints.upper))
+    return MachineConfig(stand, lower, upper, joints.kp, joints.kd)
+
+
+class Control:
+    """The loop of a policy's process, a step at a time.
+
+    Attributes:
+        policy: with its memory.
+    """
+
+    def __init__(
+        self, policy: ExportedPolicy, states: StateReader, frames: Frames | None, operator: Operator, link: Link
+    ) -> None:
+        """Args: policy: to run; states, frames, operator: what it hears; link: to the guard."""
+        self.policy, self._states, self._frames, self._operator, self._link = policy, states, frames, operator, link
+        self._motors = motor_order(policy.description)
+        described = policy.description
+        observed = {term.quantity for group in described.observations for term in group.terms}
+        moves = described.perception is not None and described.perception.base_motion
+        self._needs_velocity = not described.estimated and (moves or "base_lin_vel" in observed)
+        self._state: np.ndarray | None = None
+        self._mode, self._last_frame = Mode.DAMPING, math.inf
+
+    def step(self, now: float) -> bool:
+        """One control step; False without a state of the robot so far."""
+        newest = self._states.newest()
+        self._state = newest if newest is not None else self._state
+        frames = [] if self._frames is None else self._frames.new()
+        self._link.poll()
+        if self._state is None:
+            return False
+        command, asked = self._operator.poll(now, remote(self._state["wireless_remote"]))
+        for request in asked:
+            self._link.ask(request)
+        if self._link.mode is not self._mode:
+            self._mode = self._link.mode
+            if self._mode is Mode.POLICY:
+                self.policy.reset()
+        if self._link.mode is not Mode.POLICY:
+            command = np.zeros(3)
+        try:
+            targets = self.policy.step(self._robot_state(self._state), command, self._points(frames, now))
+        except SafetyStop as stop:
+            if self._mode is Mode.POLICY:
+                print(f"stop: {stop}", file=sys.stderr, flush=True)
+                self._link.ask(Request.DAMP)
+            return True
+        in_order = np.zeros(len(MOTORS))
+        in_order[self._motors] = targets
+        self._link.send_targets(in_order)
+        return True
+
+    def _points(self, frames: list, now: float) -> np.ndarray | None:
+        """The newest frame as training saw it; a period without one is a frame lost."""
+        if self._frames is None:
+            return None
+        period = self.policy.description.lidar.period_s  # type: ignore[union-attr]
+        if not frames:
+            if now - self._last_frame > 1.5 * period:
+                self._last_frame += period
+                self.policy.miss()
+            return None
+        self._last_frame = now
+        return self.policy.thin(frames[-1].points, frames[-1].offsets_s)
+
+    def _robot_state(self, state: np.ndarray) -> RobotState:
+        """Of a LOW_STATE, in the policy's order of joints."""
+        motors, imu = state["motor_state"][:12], state["imu_state"]
+        quat, gyro = imu["quaternion"].astype(float), imu["gyroscope"].astype(float)
+        velocity = None
+        if self._needs_velocity:
+            velocity = base_velocity(motors["q"].astype(float), motors["dq"].astype(float), gyro, down(quat))
+        order = self._motors
+        return RobotState(motors["q"][order], motors["dq"][order], quat, gyro, velocity, motors["tau_est"][order])
+
+
+def down(quat: np.ndarray) -> np.ndarray:
+    """(3,) unit vector of gravity in the base of orientation (w, x, y, z)."""
+    w, x, y, z = quat
+    return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1])
+
+
+def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> Report:
+    """Runs a policy on a robot until `should_end`, an interrupt, or the guard's end."""
+    policy = ExportedPolicy.load(config.policy)
+    description = policy.description
+    machine = machine_config(description)
+    operator = make_operator(config.steer, description.command)
+    network = Network(config.interface, config.domain)
+    states = StateReader(network.reader(LOW_STATE_TOPIC, LOW_STATE), config.check_crc)
+    frames = None
+    if description.perception is not None and description.lidar is not None:
+        if config.lidar is None:
+            raise DeployError("this policy sees: points=none is for a blind one")
+        frames = Frames(config.lidar, description.lidar, network)
+    link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
+    control = Control(policy, states, frames, operator, link)
+    try:
+        times, late = _loop(control, link, description.control_period_s, config.seconds, should_end)
+    finally:
+        operator.close()
+        if link.mode in (Mode.STANDING, Mode.STANDING_UP, Mode.POLICY):
+            link.ask(Request.LIE)
+    if link.is_closed and guard.poll() not in (None, 0):
+        raise DeployError("the guard has ended; its message stands above")
+    counts = {} if policy.safety is None else dict(policy.safety.counts)
+    counts |= {"states refused": states.refused} | ({} if frames is None else frames.counts())
+    return Report(len(times), late, np.array(times), counts)
+
+
+def _loop(
+    control: Control, link: Link, period_s: float, seconds: float | None, should_end: Callable[[], bool]
+) -> tuple[list[float], int]:
+    """Durations of the steps in ms, and how many began late."""
+    begin = due = time.monotonic()
+    times: list[float] = []
+    late = 0
+    try:
+        while not (link.is_closed or should_end() or (seconds is not None and due - begin >= seconds)):
+            now = time.monotonic()
+            if control.step(now):
+                late += now - due > period_s / 2
+                times.append(1e3 * (time.monotonic() - now))
+            due = max(due + period_s, time.monotonic() - period_s)
+            time.sleep(max(0.0, due - time.monotonic()))
+    except KeyboardInterrupt:
+        print("ended: the guard lays the robot down", file=sys.stderr)
+    return times, late

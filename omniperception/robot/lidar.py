@@ -1,0 +1,123 @@
+"""Where frames come from on a robot: the Mid-360 itself, or a driver's topic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from omniperception.deploy.description import DeployError, Lidar
+from omniperception.robot.clouds import (
+    Extrinsic,
+    Frame,
+    FrameCutter,
+    Points,
+    read_custom_msg,
+    read_point_cloud2,
+    without_noise,
+)
+from omniperception.robot.dds import CUSTOM_MSG, POINT_CLOUD2, Network, Reader
+from omniperception.robot.livox import DETECTION_PORT, HOST_POINT_PORT, Mid360
+
+
+@dataclass(frozen=True)
+class LidarSource:
+    """Where points come from.
+
+    Attributes:
+        kind: 'mid360' (its own packets, after it has been found and pointed here), 'packets' (the same, but already
+            pointed here), 'PointCloud2' or 'CustomMsg' (a topic over DDS).
+        topic: of DDS.
+        host: this machine's address in the sensor's network, of 'mid360' and 'packets'.
+        broadcast: where a Mid-360 is searched.
+        detection_port: the same.
+        point_port: of this machine, where packets come to.
+        extrinsic: what a driver has applied to the points.
+    """
+
+    kind: str = "mid360"
+    topic: str = "rt/livox/lidar"
+    host: str = "192.168.1.50"
+    broadcast: str = "255.255.255.255"
+    detection_port: int = DETECTION_PORT
+    point_port: int = HOST_POINT_PORT
+    extrinsic: Extrinsic = field(default_factory=Extrinsic)
+
+
+KINDS = ("mid360", "packets", "PointCloud2", "CustomMsg")
+
+
+class Source(Protocol):
+    """Points of a sensor."""
+
+    def read(self) -> list[Points]:
+        """Those that have come since the call before, message by message."""
+
+    def counts(self) -> dict[str, int]:
+        """What went wrong, by name."""
+
+    def close(self) -> None:
+        """Ends it."""
+
+
+class Frames:
+    """Frames of a sensor, cut to the policy's period."""
+
+    def __init__(self, source: LidarSource, lidar: Lidar, network: Network) -> None:
+        """Args: source: of the points; lidar: that the policy was trained with; network: of a topic."""
+        if source.kind not in KINDS:
+            raise DeployError(f"points={source.kind}: one of {', '.join(KINDS)} was expected")
+        is_topic = source.kind in ("PointCloud2", "CustomMsg")
+        self._source: Source = _Topic(source, network) if is_topic else _Packets(source)
+        self._cutter, self._extrinsic = FrameCutter(lidar.period_s), source.extrinsic
+
+    def new(self) -> list[Frame]:
+        """Frames that have become complete since the call before, oldest first, in the sensor's own frame."""
+        frames = []
+        for points in self._source.read():
+            frames += self._cutter.add(Points(self._extrinsic.undo(points.points), points.times_ns))
+        return frames
+
+    def counts(self) -> dict[str, int]:
+        """What went wrong so far, by name."""
+        return self._source.counts() | {"late points": self._cutter.late, "jumps of time": self._cutter.jumps}
+
+    def close(self) -> None:
+        """Ends it."""
+        self._source.close()
+
+
+class _Packets:
+    """The Mid-360's own packets."""
+
+    def __init__(self, source: LidarSource) -> None:
+        self._mid360 = Mid360(source.host, source.point_port)
+        if source.kind == "mid360":
+            self._mid360.find(source.broadcast, source.detection_port)
+
+    def read(self) -> list[Points]:
+        return [Points(without_noise(p.points, p.tags), p.times_ns) for p in self._mid360.packets()]
+
+    def counts(self) -> dict[str, int]:
+        mid360 = self._mid360
+        return {"packets lost": mid360.lost, "packets doubled": mid360.doubled, "other datagrams": mid360.other}
+
+    def close(self) -> None:
+        self._mid360.close()
+
+
+class _Topic:
+    """A driver's messages."""
+
+    def __init__(self, source: LidarSource, network: Network) -> None:
+        custom = source.kind == "CustomMsg"
+        self._reader: Reader = network.reader(source.topic, CUSTOM_MSG if custom else POINT_CLOUD2, 16)
+        self._decode = read_custom_msg if custom else read_point_cloud2
+
+    def read(self) -> list[Points]:
+        return [self._decode(data) for data in self._reader.take()]
+
+    def counts(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        """The network ends it."""

@@ -1,0 +1,50 @@
+"""Leg kinematics against MuJoCo's."""
+
+import mujoco
+import numpy as np
+
+from omniperception import build, config
+from omniperception.deploy.go2 import MOTORS
+from omniperception.robot.legs import base_velocity, feet
+from omniperception.scene import build_world
+
+
+def go2():
+    env = build.assemble(config.compose(["experiment=walk", "num_envs=1"])).env
+    model = build_world(env.robot, env.terrain, env.obstacles, set()).model
+    return model, mujoco.MjData(model)
+
+
+def test_feet_are_where_mujoco_has_them_and_move_so():
+    model, data = go2()
+    rng = np.random.default_rng(0)
+    at = [model.joint(name).qposadr[0] for name in MOTORS]
+    dof = [model.joint(name).dofadr[0] for name in MOTORS]
+    for _ in range(5):
+        data.qpos[:7] = [0, 0, 0, 1, 0, 0, 0]
+        data.qvel[:] = 0.0
+        data.qpos[at] = joints = np.array([0.0, 0.8, -1.5] * 4) + rng.uniform(-0.5, 0.5, 12)
+        data.qvel[dof] = rates = rng.uniform(-5, 5, 12)
+        mujoco.mj_forward(model, data)
+        pos, vel = feet(joints, rates)
+        for k, leg in enumerate(("FR", "FL", "RR", "RL")):
+            geom, six = model.geom(f"{leg}_foot").id, np.zeros(6)
+            np.testing.assert_allclose(pos[k], data.geom_xpos[geom], atol=1e-6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_GEOM, geom, six, 0)
+            np.testing.assert_allclose(vel[k], six[3:], atol=1e-6)
+
+
+def test_a_base_that_turns_and_moves_over_standing_feet():
+    """Joint rates that keep all four feet where they are while the base moves: found by the feet's Jacobian."""
+    joints, down = np.array([0.0, 0.8, -1.5] * 4), np.array([0.0, 0.0, -1.0])
+    velocity, turning = np.array([0.5, -0.2, 0.1]), np.array([0.1, -0.2, 0.3])
+    columns = [feet(joints, np.eye(12)[k])[1].ravel() for k in range(12)]
+    wanted = -(velocity + np.cross(turning, feet(joints, np.zeros(12))[0])).ravel()
+    rates = np.linalg.solve(np.array(columns).T, wanted)
+    np.testing.assert_allclose(base_velocity(joints, rates, turning, down), velocity, atol=1e-9)
+
+
+def test_feet_in_the_air_do_not_count():
+    joints, rates = np.array([0.0, 0.8, -1.5] * 4), np.zeros(12)
+    joints[3:6], rates[3:6] = [0.0, 1.2, -2.2], 5.0  # FL is lifted and swings
+    assert not base_velocity(joints, rates, np.zeros(3), np.array([0.0, 0.0, -1.0])).any()

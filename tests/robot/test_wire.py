@@ -1,0 +1,250 @@
+"""A simulated robot, its guard and the published policy together, step by step; and processes over DDS."""
+
+import struct
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime", reason="extra deploy")
+pytest.importorskip("onnx", reason="extra export")
+
+from lockstep import ROOT, Lockstep
+
+from omniperception.deploy import DeployError, Description
+from omniperception.deploy.export import export
+from omniperception.robot import guard
+from omniperception.robot.clouds import read_custom_msg
+from omniperception.robot.control import machine_config, motor_order
+from omniperception.robot.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
+from omniperception.robot.machine import Mode, Request
+from omniperception.robot.messages import LOW_CMD, LOW_STATE, crc, low_cmd, sealed
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory):
+    """The published policy."""
+    folder = tmp_path_factory.mktemp("avoider")
+    export(ROOT / "pretrained" / "avoider", folder, ("onnx",))
+    return folder
+
+
+@pytest.fixture
+def lockstep(exported):
+    """Makes the three; all are closed at the end."""
+    made = []
+
+    def make(*overrides, **changes):
+        made.append(Lockstep(exported, *overrides, **changes))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def walking(robot, seconds=2.0):
+    """It has stood up by itself, and walked for a while."""
+    robot.run(6.0, lambda: robot.machine.mode is Mode.POLICY)
+    assert robot.machine.mode is Mode.POLICY and robot.robot.up_since is not None, robot.machine.reason
+    return robot.run(seconds)
+
+
+def speed(robot):
+    return float(np.linalg.norm(robot.robot._env.sim.qvel[0, :2]))
+
+
+def is_lying(robot):
+    z = float(robot.robot._env.sim.qpos[0, 2])
+    return z < 0.15 and robot.machine.mode in (Mode.DAMPING, Mode.STOPPED)
+
+
+def test_it_stands_up_and_walks_and_lies_down_when_the_policy_dies(lockstep):
+    robot = walking(lockstep("scenario=static"), 1.5)
+    assert speed(robot) > 0.4 and robot.control.policy.frame_count == 5
+    robot.policy_lives = False
+    robot.run(0.05)
+    assert robot.machine.mode is Mode.LYING_DOWN and "the policy is silent" in robot.machine.reason
+    robot.run(2.3)
+    assert is_lying(robot) and robot.robot.outcome.largest_tilt_deg < 30 and not robot.robot.outcome.fell
+
+
+def unplugged(robot):
+    robot.robot.scanner._to = None
+
+
+def plugged(robot, to):
+    robot.robot.scanner._to = to
+
+
+@pytest.mark.slow
+def test_without_its_lidar_it_stands_and_then_walks_on(lockstep):
+    robot = walking(lockstep("scenario=static"))
+    to = robot.robot.scanner._to
+    unplugged(robot)
+    robot.run(0.35 + 0.3 + 0.5)
+    assert speed(robot) < 0.3
+    robot.run(0.85)
+    assert speed(robot) < 0.15 and robot.machine.mode is Mode.POLICY
+    plugged(robot, to)
+    robot.run(2.0)
+    assert speed(robot) > 0.4 and not robot.robot.outcome.fell
+
+
+def not_a_number(data):
+    state = LOW_STATE.from_cdr(data)
+    state["imu_state"]["quaternion"] = np.nan
+    return [LOW_STATE.to_cdr(sealed(state))]
+
+
+def wrong_checksum(data):
+    return [data[:100] + bytes([data[100] ^ 1]) + data[101:]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (wrong_checksum, "no valid state for 40 ms"),
+        (lambda data: [], "no valid state for 40 ms"),
+        (lambda data: [data[:-8]], "no valid state for 40 ms"),
+        (not_a_number, "the state is not finite"),
+    ],
+)
+def test_a_state_that_is_none_damps_the_joints(lockstep, damage, reason):
+    robot = walking(lockstep("scenario=static"), 1.0)
+    robot.network.damage[LOW_STATE_TOPIC] = damage
+    robot.run(0.06)
+    assert robot.machine.mode is Mode.DAMPING and reason in robot.machine.reason
+    robot.run(1.5)
+    assert is_lying(robot)
+
+
+@pytest.mark.slow
+def test_doubled_and_out_of_order_states_change_nothing(lockstep):
+    held = []
+
+    def mixed(data):
+        held.append(data)
+        return [data, held[-2] if len(held) > 1 else data, data]
+
+    robot = lockstep("scenario=static")
+    robot.network.damage[LOW_STATE_TOPIC] = mixed
+    walking(robot)
+    assert speed(robot) > 0.4 and not robot.robot.outcome.fell
+
+
+@pytest.mark.slow
+def test_an_e_stop_while_it_walks(lockstep):
+    robot = walking(lockstep("scenario=static"), 1.0)
+    robot.link.ask(Request.STOP)
+    robot.run(1.5)
+    assert robot.machine.mode is Mode.STOPPED and is_lying(robot)
+    robot.run(1.5)  # the operator still asks for standing and walking
+    assert robot.machine.mode is Mode.STOPPED and is_lying(robot)
+
+
+@pytest.mark.slow
+def test_a_simulator_without_checksums(lockstep):
+    robot = lockstep("scenario=static", crc=False)
+    assert speed(walking(robot)) > 0.4
+
+
+def test_another_robot_is_refused_before_a_motor_moves(exported):
+    described = Description.read(exported)
+    object.__setattr__(described.joints, "names", [f"leg_{k}" for k in range(12)])
+    with pytest.raises(DeployError, match="the policy moves another robot than a Go2"):
+        machine_config(described)
+
+
+def test_the_machine_has_the_motors_order(exported):
+    described = Description.read(exported)
+    assert motor_order(described).tolist() == [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
+    machine = machine_config(described)
+    assert machine.stand_pose[:6] == [-0.1, 0.8, -1.5, 0.1, 0.8, -1.5]  # right hips are negative
+    assert machine.upper[7] == pytest.approx(4.5379) and (machine.kp, machine.kd) == (25.0, 0.6)
+    again = guard.GuardConfig.from_json(guard.GuardConfig(machine).to_json())
+    assert again.machine.stand_pose == machine.stand_pose and again == guard.GuardConfig(again.machine)
+
+
+def test_the_robots_process_needs_neither_torch_nor_hydra():
+    code = (
+        "import sys; import omniperception.commands.robot, omniperception.robot.guard\n"
+        "print(sorted({'torch', 'warp', 'hydra', 'mujoco', 'omegaconf', 'yaml', 'rsl_rl'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "[]\n", done.stderr
+
+
+class TestDds:
+    """Over CycloneDDS on the loopback."""
+
+    pytestmark = pytest.mark.skipif(
+        not __import__("importlib.util").util.find_spec("cyclonedds"), reason="cyclonedds, extra robot"
+    )
+
+    def test_states_and_commands_go_over_the_loopback(self):
+        network = Network(domain=71)
+        states, commands = network.reader(LOW_STATE_TOPIC, LOW_STATE), network.reader(LOW_CMD_TOPIC, LOW_CMD)
+        to_states, to_commands = network.writer(LOW_STATE_TOPIC, LOW_STATE), network.writer(LOW_CMD_TOPIC, LOW_CMD)
+        state, command = LOW_STATE.zeros(), low_cmd()
+        state["tick"], command["motor_cmd"]["q"][3] = 123, 1.5
+        came, asked = [], []
+        end = time.monotonic() + 20.0
+        while not (came and asked) and time.monotonic() < end:
+            to_states.write(LOW_STATE.to_cdr(sealed(state)))
+            to_commands.write(LOW_CMD.to_cdr(sealed(command)))
+            time.sleep(0.02)
+            came, asked = came + states.take(), asked + commands.take()
+        assert LOW_STATE.from_cdr(came[-1])["tick"] == 123
+        read = LOW_CMD.from_cdr(asked[-1])
+        assert read["motor_cmd"]["q"][3] == 1.5 and crc(read) == read["crc"]
+
+    def test_a_drivers_cloud_goes_over_the_loopback(self):
+        """One point of livox_ros_driver2's CustomMsg; its layout is test_clouds'."""
+        network = Network(domain=74)
+        reader, writer = network.reader("rt/livox/lidar", CUSTOM_MSG, 4), network.writer("rt/livox/lidar", CUSTOM_MSG)
+        body = struct.pack("<iII", 12, 7, 4) + b"imu\0" + struct.pack("<QIB3xI", 5 * 10**9, 1, 0, 1)
+        body += struct.pack("<IfffBBBx", 480, 1.0, 2.0, 3.0, 9, 0, 1)
+        end, came = time.monotonic() + 20.0, []
+        while not came and time.monotonic() < end:
+            writer.write(b"\0\1\0\0" + body)
+            time.sleep(0.02)
+            came = reader.take()
+        read = read_custom_msg(came[-1])
+        assert read.points.tolist() == [[1.0, 2.0, 3.0]] and read.times_ns.tolist() == [5 * 10**9 + 480]
+
+    def test_a_guard_outlives_its_policy_and_then_ends(self, exported):
+        machine = machine_config(Description.read(exported))
+        link, process = guard.start(guard.GuardConfig(machine, domain=72, listen_s=0.1, linger_s=0.5))
+        commands = Network(domain=72).reader(LOW_CMD_TOPIC, LOW_CMD)
+        end = time.monotonic() + 20.0
+        while not (before := commands.take()) and time.monotonic() < end:
+            time.sleep(0.01)
+        command = LOW_CMD.from_cdr(before[-1])
+        assert not command["motor_cmd"]["kp"].any() and command["motor_cmd"]["kd"][:12].tolist() == [3.0] * 12
+        link.close()
+        time.sleep(0.1)
+        commands.take()
+        time.sleep(0.2)
+        assert commands.take()  # it damps on
+        assert process.wait(20.0) == 0
+
+    def test_somebody_else_who_writes_lowcmd_is_refused(self, exported):
+        network = Network(domain=73)
+        writer = network.writer(LOW_CMD_TOPIC, LOW_CMD)
+        machine = machine_config(Description.read(exported))
+        _, process = guard.start(guard.GuardConfig(machine, domain=73, listen_s=20.0))
+        end = time.monotonic() + 30.0
+        while process.poll() is None and time.monotonic() < end:
+            writer.write(LOW_CMD.to_cdr(sealed(low_cmd())))
+            time.sleep(0.01)
+        assert process.wait(1.0) == 2
+
+
+def test_a_missing_cyclonedds_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    with pytest.raises(DeployError, match=r"pip install 'omniperception\[robot\]'"):
+        Network()
