@@ -89,7 +89,11 @@ class Reader:
 
 
 class Writer:
-    """Samples to a topic."""
+    """Samples to a topic.
+
+    Attributes:
+        unsent: samples that DDS did not take, because a reader is behind or the network is gone.
+    """
 
     def __init__(self, network: Network, topic: str, kind: Struct | str) -> None:
         from cyclonedds.core import Policy, Qos
@@ -97,16 +101,21 @@ class Writer:
         from cyclonedds.topic import Topic
         from cyclonedds.util import duration
 
-        self._network, self._type = network, _type(kind)
+        self._network, self._type, self.unsent = network, _type(kind), 0
         participant = network.participant
         qos = Qos(Policy.Reliability.Reliable(duration(milliseconds=1)), Policy.History.KeepLast(1))
         self._writer = DataWriter(participant, Topic(participant, topic, self._type), qos=qos)
 
     def write(self, cdr: bytes) -> None:
-        """One sample."""
+        """One sample; the next one matters more than one that cannot be sent."""
+        from cyclonedds.core import DDSException
+
         sample: Any = object.__new__(self._type)
         sample.cdr = cdr
-        self._writer.write(sample)
+        try:
+            self._writer.write(sample)
+        except DDSException:
+            self.unsent += 1
 
 
 @cache

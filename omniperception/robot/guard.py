@@ -202,7 +202,11 @@ class Guard:
         """Until the policy's process has gone and the joints have been damped for a while."""
         due = time.monotonic()
         while not self._is_over(time.monotonic()):
-            self.tick(time.monotonic())
+            try:
+                self.tick(time.monotonic())
+            except Exception as error:  # whatever it is: damped joints are better than joints left alone
+                print(f"guard: e-stop: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+                self.machine.ask(time.monotonic(), Request.STOP)
             due = max(due + PERIOD_S, time.monotonic() - PERIOD_S)  # what was missed is not made up for
             time.sleep(max(0.0, due - time.monotonic()))
 

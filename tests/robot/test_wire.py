@@ -1,5 +1,6 @@
 """A simulated robot, its guard and the published policy together, step by step; and processes over DDS."""
 
+import socket
 import struct
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import pytest
 pytest.importorskip("onnxruntime", reason="extra deploy")
 pytest.importorskip("onnx", reason="extra export")
 
-from lockstep import ROOT, Lockstep
+from lockstep import ROOT, Lockstep, Memory
 
 from omniperception.deploy import DeployError, Description
 from omniperception.deploy.export import export
@@ -176,6 +177,25 @@ def test_the_robots_process_needs_neither_torch_nor_hydra():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.stdout == "[]\n", done.stderr
+
+
+def test_a_guard_that_fails_inside_stops_the_robot(exported):
+    """And goes on damping until the policy's process has been gone for a while."""
+    network, (ours, theirs) = Memory(), socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    settings = guard.GuardConfig(machine_config(Description.read(exported)), listen_s=1e-9, linger_s=0.1)
+    failing, sent = guard.Guard(settings, theirs, network), network.reader(LOW_CMD_TOPIC, LOW_CMD, 100)
+    failures = iter([RuntimeError("broken")])
+
+    def fails_once():
+        for failure in failures:
+            raise failure
+
+    failing._states.newest = fails_once
+    ours.close()
+    failing.run()
+    assert failing.machine.mode is Mode.STOPPED
+    last = LOW_CMD.from_cdr(sent.take()[-1])
+    assert not last["motor_cmd"]["kp"].any() and last["motor_cmd"]["kd"][0] == 3.0
 
 
 class TestDds:
