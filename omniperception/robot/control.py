@@ -89,11 +89,11 @@ def machine_config(description: Description) -> MachineConfig:
 
     def in_motors_order(values: object) -> list[float]:
         ordered = np.zeros(len(MOTORS))
-        ordered[motors] = np.asarray(values)
+        ordered[motors] = np.asarray(values)  # one number for all, or one each
         return ordered.tolist()
 
-    stand, lower, upper = (in_motors_order(values) for values in (joints.default_pos, joints.lower, joints.upper))
-    return MachineConfig(stand, lower, upper, joints.kp, joints.kd)
+    values = (joints.default_pos, joints.lower, joints.upper, joints.kp, joints.kd)
+    return MachineConfig(*(in_motors_order(value) for value in values))
 
 
 class Control:

@@ -49,8 +49,8 @@ class MachineConfig:
         crouch_pose: (12,) rad, folded legs.
         lower: (12,) joint limits, rad.
         upper: (12,) rad.
-        kp: of the policy, N m / rad.
-        kd: N m s / rad.
+        kp: of the policy, N m / rad, one number or 12.
+        kd: N m s / rad, likewise.
         stand_kp: while the machine itself moves the joints.
         stand_kd: the same.
         damping_kd: of damped joints; their kp is 0.
@@ -69,8 +69,8 @@ class MachineConfig:
     stand_pose: Sequence[float]
     lower: Sequence[float]
     upper: Sequence[float]
-    kp: float
-    kd: float
+    kp: float | Sequence[float]
+    kd: float | Sequence[float]
     crouch_pose: Sequence[float] = (0.0, 1.36, -2.65) * 4
     stand_kp: float = 60.0
     stand_kd: float = 5.0
@@ -114,11 +114,11 @@ class Sensed:
 
 @dataclass(frozen=True)
 class Drive:
-    """What the motors are told: a position controller's targets (12,) rad, and its gains."""
+    """What the motors are told: a position controller's targets (12,) rad, and its gains, one number or 12."""
 
     joint_pos: np.ndarray
-    kp: float
-    kd: float
+    kp: float | Sequence[float]
+    kd: float | Sequence[float]
 
 
 class Machine:

@@ -115,7 +115,7 @@ class Motors:
         sim = env.sim
         self._of_joint = np.array([MOTORS.index(name) for name in env.robot.joints])
         self._gain, self._bias = sim.model_field("actuator_gainprm"), sim.model_field("actuator_biasprm")
-        self._strength = (self._gain[0, :, 0] / env.robot.kp).clone()
+        self._strength = self._gain[0, :, 0] / torch.tensor(env.robot.by_joint("kp"), dtype=torch.float64)
         self.targets = torch.zeros(1, len(MOTORS))
         self.follow(LOW_CMD.zeros())
 

@@ -165,7 +165,7 @@ def test_the_machine_has_the_motors_order(exported):
     assert motor_order(described).tolist() == [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
     machine = machine_config(described)
     assert machine.stand_pose[:6] == [-0.1, 0.8, -1.5, 0.1, 0.8, -1.5]  # right hips are negative
-    assert machine.upper[7] == pytest.approx(4.5379) and (machine.kp, machine.kd) == (25.0, 0.6)
+    assert machine.upper[7] == pytest.approx(4.5379) and (machine.kp, machine.kd) == ([25.0] * 12, [0.6] * 12)
     again = guard.GuardConfig.from_json(guard.GuardConfig(machine).to_json())
     assert again.machine.stand_pose == machine.stand_pose and again == guard.GuardConfig(again.machine)
 
@@ -212,7 +212,7 @@ class TestDds:
         state, command = LOW_STATE.zeros(), low_cmd()
         state["tick"], command["motor_cmd"]["q"][3] = 123, 1.5
         came, asked = [], []
-        end = time.monotonic() + 20.0
+        end = time.monotonic() + 120.0
         while not (came and asked) and time.monotonic() < end:
             to_states.write(LOW_STATE.to_cdr(sealed(state)))
             to_commands.write(LOW_CMD.to_cdr(sealed(command)))
@@ -228,7 +228,7 @@ class TestDds:
         reader, writer = network.reader("rt/livox/lidar", CUSTOM_MSG, 4), network.writer("rt/livox/lidar", CUSTOM_MSG)
         body = struct.pack("<iII", 12, 7, 4) + b"imu\0" + struct.pack("<QIB3xI", 5 * 10**9, 1, 0, 1)
         body += struct.pack("<IfffBBBx", 480, 1.0, 2.0, 3.0, 9, 0, 1)
-        end, came = time.monotonic() + 20.0, []
+        end, came = time.monotonic() + 120.0, []
         while not came and time.monotonic() < end:
             writer.write(b"\0\1\0\0" + body)
             time.sleep(0.02)
@@ -240,7 +240,7 @@ class TestDds:
         machine = machine_config(Description.read(exported))
         link, process = guard.start(guard.GuardConfig(machine, domain=72, listen_s=0.1, linger_s=0.5))
         commands = Network(domain=72).reader(LOW_CMD_TOPIC, LOW_CMD)
-        end = time.monotonic() + 20.0
+        end = time.monotonic() + 120.0
         while not (before := commands.take()) and time.monotonic() < end:
             time.sleep(0.01)
         command = LOW_CMD.from_cdr(before[-1])
@@ -250,18 +250,18 @@ class TestDds:
         commands.take()
         time.sleep(0.2)
         assert commands.take()  # it damps on
-        assert process.wait(20.0) == 0
+        assert process.wait(60.0) == 0
 
     def test_somebody_else_who_writes_lowcmd_is_refused(self, exported):
         network = Network(domain=73)
         writer = network.writer(LOW_CMD_TOPIC, LOW_CMD)
         machine = machine_config(Description.read(exported))
-        _, process = guard.start(guard.GuardConfig(machine, domain=73, listen_s=20.0))
-        end = time.monotonic() + 30.0
+        _, process = guard.start(guard.GuardConfig(machine, domain=73, listen_s=100.0))
+        end = time.monotonic() + 120.0
         while process.poll() is None and time.monotonic() < end:
             writer.write(LOW_CMD.to_cdr(sealed(low_cmd())))
             time.sleep(0.01)
-        assert process.wait(1.0) == 2
+        assert process.wait(60.0) == 2
 
 
 def test_a_missing_cyclonedds_is_named(monkeypatch):
