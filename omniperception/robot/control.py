@@ -92,8 +92,13 @@ def machine_config(description: Description) -> MachineConfig:
         ordered[motors] = np.asarray(values)  # one number for all, or one each
         return ordered.tolist()
 
-    values = (joints.default_pos, joints.lower, joints.upper, joints.kp, joints.kd)
-    return MachineConfig(*(in_motors_order(value) for value in values))
+    return MachineConfig(
+        stand_pose=in_motors_order(joints.default_pos),
+        lower=in_motors_order(joints.lower),
+        upper=in_motors_order(joints.upper),
+        kp=in_motors_order(joints.kp),
+        kd=in_motors_order(joints.kd),
+    )
 
 
 class Control:
