@@ -74,12 +74,12 @@ class TriangleMesh:
             ImportError: trimesh is not installed.
             ValueError: It is no mesh.
         """
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"mesh {path} does not exist")
         try:
             import trimesh
         except ImportError:
             raise ImportError(f"reading {path} needs trimesh: pip install 'omniperception[meshes]'") from None
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"mesh {path} does not exist")
         try:
             mesh = trimesh.load(path, force="mesh", process=False)
         except Exception as error:  # trimesh raises whatever its parsers meet
