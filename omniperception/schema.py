@@ -51,7 +51,7 @@ def _members(module: str, **names: str) -> dict[str, str]:
 
 
 _PATTERNS = "airy avia custom grid hap hdl32e hdl64e height_scanner horizon mid360 mid40 mid70 os0 os1 os2 spinning"
-_PATTERNS += " tele15 vlp16 vlp32c xt16 xt32"
+_PATTERNS += " mid360_measured tele15 unitree_l1 unitree_l2 vlp16 vlp32c xt16 xt32"
 
 NAMES: dict[str, Kind] = {
     "rewards.terms.*": Kind("omniperception.env.mdp.rewards", "func", built=False, given=1),

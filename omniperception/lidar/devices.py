@@ -20,10 +20,13 @@ from .patterns import (
     mid40,
     mid70,
     mid360,
+    mid360_measured,
     os0,
     os1,
     os2,
     tele15,
+    unitree_l1,
+    unitree_l2,
     vlp16,
     vlp32c,
     xt16,
@@ -120,6 +123,9 @@ def _livox(name: str, pattern: Callable, *specs, source: str) -> DeviceSpec:
 DEVICES: dict[str, DeviceSpec] = {
     "mid360": _livox("Mid-360", mid360, 360.0, (-7.0, 52.0), 4, 200_000.0, 0.1, 40.0, 0.02, 0.15,
                      source="Livox Mid-360 user manual v1.0, specifications: sigma at 10 m"),
+    "mid360_measured": _livox("Mid-360, as one was measured", mid360_measured, 360.0, (-7.1, 52.5), 4, 200_000.0, 0.1,
+                              40.0, 0.02, 0.15, source="two frames of one Livox device (docs/lab/fidelity.md); ranges "
+                                                       "and sigmas: Livox Mid-360 user manual v1.0"),
     "avia": _livox("Avia", avia, 70.4, (-38.6, 38.6), 6, 240_000.0, 1.0, 190.0, 0.02, 0.05,
                    source="Livox Avia user manual, specifications: sigma at 20 m"),
     "hap": _livox("HAP", hap, 120.0, (-12.5, 12.5), 6, 452_000.0, 0.5, 150.0, 0.02, 0.1,
@@ -145,6 +151,12 @@ DEVICES: dict[str, DeviceSpec] = {
                        "Hesai PandarXT user manual and SDK (angles, firing times); ranges not re-checked"),
     "xt16": DeviceSpec("Hesai XT16", xt16, 360.0, (-15.0, 15.0), 16, 320_000.0, 10.0, 0.05, 80.0, 0.005, None,
                        "Hesai PandarXT-16 user manual and SDK (angles, firing times); ranges not re-checked"),
+    "unitree_l1": DeviceSpec("Unitree L1", unitree_l1, 360.0, (0.0, 90.0), 1, 21_600.0, 10.0, 0.05, 30.0, 0.02, None,
+                             "Unitree 4D LiDAR-L1 user manual (field of view, 21,600 points/s); SDK unilidar_sdk: 120 "
+                             "points per sweep, geometry; range at 90 %, turns/s, sigma: product page, not re-checked"),
+    "unitree_l2": DeviceSpec("Unitree L2", unitree_l2, 360.0, (0.0, 90.0), 1, 63_936.0, 10.0, 0.05, 30.0, 0.02, None,
+                             "Unitree SDK unilidar_sdk2: geometry, standard field of view of 180 deg; user manual and "
+                             "product page, not re-checked: 64,000 points/s, sweeps and turns/s, range at 90 %, sigma"),
     "airy": DeviceSpec("RoboSense Airy", airy, 360.0, (0.0, 90.0), 96, 864_000.0, 10.0, 0.1, 30.0, 0.02, None,
                        "RoboSense Airy product page and driver (rs_driver); ranges not re-checked"),
 }

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchmarks.pattern_coverage import angle_to_table, compare
-from omniperception.lidar import LIVOX, hap, mid360
+from omniperception.lidar import LIVOX, hap, mid360, mid360_measured
 from omniperception.lidar.patterns.risley import RisleyScanner, Wedge
 
 needs_table = pytest.mark.skipif(
@@ -130,3 +130,18 @@ def test_a_missing_table_names_the_extra(monkeypatch):
             make("table")
         with pytest.raises(ValueError, match=r"lidar.pattern.source='tabel' must be 'model' or 'table'"):
             make("tabel")
+
+
+def test_the_measured_mid360_turns_the_other_way_and_sweeps_as_a_sine(models):
+    """Against hand-computed numbers of the mechanism: 181 turns per second, a sine that spends long at its ends."""
+    table, one = models["mid360"], mid360_measured()
+    for pattern, sense in ((table, -1.0), (one, 1.0)):
+        step = torch.rad2deg(pattern.azimuth[4::4] - pattern.azimuth[:-4:4])
+        assert sense * ((step + 180.0) % 360.0 - 180.0).median() > 1.2
+    turned = torch.rad2deg(torch.diff(one.azimuth[::4]))
+    turned = torch.where(turned < -180.0, turned + 360.0, turned).double()
+    assert turned.sum().item() / 360.0 == pytest.approx(4.0 * 181.033, abs=0.3)
+    high, low = one.elevation.rad2deg().max().item(), one.elevation.rad2deg().min().item()
+    assert (low, high) == pytest.approx((-7.0, 52.5), abs=0.4)
+    middle = [((p.elevation.rad2deg() - 20.0).abs() < 5.0).float().mean().item() for p in (table, one)]
+    assert middle[1] < 0.9 * middle[0]  # a triangle is as long in the middle as at its ends

@@ -2,10 +2,11 @@
 
 from .custom import custom
 from .grid import grid, height_scanner
-from .livox import LIVOX, avia, hap, horizon, mid40, mid70, mid360, tele15
+from .livox import LIVOX, avia, hap, horizon, mid40, mid70, mid360, mid360_measured, tele15
 from .selection import Selection, make_selection, select_rows
 from .spinning import airy, hdl32e, hdl64e, os0, os1, os2, ouster, spinning, vlp16, vlp32c, xt16, xt32
 from .table import ROW_SLACK, ScanPattern
+from .unitree import unitree_l1, unitree_l2
 
 __all__ = [
     "LIVOX",
@@ -25,6 +26,7 @@ __all__ = [
     "mid40",
     "mid70",
     "mid360",
+    "mid360_measured",
     "os0",
     "os1",
     "os2",
@@ -32,6 +34,8 @@ __all__ = [
     "select_rows",
     "spinning",
     "tele15",
+    "unitree_l1",
+    "unitree_l2",
     "vlp16",
     "vlp32c",
     "xt16",
