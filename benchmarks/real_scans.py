@@ -3,7 +3,7 @@
     python -m benchmarks.real_scans device=mid360 file=frame.pcd
     python -m benchmarks.real_scans device=os1_128 file=recording.osf
 
-Reads whatever `read_scans` reads, and packets of Ouster's (.pcap with its .json, .osf) with `pip install ouster-sdk`.
+Reads whatever `read_scans` reads, and Ouster's own .osf and .pcap (with its .json) where `ouster-sdk` is installed.
 Points must be in order of measurement. Misses are known only where the file keeps them, as zeros or NaN. Of planes and
 edges it takes what it finds: nobody measured the scene otherwise.
 """
@@ -102,14 +102,12 @@ def _ouster(path: Path) -> Iterator[PointTable]:
     try:
         from ouster.sdk import core, open_source
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"{path} needs ouster-sdk: pip install ouster-sdk", name=error.name) from None
+        raise ModuleNotFoundError(f"{path} needs ouster-sdk: pip install 'ouster-sdk>=1'", name=error.name) from None
     source = open_source(str(path))
     info = source.sensor_info[0]
     place = core.XYZLut(info)
     for scans in source:
-        scan = scans if isinstance(scans, core.LidarScan) else scans[0]
-        if scan is None:
-            continue
+        scan = scans[0]
         image, xyz = scan.field("RANGE"), place(scan)
         rows, columns = image.shape
         signal = next(
@@ -181,6 +179,7 @@ def by_elevation(frame: Frame, spec: DeviceSpec, pattern: ScanPattern) -> list[d
     bands[[0, -1]] = -90.0, 90.0
     model = np.degrees(pattern.elevation.numpy())
     whole = pattern.points_per_frame(spec.period_s)
+    kept = bool((~frame.seen).any())
     rows = []
     for start, end in pairwise(bands):
         inside = (frame.elevation >= start) & (frame.elevation < end)
@@ -192,7 +191,7 @@ def by_elevation(frame: Frame, spec: DeviceSpec, pattern: ScanPattern) -> list[d
                 "rays of the preset": whole * share,
                 "rays of the recording": int(inside.sum()),
                 "returns": int(seen.sum()),
-                "misses, %": 100.0 * float(1.0 - seen.sum() / max(inside.sum(), 1)),
+                "misses, %": 100.0 * float(1.0 - seen.sum() / max(inside.sum(), 1)) if kept else None,
                 "median range, m": float(np.median(frame.ranges[seen])) if seen.any() else None,
             }
         )
@@ -230,14 +229,16 @@ def on_planes(frame: Frame, seed: int = 0) -> list[dict]:
     return [row for row in rows if any(value is not None for value in list(row.values())[1:])]
 
 
-def at_edges(frame: Frame) -> dict:
-    """Edges along the lines, and returns between both surfaces."""
+def at_edges(frame: Frame, pattern: ScanPattern) -> dict:
+    """Edges along the lines, and returns between both surfaces; only of neighbours, between which none is missing."""
+    beside = 3.0 * abs(_model_steps(pattern))
     edges = ghosts = 0
     for line in frame.lines:
         r, seen = frame.ranges[line], frame.seen[line]
         if len(r) < 3:
             continue
-        whole = seen[:-2] & seen[1:-1] & seen[2:]
+        apart = np.abs((frame.azimuth[line[2:]] - frame.azimuth[line[:-2]] + 180.0) % 360.0 - 180.0)
+        whole = seen[:-2] & seen[1:-1] & seen[2:] & (apart < beside)
         near, far = np.minimum(r[:-2], r[2:]), np.maximum(r[:-2], r[2:])
         edge = whole & (far - near > EDGE)
         edges += int(edge.sum())
@@ -281,7 +282,7 @@ def main(given: Arguments) -> None:
     tables = [
         Table.of("summary", title, summary(found, spec, pattern)),
         Table.of("elevation", f"{title}: rays by elevation", by_elevation(found, spec, pattern)),
-        Table.of("ranges", f"{title}: returns by range", by_range(found), [f"at edges: {at_edges(found)}"]),
+        Table.of("ranges", f"{title}: returns by range", by_range(found), [f"at edges: {at_edges(found, pattern)}"]),
         Table.of("planes", f"{title}: sigma along the ray on planes, mm, by incidence", on_planes(found)),
     ]
     report([table for table in tables if table.rows], about(1), given.out or Path("outputs/real_scans") / given.device)

@@ -109,7 +109,7 @@ def test_a_ghost_between_two_surfaces_is_counted():
     ranges[50] = 3.0  # between both
     xyz = ranges[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(100)], axis=1)
     table = table_of({**dict(zip("xyz", xyz.T, strict=True)), "ring": np.zeros(100, np.uint8)})
-    found = real_scans.at_edges(real_scans.frame_of(table, vlp16()))
+    found = real_scans.at_edges(real_scans.frame_of(table, vlp16()), vlp16())
     assert found["ghosts"] == 1 and found["edges"] == 3
 
 
