@@ -79,6 +79,7 @@ class Command:
             empty: they are refused.
         errors: exceptions beside ConfigError whose message is for the user.
         flags: words such as -m that stay among the overrides.
+        first: argument that a first word without '=' gives, such as `file` of `robot-new FILE`; empty: none.
     """
 
     main: Callable[..., Any]
@@ -87,6 +88,7 @@ class Command:
     overrides: str = ""
     errors: tuple[type[Exception], ...] = ()
     flags: tuple[str, ...] = ()
+    first: str = ""
 
     def __call__(self, argv: Sequence[str] | None = None, name: str | None = None) -> None:
         """Runs the command line `argv`, by default the process's."""
@@ -109,7 +111,9 @@ class Command:
         fields = {field.name: field for field in dataclasses.fields(self.arguments)}
         hints = typing.get_type_hints(self.arguments)
         given, keys, overrides = {}, set(), []
-        for text in self._without_flags(argv):
+        for k, text in enumerate(self._without_flags(argv)):
+            if k == 0 and self.first and "=" not in text and not text.startswith("~"):
+                text = f"{self.first}={text}"
             key, separator, value = text.partition("=")
             if not separator and not text.startswith("~") and text not in self.flags:
                 raise ConfigError(f"argument '{text}' is not of the form key=value")
@@ -150,7 +154,8 @@ class Command:
     def help(self, name: str) -> str:
         """Text that `--help` prints."""
         fields = dataclasses.fields(self.arguments)
-        lines = [f"usage: {name} [key=value ...]", "", self.doc.strip(), ""]
+        first = f" {self.first.upper()}" if self.first else ""
+        lines = [f"usage: {name}{first} [key=value ...]", "", self.doc.strip(), ""]
         shown = {field.name: f"{field.name}={_text(field.default)}" for field in fields}
         width = min(max((len(text) for text in shown.values()), default=0), 30)
         lines += ["arguments:"] if fields else []

@@ -18,6 +18,8 @@ COMMANDS = {
     "robot-sim": "simulates a Go2 and its LiDAR on the robot's own wire",
     "publish": "makes a small run directory, fit for a repository",
     "scan": "draws what a LiDAR sees",
+    "robot-new": "writes a preset for a robot from its MJCF or URDF, and says what it guessed",
+    "robot-check": "stands a robot: contacts, joints and their reach, what its LiDAR sees of it, a picture",
     "plan": "lists what a configuration consists of and what was left out",
 }
 EXTRAS = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import mujoco
@@ -64,22 +64,32 @@ class Mirror:
 def mirrored_joints(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
     """For each joint the one that is its mirror image (index), and the sign of its angle in the mirror.
 
-    Found at joint angles of 0 from the joints' anchors and axes: an axis is axial, (x, y, z) -> (-x, y, -z).
-
     Raises:
         ValueError: a joint has no mirror image, or the default pose is not its own.
     """
-    model = robot.compiled()
+    index, sign = joint_twins(robot.compiled(), robot.base, robot.joints)
+    default = np.array(robot.by_joint("default_joint_pos"))
+    if not np.allclose(default[index] * sign, default, atol=_SAME):
+        raise ValueError(
+            "ppo.symmetry=true: robot.default_joint_pos is not its own mirror image; set ppo.symmetry=false"
+        )
+    return index, sign
+
+
+def joint_twins(model: mujoco.MjModel, base: str, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """`mirrored_joints` of any model, whatever its default pose.
+
+    Found at joint angles of 0 from the joints' anchors and axes: an axis is axial, (x, y, z) -> (-x, y, -z).
+    """
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
-    for name in robot.joints:
+    for name in joints:
         data.joint(name).qpos = 0
     mujoco.mj_kinematics(model, data)
-    ids = [model.joint(name).id for name in robot.joints]
-    anchor, axis = data.xanchor[ids] - data.body(robot.base).xpos, data.xaxis[ids]
-    default = np.array(robot.by_joint("default_joint_pos"))
+    ids = [model.joint(name).id for name in joints]
+    anchor, axis = data.xanchor[ids] - data.body(base).xpos, data.xaxis[ids]
     index, sign = np.zeros(len(ids), np.int64), np.zeros(len(ids), np.float32)
-    for j, name in enumerate(robot.joints):
+    for j, name in enumerate(joints):
         there = np.linalg.norm(anchor - anchor[j] * VECTOR, axis=1) < _SAME
         along = axis @ (axis[j] * ROTATION)
         twins = np.flatnonzero(there & (np.abs(along) > 1 - _SAME))
@@ -89,10 +99,6 @@ def mirrored_joints(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
                 " set ppo.symmetry=false"
             )
         index[j], sign[j] = twins[0], np.sign(along[twins[0]])
-    if not np.allclose(default[index] * sign, default, atol=_SAME):
-        raise ValueError(
-            "ppo.symmetry=true: robot.default_joint_pos is not its own mirror image; set ppo.symmetry=false"
-        )
     return index, sign
 
 

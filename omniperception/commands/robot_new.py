@@ -1,0 +1,64 @@
+"""Writes conf/robot/<name>.yaml for a robot from its file, MJCF or URDF, and says what it guessed.
+
+    robot-new robots/spider.urdf
+    robot-new g1.xml name=g1 joints=left_hip_pitch_joint,left_knee_joint frequency=3 lidar=head_link
+
+The file says the joints, their limits and, where it has actuators, which of them are driven and how strong they are.
+Feet, default pose, gains, action scale, links that can touch each other, mirror images and places for a LiDAR are
+found from geometry and masses. The robot is stood on a plane for 2 s with the result. Then: robot-check NAME.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from omniperception.cli import Command, argument
+from omniperception.config import ConfigError
+from omniperception.robots.guess import Wishes, guess
+from omniperception.robots.preset import table_of, text_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's own arguments."""
+
+    file: Path = argument(doc="MJCF or URDF of the robot; the preset names it like this")
+    name: str | None = argument(None, "of the preset; null: the file's")
+    out: Path = argument(Path("conf/robot"), "folder of the preset")
+    again: bool = argument(False, "whether a preset of that name is written over")
+    joints: tuple[str, ...] = argument((), "actuated joints; none given: those with an actuator in the file, or all")
+    frequency: float = argument(2.0, "of a joint, with what hangs on it, as a spring (Hz)", positive=True)
+    damping_ratio: float = argument(0.5, "of that spring; 1 is critical", positive=True)
+    self_collision: bool = argument(True, "whether links that can touch each other do")
+    lidar: str | None = argument(None, "link that carries the LiDAR; null: the highest of no leg or arm")
+
+
+def main(arguments: Arguments) -> None:
+    """Guesses, writes and tells."""
+    if not arguments.file.is_file():
+        raise ConfigError(f"file={arguments.file} is no file; give the robot's MJCF or URDF")
+    name = arguments.name or re.sub(r"\W+", "_", arguments.file.stem).lower()
+    if not re.fullmatch(r"\w+", name):
+        raise ConfigError(f"name={name} must be letters, digits and underscores")
+    path = arguments.out / f"{name}.yaml"
+    if path.exists() and not arguments.again:
+        raise ConfigError(f"{path} exists; give another name=..., or again=true to write over it")
+    wishes = Wishes(
+        arguments.joints,
+        arguments.frequency,
+        arguments.damping_ratio,
+        arguments.self_collision,
+        arguments.lidar,
+    )
+    found = guess(arguments.file, str(arguments.file), wishes)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text_of(found, arguments.file))
+    print(table_of(found))
+    stands = "stands" if found.standing.steady else "DOES NOT STAND"
+    print(f"after 2 s it {stands}: base at {found.standing.height:.3f} m, inclined by {found.standing.tilt:.3f} rad")
+    print(f"written: {path}; next: omniperception robot-check {name}")
+
+
+command = Command(main, Arguments, __doc__, errors=(ValueError,), first="file")
