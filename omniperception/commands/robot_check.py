@@ -101,9 +101,8 @@ def _on_joints(world: World, found: Standing) -> str:
 
 def _on_sight(sight: Sight, carrier: str) -> str:
     own = sum(sight.own.values())
-    lines = [
-        f"LiDAR on {carrier}: {100 * own:.1f} % of {sight.rays} rays hit the robot" + (" ITSELF" * (own > MANY_OWN))
-    ]
+    advice = "; a mount with a freer view is worth a try (lidar.mount=...)" if own > MANY_OWN else ""
+    lines = [f"LiDAR on {carrier}: {100 * own:.1f} % of {sight.rays} rays hit the robot{advice}"]
     if sight.own:
         most = ", ".join(f"{name} {100 * share:.1f} %" for name, share in list(sight.own.items())[:8])
         lines.append(f"  nearest {sight.nearest:.3f} m; most often {most}")

@@ -63,7 +63,7 @@ def look(world: World, data: mujoco.MjData, sensor: SensorConfig) -> Sight:
         points.append(frame.points_w[0, hit].clone())
         robots.append(own[hit])
     order = np.argsort(-counts)
-    seen = {shapes.geom_names[k]: counts[k] / rays for k in order if counts[k]}
+    seen = {shapes.geom_names[k]: float(counts[k]) / rays for k in order if counts[k]}
     return Sight(rays, seen, nearest, torch.cat(points), torch.cat(robots))
 
 
