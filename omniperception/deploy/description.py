@@ -55,12 +55,14 @@ class Term:
         size: numbers.
         scale: factor.
         frequency: of the clock (Hz), of gait_phase alone.
+        rest_s: how long (s) the command has to be to stand until the clock rests.
     """
 
     quantity: str
     size: int
     scale: float = 1.0
     frequency: float | None = None
+    rest_s: float = 0.0
 
 
 @dataclass(frozen=True)

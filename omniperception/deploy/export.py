@@ -157,13 +157,13 @@ def _group(name: str, env: OmniEnv) -> Group:
     terms = []
     for term_name, term in group.terms.items():
         function, options = (term.func, dict(term.keywords)) if isinstance(term, partial) else (term, {})
-        if function not in _MEASURABLE or set(options) - {"scale", "frequency"}:
+        if function not in _MEASURABLE or set(options) - {"scale", "frequency", "rest_s"}:
             raise ConfigError(
                 f"observations.groups.{name}.terms.{term_name} cannot be exported: a robot can measure"
                 f" {', '.join(_MEASURABLE.values())}"
             )
-        scale, frequency = options.get("scale", 1.0), options.get("frequency")
-        terms.append(Term(_MEASURABLE[function], widths[term_name], scale, frequency))
+        scale, frequency, rest_s = options.get("scale", 1.0), options.get("frequency"), options.get("rest_s", 0.0)
+        terms.append(Term(_MEASURABLE[function], widths[term_name], scale, frequency, rest_s))
     return Group(name, group.history, tuple(terms))
 
 

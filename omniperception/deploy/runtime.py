@@ -134,7 +134,7 @@ class ExportedPolicy:
         self.action = np.zeros(len(self._default_pos), np.float32)
         for history in self._histories.values():
             history.clear()
-        self.frame_count = self._steps = 0
+        self.frame_count = self._steps = self._steps_stood = 0
         self.base_lin_vel: np.ndarray | None = None
         if self.safety is not None:
             self.safety.reset()
@@ -237,6 +237,7 @@ class ExportedPolicy:
         if estimates:
             self.base_lin_vel = estimates[0]
         self._steps += 1
+        self._steps_stood = 0 if np.any(command) else self._steps_stood + 1
         self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
         targets = self._default_pos + np.asarray(joints.action_scale, np.float32) * self.action
         if self.safety is None:
@@ -278,7 +279,7 @@ class ExportedPolicy:
             if term.frequency is None:
                 value = QUANTITIES[term.quantity](self, state, command)
             else:
-                value = self._phase(term.frequency, command)
+                value = self._phase(term.frequency, term.rest_s, command)
             if value.shape != (term.size,):
                 raise DeployError(f"{term.quantity}: shape ({term.size},) was expected, {value.shape} given")
             if not np.isfinite(value).all():
@@ -286,10 +287,12 @@ class ExportedPolicy:
             values.append(value * np.float32(term.scale))
         return np.concatenate(values)
 
-    def _phase(self, frequency: float, command: ArrayLike) -> np.ndarray:
-        """(2,) sine and cosine of the clock since the last reset; 0 while the command is to stand."""
+    def _phase(self, frequency: float, rest_s: float, command: ArrayLike) -> np.ndarray:
+        """(2,) sine and cosine of the clock since the last reset; 0 once the command has been to stand for `rest_s`."""
+        stood_s = self._steps_stood * self.description.control_period_s
+        rests = not np.any(command) and stood_s > rest_s - 1e-3
         angle = 2 * np.pi * frequency * self._steps * self.description.control_period_s
-        return np.array([np.sin(angle), np.cos(angle)], np.float32) * bool(np.any(command))
+        return np.array([np.sin(angle), np.cos(angle)], np.float32) * (not rests)
 
     def _perception(self) -> tuple[Lidar, CloudSampler, np.ndarray]:
         """The sensor, the sampler and the history of frames of a policy that sees."""

@@ -97,6 +97,7 @@ class EnvState:
         joint_torque_limit: (num_joints,) N m.
         default_base_height: m, of the default pose.
         drawn_physics: (num_envs, W) what randomization drew; see `Randomizer.drawn`.
+        stand_s: (num_envs,) s for which the command has been to stand.
     """
 
     def __init__(
@@ -111,6 +112,7 @@ class EnvState:
         sensing: LidarSensing | None = None,
         errors: MeasurementErrors | None = None,
         episode_steps: torch.Tensor | None = None,
+        acceleration: Sequence[float] | None = None,
     ) -> None:
         """
         Args:
@@ -124,6 +126,7 @@ class EnvState:
             sensing: the LiDAR.
             errors: of what is measured.
             episode_steps: (num_envs,) int64 control steps since the episodes began, the environment's own.
+            acceleration: of `reference`; see `RewardsConfig`.
         """
         self._errors = errors
         steps = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
@@ -148,6 +151,8 @@ class EnvState:
         self._history = None if randomizer.delay is None else StateHistory(sim, randomizer)
         self._foot_times: ContactTimes | None = None
         self.before = self.kinematics
+        self.stand_s = torch.zeros(self.num_envs, device=self.device)
+        self._acceleration, self._reference = acceleration, torch.zeros(self.num_envs, 3, device=self.device)
 
     # ---- followed by the environment ---------------------------------------------------------------------------------
 
@@ -158,6 +163,10 @@ class EnvState:
     def end_step(self) -> None:
         """Takes in the physics steps of the control step."""
         self.invalidate()
+        self.stand_s = torch.where((self.command == 0).all(1), self.stand_s + self.control_dt, 0.0)
+        if self._acceleration is not None:
+            most = [rate * self.control_dt for rate in self._acceleration]
+            self._reference = moved_towards(self._reference, self.command, *most)
         if self._history is not None:
             self._history.record()
         if self._errors is not None:
@@ -169,6 +178,8 @@ class EnvState:
         """Clears the history of environments (n,) whose physics has been reset."""
         self.invalidate()
         self.actions = tuple(action.index_fill(0, env_ids, 0.0) for action in self.actions)
+        self.stand_s = self.stand_s.index_fill(0, env_ids, 0.0)
+        self._reference = self._reference.index_fill(0, env_ids, 0.0)
         if self._history is not None:
             self._history.reset(env_ids)
         if self._errors is not None:
@@ -194,6 +205,8 @@ class EnvState:
         """State that lasts from step to step."""
         return {
             "actions": list(self.actions),
+            "stand_s": self.stand_s,
+            "reference": self._reference,
             "history": self._history and self._history.state_dict(),
             "errors": self._errors and self._errors.state_dict(),
             "foot_times": self._foot_times and self._foot_times.state_dict(),
@@ -202,6 +215,7 @@ class EnvState:
     def load_state_dict(self, state: dict) -> None:
         self.invalidate()
         self.actions = tuple(state["actions"])
+        self.stand_s, self._reference = state["stand_s"].clone(), state["reference"].clone()
         if self._history is not None:
             self._history.load_state_dict(state["history"])
         if self._errors is not None:
@@ -234,6 +248,13 @@ class EnvState:
     def command(self) -> torch.Tensor:
         """(num_envs, 3) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame."""
         return self._command.value
+
+    @property
+    def reference(self) -> torch.Tensor:
+        """(num_envs, 3) v_x, v_y (m/s) and yaw rate (rad/s): the command as the tracking terms ask for it, 0 when an
+        episode begins and then towards the command as fast as `RewardsConfig.acceleration` says; without one the
+        command itself."""
+        return self.command if self._acceleration is None else self._reference
 
     @lazy
     def base_lin_acc_b(self) -> torch.Tensor:
@@ -359,6 +380,18 @@ class EnvState:
         """(num_envs,) m: mean of the noise-free distal ranges of the newest frame, each capped at `max_distance` (m);
         the cap before the first frame. Requires "distal_range"."""
         return _declared(self._sensing, DISTAL_RANGE).mean_distal_range(max_distance)
+
+
+def rests(state: EnvState, after_s: float) -> torch.Tensor:
+    """(num_envs,) bool: whose command is to stand, and has been for `after_s` (s)."""
+    return (state.command == 0).all(1) & (state.stand_s > after_s - 1e-3)  # sums of time steps are not exact
+
+
+def moved_towards(now: torch.Tensor, there: torch.Tensor, linear: float, angular: float) -> torch.Tensor:
+    """Velocities (n, 3) `now`, moved towards `there` by at most `linear` (m/s) and `angular` (rad/s)."""
+    change = there - now
+    share = linear / change[:, :2].norm(dim=1, keepdim=True).clamp(min=linear)
+    return now + torch.cat((change[:, :2] * share, change[:, 2:].clamp(-angular, angular)), 1)
 
 
 _CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance(value, lazy))

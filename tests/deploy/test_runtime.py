@@ -43,7 +43,10 @@ RECIPES = {
     "proximity_gru_no_proximal": overrides_of("proximity_gru_no_proximal"),
     "polar_rings": ("experiment=avoid", "init=unread"),
     "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
-    "clock": ("experiment=walk", "observations=gait"),
+    "clock": (
+        *("experiment=walk", "observations=gait", "commands.standing=0.5", "commands.resample_s=[0.1,0.3]"),
+        "observations.groups.clock.terms.gait_phase.rest_s=0.1",
+    ),
     "estimated": ("experiment=walk", "observations=gait_without_velocity"),
     "polar_rings_estimated": ("experiment=avoid", "init=unread", "observations=gait_without_velocity"),
     "motion_by_proximal": ("experiment=avoid", "init=unread", *overrides_of("pd_risknet_no_distal")),

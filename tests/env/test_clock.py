@@ -1,4 +1,4 @@
-"""The clock that times the feet: it starts with the episode, stands with the robot, and is mirrored as a trot is."""
+"""The clock that times the feet: it starts with the episode, rests with the robot, and is mirrored as a trot is."""
 
 import math
 
@@ -9,14 +9,16 @@ from omniperception.env.mirror import Mirror
 GAIT = ("observations=gait", "rewards=gait", "obstacles=none")
 
 
-def test_it_starts_with_each_episode_and_is_0_while_the_robot_should_stand(make_env):
-    env = make_env(*GAIT, "terminations.episode_length_s=0.2", "commands.standing=0.5", blind=True, num_envs=16)
+def test_it_starts_with_each_episode_and_is_0_once_the_robot_should_rest(make_env):
+    """It rests where the command has been to stand for 0.06 s, three steps."""
+    rest = ("commands.standing=0.5", "observations.groups.clock.terms.gait_phase.rest_s=0.06")
+    env = make_env(*GAIT, *rest, "terminations.episode_length_s=0.2", blind=True, num_envs=16)
     moved = stood = 0
     for step in range(25):
         clock, command = env.get_observations()["clock"], env.command.value
         time = 0.02 * (step % 10)  # episodes of ten steps
         for k in range(16):
-            moves = bool(command[k].any())
+            moves = bool(command[k].any()) or step % 10 < 3
             expected = (math.sin(5 * math.pi * time), math.cos(5 * math.pi * time)) if moves else (0.0, 0.0)
             torch.testing.assert_close(clock[k], torch.tensor(expected), atol=1e-5, rtol=0)
             moved, stood = moved + moves, stood + (not moves)
@@ -35,6 +37,26 @@ def test_its_mirror_image_is_that_of_the_feet_of_a_trot(make_env):
     offsets = env.config.rewards.terms["foot_timing"].func.keywords["offsets"]
     left_right = [1, 0, 3, 2]
     assert [offsets[k] for k in left_right] == [(offset + 0.5) % 1.0 for offset in offsets]
+
+
+def test_tracking_terms_ask_for_no_more_acceleration_than_was_said(make_env):
+    """From rest towards (1.2, -0.5) m/s, 1.3 m/s in all, by 0.1 m/s in each step, and 1 rad/s by 0.4; then back."""
+    acceleration = "rewards.acceleration=[5.0,20.0]"
+    env = make_env(*GAIT, acceleration, "terminations.episode_length_s=0.12", blind=True, num_envs=2)
+    env.command.value[:] = torch.tensor([1.2, -0.5, 1.0])
+    ahead = torch.tensor([12 / 13, -5 / 13])
+    for step in range(1, 6):
+        env.step(torch.zeros(2, 12))
+        expected = torch.cat((0.1 * step * ahead, torch.tensor([min(0.4 * step, 1.0)])))
+        torch.testing.assert_close(env.state.reference[0], expected, atol=1e-5, rtol=0)
+    kept = env.state.state_dict()
+    env.command.value[0] = 0.0
+    env.step(torch.zeros(2, 12))  # the sixth ends the episode
+    assert not env.state.reference.any() and not env.state.stand_s.any()
+    env.state.load_state_dict(kept)
+    torch.testing.assert_close(env.state.reference[0], expected, atol=1e-5, rtol=0)
+    plain = make_env(*GAIT, "rewards.acceleration=null", blind=True, num_envs=2)
+    assert plain.state.reference is plain.command.value
 
 
 def _with(env, clock):

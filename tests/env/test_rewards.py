@@ -130,7 +130,8 @@ class TestTerms:
         }
         state = given(
             kinematics=kinematics,
-            command=tensor([1.0, 0.0, 0.6], [0.0, 0.0, 7.0]),
+            command=tensor([1.0, 0.0, 5.0], [0.0, 0.0, 5.0]),
+            reference=tensor([1.0, 0.0, 0.6], [0.0, 0.0, 7.0]),
             avoidance_velocity=tensor([-0.5, 0.0], [0.0, 0.1]),
             mean_distal_range=lambda limit: tensor(limit, 0.25 * limit),
             foot_force=tensor([[30.0, 40.0, 5.0], [3.0, 4.0, -50.0], [0.0, 0.0, 0.0]], [[0.0, 0.0, 9.0]] * 3),
@@ -148,11 +149,12 @@ class TestTerms:
         )
         assert getattr(rewards, term)(state, **settings).tolist() == pytest.approx(expected)
 
-    def test_standing_counts_where_the_command_says_so(self):
-        joint_vel = tensor([1.0, -2.0], [1.0, -2.0], [0.0, 0.0])
-        command = tensor([0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.0])
-        state = given(kinematics={"joint_vel": joint_vel}, command=command)
-        assert rewards.standing_joint_velocity_squared(state).tolist() == [5.0, 0.0, 0.0]
+    def test_standing_counts_where_the_command_has_said_so_for_long_enough(self):
+        joint_vel = tensor([1.0, -2.0], [1.0, -2.0], [0.0, 0.0], [1.0, -2.0])
+        command = tensor([0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+        stand_s = torch.tensor([0.5, 0.0, 0.5, 0.3])
+        state = given(kinematics={"joint_vel": joint_vel}, command=command, stand_s=stand_s)
+        assert rewards.standing_joint_velocity_squared(state, rest_s=0.4).tolist() == [5.0, 0.0, 0.0, 0.0]
 
     def closing(self, pos, vel, base_vel=(0.0, 0.0), active=True):
         state = given(
@@ -195,12 +197,19 @@ class TestFeet:
         """At 2 Hz and 0.1 s the clock is at 0.2 of its period, a foot half a period later at 0.7."""
         contact = torch.tensor([[True, False], [True, True], [True, True]])
         command = tensor([0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
-        state = given(time_s=torch.tensor([0.1, 0.1, 0.1]), foot_contact=contact, command=command, device="cpu")
-        settings = {"frequency": 2.0, "offsets": [0.0, 0.5], "duty": 0.5}
+        state = given(
+            time_s=torch.tensor([0.1, 0.1, 0.1]),
+            foot_contact=contact,
+            command=command,
+            stand_s=torch.tensor([0.0, 0.0, 0.6]),
+            device="cpu",
+        )
+        settings = {"frequency": 2.0, "offsets": [0.0, 0.5], "duty": 0.5, "rest_s": 0.5}
         assert rewards.foot_timing(state, **settings).tolist() == [1.0, 0.5, 1.0]  # the last one stands, as it should
         assert rewards.foot_timing(state, **settings | {"duty": 0.8}).tolist() == [0.5, 1.0, 1.0]
         state.time_s = torch.tensor([0.35, 0.35, 0.35])  # half a period later
         assert rewards.foot_timing(state, **settings).tolist() == [0.0, 0.5, 1.0]
+        assert rewards.foot_timing(state, **settings | {"rest_s": 1.0}).tolist() == [0.0, 0.5, 0.5]  # it steps to stop
 
     def test_slip_is_of_feet_in_contact(self):
         state = given(foot_vel_w=tensor([[0.3, 0.4, 5.0], [2.0, 0.0, 0.0]]), foot_contact=torch.tensor([[True, False]]))

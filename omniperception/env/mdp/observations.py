@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from omniperception.env.mdp.terms import JOINT_MAGNITUDES, JOINTS, ROTATION, VECTOR, mirrors
-from omniperception.env.state import EnvState, requires
+from omniperception.env.state import EnvState, requires, rests
 
 
 @mirrors(JOINTS)
@@ -51,14 +51,15 @@ def previous_action(state: EnvState) -> torch.Tensor:
 
 
 @mirrors((-1.0, -1.0))
-def gait_phase(state: EnvState, frequency: float) -> torch.Tensor:
-    """Sine and cosine of a clock of `frequency` (Hz) that starts with the episode; 0 while the command is to stand.
+def gait_phase(state: EnvState, frequency: float, rest_s: float) -> torch.Tensor:
+    """Sine and cosine of a clock of `frequency` (Hz) that starts with the episode; 0 once the robot should rest.
+
+    It should rest while the command is to stand, and has been for `rest_s` (s): whoever runs has to step to stop.
 
     Its mirror image is half a period off, as the feet of a trot are.
     """
     angle = 2 * torch.pi * frequency * state.time_s
-    moves = (state.command != 0).any(1)
-    return torch.stack((angle.sin(), angle.cos()), 1) * moves[:, None]
+    return torch.stack((angle.sin(), angle.cos()), 1) * ~rests(state, rest_s)[:, None]
 
 
 @mirrors(JOINTS, JOINTS, VECTOR, ROTATION, VECTOR)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import torch
 
-from omniperception.env.state import EnvState, requires
+from omniperception.env.state import EnvState, requires, rests
 
 
 @requires("avoidance")
@@ -21,25 +21,25 @@ def velocity_tracking_with_avoidance(state: EnvState, beta: float) -> torch.Tens
 
 
 def velocity_tracking(state: EnvState, beta: float) -> torch.Tensor:
-    """exp(-beta |v_xy - v_cmd|^2): tracking without obstacles."""
-    error = state.kinematics.base_lin_vel_yaw - state.command[:, :2]
+    """exp(-beta |v_xy - v_ref|^2): tracking without obstacles, of `EnvState.reference`."""
+    error = state.kinematics.base_lin_vel_yaw - state.reference[:, :2]
     return torch.exp(-beta * error.square().sum(1))
 
 
 def yaw_rate_tracking(state: EnvState, beta: float) -> torch.Tensor:
-    """exp(-beta (w_z - w_cmd)^2); the paper commands a yaw rate and has no term for it."""
-    error = state.kinematics.base_ang_vel_b[:, 2] - state.command[:, 2]
+    """exp(-beta (w_z - w_ref)^2); the paper commands a yaw rate and has no term for it."""
+    error = state.kinematics.base_ang_vel_b[:, 2] - state.reference[:, 2]
     return torch.exp(-beta * error.square())
 
 
 def velocity_error(state: EnvState) -> torch.Tensor:
-    """|v_xy - v_cmd|, m/s: unlike `velocity_tracking` as steep far from the command as near it."""
-    return (state.kinematics.base_lin_vel_yaw - state.command[:, :2]).norm(dim=1)
+    """|v_xy - v_ref|, m/s: unlike `velocity_tracking` as steep far from the reference as near it."""
+    return (state.kinematics.base_lin_vel_yaw - state.reference[:, :2]).norm(dim=1)
 
 
 def yaw_rate_error(state: EnvState) -> torch.Tensor:
-    """|w_z - w_cmd|, rad/s."""
-    return (state.kinematics.base_ang_vel_b[:, 2] - state.command[:, 2]).abs()
+    """|w_z - w_ref|, rad/s."""
+    return (state.kinematics.base_ang_vel_b[:, 2] - state.reference[:, 2]).abs()
 
 
 @requires("distal_range")
@@ -106,15 +106,17 @@ def closing_speed(state: EnvState, horizon: float, margin: float) -> torch.Tenso
 
 
 @requires("foot_force")
-def foot_timing(state: EnvState, frequency: float, offsets: Sequence[float], duty: float) -> torch.Tensor:
-    """Share of the feet that are down or up as a clock says; all should be down while the command is to stand.
+def foot_timing(
+    state: EnvState, frequency: float, offsets: Sequence[float], duty: float, rest_s: float
+) -> torch.Tensor:
+    """Share of the feet that are down or up as a clock says; all should be down once the robot should rest.
 
     A foot should be down during the first `duty` of its period, which begins `offsets` of a period after the clock's,
-    that of the observation `gait_phase` of the same `frequency` (Hz).
+    that of the observation `gait_phase` of the same `frequency` (Hz) and `rest_s`.
     """
     phase = frequency * state.time_s[:, None] - torch.tensor(offsets, device=state.device)
     down = torch.remainder(phase, 1.0) < duty
-    down = down | (state.command == 0).all(1, keepdim=True)
+    down = down | rests(state, rest_s)[:, None]
     return (down == state.foot_contact).float().mean(1)
 
 
@@ -159,9 +161,9 @@ def joint_torque_near_limit(state: EnvState, share: float) -> torch.Tensor:
     return (state.joint_torque.abs() / state.joint_torque_limit - share).clamp(min=0.0).sum(1)
 
 
-def standing_joint_velocity_squared(state: EnvState) -> torch.Tensor:
-    """|qdot|^2, (rad/s)^2, while the command is to stand; 0 otherwise."""
-    return state.kinematics.joint_vel.square().sum(1) * (state.command == 0).all(1)
+def standing_joint_velocity_squared(state: EnvState, rest_s: float) -> torch.Tensor:
+    """|qdot|^2, (rad/s)^2, once the robot should rest; 0 otherwise."""
+    return state.kinematics.joint_vel.square().sum(1) * rests(state, rest_s)
 
 
 def joint_torque_squared(state: EnvState) -> torch.Tensor:

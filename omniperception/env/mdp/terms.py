@@ -82,12 +82,19 @@ class RewardsConfig:
     Attributes:
         terms: the terms.
         avoidance: how sector distances become the avoidance velocity.
+        acceleration: how fast (m/s^2, rad/s^2) the velocity that tracking terms ask for may change when the command
+            jumps; None: at once, which asks a robot at full speed for a stop that throws it over.
     """
 
     terms: Mapping[str, RewardTerm]
     avoidance: AvoidanceConfig
+    acceleration: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
+        if self.acceleration is not None and (len(self.acceleration) != 2 or min(self.acceleration) <= 0):
+            raise ValueError(
+                f"rewards.acceleration={list(self.acceleration)} must be [m/s^2, rad/s^2], both positive, or null"
+            )
         used = {name: term for name, term in self.terms.items() if term.weight != 0}
         object.__setattr__(self, "terms", used)
 
