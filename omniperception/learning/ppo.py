@@ -49,6 +49,7 @@ class PerceptivePpo(PPO):
     """
 
     storage: PerceptiveStorage
+    entropy_coef: float
     perception_optimizer: torch.optim.Adam | None = None
     estimator_optimizer: torch.optim.Adam | None = None
 
