@@ -21,5 +21,5 @@ def read(path: Path, topic: str | None) -> Iterator[PointTable]:
             chosen = chosen_topic(path, of_clouds, topic)
             for connection, _, data in bag.messages([c for c in bag.connections if c.topic == chosen]):
                 yield table_from_message(bag.deserialize(data, connection.msgtype))
-    except AnyReaderError as error:
+    except (AnyReaderError, FileNotFoundError) as error:  # the latter from rosbags 0.11 for a folder that is no bag
         raise ValueError(f"{path} is not a readable bag: {str(error).splitlines()[0]}") from error
