@@ -120,6 +120,7 @@ class Control:
         self._needs_velocity = not described.estimated and (moves or "base_lin_vel" in observed)
         self._state: np.ndarray | None = None
         self._mode, self._last_frame = Mode.DAMPING, math.inf
+        self._velocity = np.zeros(3)
 
     def step(self, now: float) -> bool:
         """One control step; False without a state of the robot so far."""
@@ -169,7 +170,10 @@ class Control:
         quat, gyro = imu["quaternion"].astype(float), imu["gyroscope"].astype(float)
         velocity = None
         if self._needs_velocity:
-            velocity = base_velocity(motors["q"].astype(float), motors["dq"].astype(float), gyro, down(quat))
+            joints = (motors[name].astype(float) for name in ("q", "dq", "tau_est"))
+            stood = base_velocity(*joints, gyro, down(quat))
+            self._velocity = self._velocity if stood is None else stood
+            velocity = self._velocity
         order = self._motors
         return RobotState(motors["q"][order], motors["dq"][order], quat, gyro, velocity, motors["tau_est"][order])
 

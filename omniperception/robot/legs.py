@@ -8,44 +8,50 @@ _HIP = np.array([[0.1934, -0.0465, 0], [0.1934, 0.0465, 0], [-0.1934, -0.0465, 0
 """Hips of FR, FL, RR, RL in the base, m; as the lengths below from Unitree's description (scene/assets/go2.xml)."""
 _THIGH = np.array([[0, -0.0955, 0], [0, 0.0955, 0], [0, -0.0955, 0], [0, 0.0955, 0]])
 _CALF, _FOOT = np.array([0.0, 0.0, -0.213]), np.array([-0.002, 0.0, -0.213])
-_STANDING_BAND = 0.015
-"""A foot so little above the lowest one (m, along gravity) counts as standing."""
+_STANDING_FORCE = 15.0
+"""A foot that pushes down with less (N) does not count as standing."""
 
 
-def feet(joint_pos: np.ndarray, joint_vel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position (4, 3) m and velocity (4, 3) m/s of the feet in the base, relative to it.
+def feet(joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position (4, 3) m of the feet in the base, and its Jacobian (4, 3, 3): by axis and joint, m/rad.
 
     Args:
         joint_pos: (12,) rad, in the motors' order.
-        joint_vel: (12,) rad/s.
     """
     hip, thigh, calf = joint_pos.reshape(4, 3).T
-    hip_rate, thigh_rate, calf_rate = joint_vel.reshape(4, 3).T
     shank = _about_y(thigh + calf, _FOOT)
     leg = _about_y(thigh, _CALF) + shank
     from_hip = _about_x(hip, _THIGH + leg)
     lateral = _about_x(hip, np.array([0.0, 1.0, 0.0]))
-    velocity = (
-        hip_rate[:, None] * np.cross([1.0, 0.0, 0.0], from_hip)
-        + thigh_rate[:, None] * np.cross(lateral, _about_x(hip, leg))
-        + calf_rate[:, None] * np.cross(lateral, _about_x(hip, shank))
+    turned = (
+        np.cross([1.0, 0.0, 0.0], from_hip),
+        np.cross(lateral, _about_x(hip, leg)),
+        np.cross(lateral, _about_x(hip, shank)),
     )
-    return _HIP + from_hip, velocity
+    return _HIP + from_hip, np.stack(turned, -1)
 
 
-def base_velocity(joint_pos: np.ndarray, joint_vel: np.ndarray, ang_vel: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """(3,) m/s in the base: minus what the standing feet, which do not slip, do relative to it.
+def base_velocity(
+    joint_pos: np.ndarray, joint_vel: np.ndarray, torque: np.ndarray, ang_vel: np.ndarray, down: np.ndarray
+) -> np.ndarray | None:
+    """(3,) m/s in the base: minus what the standing feet, which do not slip, do relative to it; None where none stands.
+
+    Feet count by the force with which they push down, which follows from the torques of legs without mass.
 
     Args:
         joint_pos: (12,) rad, in the motors' order.
         joint_vel: (12,) rad/s.
+        torque: (12,) N m, as estimated by the motors.
         ang_vel: (3,) rad/s of the base, in the base.
         down: (3,) unit vector of gravity in the base.
     """
-    at, velocity = feet(joint_pos, joint_vel)
-    depth = at @ down
-    standing = depth >= depth.max() - _STANDING_BAND
-    return -(velocity[standing] + np.cross(ang_vel, at[standing])).mean(0)
+    at, jacobian = feet(joint_pos)
+    velocity = np.einsum("fij,fj->fi", jacobian, joint_vel.reshape(4, 3))
+    push = np.linalg.solve(jacobian.transpose(0, 2, 1), torque.reshape(4, 3, 1))[:, :, 0] @ down
+    weight = np.maximum(push - _STANDING_FORCE, 0.0)
+    if not weight.any():
+        return None
+    return -(weight @ (velocity + np.cross(ang_vel, at))) / weight.sum()
 
 
 def _about_x(angle: np.ndarray, vectors: np.ndarray) -> np.ndarray:
