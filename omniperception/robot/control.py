@@ -170,8 +170,8 @@ class Control:
         quat, gyro = imu["quaternion"].astype(float), imu["gyroscope"].astype(float)
         velocity = None
         if self._needs_velocity:
-            joints = (motors[name].astype(float) for name in ("q", "dq", "tau_est"))
-            stood = base_velocity(*joints, gyro, down(quat))
+            angles, speeds, torques = (motors[name].astype(float) for name in ("q", "dq", "tau_est"))
+            stood = base_velocity(angles, speeds, torques, gyro, down(quat))
             self._velocity = self._velocity if stood is None else stood
             velocity = self._velocity
         order = self._motors
