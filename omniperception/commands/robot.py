@@ -17,9 +17,9 @@ from pathlib import Path
 
 from omniperception.cli import Command, argument
 from omniperception.deploy.description import DeployError
-from omniperception.robot.clouds import Extrinsic
-from omniperception.robot.control import RobotConfig, run
-from omniperception.robot.lidar import KINDS, LidarSource
+from omniperception.hardware.clouds import Extrinsic
+from omniperception.hardware.control import RobotConfig, run
+from omniperception.hardware.lidar import KINDS, LidarSource
 
 
 @dataclass(frozen=True, kw_only=True)

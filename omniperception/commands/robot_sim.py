@@ -20,7 +20,7 @@ from omniperception import build, config
 from omniperception.cli import Command, argument, trust
 from omniperception.deploy.description import DeployError
 from omniperception.env.env import OmniEnv
-from omniperception.robot.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
+from omniperception.hardware.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
 
 
 @dataclass(frozen=True, kw_only=True)

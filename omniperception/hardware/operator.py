@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from omniperception.deploy.description import DeployError
-from omniperception.robot.machine import Request
-from omniperception.robot.messages import Remote
+from omniperception.hardware.machine import Request
+from omniperception.hardware.messages import Remote
 
 _NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 _STALE_S = 0.5

@@ -10,7 +10,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from omniperception.deploy.description import DeployError
-from omniperception.robot.messages import LOW_CMD, LOW_STATE, Struct
+from omniperception.hardware.messages import LOW_CMD, LOW_STATE, Struct
 
 if TYPE_CHECKING:
     from cyclonedds.domain import DomainParticipant

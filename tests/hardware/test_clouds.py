@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omniperception.deploy import DeployError
-from omniperception.robot.clouds import (
+from omniperception.hardware.clouds import (
     Extrinsic,
     FrameCutter,
     Points,

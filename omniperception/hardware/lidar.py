@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from omniperception.deploy.description import DeployError, Lidar
-from omniperception.robot.clouds import (
+from omniperception.hardware.clouds import (
     Extrinsic,
     Frame,
     FrameCutter,
@@ -15,8 +15,8 @@ from omniperception.robot.clouds import (
     read_point_cloud2,
     without_noise,
 )
-from omniperception.robot.dds import CUSTOM_MSG, POINT_CLOUD2, Network, Reader
-from omniperception.robot.livox import DETECTION_PORT, HOST_POINT_PORT, Mid360
+from omniperception.hardware.dds import CUSTOM_MSG, POINT_CLOUD2, Network, Reader
+from omniperception.hardware.livox import DETECTION_PORT, HOST_POINT_PORT, Mid360
 
 
 @dataclass(frozen=True)

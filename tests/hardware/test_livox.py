@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from omniperception.deploy import DeployError
-from omniperception.robot import livox
-from omniperception.robot.livox import Message, Mid360, Sensor
+from omniperception.hardware import livox
+from omniperception.hardware.livox import Message, Mid360, Sensor
 
 SEARCH = "aa0018000100000000000000000000000000a91f00000000"
 CONFIGURE = "aa0032000200000000010000000000000000d16e86a7c40103000000000001000106000800c0a80132eddbecdb1a00010001"

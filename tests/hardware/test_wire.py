@@ -16,12 +16,12 @@ from lockstep import ROOT, Lockstep, Memory
 
 from omniperception.deploy import DeployError, Description
 from omniperception.deploy.export import export
-from omniperception.robot import guard
-from omniperception.robot.clouds import read_custom_msg
-from omniperception.robot.control import machine_config, motor_order
-from omniperception.robot.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
-from omniperception.robot.machine import Mode, Request
-from omniperception.robot.messages import LOW_CMD, LOW_STATE, crc, low_cmd, sealed
+from omniperception.hardware import guard
+from omniperception.hardware.clouds import read_custom_msg
+from omniperception.hardware.control import machine_config, motor_order
+from omniperception.hardware.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
+from omniperception.hardware.machine import Mode, Request
+from omniperception.hardware.messages import LOW_CMD, LOW_STATE, crc, low_cmd, sealed
 
 
 @pytest.fixture(scope="session")
@@ -172,7 +172,7 @@ def test_the_machine_has_the_motors_order(exported):
 
 def test_the_robots_process_needs_neither_torch_nor_hydra():
     code = (
-        "import sys; import omniperception.commands.robot, omniperception.robot.guard\n"
+        "import sys; import omniperception.commands.robot, omniperception.hardware.guard\n"
         "print(sorted({'torch', 'warp', 'hydra', 'mujoco', 'omegaconf', 'yaml', 'rsl_rl'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)

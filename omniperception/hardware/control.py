@@ -14,13 +14,13 @@ import numpy as np
 from omniperception.deploy import DeployError, ExportedPolicy, RobotState, SafetyStop
 from omniperception.deploy.description import Description
 from omniperception.deploy.go2 import MOTORS
-from omniperception.robot.dds import LOW_STATE_TOPIC, Network
-from omniperception.robot.guard import GuardConfig, Link, StateReader, start
-from omniperception.robot.legs import base_velocity
-from omniperception.robot.lidar import Frames, LidarSource
-from omniperception.robot.machine import MachineConfig, Mode, Request
-from omniperception.robot.messages import LOW_STATE, remote
-from omniperception.robot.operator import Operator, make_operator
+from omniperception.hardware.dds import LOW_STATE_TOPIC, Network
+from omniperception.hardware.guard import GuardConfig, Link, StateReader, start
+from omniperception.hardware.legs import base_velocity
+from omniperception.hardware.lidar import Frames, LidarSource
+from omniperception.hardware.machine import MachineConfig, Mode, Request
+from omniperception.hardware.messages import LOW_STATE, remote
+from omniperception.hardware.operator import Operator, make_operator
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omniperception.deploy import DeployError
-from omniperception.robot.machine import Machine, MachineConfig, Mode, Request, Sensed
+from omniperception.hardware.machine import Machine, MachineConfig, Mode, Request, Sensed
 
 STAND, CROUCH = np.array([0.0, 0.8, -1.5] * 4), np.array([0.0, 1.36, -2.65] * 4)
 CONFIG = MachineConfig(STAND, [-1.0, -1.5, -2.72] * 4, [1.0, 3.4, -0.84] * 4, 25.0, 0.6)

@@ -1,6 +1,6 @@
 """The process that owns rt/lowcmd, and outlives the policy's.
 
-    python -m omniperception.robot.guard SETTINGS FD
+    python -m omniperception.hardware.guard SETTINGS FD
 
 `robot` starts it. Targets and requests come through the socket FD; the robot's state it reads itself. When the other
 end falls silent or closes, the robot lies down, its joints are damped for a while, and the process ends.
@@ -20,9 +20,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from omniperception.deploy.description import DeployError
-from omniperception.robot.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network, Reader
-from omniperception.robot.machine import Drive, Machine, MachineConfig, Mode, Request, Sensed
-from omniperception.robot.messages import LOW_CMD, LOW_STATE, crc, low_cmd, remote, sealed
+from omniperception.hardware.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network, Reader
+from omniperception.hardware.machine import Drive, Machine, MachineConfig, Mode, Request, Sensed
+from omniperception.hardware.messages import LOW_CMD, LOW_STATE, crc, low_cmd, remote, sealed
 
 PERIOD_S = 0.002
 MODES, REQUESTS = tuple(Mode), tuple(Request)
@@ -162,7 +162,7 @@ class Link:
 def start(config: GuardConfig) -> tuple[Link, subprocess.Popen]:
     """A guard as a process of its own session, which signals to this one's group do not reach."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    words = [sys.executable, "-m", "omniperception.robot.guard", config.to_json(), str(theirs.fileno())]
+    words = [sys.executable, "-m", "omniperception.hardware.guard", config.to_json(), str(theirs.fileno())]
     process = subprocess.Popen(words, pass_fds=(theirs.fileno(),), start_new_session=True, stdin=subprocess.DEVNULL)
     theirs.close()
     return Link(ours), process

@@ -13,9 +13,8 @@ import torch
 from omniperception.deploy.description import DeployError
 from omniperception.deploy.go2 import MOTORS
 from omniperception.env.env import OmniEnv
-from omniperception.lidar import Lidar
-from omniperception.robot.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
-from omniperception.robot.livox import (
+from omniperception.hardware.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
+from omniperception.hardware.livox import (
     CONFIGURE,
     POINT_PORT,
     POINTS_PER_PACKET,
@@ -28,8 +27,9 @@ from omniperception.robot.livox import (
     write_message,
     write_points,
 )
-from omniperception.robot.machine import Request
-from omniperception.robot.messages import LOW_CMD, LOW_STATE, MOTOR_ON, crc, sealed
+from omniperception.hardware.machine import Request
+from omniperception.hardware.messages import LOW_CMD, LOW_STATE, MOTOR_ON, crc, sealed
+from omniperception.lidar import Lidar
 
 STEP_S, CONTROL_STEPS = 0.002, 10
 """Physics step, which is also the period of rt/lowstate, and how many of them make a step of the world."""

@@ -11,13 +11,13 @@ from pathlib import Path
 from omniperception import build, config
 from omniperception.deploy import ExportedPolicy
 from omniperception.env.env import OmniEnv
-from omniperception.robot.control import Control, machine_config
-from omniperception.robot.dds import LOW_STATE_TOPIC
-from omniperception.robot.guard import Guard, GuardConfig, Link, StateReader
-from omniperception.robot.lidar import Frames, LidarSource
-from omniperception.robot.messages import LOW_STATE
-from omniperception.robot.operator import make_operator
-from omniperception.robot.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, SimulatedRobot
+from omniperception.hardware.control import Control, machine_config
+from omniperception.hardware.dds import LOW_STATE_TOPIC
+from omniperception.hardware.guard import Guard, GuardConfig, Link, StateReader
+from omniperception.hardware.lidar import Frames, LidarSource
+from omniperception.hardware.messages import LOW_STATE
+from omniperception.hardware.operator import make_operator
+from omniperception.hardware.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, SimulatedRobot
 
 ROOT = Path(__file__).resolve().parents[2]
 

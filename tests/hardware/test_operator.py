@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from omniperception.deploy import DeployError
-from omniperception.robot.machine import Request
-from omniperception.robot.messages import Remote
-from omniperception.robot.operator import make_operator
+from omniperception.hardware.machine import Request
+from omniperception.hardware.messages import Remote
+from omniperception.hardware.operator import make_operator
 
 RANGES = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_z": [-1.5, 1.5]}
 CENTRED = Remote(frozenset(), 0.0, 0.0, 0.0, 0.0)

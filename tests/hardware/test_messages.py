@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from omniperception.deploy import DeployError
-from omniperception.robot.messages import LOW_CMD, LOW_STATE, Struct, crc, low_cmd, remote, sealed
+from omniperception.hardware.messages import LOW_CMD, LOW_STATE, Struct, crc, low_cmd, remote, sealed
 
 GOLDEN = {
     "unitree_go.msg.dds_.LowCmd_": (

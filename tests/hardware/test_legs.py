@@ -5,7 +5,7 @@ import numpy as np
 
 from omniperception import build, config
 from omniperception.deploy.go2 import MOTORS
-from omniperception.robot.legs import base_velocity, feet
+from omniperception.hardware.legs import base_velocity, feet
 from omniperception.scene import build_world
 
 
