@@ -244,8 +244,8 @@ class Randomizer:
         """(num_envs, W) what was drawn, in the order of DRAWN and in its own units: a number for each joint of motor
         strength and joint offset, three of gravity, one of every other row; 0 where not randomized."""
         if self._shapes:
-            every = torch.arange(sum(widths), device=sim.device).split(widths)
-            self._columns = torch.cat([c for name, c in zip(DRAWN, every, strict=True) if name in self._shapes])
+            columns = torch.arange(sum(widths), device=sim.device).split(widths)
+            self._columns = torch.cat([c for name, c in zip(DRAWN, columns, strict=True) if name in self._shapes])
             bounds = [getattr(config, name) for name, shape in self._shapes.items() for _ in range(math.prod(shape))]
             low, high = torch.tensor(bounds, dtype=torch.float64, device=sim.device).unbind(1)
             self._low, self._span = low.float(), (high - low).float()
@@ -254,11 +254,11 @@ class Randomizer:
         if self._mass:
             self._payload_position = torch.tensor(config.payload_position, dtype=torch.float64, device=sim.device)
         self.joint_offset: torch.Tensor | None = None
-        """(num_envs, num_joints) rad added to the joint targets; None when not randomized."""
+        """(num_envs, num_joints) rad added to the joint targets, a view of `drawn`; None when not randomized."""
         self.delay: torch.Tensor | None = None
         """(num_envs,) int64 physics steps by which proprioception is late; None when not randomized."""
         if config.joint_offset:
-            self.joint_offset = torch.zeros(sim.num_envs, sim.world.robot.num_joints, device=sim.device)
+            self.joint_offset = self.drawn.split(widths, 1)[DRAWN.index("joint_offset")]
         if config.latency_s:
             self.delay = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
 
@@ -289,8 +289,6 @@ class Randomizer:
                 self._write(name, env_ids, self._nominal_of(name) * drawn["motor_strength"])
         if "gravity_offset" in drawn:
             self._write("opt.gravity", env_ids, self._nominal_of("opt.gravity") + drawn["gravity_offset"])
-        if self.joint_offset is not None:
-            self.joint_offset[env_ids] = drawn["joint_offset"].float()
         if self.delay is not None:
             self.delay[env_ids] = (drawn["latency_s"] / self._model.opt.timestep).round().long()
         if self._mass:
@@ -298,7 +296,7 @@ class Randomizer:
 
     def state_dict(self) -> dict:
         """Parameters that live outside the physics model."""
-        return {"drawn": self.drawn, "joint_offset": self.joint_offset, "delay": self.delay}
+        return {"drawn": self.drawn, "delay": self.delay}
 
     def load_state_dict(self, state: dict) -> None:
         for name, mine in self.state_dict().items():
