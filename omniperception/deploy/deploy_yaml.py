@@ -96,6 +96,10 @@ def _caveats(description: Description) -> list[str]:
         lines.append("History is by time: all terms of the oldest step first, where Isaac Lab goes term by term.")
     if any(term.quantity == "base_lin_vel" for _, term in _terms(description)):
         lines.append("base_lin_vel is no observation of unitree_rl_lab's controller; a state estimator must give it.")
+    if description.command_acceleration is not None:
+        lines.append(
+            f"velocity_commands follow the command at {list(description.command_acceleration)} m/s^2, rad/s^2."
+        )
     return lines
 
 

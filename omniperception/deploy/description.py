@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 FORMAT = "omniperception-policy"
-VERSION = 3
+VERSION = 4
 FILE = "policy.json"
 FINGERPRINT = "omniperception-description"
 """Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
@@ -130,6 +130,8 @@ class Description:
         joints: names, gains and limits.
         observations: groups in the order in which they are concatenated.
         command: range of each commanded value that training drew from, by name (m/s, rad/s).
+        command_acceleration: how fast (m/s^2, rad/s^2) the command that is observed follows the one given; None: at
+            once.
         lidar: the sensor; None for a blind policy.
         perception: what is made of its frames; None for a blind policy.
         estimated: quantities of the robot's state that the network gives in the output `estimate` and nobody measures:
@@ -143,6 +145,7 @@ class Description:
     joints: Joints
     observations: Sequence[Group]
     command: Mapping[str, Sequence[float]]
+    command_acceleration: Sequence[float] | None = None
     lidar: Lidar | None = None
     perception: Perception | None = None
     estimated: Sequence[str] = ()

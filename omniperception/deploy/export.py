@@ -131,6 +131,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         joints=joints,
         observations=tuple(_group(name, env) for name in run.env.observations.actor),
         command=_command_ranges(run),
+        command_acceleration=run.env.observations.command_acceleration,
         lidar=_lidar(run.env.lidar) if run.perception is not None and run.env.lidar is not None else None,
         perception=_perception(run.perception) if run.perception is not None else None,
         estimated=_estimated(run),

@@ -135,6 +135,7 @@ class ExportedPolicy:
         for history in self._histories.values():
             history.clear()
         self.frame_count = self._steps = self._steps_stood = 0
+        self._reference = np.zeros(3, np.float32)
         self.base_lin_vel: np.ndarray | None = None
         if self.safety is not None:
             self.safety.reset()
@@ -228,6 +229,7 @@ class ExportedPolicy:
         if self.safety is not None:
             command = self.safety.limit_command(command)
         self.observation = self._observe(state, command)
+        self._follow(command)
         feed = {"observations": self.observation[None]}
         if self.frames is not None:
             blind = self.safety is not None and self.safety.sight is Sight.STOPPED
@@ -256,6 +258,20 @@ class ExportedPolicy:
             safety.check_torque(np.asarray(state.joint_torque, np.float32))
         if command.shape != (3,) or not np.isfinite(command).all():
             raise SafetyStop(f"command: 3 finite numbers were expected, {command} given")
+
+    def reference(self, command: np.ndarray) -> np.ndarray:
+        """(3,) the command as the policy observes it: it follows the given one no faster than in training."""
+        return command if self.description.command_acceleration is None else self._reference
+
+    def _follow(self, command: np.ndarray) -> None:
+        """Moves what is observed at the next step towards the command."""
+        if self.description.command_acceleration is None:
+            return
+        linear, angular = (rate * self.description.control_period_s for rate in self.description.command_acceleration)
+        change = command - self._reference
+        change[:2] *= linear / max(linear, float(np.hypot(*change[:2])))
+        change[2] = np.clip(change[2], -angular, angular)
+        self._reference = self._reference + change
 
     def _velocity(self, state: RobotState) -> np.ndarray:
         """(3,) m/s, base frame: estimated at the step before, or measured."""
@@ -373,7 +389,7 @@ QUANTITIES: dict[str, Quantity] = {
     "base_lin_vel": _vector("base_lin_vel"),
     "base_ang_vel": _vector("base_ang_vel"),
     "projected_gravity": _projected_gravity,
-    "command": lambda policy, state, command: np.asarray(command, np.float32),
+    "command": lambda policy, state, command: policy.reference(np.asarray(command, np.float32)),
     "previous_action": lambda policy, state, command: policy.action,
 }
 """Quantities that a policy can observe, by the name of training's observation term."""

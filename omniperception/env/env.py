@@ -91,7 +91,7 @@ class OmniEnv(VecEnv):
             self.sensing,
             build_errors(config, self.random, self.difficulty),
             self.episode_length_buf,
-            config.rewards.acceleration,
+            config.observations.command_acceleration,
         )
         if config.initial_level is not None:
             self.curriculum_levels = (config.initial_level,) * len(self._curricula())

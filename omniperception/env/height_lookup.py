@@ -33,6 +33,10 @@ class HeightLookup:
         self._launch(heights_around, kinematics, self._grid, [MAX_HEIGHT, view(self._heights, wp.float32)])
         return self._heights.clone()
 
+    def ground(self, pos_w: torch.Tensor) -> torch.Tensor:
+        """(num_envs, P) height (m) of the ground below points (num_envs, P, 3), environment frame."""
+        return self._ground.height(pos_w[..., :2])
+
     def _launch(self, kernel: wp.Kernel, kinematics: Kinematics, points: torch.Tensor, outputs: list) -> None:
         self._base_pos_w.copy_(kinematics.base_pos_w)
         self._yaw.copy_(kinematics.yaw)

@@ -112,7 +112,7 @@ class EnvState:
         sensing: LidarSensing | None = None,
         errors: MeasurementErrors | None = None,
         episode_steps: torch.Tensor | None = None,
-        acceleration: Sequence[float] | None = None,
+        command_acceleration: Sequence[float] | None = None,
     ) -> None:
         """
         Args:
@@ -126,7 +126,7 @@ class EnvState:
             sensing: the LiDAR.
             errors: of what is measured.
             episode_steps: (num_envs,) int64 control steps since the episodes began, the environment's own.
-            acceleration: of `reference`; see `RewardsConfig`.
+            command_acceleration: of `reference`; see `ObservationsConfig`.
         """
         self._errors = errors
         steps = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
@@ -152,7 +152,8 @@ class EnvState:
         self._foot_times: ContactTimes | None = None
         self.before = self.kinematics
         self.stand_s = torch.zeros(self.num_envs, device=self.device)
-        self._acceleration, self._reference = acceleration, torch.zeros(self.num_envs, 3, device=self.device)
+        self._command_acceleration = command_acceleration
+        self._reference = torch.zeros(self.num_envs, 3, device=self.device)
 
     # ---- followed by the environment ---------------------------------------------------------------------------------
 
@@ -164,8 +165,8 @@ class EnvState:
         """Takes in the physics steps of the control step."""
         self.invalidate()
         self.stand_s = torch.where((self.command == 0).all(1), self.stand_s + self.control_dt, 0.0)
-        if self._acceleration is not None:
-            most = [rate * self.control_dt for rate in self._acceleration]
+        if self._command_acceleration is not None:
+            most = [rate * self.control_dt for rate in self._command_acceleration]
             self._reference = moved_towards(self._reference, self.command, *most)
         if self._history is not None:
             self._history.record()
@@ -251,10 +252,10 @@ class EnvState:
 
     @property
     def reference(self) -> torch.Tensor:
-        """(num_envs, 3) v_x, v_y (m/s) and yaw rate (rad/s): the command as the tracking terms ask for it, 0 when an
-        episode begins and then towards the command as fast as `RewardsConfig.acceleration` says; without one the
-        command itself."""
-        return self.command if self._acceleration is None else self._reference
+        """(num_envs, 3) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame: the command as policies observe it and
+        tracking terms ask for it, 0 when an episode begins and then, at each control step, towards the command by at
+        most `ObservationsConfig.command_acceleration`; without one the command itself."""
+        return self.command if self._command_acceleration is None else self._reference
 
     @lazy
     def base_lin_acc_b(self) -> torch.Tensor:
@@ -284,6 +285,12 @@ class EnvState:
         if self._height_lookup is None:
             return flat_heights(self.base_height)
         return self._height_lookup.around(self.kinematics)
+
+    @lazy
+    def foot_height(self) -> torch.Tensor:
+        """(num_envs, F) m: of `foot_pos_w` above the ground below each."""
+        height = self.foot_pos_w[..., 2]
+        return height if self._height_lookup is None else height - self._height_lookup.ground(self.foot_pos_w)
 
     # ---- contacts ----------------------------------------------------------------------------------------------------
 

@@ -55,9 +55,7 @@ def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvCon
         config: the task, of the run or of the walker.
         lidar: the run's.
     """
-    config = replace(
-        config, rewards=replace(config.rewards, terms={}, acceleration=None), shows_frames=name not in BASELINES
-    )
+    config = replace(config, rewards=replace(config.rewards, terms={}), shows_frames=name not in BASELINES)
     if isinstance(config.commands, VelocityCommandConfig):
         config = replace(config, read_besides=(FOOT_FORCE,))  # for the figures of a gait
     if name in ("stop", "histogram"):

@@ -39,9 +39,9 @@ def test_its_mirror_image_is_that_of_the_feet_of_a_trot(make_env):
     assert [offsets[k] for k in left_right] == [(offset + 0.5) % 1.0 for offset in offsets]
 
 
-def test_tracking_terms_ask_for_no_more_acceleration_than_was_said(make_env):
+def test_policies_see_and_rewards_ask_for_no_more_acceleration_than_was_said(make_env):
     """From rest towards (1.2, -0.5) m/s, 1.3 m/s in all, by 0.1 m/s in each step, and 1 rad/s by 0.4; then back."""
-    acceleration = "rewards.acceleration=[5.0,20.0]"
+    acceleration = "observations.command_acceleration=[5.0,20.0]"
     env = make_env(*GAIT, acceleration, "terminations.episode_length_s=0.12", blind=True, num_envs=2)
     env.command.value[:] = torch.tensor([1.2, -0.5, 1.0])
     ahead = torch.tensor([12 / 13, -5 / 13])
@@ -49,13 +49,14 @@ def test_tracking_terms_ask_for_no_more_acceleration_than_was_said(make_env):
         env.step(torch.zeros(2, 12))
         expected = torch.cat((0.1 * step * ahead, torch.tensor([min(0.4 * step, 1.0)])))
         torch.testing.assert_close(env.state.reference[0], expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(env.get_observations()["command"][0], expected, atol=1e-5, rtol=0)
     kept = env.state.state_dict()
     env.command.value[0] = 0.0
     env.step(torch.zeros(2, 12))  # the sixth ends the episode
     assert not env.state.reference.any() and not env.state.stand_s.any()
     env.state.load_state_dict(kept)
     torch.testing.assert_close(env.state.reference[0], expected, atol=1e-5, rtol=0)
-    plain = make_env(*GAIT, "rewards.acceleration=null", blind=True, num_envs=2)
+    plain = make_env(*GAIT, "observations.command_acceleration=null", blind=True, num_envs=2)
     assert plain.state.reference is plain.command.value
 
 

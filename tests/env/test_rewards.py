@@ -184,13 +184,8 @@ class TestFeet:
         got = rewards.foot_air_time(state, target=0.3, min_speed=0.1)
         assert got.tolist() == pytest.approx([0.2 - 0.1, 0.0])  # the second is commanded to stand
 
-    def test_clearance_is_counted_above_the_ground_below_the_base(self):
-        state = given(
-            kinematics={"base_pos_w": tensor([0.0, 0.0, 1.3])},
-            base_height=tensor(0.3),  # so the ground is at 1 m
-            foot_pos_w=tensor([[0.0, 0.0, 1.02], [0.0, 0.0, 1.1]]),
-            foot_vel_w=tensor([[0.3, -0.4, 9.0], [1.0, 0.0, 9.0]]),
-        )
+    def test_clearance_is_counted_above_the_ground_below_the_foot(self):
+        state = given(foot_height=tensor([0.02, 0.1]), foot_vel_w=tensor([[0.3, -0.4, 9.0], [1.0, 0.0, 9.0]]))
         assert rewards.foot_clearance(state, target=0.1).item() == pytest.approx(0.08**2 * 0.5, rel=1e-4)
 
     def test_timing_by_the_clock(self):

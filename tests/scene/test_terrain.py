@@ -249,6 +249,18 @@ class TestSurface:
         env.sim.qpos.copy_(before)
         env.state.invalidate()
 
+    def test_feet_are_as_high_as_they_are_above_the_ground_below_each(self, env):
+        before = env.sim.qpos.clone()
+        env.sim.qpos[:, 0] += 2.5  # off the middle of the tile, where it is level
+        env.state.invalidate()
+        height, feet = env.state.foot_height, env.state.foot_pos_w
+        for i in range(0, env.num_envs, 3):
+            below = torch.tensor(looking_down(env, i, feet[i, :, :2]), dtype=torch.float32)
+            torch.testing.assert_close(height[i], feet[i, :, 2] - below, atol=1e-4, rtol=0)
+        assert (feet[..., 2] - height).abs().max() > 0.05
+        env.sim.qpos[:] = before
+        env.state.invalidate()
+
     def test_heights_far_from_the_middle_are_not_rounded(self, env):
         """Every environment counts from its own tile: float32 leaves 1e-6 m at 4 m, however far off the tile lies."""
         assert env.sim.ground_pos[:, 1].abs().max() > 30.0

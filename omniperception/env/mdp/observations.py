@@ -40,8 +40,8 @@ def projected_gravity(state: EnvState) -> torch.Tensor:
 
 @mirrors((1.0, -1.0, -1.0))
 def command(state: EnvState) -> torch.Tensor:
-    """v_x, v_y (m/s) and yaw rate (rad/s) in the base frame."""
-    return state.command
+    """v_x, v_y (m/s) and yaw rate (rad/s) in the base frame: `EnvState.reference`."""
+    return state.reference
 
 
 @mirrors(JOINTS)

@@ -16,7 +16,7 @@ from omniperception.env.state import EnvState, requires, rests
 @requires("avoidance")
 def velocity_tracking_with_avoidance(state: EnvState, beta: float) -> torch.Tensor:
     """r_vel_avoid = exp(-beta_va |v - (v_cmd + V_avoid)|^2)."""
-    target = state.command[:, :2] + state.avoidance_velocity
+    target = state.reference[:, :2] + state.avoidance_velocity
     return torch.exp(-beta * (state.kinematics.base_lin_vel_yaw - target).square().sum(1))
 
 
@@ -131,10 +131,8 @@ def foot_air_time(state: EnvState, target: float, min_speed: float) -> torch.Ten
 
 def foot_clearance(state: EnvState, target: float) -> torch.Tensor:
     """Sum over feet of (height - `target`)^2 times horizontal speed, m^3/s: small where feet that move are lifted to
-    `target` (m) above the ground below the base."""
-    ground = state.kinematics.base_pos_w[:, 2] - state.base_height
-    height = state.foot_pos_w[..., 2] - ground[:, None]
-    return ((height - target).square() * state.foot_vel_w[..., :2].norm(dim=-1)).sum(1)
+    `target` (m) above the ground below them."""
+    return ((state.foot_height - target).square() * state.foot_vel_w[..., :2].norm(dim=-1)).sum(1)
 
 
 @requires("foot_force")

@@ -82,19 +82,12 @@ class RewardsConfig:
     Attributes:
         terms: the terms.
         avoidance: how sector distances become the avoidance velocity.
-        acceleration: how fast (m/s^2, rad/s^2) the velocity that tracking terms ask for may change when the command
-            jumps; None: at once, which asks a robot at full speed for a stop that throws it over.
     """
 
     terms: Mapping[str, RewardTerm]
     avoidance: AvoidanceConfig
-    acceleration: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        if self.acceleration is not None and (len(self.acceleration) != 2 or min(self.acceleration) <= 0):
-            raise ValueError(
-                f"rewards.acceleration={list(self.acceleration)} must be [m/s^2, rad/s^2], both positive, or null"
-            )
         used = {name: term for name, term in self.terms.items() if term.weight != 0}
         object.__setattr__(self, "terms", used)
 
@@ -122,14 +115,25 @@ class ObservationGroup:
 
 @dataclass(frozen=True)
 class ObservationsConfig:
-    """Groups by name, which of them actor and critic see, and which one the actor estimates from what it sees."""
+    """Groups by name, which of them actor and critic see, and which one the actor estimates from what it sees.
+
+    Attributes:
+        command_acceleration: how fast (m/s^2, rad/s^2) the command that is observed, and that tracking rewards ask
+            for, follows the one given; None: at once. See `EnvState.reference`.
+    """
 
     groups: Mapping[str, ObservationGroup]
     actor: Sequence[str]
     critic: Sequence[str]
     estimated: str | None = None
+    command_acceleration: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
+        most = self.command_acceleration
+        if most is not None and (len(most) != 2 or min(most) <= 0):
+            raise ValueError(
+                f"observations.command_acceleration={list(most)} must be [m/s^2, rad/s^2], both positive, or null"
+            )
         used = [*self.actor, *self.critic, *([self.estimated] if self.estimated else [])]
         missing = [name for name in used if name not in self.groups]
         if missing:
