@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omniperception.common import point_fields
 from omniperception.deploy.description import DeployError
 from omniperception.deploy.sampling import rotation_matrix
 
@@ -146,8 +147,6 @@ class _Cdr:
         return part
 
 
-_FIELD_TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
-"""sensor_msgs/PointField's datatypes."""
 _TIME_FIELDS = ("timestamp", "offset_time", "time", "t")
 _CUSTOM_POINT = np.dtype(
     {
@@ -183,7 +182,7 @@ def _point_cloud2(data: bytes) -> Points:
     fields = {}
     for _ in range(cdr.read("I")):
         name, offset, kind, _ = cdr.text(), cdr.read("I"), cdr.read("B"), cdr.read("I")
-        fields[name] = (_FIELD_TYPES.get(kind, "V"), offset)
+        fields[name] = ("<" + point_fields.TYPES.get(kind, "V"), offset)
     big_endian, step, _ = cdr.read("B"), cdr.read("I"), cdr.read("I")
     time_field = next((name for name in _TIME_FIELDS if name in fields), None)
     if big_endian or not {"x", "y", "z"} <= set(fields) or time_field is None:

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from omniperception.common.point_fields import CODES, TYPES
+
 from .table import PointTable
 
-TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-CODES = {np.dtype(kind): code for code, kind in TYPES.items()}
 MESSAGE = "sensor_msgs/msg/PointCloud2"
 DEFINITION = """\
 std_msgs/Header header
