@@ -92,6 +92,7 @@ class OmniEnv(VecEnv):
             build_errors(config, self.random, self.difficulty),
             self.episode_length_buf,
             config.observations.command_acceleration,
+            self.difficulty,
         )
         if config.initial_level is not None:
             self.curriculum_levels = (config.initial_level,) * len(self._curricula())

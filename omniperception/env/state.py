@@ -14,6 +14,7 @@ from omniperception.common.lazy import lazy
 from omniperception.common.rotations import rotate, rotate_yaw
 from omniperception.env.heights import flat_heights
 from omniperception.env.kinematics import Kinematics
+from omniperception.env.mdp.curriculum import FULL, Curriculum
 from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE
 
 if TYPE_CHECKING:  # parts that not every task has
@@ -113,6 +114,7 @@ class EnvState:
         errors: MeasurementErrors | None = None,
         episode_steps: torch.Tensor | None = None,
         command_acceleration: Sequence[float] | None = None,
+        difficulty: Curriculum = FULL,
     ) -> None:
         """
         Args:
@@ -127,6 +129,7 @@ class EnvState:
             errors: of what is measured.
             episode_steps: (num_envs,) int64 control steps since the episodes began, the environment's own.
             command_acceleration: of `reference`; see `ObservationsConfig`.
+            difficulty: share of the randomization; the less of it, the faster `reference` follows.
         """
         self._errors = errors
         steps = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
@@ -152,7 +155,7 @@ class EnvState:
         self._foot_times: ContactTimes | None = None
         self.before = self.kinematics
         self.stand_s = torch.zeros(self.num_envs, device=self.device)
-        self._command_acceleration = command_acceleration
+        self._command_acceleration, self._difficulty = command_acceleration, difficulty
         self._reference = torch.zeros(self.num_envs, 3, device=self.device)
 
     # ---- followed by the environment ---------------------------------------------------------------------------------
@@ -166,7 +169,7 @@ class EnvState:
         self.invalidate()
         self.stand_s = torch.where((self.command == 0).all(1), self.stand_s + self.control_dt, 0.0)
         if self._command_acceleration is not None:
-            most = [rate * self.control_dt for rate in self._command_acceleration]
+            most = [rate * self.control_dt / max(self._difficulty.level, 1e-3) for rate in self._command_acceleration]
             self._reference = moved_towards(self._reference, self.command, *most)
         if self._history is not None:
             self._history.record()
@@ -253,8 +256,8 @@ class EnvState:
     @property
     def reference(self) -> torch.Tensor:
         """(num_envs, 3) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame: the command as policies observe it and
-        tracking terms ask for it, 0 when an episode begins and then, at each control step, towards the command by at
-        most `ObservationsConfig.command_acceleration`; without one the command itself."""
+        tracking terms ask for it, 0 when an episode begins and then towards the command at no more than
+        `ObservationsConfig.command_acceleration` over the difficulty; without one the command itself."""
         return self.command if self._command_acceleration is None else self._reference
 
     @lazy

@@ -4,6 +4,7 @@ import math
 
 import torch
 
+from omniperception.env.mdp.curriculum import Curriculum, CurriculumConfig
 from omniperception.env.mirror import Mirror
 
 GAIT = ("observations=gait", "rewards=gait", "obstacles=none")
@@ -56,6 +57,10 @@ def test_policies_see_and_rewards_ask_for_no_more_acceleration_than_was_said(mak
     assert not env.state.reference.any() and not env.state.stand_s.any()
     env.state.load_state_dict(kept)
     torch.testing.assert_close(env.state.reference[0], expected, atol=1e-5, rtol=0)
+    env.state._difficulty = Curriculum(CurriculumConfig(start=0.5, max_velocity_error=1.0, rise=1.0))
+    env.command.value[:] = 0.0
+    env.step(torch.zeros(2, 12))  # with half of the randomization it goes back twice as fast
+    torch.testing.assert_close(env.state.reference[0, :2], 0.3 * ahead, atol=1e-5, rtol=0)
     plain = make_env(*GAIT, "observations.command_acceleration=null", blind=True, num_envs=2)
     assert plain.state.reference is plain.command.value
 
