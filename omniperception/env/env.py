@@ -197,7 +197,7 @@ class OmniEnv(VecEnv):
             elif self._lidar_is_awake():
                 self.sensing.record_motion(self.step_count)
         if self.avoidance is not None:
-            self.avoidance.choose(self.command.value[:, :2])
+            self.avoidance.choose(self.state.reference[:, :2])
 
     def _sense(self) -> None:
         """Casts a frame of the LiDAR, samples it and updates the avoidance velocity."""

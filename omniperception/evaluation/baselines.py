@@ -242,7 +242,7 @@ class _Stop:
             self._place = torch.where(fresh[:, None, None], nearest.place, self._place)
             self._distance = torch.where(fresh[:, None], nearest.distance, self._distance)
         self._distance = torch.where(clouds.begun[:, None], torch.inf, self._distance)
-        command = self._env.command.value[:, :2]
+        command = self._env.state.reference[:, :2]
         return command * free_share(self._place, self._distance, command, config)[:, None]
 
 
@@ -269,7 +269,7 @@ def _avoiding(env: OmniEnv, avoidance: AvoidanceConfig, motion: Steering) -> Ste
     candidates = None if risk is None else risk.candidates(env.device)
 
     def velocity() -> torch.Tensor:
-        command, sectors = env.command.value[:, :2], motion()
+        command, sectors = env.state.reference[:, :2], motion()
         if risk is None or candidates is None:
             return command + avoidance_velocity(sectors[..., 0], avoidance)
         return command + risk.avoidance(risk.risk(sectors, candidates), command, candidates)
@@ -303,7 +303,7 @@ def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | N
             low, high = velocity.new_tensor(limits).unbind(1)
             velocity = velocity.clamp(low, high)
         observations = observations.clone(recurse=False)
-        observations[COMMAND_GROUP] = torch.cat((velocity, env.command.value[:, 2:]), 1)
+        observations[COMMAND_GROUP] = torch.cat((velocity, env.state.reference[:, 2:]), 1)
         return policy(observations)
 
     return drive
