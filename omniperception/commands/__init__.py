@@ -36,6 +36,7 @@ EXTRAS = {
     "onnxruntime": "deploy",
     "cyclonedds": "robot",
     "trimesh": "meshes",
+    "viser": "viewer",
     **dict.fromkeys(("laspy", "mcap", "mcap_ros2", "pypcd4", "rosbags"), "clouds"),
 }
 """Extra of this package that brings each library."""

@@ -23,6 +23,9 @@ weights, and each result is noted in `log`. Policies:
 
 Prints one table. Each policy and world becomes a JSON file with every trial in the run's evaluation folder at once; the
 same command goes on where it was stopped. `out` adds all of them to one file, which the tables command renders.
+
+With viewer=web the first policy walks in the first world before your eyes, in the browser; nothing is measured or
+written, and the page switches worlds, conditions and policies.
 """
 
 from __future__ import annotations
@@ -36,6 +39,8 @@ from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
 from omniperception.evaluation.suite import POLICIES, SPLITS, Evaluation, World, evaluate, suite_worlds
 from omniperception.learning import CheckpointError
+from omniperception.viewer import PageOptions, Shown, ViewerError, serve
+from omniperception.viewer.options import LOCALHOST, PORT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +65,11 @@ class Arguments:
     again: bool = argument(False, "whether to measure again what has been measured before")
     out: Path | None = argument(None, "file (.json or .json.gz) that the results are added to, for tables")
     log: Path | None = argument(None, "where split=test is noted; null: docs/lab/evaluations.jsonl of the checkout")
+    viewer: str = argument("none", "web: look at the first policy in the first world", choices=("none", "web"))
+    host: str = argument(
+        LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
+    )
+    port: int = argument(PORT, "port at which viewer=web listens", least=1)
     trust: tuple[str, ...] = trust()
 
 
@@ -67,10 +77,13 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     """Evaluates, prints the table and writes the runs' evaluation folders."""
     runs = [config.find_run(name) for name in arguments.run]
     folders = config.search_path(overrides, config.read(runs[0]))
+    worlds = _worlds(arguments, folders, any(o.split("=", 1)[0] == "terrain" for o in overrides))
+    if arguments.viewer == "web":
+        return serve(_shown(arguments, runs[0], worlds[0], overrides), PageOptions(arguments.host, arguments.port))
     evaluate(
         Evaluation(
             runs=runs,
-            worlds=_worlds(arguments, folders, any(o.split("=", 1)[0] == "terrain" for o in overrides)),
+            worlds=worlds,
             policies=arguments.policy,
             split=arguments.split,
             condition=arguments.condition,
@@ -88,6 +101,18 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     )
 
 
+def _shown(arguments: Arguments, run_dir: Path, world: World, overrides: list[str]) -> Shown:
+    """What the browser shows of an evaluation."""
+    if arguments.split == "test":
+        raise ConfigError("viewer=web shows split=dev: who has looked at the test split has chosen by it")
+    if arguments.policy[0] == "exported" or arguments.walker is not None:
+        raise ConfigError("viewer=web shows policy=run and those that drive the run's own gait; leave walker= out")
+    presets = [f"scenario={world.name}"]
+    presets += [f"terrain={world.terrain}"] if world.terrain is not None else []
+    presets += [f"condition={arguments.condition}"] if arguments.condition is not None else []
+    return Shown(run_dir, (*overrides, *presets), arguments.policy[0], trust=arguments.trust)
+
+
 def _worlds(arguments: Arguments, folders: list[Path], terrain_given: bool) -> list[World]:
     """The worlds of a suite, or the scenarios on their own terrain."""
     if arguments.suite is None:
@@ -102,4 +127,6 @@ def _worlds(arguments: Arguments, folders: list[Path], terrain_given: bool) -> l
     return suite_worlds(arguments.suite, folders)
 
 
-command = Command(main, Arguments, __doc__, "of the runs' configuration", (CheckpointError, PlotsUnavailable))
+command = Command(
+    main, Arguments, __doc__, "of the runs' configuration", (CheckpointError, PlotsUnavailable, ViewerError)
+)

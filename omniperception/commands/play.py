@@ -2,6 +2,7 @@
 
     play run=latest obstacles=static num_envs=64 seed=3
     play run=pretrained/avoider scenario=moving viewer=none
+    play run=pretrained/avoider viewer=web    # live in the browser: drive it, disturb it, switch what it walks in
 
 All obstacles are present from the first step. Writes replay.json and, with viewer=video, replay.mp4 and replay.png into
 the run directory.
@@ -21,6 +22,8 @@ from omniperception.evaluation.episodes import Policy, run_episodes
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.report import summary_table, times_line
 from omniperception.learning import CheckpointError
+from omniperception.viewer import PageOptions, Shown, ViewerError, serve
+from omniperception.viewer.options import LOCALHOST, PORT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,15 +31,22 @@ class Arguments:
     """The command's own arguments."""
 
     run: str = argument("latest", "run directory, or latest for the newest under outputs/")
-    viewer: str = argument("video", "how it is shown", choices=("video", "none"))
+    viewer: str = argument("video", "how it is shown", choices=("video", "web", "none"))
     trials: int = argument(200, "trials", least=1)
     video_s: float = argument(20.0, "length of the video (s)", positive=True)
+    host: str = argument(
+        LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
+    )
+    port: int = argument(PORT, "port at which viewer=web listens", least=1)
     trust: tuple[str, ...] = trust()
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Runs the episodes, prints the table and writes the results."""
     run_dir = config.find_run(arguments.run)
+    if arguments.viewer == "web":
+        shown = Shown(run_dir, tuple(overrides), trust=arguments.trust)
+        return serve(shown, PageOptions(arguments.host, arguments.port))
     composed = config.load(run_dir, overrides)
     if not any(override.startswith("num_envs=") for override in overrides):
         composed.num_envs = min(composed.num_envs, arguments.trials)
@@ -76,4 +86,4 @@ def _film(arguments: Arguments, run_dir: Path, env: OmniEnv, policy: Policy) -> 
     return episodes
 
 
-command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError,))
+command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError, ViewerError))

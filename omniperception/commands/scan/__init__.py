@@ -3,6 +3,7 @@
     scan lidar=avia rays=20000 lidar.max_range=30
     scan lidar=mid360,avia,os0_128,vlp16        # each of them, and comparison.png
     scan mesh=hall.stl scale=0.001 at=12,3,0    # in a mesh of your own, z up
+    scan lidar=mid360 viewer=web                # the scan lab: in the browser, among people, with sliders
 
 The room holds people, thin rods, a shelf without legs, a rock, rubble and the robot, which carries the sensor. Writes
 pattern.png, scan.png and the points; the pictures need the extra `plots`, a mesh `meshes`, other files than .ply and
@@ -12,18 +13,25 @@ pattern.png, scan.png and the points; the pictures need the extra `plots`, a mes
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from omniperception import build, config
 from omniperception.cli import Command, argument
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
-from omniperception.commands.scan.room import DemoScene, demo_scene, mesh_scene
+from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene, demo_scene, mesh_scene
 from omniperception.common.figures import PlotsUnavailable
+from omniperception.env.config import EnvConfig
+from omniperception.env.sensing import SensorConfig
 from omniperception.lidar import TriangleMesh
 from omniperception.scene import RobotConfig
+from omniperception.viewer import PageOptions, ViewerError, serve_lab
+from omniperception.viewer.options import LOCALHOST, PORT, Room
 
 NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
 """A sensor is looked at, no task is run."""
+WALKERS = 4
+"""People who walk about in the scan lab."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +48,11 @@ class Arguments:
     mesh: Path | None = argument(None, "file of a mesh in place of the demonstration room, z up; null: the room")
     scale: float = argument(1.0, "metres to which a unit of the mesh corresponds", positive=True)
     at: tuple[float, ...] = argument((0.0, 0.0, 0.0), "where in the mesh the robot's feet stand (m)")
+    viewer: str = argument("none", "web: the scan lab in the browser", choices=("none", "web"))
+    host: str = argument(
+        LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
+    )
+    port: int = argument(PORT, "port at which viewer=web listens", least=1)
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
@@ -47,9 +60,10 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     if "none" in arguments.lidar:
         raise config.ConfigError("lidar=none has nothing to view; give a sensor, such as lidar=mid360")
     out, scans = arguments.out or Path("outputs/view_scan"), []
+    if arguments.viewer == "web":
+        return _serve(arguments, out, overrides)
     for name in arguments.lidar:
-        composed = config.compose([*NO_TASK, f"lidar={name}", *overrides])
-        env = build.assemble(composed).env
+        env = _task(name, overrides)
         assert env.lidar is not None  # only lidar=none has none
         demo = _surroundings(arguments, env.robot)
         scans.append(take_scan(name, env.lidar, demo, arguments.seconds, arguments.rays, arguments.seed))
@@ -64,15 +78,52 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         print(f"written: {out / 'comparison.png'}")
 
 
-def _surroundings(arguments: Arguments, robot: RobotConfig) -> DemoScene:
+def _task(name: str, overrides: list[str]) -> EnvConfig:
+    """A sensor's preset on the robot."""
+    return build.assemble(config.compose([*NO_TASK, f"lidar={name}", *overrides])).env
+
+
+def _serve(arguments: Arguments, out: Path, overrides: list[str]) -> None:
+    """The scan lab."""
+    robot = _task(arguments.lidar[0], overrides).robot
+    names = [name for name in config.presets("lidar", config.search_path(overrides)) if name != "none"]
+    sensors = {name: partial(_sensor, name, overrides) for name in (*arguments.lidar, *names)}
+    room = _surroundings(arguments, robot, walkers=WALKERS)
+    look = Room(
+        room.scene,
+        robot,
+        room.bodies,
+        room.robot_geoms,
+        room.movers,
+        room.extent[:2],
+        room.open_side,
+        {int(kind): COLOURS[kind] for kind in DemoClass},
+        {int(kind): value for kind, value in REFLECTIVITY.items()},
+        {int(kind): kind.name.lower() for kind in DemoClass},
+    )
+    serve_lab(look, sensors, out, PageOptions(arguments.host, arguments.port))
+
+
+def _sensor(name: str, overrides: list[str]) -> SensorConfig:
+    """A sensor's preset."""
+    sensor = _task(name, overrides).lidar
+    assert sensor is not None  # only lidar=none has none
+    return sensor
+
+
+def _surroundings(arguments: Arguments, robot: RobotConfig, walkers: int = 0) -> DemoScene:
     if arguments.mesh is None:
-        return demo_scene(robot)
+        return demo_scene(robot, walkers=walkers)
     if len(arguments.at) != 3:
         raise config.ConfigError(f"at={','.join(map(str, arguments.at))} must be three numbers, x,y,z in metres")
     x, y, z = arguments.at
-    return mesh_scene(robot, TriangleMesh.from_file(arguments.mesh, arguments.scale), (x, y, z))
+    return mesh_scene(robot, TriangleMesh.from_file(arguments.mesh, arguments.scale), (x, y, z), walkers)
 
 
 command = Command(
-    main, Arguments, __doc__, "of the sensor's preset", (PlotsUnavailable, ImportError, FileNotFoundError, ValueError)
+    main,
+    Arguments,
+    __doc__,
+    "of the sensor's preset",
+    (PlotsUnavailable, ViewerError, ImportError, FileNotFoundError, ValueError),
 )

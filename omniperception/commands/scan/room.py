@@ -19,6 +19,9 @@ Vector = tuple[float, float, float]
 ROOM = ((-2.6, 4.4), (-2.7, 2.7), 2.6)
 """The room's extent along x and y and its height, metres; the robot stands at the origin and looks along x."""
 
+WALKING_STRIDE = 0.2
+"""How far (m) the feet of people who walk about stand before and behind their hips."""
+
 
 class DemoClass(IntEnum):
     """Class of the surface that a ray has hit."""
@@ -68,6 +71,7 @@ class DemoScene:
         open_side: Shapes that a picture of the room from outside leaves out: the ceiling and two of the walls.
         extent: Of the room or the mesh along x and y, and its highest point, metres.
         mesh: The mesh; None: it is the room.
+        movers: Bodies of the scene beside the robot's that walk about, after all of its own.
     """
 
     scene: RayScene
@@ -77,22 +81,27 @@ class DemoScene:
     open_side: tuple[int, ...]
     extent: tuple[tuple[float, float], tuple[float, float], float]
     mesh: TriangleMesh | None = None
+    movers: tuple[int, ...] = ()
 
 
-def demo_scene(robot: RobotConfig, num_threads: int | None = None) -> DemoScene:
-    """The room with a robot in its default pose; lengths in metres, the floor at z = 0."""
+def demo_scene(robot: RobotConfig, num_threads: int | None = None, walkers: int = 0) -> DemoScene:
+    """The room with a robot in its default pose; lengths in metres, the floor at z = 0.
+
+    With ``walkers`` so many people are bodies of their own, at the origin until somebody moves them, and none stands.
+    """
     open_side, walls = _room()
-    shapes = [*open_side, *walls, *_furniture(), *_people(), *_stones()]
-    return _with_robot(shapes, robot, (0.0, 0.0, 0.0), tuple(range(len(open_side))), ROOM, num_threads=num_threads)
+    shapes = [*open_side, *walls, *_furniture(), *([] if walkers else _people()), *_stones()]
+    removed = tuple(range(len(open_side)))
+    return _with_robot(shapes, robot, (0.0, 0.0, 0.0), removed, ROOM, num_threads=num_threads, walkers=walkers)
 
 
-def mesh_scene(robot: RobotConfig, mesh: TriangleMesh, at: Vector = (0.0, 0.0, 0.0)) -> DemoScene:
-    """A mesh with a robot in its default pose whose feet stand ``at`` a place of it, metres, z up."""
+def mesh_scene(robot: RobotConfig, mesh: TriangleMesh, at: Vector = (0.0, 0.0, 0.0), walkers: int = 0) -> DemoScene:
+    """A mesh with a robot in its default pose whose feet stand ``at`` a place of it, metres, z up; see `demo_scene`."""
     corners = mesh.vertices[mesh.triangles].reshape(-1, 3).astype(float)
     low, high = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
     shape = Shape(ShapeKind.MESH, asset=mesh, class_id=DemoClass.MESH)
     extent = ((low[0], high[0]), (low[1], high[1]), high[2])
-    return _with_robot([shape], robot, at, (), extent, mesh)
+    return _with_robot([shape], robot, at, (), extent, mesh, walkers=walkers)
 
 
 def _with_robot(
@@ -103,6 +112,7 @@ def _with_robot(
     extent: tuple[tuple[float, float], tuple[float, float], float],
     mesh: TriangleMesh | None = None,
     num_threads: int | None = None,
+    walkers: int = 0,
 ) -> DemoScene:
     model = robot.compiled()
     found = geom_shapes(model, geoms=robot_geoms(model, robot))
@@ -115,9 +125,13 @@ def _with_robot(
 
     first = len(shapes)
     shapes = shapes + [replace(shape, class_id=DemoClass.ROBOT) for shape in found.shapes]
-    scene = RayScene(shapes, num_envs=1, num_bodies=len(bodies), num_threads=num_threads)
-    scene.body_pos.copy_(torch.from_numpy(data.xpos[list(bodies)]))
-    scene.body_quat.copy_(torch.from_numpy(data.xquat[list(bodies)]))
+    own = len(bodies)
+    movers = tuple(range(own, own + walkers))
+    shapes += [replace(shape, body=body) for body in movers for shape in _person(0.0, 0.0, 0.0, WALKING_STRIDE)]
+    scene = RayScene(shapes, num_envs=1, num_bodies=own + walkers, num_threads=num_threads)
+    scene.body_pos[:, :own].copy_(torch.from_numpy(data.xpos[list(bodies)]))
+    scene.body_quat[:, :own].copy_(torch.from_numpy(data.xquat[list(bodies)]))
+    scene.body_pos[:, own:], scene.body_quat[:, own:] = 0.0, scene.body_quat.new_tensor([1.0, 0.0, 0.0, 0.0])
     return DemoScene(
         scene=scene,
         bodies={model.body(k).name: i for i, k in enumerate(bodies)},
@@ -126,6 +140,7 @@ def _with_robot(
         open_side=open_side,
         extent=extent,
         mesh=mesh,
+        movers=movers,
     )
 
 

@@ -1,0 +1,61 @@
+"""Opens the page: checks address and port, says where it is and who can reach it."""
+
+from __future__ import annotations
+
+import socket
+from typing import TYPE_CHECKING
+
+from omniperception.viewer.options import LOCALHOST, PageOptions, ViewerError
+
+if TYPE_CHECKING:
+    import viser
+
+PANEL_PIXELS = 440
+
+
+def open_page(options: PageOptions, title: str) -> viser.ViserServer:
+    """A page without content.
+
+    Raises:
+        ViewerError: the address or the port cannot be had.
+    """
+    import rich
+    import viser
+
+    _check_free(options)
+    console = rich.get_console()
+    quiet, console.quiet = console.quiet, True  # the line below says it, and who can reach the page
+    try:
+        server = viser.ViserServer(options.host, options.port, label=title, verbose=False)
+    finally:
+        console.quiet = quiet
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(PANEL_PIXELS)
+    print(announcement(options), flush=True)
+    return server
+
+
+def announcement(options: PageOptions) -> str:
+    """The line that tells where the page is and who can reach it."""
+    if options.is_local:
+        return f"viewer: http://{options.host}:{options.port} (reached from this machine alone; Ctrl-C ends it)"
+    return (
+        f"viewer: http://{options.host}:{options.port} (WHOEVER REACHES THIS MACHINE can look and take hold;"
+        f" host={LOCALHOST} keeps it to this machine; Ctrl-C ends it)"
+    )
+
+
+def _check_free(options: PageOptions) -> None:
+    """viser itself would quietly take the next port."""
+    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((options.host, options.port))
+        except OSError as error:
+            why = (error.strerror or str(error)).lower()
+            raise ViewerError(
+                f"the viewer cannot listen on {options.host}:{options.port} ({why}); give another, such as"
+                f" port={options.port + 1}"
+            ) from None

@@ -1,0 +1,300 @@
+"""The controls of the page, and what stands beside the scene: status, charts, messages."""
+
+from __future__ import annotations
+
+import contextlib
+import html
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omniperception.config import CONFIG_FILE, OUTPUTS
+from omniperception.evaluation.baselines import BASELINES
+from omniperception.viewer import charts
+from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, PROXIMAL
+from omniperception.viewer.drive import MAX_SPEED, MAX_YAW_RATE, Velocity
+from omniperception.viewer.perceived import Perceived
+from omniperception.viewer.session import MOST_POINTS, Session, spare_kinds
+from omniperception.viewer.stage import POINT_COLOURS
+
+if TYPE_CHECKING:
+    from omniperception.viewer.viewer import Viewer
+
+OWN = "(the run's own)"
+STEP, TURN = 0.2, 0.25
+"""By how much (m/s, rad/s) a key changes the command."""
+SPEEDS = {"1": 1.0, "1/2": 0.5, "1/4": 0.25, "1/10": 0.1}
+SHOWN = ("robot", "obstacles", "points", "sectors", "arrows", "heights")
+SMOOTHING = 0.2
+"""Share of the newest value in the bars of rewards."""
+KEYS = (
+    "**W S** ahead, back · **A D** left, right · **Q E** turn · **X** stand · **T** the task commands ·"
+    " **Space** pause · **N** one step · **R** new trial · **P** push · **B** bring the obstacle"
+)
+
+
+class Panels:
+    """Controls of the page.
+
+    Attributes:
+        num_rays: rays shown of a frame; None: those of the policy.
+    """
+
+    def __init__(self, viewer: Viewer) -> None:
+        self._viewer, self._gui = viewer, viewer.server.gui
+        self.num_rays: int | None = None
+        self._rewards: dict[str, float] = {}
+        self._showing = False
+        self._status = self._gui.add_html("")
+        with self._gui.add_folder("Risk of velocities, ahead is up"):
+            self._polar = self._gui.add_html("")
+            self._gui.add_html(charts.legend(ARROWS))
+        tabs = self._gui.add_tab_group()
+        with tabs.add_tab("Drive"):
+            self._build_drive()
+        with tabs.add_tab("Task"):
+            self._build_task()
+        with tabs.add_tab("View"):
+            self._build_view()
+        with tabs.add_tab("Rewards"):
+            self._bars = self._gui.add_html("")
+        self._build_keys()
+
+    # ---- building ----------------------------------------------------------------------------------------------------
+
+    def _build_drive(self) -> None:
+        gui, viewer = self._gui, self._viewer
+        self._driven = gui.add_checkbox("I command", False, hint="or else the task does")
+        self._sliders = [
+            gui.add_slider(name, min=-most, max=most, step=0.05, initial_value=0.0)
+            for name, most in (
+                ("ahead (m/s)", MAX_SPEED),
+                ("left (m/s)", MAX_SPEED),
+                ("turn left (rad/s)", MAX_YAW_RATE),
+            )
+        ]
+        self._on(self._driven, lambda on: viewer.drive(viewer.stick.value if on else None))
+        for slider in self._sliders:
+            self._on(slider, lambda _: viewer.drive(self._stick()))
+        gui.add_markdown(KEYS)
+        with gui.add_folder("Time"):
+            self._pause = gui.add_checkbox("pause", False)
+            self._on(self._pause, viewer.pause)
+            speed = gui.add_button_group("speed", tuple(SPEEDS))
+            self._on_click(speed, lambda: viewer.set_speed(SPEEDS[speed.value]))
+            self._on_click(gui.add_button("one step (N)"), viewer.single_step)
+            self._on_click(gui.add_button("new trial (R)"), viewer.new_trial)
+        with gui.add_folder("Disturb"):
+            push = gui.add_slider("push by (m/s)", min=0.1, max=3.0, step=0.1, initial_value=viewer.push_speed)
+            self._on(push, lambda value: setattr(viewer, "push_speed", value))
+            self._on_click(gui.add_button("push to its left (P)"), viewer.push_aside)
+            self._kind = gui.add_dropdown("obstacle", spare_kinds(viewer.session.env))
+            self._on_click(gui.add_button("bring it (B)"), lambda: viewer.bring(self._kind.value))
+            gui.add_markdown("Drag obstacles with the mouse; shift-click takes one away; click on the robot pushes it.")
+
+    def _build_task(self) -> None:
+        gui, viewer = self._gui, self._viewer
+        from omniperception.viewer.viewer import SWITCHED
+
+        runs = _runs(viewer.session.shown.run_dir)
+        self._run = gui.add_dropdown("run", runs, initial_value=runs[0])
+        self._on(self._run, lambda name: viewer.choose_run(Path(name)))
+        self._checkpoint = gui.add_dropdown("checkpoint", self._checkpoint_names())
+        self._on(self._checkpoint, self._choose_checkpoint)
+        self._weights = gui.add_text(
+            "weights file", str(viewer.session.checkpoint), hint="any checkpoint of this network"
+        )
+        self._on_click(gui.add_button("load weights file"), lambda: viewer.choose_checkpoint(Path(self._weights.value)))
+        self._follow = gui.add_checkbox("follow the newest checkpoint", False, hint="of a training that goes on")
+        self._on(self._follow, lambda on: setattr(viewer, "follows", on))
+        self._policy = gui.add_dropdown("policy", ("run", *BASELINES), initial_value=viewer.session.shown.policy)
+        self._on(self._policy, viewer.choose_policy)
+        self._presets = {}
+        for group in SWITCHED:
+            names = (OWN, *viewer.presets(group))
+            chosen = viewer.choices[group]
+            dropdown = gui.add_dropdown(group, names, initial_value=chosen if chosen in names else OWN)
+            self._on(dropdown, partial(self._choose, group))
+            self._presets[group] = dropdown
+
+    def _build_view(self) -> None:
+        gui, stage = self._gui, self._viewer.stage
+        follow = gui.add_checkbox("keep the robot in the middle", stage.follows)
+        self._on(follow, lambda on: setattr(stage, "follows", on))
+        for name in SHOWN:
+            box = gui.add_checkbox(name, name in stage.shows)
+            self._on(box, partial(self._show, name))
+        colour = gui.add_dropdown("points coloured by", POINT_COLOURS, initial_value=stage.points_by)
+        self._on(colour, self._colour_points)
+        size = gui.add_slider("point size (m)", min=0.005, max=0.08, step=0.005, initial_value=stage.point_size)
+        self._on(size, lambda value: setattr(stage, "point_size", value))
+        rays = gui.add_dropdown("rays shown", ("those of the policy", "the whole sensor"))
+        self._on(rays, self._choose_rays)
+        self._legend = gui.add_html(_point_legend(stage.points_by))
+
+    def _build_keys(self) -> None:
+        viewer = self._viewer
+        keys: dict[str, tuple[str, Callable[[], None]]] = {
+            "W": ("faster ahead", lambda: viewer.nudge(ahead=STEP)),
+            "S": ("slower, then back", lambda: viewer.nudge(ahead=-STEP)),
+            "A": ("to the left", lambda: viewer.nudge(aside=STEP)),
+            "D": ("to the right", lambda: viewer.nudge(aside=-STEP)),
+            "Q": ("turn left", lambda: viewer.nudge(turn=TURN)),
+            "E": ("turn right", lambda: viewer.nudge(turn=-TURN)),
+            "X": ("stand", lambda: viewer.drive((0.0, 0.0, 0.0))),
+            "T": ("the task commands", lambda: viewer.drive(None)),
+            "space": ("pause or go on", lambda: viewer.pause(not viewer.paused)),
+            "N": ("one control step", viewer.single_step),
+            "R": ("new trial", viewer.new_trial),
+            "P": ("push the robot to its left", viewer.push_aside),
+            "B": ("bring the obstacle", lambda: viewer.bring(self._kind.value)),
+        }
+        for key, (label, act) in keys.items():
+            command = self._gui.add_command(label, hotkey=key)  # type: ignore[arg-type]  # viser's literals
+            command.on_trigger(lambda _, act=act: viewer.ask(act))
+
+    def _on(self, handle: Any, act: Callable[[Any], None]) -> None:
+        """Has a change by a person served between two steps; changes by the viewer itself are none."""
+
+        def changed(event: Any) -> None:
+            if event.client is not None:
+                value = handle.value
+                self._viewer.ask(partial(act, value))
+
+        handle.on_update(changed)
+
+    def _on_click(self, handle: Any, act: Callable[[], None]) -> None:
+        handle.on_click(lambda _: self._viewer.ask(act))
+
+    def _stick(self) -> Velocity:
+        ahead, aside, turn = (float(slider.value) for slider in self._sliders)
+        return ahead, aside, turn
+
+    def _choose(self, group: str, name: str) -> None:
+        self._viewer.choose(group, None if name == OWN else name)
+
+    def _show(self, name: str, on: bool) -> None:
+        (self._viewer.stage.shows.add if on else self._viewer.stage.shows.discard)(name)
+
+    def _colour_points(self, name: str) -> None:
+        self._viewer.stage.points_by = name
+        self._legend.content = _point_legend(name)
+
+    def _choose_rays(self, name: str) -> None:
+        self.num_rays = MOST_POINTS if name == "the whole sensor" else None
+        self._viewer.session.show_cloud(self.num_rays)
+
+    def _choose_checkpoint(self, name: str) -> None:
+        for path in self._viewer.checkpoints():
+            if path.name == name:
+                return self._viewer.choose_checkpoint(path)
+        raise ValueError(f"{name} is gone: {self._viewer.session.shown.run_dir} keeps its newest checkpoints only")
+
+    def _checkpoint_names(self) -> tuple[str, ...]:
+        return tuple(path.name for path in self._viewer.checkpoints()) or ("none",)
+
+    # ---- showing what is the case ------------------------------------------------------------------------------------
+
+    def show_drive(self, velocity: Velocity | None) -> None:
+        """The stick as it is."""
+        self._set(self._driven, velocity is not None)
+        for slider, value in zip(self._sliders, velocity or (0.0, 0.0, 0.0), strict=True):
+            self._set(slider, value)
+
+    def show_pause(self, paused: bool) -> None:
+        """Whether time stands."""
+        self._set(self._pause, paused)
+
+    def show_follow(self, follows: bool) -> None:
+        """Whether the newest checkpoint is loaded as it appears."""
+        self._set(self._follow, follows)
+
+    def show_checkpoint(self, path: Path) -> None:
+        """Whose weights walk."""
+        names = self._checkpoint_names()
+        self._checkpoint.options = names
+        if path.name in names and path.parent.parent == self._viewer.session.shown.run_dir:
+            self._set(self._checkpoint, path.name)
+        self._set(self._weights, str(path))
+
+    def show_choices(self, choices: dict[str, str | None], session: Session) -> None:
+        """The task as it is."""
+        for group, dropdown in self._presets.items():
+            self._set(dropdown, choices.get(group) or OWN)
+        self._set(self._policy, session.shown.policy)
+        self._set(self._run, str(session.shown.run_dir))
+        self.show_checkpoint(session.checkpoint)
+
+    def _set(self, handle: Any, value: object) -> None:
+        with contextlib.suppress(ValueError):  # an option that is gone meanwhile
+            if handle.value != value:
+                handle.value = value
+
+    def draw_status(self, points: int) -> None:
+        """Who walks where, how fast time runs and what was left out."""
+        viewer, session = self._viewer, self._viewer.session
+        clock = viewer.clock
+        shown = "paused" if viewer.paused else f"real time x {clock.reached:.2f}"
+        slow = not viewer.paused and 0.0 < clock.reached < 0.95 * clock.speed
+        colour = "#c62f2f" if slow else "#2c7a3f"
+        asked = "" if clock.speed == 1.0 else f" (asked for {clock.speed:g})"
+        cloud = f"{points:,} points x {viewer.points_hz:.0f}/s"
+        rate = f"{clock.pictures_hz:.0f} pictures/s, {clock.dropped} dropped · {cloud}"
+        ends: dict[str, int] = {}
+        for outcome in session.outcomes:
+            ends[outcome.cause] = ends.get(outcome.cause, 0) + 1
+        touched = sum(outcome.touched for outcome in session.outcomes)
+        trials = f"trial {len(session.outcomes) + 1}, {session.time_s:.1f} s"
+        if ends:
+            trials += " · ended: " + ", ".join(f"{n} {cause}" for cause, n in ends.items()) + f", {touched} touched"
+        warning = (
+            "" if viewer.reached_by_this_machine_alone else _line("everybody who reaches this machine can take hold")
+        )
+        self._status.content = (
+            f'<div style="padding:6px 12px;font-size:12px;line-height:1.5"><b style="color:{colour}">{shown}</b>{asked}'
+            f" · {rate}<br>{html.escape(trials)}<br>{html.escape(str(session.checkpoint))}"
+            f"{warning}{_line(viewer.message)}</div>"
+        )
+
+    def draw_charts(self, perceived: Perceived | None, true: Perceived) -> None:
+        """Risk of velocities and bars of reward terms."""
+        env, session = self._viewer.session.env, self._viewer.session
+        risk = env.config.rewards.avoidance.risk
+        command = {"command": env.command.value[0, :2].tolist()}
+        command["velocity"] = env.state.kinematics.base_lin_vel_yaw[0].tolist()[:2]
+        drawings = []
+        for name, seen in (("perceived", perceived), ("true", true)):
+            if risk is not None and seen is not None and seen.risk is not None:
+                arrows = dict(command)
+                if seen.velocity is not None:
+                    arrows[f"V_avoid {name}"] = seen.velocity.tolist()
+                drawings.append(charts.risk_polar(name, seen.risk, risk, arrows))
+        self._polar.content = charts.side_by_side(drawings) if drawings else _line("this task has no velocity risk")
+        for term, value in session.rewards.items():
+            self._rewards[term] = self._rewards.get(term, value) * (1 - SMOOTHING) + SMOOTHING * value
+        self._rewards = {term: self._rewards[term] for term in session.rewards}
+        bars = charts.reward_bars(self._rewards, sum(self._rewards.values())) if self._rewards else ""
+        self._bars.content = charts.padded(bars) if bars else _line("this task has no rewards")
+
+
+def _line(text: str) -> str:
+    return f'<div style="font-size:12px"><i>{html.escape(text)}</i></div>' if text else ""
+
+
+def _point_legend(name: str) -> str:
+    if name == "what it hit":
+        return charts.legend({kind.name.lower(): rgb for kind, rgb in CLASSES.items()})  # type: ignore[attr-defined]
+    if name == "proximal/distal":
+        return charts.legend({"proximal": PROXIMAL, "distal": DISTAL})
+    return charts.legend({f"blue to yellow: {name} from low to high": (60, 160, 120)})
+
+
+def _runs(first: Path) -> list[str]:
+    """Run directories that there are, the given one first."""
+    found = [path.parent for path in (*_below(OUTPUTS), *_below(Path("pretrained")))]
+    return list(dict.fromkeys(str(path) for path in (first, *found)))
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    yield from sorted(folder.glob(f"**/{CONFIG_FILE}"))

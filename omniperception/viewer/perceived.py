@@ -1,0 +1,83 @@
+"""What a network makes of its LiDAR frames, beside what is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from omniperception.avoidance.sector_motion import NEARNESS_RANGE, decode
+from omniperception.avoidance.velocity import SECTOR_TARGET
+from omniperception.env.config import HEIGHT_TARGET
+from omniperception.env.env import OmniEnv
+from omniperception.learning.models import PerceptionActor
+from omniperception.learning.read_out import MotionReadOut
+
+
+@dataclass(frozen=True)
+class Perceived:
+    """What is perceived or true in environment 0; None where nobody says.
+
+    Attributes:
+        sectors: (S, 3) distance (m, infinite without an obstacle) and velocity (m/s, yaw-aligned frame), by sector.
+        risk: (K,) of the candidate velocities.
+        velocity: (2,) V_avoid, m/s, yaw-aligned frame.
+        heights: (187,) m, base above the ground at `env.heights.height_grid`.
+    """
+
+    sectors: np.ndarray | None = None
+    risk: np.ndarray | None = None
+    velocity: np.ndarray | None = None
+    heights: np.ndarray | None = None
+
+
+@torch.no_grad()
+def perceived(actor: nn.Module, observations: TensorDict, command: torch.Tensor) -> Perceived | None:
+    """What the network of an actor says of its newest frames; None where it looks at none, or has none yet.
+
+    Args:
+        actor: of any kind.
+        observations: what it acts on.
+        command: (1, 3) as the actor is commanded.
+    """
+    if not isinstance(actor, PerceptionActor) or not int(observations.get("frame_count", torch.zeros(1)).max()):
+        return None
+    features = actor.embed_newest(observations)
+    embedding = features[:, : actor.perception.feature_dim]
+    parts = actor.perception.supervised
+    heights = embedding[0, parts[HEIGHT_TARGET]] if HEIGHT_TARGET in actor.supervision else None
+    sectors = risk = velocity = None
+    if isinstance(actor.read_out, MotionReadOut):
+        sectors = decode(actor.read_out.motion(embedding))[0]
+        risk = features[0, actor.perception.feature_dim :]
+    elif SECTOR_TARGET in actor.supervision:
+        nearness = embedding[0, parts[SECTOR_TARGET]].clamp(max=1.0)
+        distance = torch.where(nearness > 0.05, NEARNESS_RANGE * (1.0 - nearness), torch.inf)
+        sectors = torch.cat((distance[:, None], torch.zeros(len(distance), 2)), 1)
+    if actor.read_out is not None:
+        velocity = actor.read_out.velocity(features, command[:, :2])[0]
+    return Perceived(_array(sectors), _array(risk), _array(velocity), _array(heights))
+
+
+@torch.no_grad()
+def true(env: OmniEnv) -> Perceived:
+    """The same as the simulation has it; sectors without motion where V_avoid is the paper's."""
+    avoidance, sectors = env.avoidance, None
+    if avoidance is not None and avoidance.motion is not None:
+        sectors = avoidance.motion[0]
+    elif avoidance is not None and avoidance.sector_distance is not None:
+        distance = avoidance.sector_distance[0, :, None]
+        sectors = torch.cat((distance, torch.zeros_like(distance).expand(-1, 2)), 1)
+    return Perceived(
+        _array(sectors),
+        None if avoidance is None or avoidance.risk is None else _array(avoidance.risk[0]),
+        None if avoidance is None else _array(avoidance.velocity[0]),
+        _array(env.state.heights[0]),
+    )
+
+
+def _array(tensor: torch.Tensor | None) -> np.ndarray | None:
+    return None if tensor is None else tensor.detach().float().cpu().numpy()

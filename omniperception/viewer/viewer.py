@@ -1,0 +1,379 @@
+"""The viewer: one thread steps the task in real time and draws, the page's threads only ask it to do things."""
+
+from __future__ import annotations
+
+import math
+import queue
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from omniperception import config
+from omniperception.config import ConfigError
+from omniperception.learning import CheckpointError, latest_checkpoint
+from omniperception.learning.checkpoint import list_checkpoints
+from omniperception.viewer.clock import Clock
+from omniperception.viewer.drive import Stick, Velocity
+from omniperception.viewer.options import PageOptions, Shown
+from omniperception.viewer.page import open_page
+from omniperception.viewer.panels import Panels
+from omniperception.viewer.perceived import true
+from omniperception.viewer.session import Session
+from omniperception.viewer.stage import STICK_REACH, Stage, turned
+
+PICTURE_HZ, CHART_HZ, STATUS_HZ = 25.0, 5.0, 2.0
+LOOK_S = 2.0
+"""How often (s) a followed run is asked for a newer checkpoint."""
+PUSH_AHEAD_M = 1.5
+"""Where (m) before the robot a spare obstacle is put."""
+SWITCHED = ("scenario", "condition", "terrain", "obstacles", "lidar", "robot")
+"""Groups of presets that are switched on the page; a scenario brings its own terrain and obstacles."""
+WRONG = (ConfigError, CheckpointError, ValueError, ImportError)
+"""What a person can ask for in vain: one line on the page, and what was there goes on."""
+
+
+class Viewer:
+    """A run in the browser.
+
+    Attributes:
+        session: the run and its task.
+        stage, panels: the scene and the controls of the page.
+        clock: paces the steps.
+        paused: whether time stands.
+        stick: what a person commands.
+        push_speed: m/s by which a push changes the robot's velocity.
+        follows: whether the newest checkpoint of the run is loaded as it appears.
+        message: the newest line for whoever looks.
+    """
+
+    def __init__(self, shown: Shown, options: PageOptions) -> None:
+        """Builds the task, then opens the page.
+
+        Raises:
+            ViewerError: the page cannot be opened.
+            ConfigError, CheckpointError: the run cannot be shown.
+        """
+        torch.set_num_threads(1)
+        chosen, rest = _split(shown.overrides)
+        self._choices, self._rest = chosen, rest
+        self._options = options
+        self.server = open_page(options, "OmniPerception")
+        try:
+            self.session = Session(replace(shown, overrides=self._overrides()))
+        except BaseException:
+            self.server.stop()
+            raise
+        self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
+        self.paused, self._single, self._stopped = False, 0, False
+        self.stick, self.push_speed, self.follows, self.message = Stick(), 0.8, False, ""
+        self._stick_keeps = False
+        self.clock = Clock(self.session.env.control_dt, PICTURE_HZ)
+        self._charts_due = self._status_due = self._look_due = 0.0
+        self._frames_drawn, self._shown_points, self._frames_window = 0, 0, (time.monotonic(), 0)
+        self.points_hz, self._mean_rewards = 0.0, dict[str, float]()
+        self._redraw = True
+        self.stage = Stage(self.server)
+        self.stage.show(self.session)
+        self.stage.on_drag = self._obstacle_dragged
+        self.stage.on_take_away = self._obstacle_taken
+        self.stage.on_push = lambda direction: self.ask(lambda: self.push(direction))
+        self.stage.on_stick = lambda xy: self.ask(lambda: self._stick_dragged(xy))
+        self.panels = Panels(self)
+        self.server.on_client_connect(lambda client: self.ask(self._draw_again))
+
+    # ---- the loop ----------------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Steps and draws until Ctrl-C, `stop`, or the time is up."""
+        end = math.inf if self._options.stop_after_s is None else time.monotonic() + self._options.stop_after_s
+        self.clock.start()
+        try:
+            while not self._stopped and time.monotonic() < end:
+                self._serve_requests()
+                if self.paused and not self._single:
+                    self._draw_if_due(paused=True)
+                    time.sleep(0.02)
+                    continue
+                self._single = max(self._single - 1, 0)
+                self.session.step()
+                wait = self.clock.stepped()
+                self._draw_if_due()
+                self._look_for_weights()
+                if wait > 0:
+                    time.sleep(wait)
+        except KeyboardInterrupt:
+            print("viewer: ended")
+
+    def stop(self) -> None:
+        """Ends `run`; from any thread."""
+        self._stopped = True
+
+    def close(self) -> None:
+        """Takes the page down."""
+        self.server.stop()
+
+    def ask(self, request: Callable[[], None]) -> None:
+        """Has something done between two control steps; from any thread."""
+        self._requests.put(request)
+        self._redraw = True
+
+    def say(self, line: str) -> None:
+        """Shows a line to whoever looks, on the page and in the terminal."""
+        self.message = line
+        self._status_due = 0.0
+        print(f"viewer: {line}", flush=True)
+
+    def _serve_requests(self) -> None:
+        while True:
+            try:
+                request = self._requests.get_nowait()
+            except queue.Empty:
+                return
+            try:
+                request()
+            except WRONG as error:
+                self.say(f"refused: {' '.join(str(error).split())}")
+
+    # ---- drawing -----------------------------------------------------------------------------------------------------
+
+    def _draw_if_due(self, paused: bool = False) -> None:
+        if not self.server.get_clients():
+            return
+        now = time.monotonic()
+        due = self._redraw if paused else self.clock.picture_is_due() or self._redraw
+        if due:
+            perceived, there = self.session.perceived(), true(self.session.env)
+            self.stage.draw(perceived, there, self.session.driven is not None)
+            if self.session.frames != self._frames_drawn or self._redraw:
+                self._frames_drawn, self._shown_points = self.session.frames, self.stage.draw_points()
+                started, count = self._frames_window
+                self._frames_window = started, count + 1
+            if now >= self._charts_due or self._redraw:
+                self._charts_due = now + 1.0 / CHART_HZ
+                self.panels.draw_charts(perceived, there)
+            self._redraw = False
+        if now >= self._status_due:
+            self._status_due = now + 1.0 / STATUS_HZ
+            started, count = self._frames_window
+            if now - started >= 1.0:
+                self.points_hz, self._frames_window = count / (now - started), (now, 0)
+            self.panels.draw_status(self._shown_points)
+
+    def _draw_again(self) -> None:
+        """Draws everything for somebody who has just come."""
+        self._redraw, self._frames_drawn = True, -1
+
+    # ---- driving -----------------------------------------------------------------------------------------------------
+
+    def drive(self, velocity: Velocity | None) -> None:
+        """Commands a velocity; None gives the task its commands back."""
+        self.session.drive(None if velocity is None else self.stick.set(velocity))
+        self.panels.show_drive(self.session.driven)
+
+    def nudge(self, ahead: float = 0.0, aside: float = 0.0, turn: float = 0.0) -> None:
+        """Changes the command by a step."""
+        if self.session.driven is None:
+            self.stick.set((0.0, 0.0, 0.0))
+        self.drive(self.stick.moved(ahead, aside, turn))
+
+    def push(self, direction: tuple[float, float]) -> None:
+        """Pushes the robot along (x, y), environment frame."""
+        self.session.push((self.push_speed * direction[0], self.push_speed * direction[1]))
+
+    def push_aside(self) -> None:
+        """Pushes the robot to its left."""
+        yaw = float(self.session.env.state.kinematics.yaw[0])
+        self.push((-math.sin(yaw), math.cos(yaw)))
+
+    def _stick_dragged(self, xy: tuple[float, float]) -> None:
+        kinematics = self.session.env.state.kinematics
+        offset = kinematics.base_pos_w.new_tensor(xy) - kinematics.base_pos_w[0, :2]
+        ahead, aside = turned(offset.numpy(force=True), -float(kinematics.yaw[0])) / STICK_REACH
+        turn = self.stick.value[2] if self.session.driven is not None else 0.0
+        self.drive((float(ahead), float(aside), turn))
+
+    # ---- time --------------------------------------------------------------------------------------------------------
+
+    def pause(self, paused: bool) -> None:
+        """Lets time stand or run."""
+        self.paused = paused
+        self.clock.start()
+        self.panels.show_pause(paused)
+
+    def single_step(self) -> None:
+        """Pauses and does one control step."""
+        self.pause(True)
+        self._single += 1
+        self._redraw = True
+
+    def set_speed(self, speed: float) -> None:
+        """Simulated seconds per second."""
+        self.clock.speed = speed
+        self.clock.start()
+
+    def new_trial(self) -> None:
+        """Ends the trial; the next one is another scene."""
+        self.session.reset()
+
+    # ---- obstacles ---------------------------------------------------------------------------------------------------
+
+    def bring(self, kind: str) -> None:
+        """Puts a spare obstacle before the robot, in the direction of its command."""
+        state = self.session.env.state.kinematics
+        yaw = float(state.yaw[0])
+        x, y = state.base_pos_w[0, :2].tolist()
+        number = self.session.bring(kind, (x + PUSH_AHEAD_M * math.cos(yaw), y + PUSH_AHEAD_M * math.sin(yaw)))
+        self.say(f"{kind} (obstacle {number}) stands {PUSH_AHEAD_M:g} m ahead; drag it, shift-click takes it away")
+
+    def _obstacle_dragged(self, part: int, phase: str, xy: tuple[float, float]) -> None:
+        def request() -> None:
+            obstacle = self.session.obstacle_of(part)
+            if phase == "end":
+                self.session.let_go(obstacle)
+            else:
+                self.session.hold(obstacle, xy)
+
+        self.ask(request)
+
+    def _obstacle_taken(self, part: int) -> None:
+        self.ask(lambda: self.session.take_away(self.session.obstacle_of(part)))
+
+    # ---- switching ---------------------------------------------------------------------------------------------------
+
+    def choose(self, group: str, preset: str | None) -> None:
+        """Switches a preset of SWITCHED, or gives the run its own back; builds the task anew."""
+        choices = {**self._choices, group: preset}
+        if group == "scenario" and preset is not None:
+            choices |= {"terrain": None, "obstacles": None}
+        self._switch(choices, self.session.shown)
+
+    def choose_policy(self, name: str) -> None:
+        """Switches who acts."""
+        self._switch(self._choices, replace(self.session.shown, policy=name))
+
+    def choose_run(self, run_dir: Path) -> None:
+        """Switches to another run, with the presets that are chosen."""
+        self._switch(self._choices, replace(self.session.shown, run_dir=run_dir, checkpoint=None))
+
+    def choose_checkpoint(self, path: Path) -> None:
+        """Puts other weights into the network while the robot walks on."""
+        self.session.load(path)
+        self.say(f"{path} walks now")
+        self.panels.show_checkpoint(path)
+
+    def _switch(self, choices: dict[str, str | None], shown: Shown) -> None:
+        before, self._choices = self._choices, choices
+        self.say("building ...")
+        self.panels.draw_status(self._shown_points)
+        try:
+            session = Session(replace(shown, overrides=self._overrides()))
+        except WRONG:
+            self._choices = before
+            self.panels.show_choices(before, self.session)
+            raise
+        driven = self.session.driven
+        self.session = session
+        self.session.drive(driven)
+        if self.panels.num_rays is not None:
+            session.show_cloud(self.panels.num_rays)
+        self.stage.show(session)
+        self.panels.show_choices(choices, session)
+        self.clock.start()
+        self._draw_again()
+        self.say(f"{session.checkpoint} in {self._where()}")
+
+    def _overrides(self) -> tuple[str, ...]:
+        chosen = tuple(f"{group}={preset}" for group, preset in self._choices.items() if preset is not None)
+        threads = () if any(o.startswith("sim.num_threads=") for o in self._rest) else ("sim.num_threads=1",)
+        return (*self._rest, *chosen, *threads)
+
+    def _where(self) -> str:
+        chosen = [f"{group}={preset}" for group, preset in self._choices.items() if preset is not None]
+        return ", ".join(chosen) or "the task that it was trained in"
+
+    @property
+    def reached_by_this_machine_alone(self) -> bool:
+        """Tell whether the page listens on localhost."""
+        return self._options.is_local
+
+    @property
+    def choices(self) -> dict[str, str | None]:
+        """Presets that are chosen, by group; None: the run's own."""
+        return {group: self._choices.get(group) for group in SWITCHED}
+
+    def presets(self, group: str) -> tuple[str, ...]:
+        """Presets of a group, those in the run's own folders included."""
+        run = config.read(self.session.shown.run_dir)
+        return config.presets(group, config.search_path((), run))
+
+    def _look_for_weights(self) -> None:
+        now = time.monotonic()
+        if not self.follows or now < self._look_due:
+            return
+        self._look_due = now + LOOK_S
+        try:
+            newest = latest_checkpoint(self.session.shown.run_dir)
+            if newest != self.session.checkpoint:
+                self.choose_checkpoint(newest)
+        except WRONG as error:
+            self.follows = False
+            self.say(f"refused: {' '.join(str(error).split())}; following ends")
+            self.panels.show_follow(False)
+
+    def checkpoints(self) -> list[Path]:
+        """Checkpoints of the run, the newest first."""
+        return list_checkpoints(self.session.shown.run_dir)[::-1]
+
+    # ---- for whoever asks --------------------------------------------------------------------------------------------
+
+    def state(self, timeout_s: float = 60.0) -> dict[str, Any]:
+        """What is the case now, in plain numbers; from any thread while the viewer runs.
+
+        Raises:
+            TimeoutError: it does not run.
+        """
+        answer: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._requests.put(lambda: answer.put(self._state()))
+        try:
+            return answer.get(timeout=timeout_s)
+        except queue.Empty:
+            raise TimeoutError(f"the viewer has not answered in {timeout_s:g} s; is it running?") from None
+
+    def _state(self) -> dict[str, Any]:
+        env = self.session.env
+        kinematics, field = env.state.kinematics, env.obstacles
+        return {
+            "time_s": self.session.time_s,
+            "steps": env.step_count,
+            "position": kinematics.base_pos_w[0].tolist(),
+            "yaw": float(kinematics.yaw[0]),
+            "velocity": kinematics.base_lin_vel_yaw[0].tolist(),
+            "command": env.command.value[0].tolist(),
+            "driven": self.session.driven,
+            "paused": self.paused,
+            "checkpoint": str(self.session.checkpoint),
+            "choices": self.choices,
+            "obstacles": [] if field is None else field.root_pos_w[0].tolist(),
+            "present": [] if field is None else field.root_active[0].tolist(),
+            "trials": len(self.session.outcomes),
+            "points": self._shown_points,
+            "message": self.message,
+            "real_time": self.clock.reached,
+        }
+
+
+def _split(overrides: tuple[str, ...]) -> tuple[dict[str, str | None], tuple[str, ...]]:
+    """Presets that the page switches, by group, and the other overrides."""
+    chosen: dict[str, str | None] = {}
+    rest = []
+    for override in overrides:
+        group, _, preset = override.partition("=")
+        if group in SWITCHED:
+            chosen[group] = None if preset in ("null", "") else preset
+        else:
+            rest.append(override)
+    return chosen, tuple(rest)

@@ -1,0 +1,57 @@
+"""A headless chromium that looks at a page, and what of a page a test takes hold of."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+SIZE = {"width": 900, "height": 500}
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """A browser of Debian's; without one, or without playwright, the test is skipped."""
+    api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+    path = next((found for name in NAMES if (found := shutil.which(name))), None)
+    if path is None:
+        pytest.skip("needs chromium: apt-get install chromium")
+    with api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=path, args=list(FLAGS))
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+def wait_for(happened: Callable[[], object], what: str, seconds: float = 120.0) -> Any:
+    """What `happened` gives once it gives anything; fails after so long (s) of wall time."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if found := happened():
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"waited {seconds:g} s in vain: {what}")
+
+
+def pixel(camera: Any, point: np.ndarray, width: float, height: float) -> tuple[float, float]:
+    """Where in a picture of width x height pixels a point (3,) is; the camera's quaternion turns x right, y down, z
+    ahead into the page's frame, its `fov` is vertical."""
+    w, x, y, z = camera.wxyz
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    right, down, ahead = turn.T @ (np.asarray(point) - camera.position)
+    focal = height / 2 / np.tan(camera.fov / 2)
+    return width / 2 + focal * right / ahead, height / 2 + focal * down / ahead

@@ -1,0 +1,132 @@
+"""Operates the page in a real browser and reads back what became of it."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from browser import SIZE, chromium, pixel, wait_for
+
+from omniperception.learning import latest_checkpoint
+from omniperception.learning.checkpoint import load_checkpoint, save_checkpoint
+from omniperception.viewer import PageOptions, Shown
+from omniperception.viewer.viewer import Viewer
+
+RUN = Path(__file__).parents[2] / "pretrained" / "avoider"
+PORT = 18231
+
+
+def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
+    """The joystick, an obstacle, the weights, and time."""
+    page.goto(f"http://127.0.0.1:{PORT}")
+    client = wait_for(lambda: next(iter(viewer.server.get_clients().values()), None), "the page connects")
+    page.get_by_text("I command").wait_for()
+    page.screenshot(path=pictures / "1_opened.png")
+
+    assert viewer.state()["driven"] is None
+    start = np.array(viewer.state()["position"][:2])
+    for _ in range(3):
+        page.keyboard.press("w")
+    wait_for(lambda: viewer.state()["driven"] == (0.6, 0.0, 0.0), "three presses of W command 0.6 m/s")
+    yaw = viewer.state()["yaw"]
+    heading = np.array([np.cos(yaw), np.sin(yaw)])
+    wait_for(lambda: (np.array(viewer.state()["position"][:2]) - start) @ heading > 0.3, "the robot walks ahead")
+    page.keyboard.press("x")
+    wait_for(lambda: viewer.state()["driven"] == (0.0, 0.0, 0.0), "X stands")
+
+    there = viewer.state()["present"]
+    page.keyboard.press("b")
+    number = wait_for(
+        lambda: [k for k, p in enumerate(viewer.state()["present"]) if p and not there[k]], "B brings one"
+    )[0]
+    page.keyboard.press("Space")
+    wait_for(lambda: viewer.state()["paused"], "Space pauses")
+    drag(viewer, page, client, number)
+    page.screenshot(path=pictures / "2_dragged.png")
+
+    steps = viewer.state()["steps"]
+    page.keyboard.press("n")
+    wait_for(lambda: viewer.state()["steps"] == steps + 1, "N does one step")
+
+    page.get_by_role("tab", name="Task").click()
+    load(page, pictures / "none.pt")
+    wait_for(
+        lambda: "refused: no checkpoint at" in viewer.state()["message"], "weights that are not there are one line"
+    )
+    load(page, pictures / "still.pt")
+    wait_for(lambda: viewer.state()["checkpoint"] == str(pictures / "still.pt"), "other weights are loaded")
+    page.get_by_role("tab", name="Drive").click()
+    page.keyboard.press("w")
+    viewer.ask(lambda: viewer.pause(False))
+    start = viewer.state()["time_s"]
+    wait_for(lambda: viewer.state()["time_s"] > start + 1.0, "time runs")
+    state = viewer.state()
+    assert state["driven"] == (0.2, 0.0, 0.0) and np.hypot(*state["velocity"]) < 0.1, "weights of zero stand still"
+    page.screenshot(path=pictures / "3_other_weights.png")
+
+
+def load(page: Any, path: Path) -> None:
+    """Names a file of weights on the page."""
+    page.get_by_label("weights file").fill(str(path))
+    page.get_by_role("button", name="load weights file").click()
+
+
+def write_still_weights(path: Path) -> None:
+    """The run's weights with an actor that always gives 0, which is the default pose."""
+    state = load_checkpoint(latest_checkpoint(RUN))
+    weights = state["actor_state_dict"]
+    last = max(name for name in weights if name.startswith("mlp.") and name.endswith(".weight")).removesuffix("weight")
+    for name in ("weight", "bias"):
+        weights[last + name] = torch.zeros_like(weights[last + name])
+    save_checkpoint(path, {key: value for key, value in state.items() if key not in ("format", "version")})
+
+
+def drag(viewer: Viewer, page: Any, client: Any, obstacle: int) -> None:
+    """Pulls an obstacle aside with the mouse, and lets time run meanwhile."""
+    session = viewer.session
+    before = np.array(viewer.state()["obstacles"][obstacle])
+    box = page.locator("canvas").first.bounding_box()
+    middle = np.array([*(before[:2] - viewer.stage.origin), 0.3])
+    x, y = pixel(client.camera, middle, box["width"], box["height"])
+    page.mouse.move(box["x"] + x, box["y"] + y)
+    page.mouse.down()
+    page.mouse.move(box["x"] + x + 40, box["y"] + y, steps=5)
+    viewer.ask(lambda: viewer.pause(False))
+    wait_for(
+        lambda: np.hypot(*(np.array(viewer.state()["obstacles"][obstacle]) - before)[:2]) > 0.1,
+        f"obstacle {obstacle} of trial {len(session.outcomes)} follows the mouse",
+    )
+    page.mouse.up()
+    viewer.ask(lambda: viewer.pause(True))
+
+
+def test_a_person_drives_drags_and_switches_in_a_browser(tmp_path):
+    pytest.importorskip("viser", reason="needs viser: pip install 'omniperception[viewer]'")
+    overrides = ("scenario=static", "condition=ideal", "lidar.num_rays=500", "terminations.episode_length_s=10000")
+    viewer = Viewer(Shown(RUN, overrides), PageOptions(port=PORT, stop_after_s=600))
+    write_still_weights(tmp_path / "still.pt")
+    failures: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            with chromium() as browser:
+                operate(viewer, browser.new_page(viewport=SIZE), tmp_path)
+        except BaseException as failure:  # of the other thread: raised in this one
+            failures.append(failure)
+        finally:
+            viewer.stop()
+
+    operator = threading.Thread(target=work)
+    operator.start()
+    try:
+        viewer.run()
+    finally:
+        operator.join()
+        viewer.close()
+    if failures:
+        raise failures[0]
+    assert not viewer.server.get_clients()
