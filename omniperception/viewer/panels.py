@@ -152,7 +152,10 @@ class Panels:
         }
         for key, (label, act) in keys.items():
             command = self._gui.add_command(label, hotkey=key)  # type: ignore[arg-type]  # viser's literals
-            command.on_trigger(lambda _, act=act: viewer.ask(act))
+            command.on_trigger(partial(self._pressed, act))
+
+    def _pressed(self, act: Callable[[], None], event: Any) -> None:
+        self._viewer.ask(act)
 
     def _on(self, handle: Any, act: Callable[[Any], None]) -> None:
         """Has a change by a person served between two steps; changes by the viewer itself are none."""
@@ -253,7 +256,7 @@ class Panels:
         )
         self._status.content = (
             f'<div style="padding:6px 12px;font-size:12px;line-height:1.5"><b style="color:{colour}">{shown}</b>{asked}'
-            f" · {rate}<br>{html.escape(trials)}<br>{html.escape(str(session.checkpoint))}"
+            f" · {rate}<br>{html.escape(trials)}<br>{html.escape(_short(session.checkpoint))}"
             f"{warning}{_line(viewer.message)}</div>"
         )
 
@@ -280,6 +283,12 @@ class Panels:
 
 def _line(text: str) -> str:
     return f'<div style="font-size:12px"><i>{html.escape(text)}</i></div>' if text else ""
+
+
+def _short(path: Path) -> str:
+    """A path from the working directory, or its last parts."""
+    path, here = path.resolve(), Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(Path("...", *path.parts[-3:]))
 
 
 def _point_legend(name: str) -> str:

@@ -83,7 +83,7 @@ class Stage:
         looks = robot_looks(env.robot)
         self._link_bodies = tuple(model.body(look.body).id for look in looks)
         for k, look in enumerate(looks):
-            handle = self.scene.add_mesh_simple(
+            handle: Any = self.scene.add_mesh_simple(
                 f"{ROOT}/robot/{look.body}_{k}", look.vertices, look.faces, color=look.colour, flat_shading=False
             )
             handle.on_click(self._pushed)
@@ -150,7 +150,7 @@ class Stage:
         if mesh is None:
             return
         part = self._part_of[shape]
-        handle = self.scene.add_mesh_simple(
+        handle: Any = self.scene.add_mesh_simple(
             f"{ROOT}/obstacles/{self._session.shapes.geom_names[shape]}",
             np.asarray(mesh.vertices),
             np.asarray(mesh.faces),

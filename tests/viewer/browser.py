@@ -55,3 +55,8 @@ def pixel(camera: Any, point: np.ndarray, width: float, height: float) -> tuple[
     right, down, ahead = turn.T @ (np.asarray(point) - camera.position)
     focal = height / 2 / np.tan(camera.fov / 2)
     return width / 2 + focal * right / ahead, height / 2 + focal * down / ahead
+
+
+def control(page: Any, label: str) -> Any:
+    """The input beside a label of the page."""
+    return page.locator(f"xpath=//*[text()='{label}']/following::input[@type='text' or not(@type)][1]")

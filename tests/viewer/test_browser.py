@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browser import SIZE, chromium, pixel, wait_for
+from browser import SIZE, chromium, control, pixel, wait_for
 
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint, save_checkpoint
@@ -71,7 +71,7 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
 
 def load(page: Any, path: Path) -> None:
     """Names a file of weights on the page."""
-    page.get_by_label("weights file").fill(str(path))
+    control(page, "weights file").fill(str(path))
     page.get_by_role("button", name="load weights file").click()
 
 
@@ -106,7 +106,7 @@ def drag(viewer: Viewer, page: Any, client: Any, obstacle: int) -> None:
 
 def test_a_person_drives_drags_and_switches_in_a_browser(tmp_path):
     pytest.importorskip("viser", reason="needs viser: pip install 'omniperception[viewer]'")
-    overrides = ("scenario=static", "condition=ideal", "lidar.num_rays=500", "terminations.episode_length_s=10000")
+    overrides = ("scenario=static", "condition=ideal", "terminations.episode_length_s=10000")
     viewer = Viewer(Shown(RUN, overrides), PageOptions(port=PORT, stop_after_s=600))
     write_still_weights(tmp_path / "still.pt")
     failures: list[BaseException] = []

@@ -88,20 +88,24 @@ def _serve(arguments: Arguments, out: Path, overrides: list[str]) -> None:
     robot = _task(arguments.lidar[0], overrides).robot
     names = [name for name in config.presets("lidar", config.search_path(overrides)) if name != "none"]
     sensors = {name: partial(_sensor, name, overrides) for name in (*arguments.lidar, *names)}
-    room = _surroundings(arguments, robot, walkers=WALKERS)
-    look = Room(
-        room.scene,
+    room = lab_room(robot, _surroundings(arguments, robot, walkers=WALKERS))
+    serve_lab(room, sensors, out, PageOptions(arguments.host, arguments.port))
+
+
+def lab_room(robot: RobotConfig, demo: DemoScene) -> Room:
+    """The demonstration scene as the scan lab takes it."""
+    return Room(
+        demo.scene,
         robot,
-        room.bodies,
-        room.robot_geoms,
-        room.movers,
-        room.extent[:2],
-        room.open_side,
+        demo.bodies,
+        demo.robot_geoms,
+        demo.movers,
+        demo.extent[:2],
+        demo.open_side,
         {int(kind): COLOURS[kind] for kind in DemoClass},
         {int(kind): value for kind, value in REFLECTIVITY.items()},
         {int(kind): kind.name.lower() for kind in DemoClass},
     )
-    serve_lab(look, sensors, out, PageOptions(arguments.host, arguments.port))
 
 
 def _sensor(name: str, overrides: list[str]) -> SensorConfig:
