@@ -57,7 +57,7 @@ class Viewer:
             ViewerError: the page cannot be opened.
             ConfigError, CheckpointError: the run cannot be shown.
         """
-        torch.set_num_threads(1)
+        self._threads = torch.get_num_threads()
         chosen, rest = _split(shown.overrides)
         self._choices, self._rest = chosen, rest
         self._options = options
@@ -90,6 +90,7 @@ class Viewer:
     def run(self) -> None:
         """Steps and draws until Ctrl-C, `stop`, or the time is up."""
         end = math.inf if self._options.stop_after_s is None else time.monotonic() + self._options.stop_after_s
+        torch.set_num_threads(1)  # tensors of one environment
         self.clock.start()
         try:
             while not self._stopped and time.monotonic() < end:
@@ -107,6 +108,8 @@ class Viewer:
                     time.sleep(wait)
         except KeyboardInterrupt:
             print("viewer: ended")
+        finally:
+            torch.set_num_threads(self._threads)
 
     def stop(self) -> None:
         """Ends `run`; from any thread."""

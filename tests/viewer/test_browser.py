@@ -68,6 +68,14 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     assert state["driven"] == (0.2, 0.0, 0.0) and np.hypot(*state["velocity"]) < 0.1, "weights of zero stand still"
     page.screenshot(path=pictures / "3_other_weights.png")
 
+    second = page.context.browser.new_page(viewport={"width": 300, "height": 200})
+    second.goto(f"http://127.0.0.1:{PORT}")
+    wait_for(lambda: len(viewer.server.get_clients()) == 2, "a second browser looks")
+    second.close()
+    wait_for(lambda: len(viewer.server.get_clients()) == 1, "it leaves")
+    page.keyboard.press("x")
+    wait_for(lambda: viewer.state()["driven"] == (0.0, 0.0, 0.0), "the first one drives on")
+
 
 def load(page: Any, path: Path) -> None:
     """Names a file of weights on the page."""
