@@ -14,6 +14,8 @@ import pytest
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 SIZE = {"width": 900, "height": 500}
+PATIENCE_S = 120.0
+"""Wall time: pictures without a graphics card on a busy machine take seconds each."""
 
 
 @contextmanager
@@ -31,7 +33,14 @@ def chromium() -> Iterator[Any]:
             browser.close()
 
 
-def wait_for(happened: Callable[[], object], what: str, seconds: float = 120.0) -> Any:
+def open_tab(browser: Any) -> Any:
+    """A page that waits as long for the browser as `wait_for` does for what happens."""
+    page = browser.new_page(viewport=SIZE)
+    page.set_default_timeout(1e3 * PATIENCE_S)
+    return page
+
+
+def wait_for(happened: Callable[[], object], what: str, seconds: float = PATIENCE_S) -> Any:
     """What `happened` gives once it gives anything; fails after so long (s) of wall time."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browser import SIZE, chromium, control, pixel, wait_for
+from browser import chromium, control, open_tab, pixel, wait_for
 
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint, save_checkpoint
@@ -122,7 +122,7 @@ def test_a_person_drives_drags_and_switches_in_a_browser(tmp_path):
     def work() -> None:
         try:
             with chromium() as browser:
-                operate(viewer, browser.new_page(viewport=SIZE), tmp_path)
+                operate(viewer, open_tab(browser), tmp_path)
         except BaseException as failure:  # of the other thread: raised in this one
             failures.append(failure)
         finally:

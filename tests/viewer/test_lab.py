@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 import torch
-from browser import SIZE, chromium, control, wait_for
+from browser import chromium, control, open_tab, wait_for
 
 from omniperception import build, config
 from omniperception.commands.scan import NO_TASK, lab_room
@@ -103,7 +103,7 @@ def test_the_page_turns_knobs_refuses_what_cannot_be_and_writes_scans(task, room
     def operate() -> None:
         try:
             with chromium() as browser:
-                page = browser.new_page(viewport=SIZE)
+                page = open_tab(browser)
                 page.goto(f"http://127.0.0.1:{PORT}")
                 noise = control(page, "Gaussian (m)")
                 noise.fill("0.1")
