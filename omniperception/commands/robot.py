@@ -20,6 +20,7 @@ from omniperception.deploy.description import DeployError
 from omniperception.hardware.clouds import Extrinsic
 from omniperception.hardware.control import RobotConfig, run
 from omniperception.hardware.lidar import KINDS, LidarSource
+from omniperception.hardware.switcher import CHOICES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +39,11 @@ class Arguments:
     point_port: int = argument(56301, "UDP port that points come to", least=1)
     topic: str = argument("rt/livox/lidar", "topic of PointCloud2 or CustomMsg")
     extrinsic: str | None = argument(None, "x,y,z,qw,qx,qy,qz that the driver has applied to the points; undone")
-    steer: str = argument("remote", "remote, keyboard, udp:PORT, or v_x,v_y,yaw_rate")
+    steer: str = argument("remote", "remote, keyboard, udp:PORT, goal:X,Y[,SPEED] in odometry, or v_x,v_y,yaw_rate")
     crc: bool = argument(True, "whether states with a wrong checksum are refused; simulators that fill none need false")
+    sport_mode: str = argument(
+        "check", "the robot's own controller: refuse while it runs, end it, or do not ask", choices=CHOICES
+    )
     seconds: float | None = argument(None, "how long; null: until it is interrupted", positive=True)
 
 
@@ -59,6 +63,7 @@ def main(arguments: Arguments) -> None:
         lidar=None if arguments.points == "none" else source,
         steer=arguments.steer,
         check_crc=arguments.crc,
+        sport_mode=arguments.sport_mode,
         seconds=arguments.seconds,
     )
     print(run(config))

@@ -35,6 +35,7 @@ class Arguments:
     detection_port: int | None = argument(None, "UDP port on which it answers to searches; null: none")
     steer_to: int | None = argument(None, "UDP port that the world's commands are sent to; null: none are")
     hold_last: bool = argument(True, "whether motors go on with the last command when none comes")
+    sport_mode: str = argument("", "name of a controller of its own that runs until it is released; empty: none")
     seconds: float | None = argument(None, "simulated time; null: until the goal or an interrupt", positive=True)
     trust: tuple[str, ...] = trust()
 
@@ -52,6 +53,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         point_to=None if arguments.detection_port is not None else ("127.0.0.1", arguments.point_to),
         steer_to=arguments.steer_to,
         hold_last=arguments.hold_last,
+        sport_mode=arguments.sport_mode,
         seconds=arguments.seconds,
     )
     print(run(env, wire))

@@ -14,13 +14,15 @@ import numpy as np
 from omniperception.deploy import DeployError, ExportedPolicy, RobotState, SafetyStop
 from omniperception.deploy.description import Description
 from omniperception.deploy.go2 import MOTORS
+from omniperception.deploy.odometry import Odometry
 from omniperception.hardware.dds import LOW_STATE_TOPIC, Network
 from omniperception.hardware.guard import GuardConfig, Link, StateReader, start
 from omniperception.hardware.legs import base_velocity
 from omniperception.hardware.lidar import Frames, LidarSource
 from omniperception.hardware.machine import MachineConfig, Mode, Request
 from omniperception.hardware.messages import LOW_STATE, remote
-from omniperception.hardware.operator import Operator, make_operator
+from omniperception.hardware.operator import Goal, Operator, make_operator
+from omniperception.hardware.switcher import ensure_released
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class RobotConfig:
         lidar: where points come from; None for a blind policy.
         steer: see `operator.make_operator`.
         check_crc: whether states with another checksum than theirs are refused.
+        sport_mode: what is done about the robot's own controller, see `switcher.ensure_released`.
         seconds: how long it runs; None: until it is ended.
     """
 
@@ -43,6 +46,7 @@ class RobotConfig:
     lidar: LidarSource | None = None
     steer: str = "remote"
     check_crc: bool = True
+    sport_mode: str = "check"
     seconds: float | None = None
 
 
@@ -117,10 +121,15 @@ class Control:
         described = policy.description
         observed = {term.quantity for group in described.observations for term in group.terms}
         moves = described.perception is not None and described.perception.base_motion
+        self._is_led = isinstance(operator, Goal)
         self._needs_velocity = not described.estimated and (moves or "base_lin_vel" in observed)
         self._state: np.ndarray | None = None
         self._mode, self._last_frame = Mode.DAMPING, math.inf
         self._velocity = np.zeros(3)
+        self._begin_odometry()
+
+    def _begin_odometry(self) -> None:
+        self._pose, self._odometry = np.zeros(3), Odometry(self.policy.description.control_period_s)
 
     def step(self, now: float) -> bool:
         """One control step; False without a state of the robot so far."""
@@ -130,13 +139,16 @@ class Control:
         self._link.poll()
         if self._state is None:
             return False
-        command, asked = self._operator.poll(now, remote(self._state["wireless_remote"]))
+        if self._is_led:
+            self._advance_odometry(self._state)
+        command, asked = self._operator.poll(now, remote(self._state["wireless_remote"]), self._pose)
         for request in asked:
             self._link.ask(request)
         if self._link.mode is not self._mode:
             self._mode = self._link.mode
             if self._mode is Mode.POLICY:
                 self.policy.reset()
+                self._begin_odometry()
         if self._link.mode is not Mode.POLICY:
             command = np.zeros(3)
         try:
@@ -164,16 +176,27 @@ class Control:
         self._last_frame = now
         return self.policy.thin(frames[-1].points, frames[-1].offsets_s)
 
+    def _advance_odometry(self, state: np.ndarray) -> None:
+        """Adds one step to the pose (3,) x, y (m), heading (rad) since the policy began."""
+        self._odometry.advance(state["imu_state"]["quaternion"].astype(float), self._leg_velocity(state))
+        dx, dy, turned = self._odometry.since_last_frame()
+        cos, sin = np.cos(self._pose[2]), np.sin(self._pose[2])
+        self._pose = self._pose + np.array([cos * dx - sin * dy, sin * dx + cos * dy, turned])
+
+    def _leg_velocity(self, state: np.ndarray) -> np.ndarray:
+        """(3,) m/s in the base; the newest known while no foot stands."""
+        motors, imu = state["motor_state"][:12], state["imu_state"]
+        angles, speeds, torques = (motors[name].astype(float) for name in ("q", "dq", "tau_est"))
+        gyro, vertical = imu["gyroscope"].astype(float), down(imu["quaternion"].astype(float))
+        stood = base_velocity(angles, speeds, torques, gyro, vertical)
+        self._velocity = self._velocity if stood is None else stood
+        return self._velocity
+
     def _robot_state(self, state: np.ndarray) -> RobotState:
         """Of a LOW_STATE, in the policy's order of joints."""
         motors, imu = state["motor_state"][:12], state["imu_state"]
         quat, gyro = imu["quaternion"].astype(float), imu["gyroscope"].astype(float)
-        velocity = None
-        if self._needs_velocity:
-            angles, speeds, torques = (motors[name].astype(float) for name in ("q", "dq", "tau_est"))
-            stood = base_velocity(angles, speeds, torques, gyro, down(quat))
-            self._velocity = self._velocity if stood is None else stood
-            velocity = self._velocity
+        velocity = self._leg_velocity(state) if self._needs_velocity else None
         order = self._motors
         return RobotState(motors["q"][order], motors["dq"][order], quat, gyro, velocity, motors["tau_est"][order])
 
@@ -197,6 +220,7 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         if config.lidar is None:
             raise DeployError("this policy sees: points=none is for a blind one")
         frames = Frames(config.lidar, description.lidar, network)
+    ensure_released(network, config.sport_mode)
     link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
     control = Control(policy, states, frames, operator, link)
     try:

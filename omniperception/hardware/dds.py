@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 POINT_CLOUD2 = "sensor_msgs.msg.dds_.PointCloud2_"
 CUSTOM_MSG = "livox_ros_driver2.msg.dds_.CustomMsg_"
+REQUEST, RESPONSE = "unitree_api.msg.dds_.Request_", "unitree_api.msg.dds_.Response_"
 LOW_CMD_TOPIC, LOW_STATE_TOPIC = "rt/lowcmd", "rt/lowstate"
 
 _LOOPBACK = """<CycloneDDS><Domain Id="any"><General>
@@ -169,7 +170,7 @@ def _make(name: str, fields: dict[str, Any]) -> Any:
 
 @cache
 def _variable() -> dict[str, Any]:
-    """ROS 2's types of variable size that are read here."""
+    """Types of variable size: ROS 2's clouds, and requests to the robot's services."""
     types = _idl_types()
     stamp = _make("builtin_interfaces.msg.dds_.Time_", {"sec": types.int32, "nanosec": types.uint32})
     header = _make("std_msgs.msg.dds_.Header_", {"stamp": stamp, "frame_id": str})
@@ -197,7 +198,28 @@ def _variable() -> dict[str, Any]:
         "rsvd": types.array[types.uint8, 3],
         "points": types.sequence[point],
     }
-    return {POINT_CLOUD2: _make(POINT_CLOUD2, cloud), CUSTOM_MSG: _make(CUSTOM_MSG, custom)}
+    made = {POINT_CLOUD2: _make(POINT_CLOUD2, cloud), CUSTOM_MSG: _make(CUSTOM_MSG, custom)}
+    identity = _make("unitree_api.msg.dds_.RequestIdentity_", {"id": types.int64, "api_id": types.int64})
+    lease = _make("unitree_api.msg.dds_.RequestLease_", {"id": types.int64})
+    policy = _make("unitree_api.msg.dds_.RequestPolicy_", {"priority": types.int32, "noreply": bool})
+    status = _make("unitree_api.msg.dds_.ResponseStatus_", {"code": types.int32})
+    asked_types = {"identity": identity, "lease": lease, "policy": policy}
+    asked = _make("unitree_api.msg.dds_.RequestHeader_", asked_types)
+    answered = _make("unitree_api.msg.dds_.ResponseHeader_", {"identity": identity, "status": status})
+    binary = types.sequence[types.uint8]
+    made[REQUEST] = _make(REQUEST, {"header": asked, "parameter": str, "binary": binary})
+    made[RESPONSE] = _make(RESPONSE, {"header": answered, "data": str, "binary": binary})
+    return made
 
 
-__all__ = ["CUSTOM_MSG", "LOW_CMD", "LOW_CMD_TOPIC", "LOW_STATE", "LOW_STATE_TOPIC", "POINT_CLOUD2", "Network"]
+__all__ = [
+    "CUSTOM_MSG",
+    "LOW_CMD",
+    "LOW_CMD_TOPIC",
+    "LOW_STATE",
+    "LOW_STATE_TOPIC",
+    "POINT_CLOUD2",
+    "REQUEST",
+    "RESPONSE",
+    "Network",
+]

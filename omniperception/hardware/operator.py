@@ -1,4 +1,4 @@
-"""Where commands come from: the remote's sticks, datagrams, the keyboard, or one command for good."""
+"""Where commands come from: the remote's sticks, datagrams, the keyboard, a goal, or one command for good."""
 
 from __future__ import annotations
 
@@ -23,15 +23,21 @@ _STALE_S = 0.5
 class Operator(Protocol):
     """Somebody who commands."""
 
-    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
-        """(3,) v_x, v_y (m/s), yaw rate (rad/s), and what has been asked for since the call before."""
+    def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
+        """(3,) v_x, v_y (m/s), yaw rate (rad/s), and what has been asked for since the call before.
+
+        Args:
+            now: s.
+            remote: the robot's.
+            pose: (3,) x, y (m) and heading (rad) of the base in its odometry, which begins with the policy.
+        """
 
     def close(self) -> None:
         """Ends it."""
 
 
 def make_operator(text: str, ranges: Mapping[str, Sequence[float]]) -> Operator:
-    """Of `steer=remote`, `keyboard`, `udp:PORT` or `V_X,V_Y,YAW_RATE`; ranges: of the policy's training."""
+    """Of `steer=remote`, `keyboard`, `udp:PORT`, `goal:X,Y` or `V_X,V_Y,YAW_RATE`; ranges: of the policy's training."""
     if text == "remote":
         return Sticks(ranges)
     if text == "keyboard":
@@ -39,10 +45,14 @@ def make_operator(text: str, ranges: Mapping[str, Sequence[float]]) -> Operator:
     if text.startswith("udp:") and text[4:].isdigit():
         return Datagrams(int(text[4:]))
     with contextlib.suppress(ValueError):
-        numbers = [float(part) for part in text.split(",")]
-        if len(numbers) == 3:
+        numbers = [float(part) for part in text.removeprefix("goal:").split(",")]
+        if not np.isfinite(numbers).all():
+            raise ValueError
+        if text.startswith("goal:") and len(numbers) in (2, 3) and numbers[2:] > [0.0] * (len(numbers) - 2):
+            return Goal(numbers[:2], ranges, *numbers[2:])
+        if not text.startswith("goal:") and len(numbers) == 3:
             return Constant(numbers)
-    raise DeployError(f"steer={text}: remote, keyboard, udp:PORT or V_X,V_Y,YAW_RATE was expected")
+    raise DeployError(f"steer={text}: remote, keyboard, udp:PORT, goal:X,Y[,SPEED] or V_X,V_Y,YAW_RATE was expected")
 
 
 def scaled(shares: Sequence[float], ranges: Mapping[str, Sequence[float]]) -> np.ndarray:
@@ -57,7 +67,7 @@ class Sticks:
     def __init__(self, ranges: Mapping[str, Sequence[float]]) -> None:
         self._ranges = ranges
 
-    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         shares = [0.0 if abs(s) < 0.05 else s for s in (remote.ly, -remote.lx, -remote.rx)]
         return scaled(shares, self._ranges), []
 
@@ -71,8 +81,32 @@ class Constant:
     def __init__(self, command: Sequence[float]) -> None:
         self._command = np.array(command)
 
-    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         return self._command, []
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+class Goal:
+    """Leads to a place in the robot's odometry, facing it, and stays there; slower over the last metre."""
+
+    _RADIUS, _SLOW_WITHIN, _YAW_GAIN = 0.3, 1.0, 1.0
+
+    def __init__(self, goal: Sequence[float], ranges: Mapping[str, Sequence[float]], speed: float = 0.5) -> None:
+        """Args: goal: x ahead and y to the left (m) of where the policy begins; speed: m/s."""
+        self._goal, self._speed = np.array(goal), speed
+        self._low, self._high = np.array([ranges[name] for name in _NAMES]).T
+
+    def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
+        way = self._goal - pose[:2]
+        distance = float(np.hypot(*way))
+        if distance < self._RADIUS:
+            return np.zeros(3), []
+        error = np.remainder(np.arctan2(way[1], way[0]) - pose[2] + np.pi, 2 * np.pi) - np.pi
+        pace = self._speed * min(1.0, distance / self._SLOW_WITHIN)
+        wanted = np.array([pace * np.cos(error), pace * np.sin(error), self._YAW_GAIN * error])
+        return np.clip(wanted, self._low, self._high), []
 
     def close(self) -> None:
         """Nothing to end."""
@@ -91,7 +125,7 @@ class Datagrams:
             raise DeployError(f"steer=udp:{port}: the port cannot be listened to ({error.strerror})") from None
         self._command, self._since = np.zeros(3), -1e9
 
-    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         asked = []
         while True:
             try:
@@ -134,7 +168,7 @@ class Keyboard:
         self._before = termios.tcgetattr(sys.stdin)
         tty.setcbreak(sys.stdin)
 
-    def poll(self, now: float, remote: Remote) -> tuple[np.ndarray, list[Request]]:
+    def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         asked = []
         while select.select([sys.stdin], [], [], 0.0)[0]:
             for key in os.read(sys.stdin.fileno(), 64).decode("ascii", "replace"):

@@ -29,6 +29,7 @@ from omniperception.hardware.livox import (
 )
 from omniperception.hardware.machine import Request
 from omniperception.hardware.messages import LOW_CMD, LOW_STATE, MOTOR_ON, crc, sealed
+from omniperception.hardware.switcher import SwitcherService
 from omniperception.lidar import Lidar
 
 STEP_S, CONTROL_STEPS = 0.002, 10
@@ -55,6 +56,7 @@ class SimulatedConfig:
             stand and walk when the robot is ready; None: none are sent.
         hold_last: whether the motors go on with the last command when none comes; otherwise they are limp after 0.1 s.
             What a Go2 does is not known here: the first is the worst case.
+        sport_mode: name of a controller of its own, for which it ignores commands until it is released; empty: none.
         seconds: simulated time; None: until it is ended.
     """
 
@@ -66,6 +68,7 @@ class SimulatedConfig:
     point_to: tuple[str, int] | None = ("127.0.0.1", 56301)
     steer_to: int | None = None
     hold_last: bool = True
+    sport_mode: str = ""
     seconds: float | None = None
 
 
@@ -229,6 +232,7 @@ class SimulatedRobot:
         self.scanner = Scanner(env, config) if env.sensing is not None else None
         self._commands = network.reader(LOW_CMD_TOPIC, LOW_CMD, 2)
         self._states = network.writer(LOW_STATE_TOPIC, LOW_STATE)
+        self._switcher = SwitcherService(network, config.sport_mode)
         self._operator = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.outcome, self.time_s = Outcome(), 0.0
         self.up_since: float | None = None
@@ -265,6 +269,7 @@ class SimulatedRobot:
         if self.scanner is not None and self._ticks % SCAN_STEPS == 0:
             self.scanner.scan(self.time_s)
         if self._ticks % CONTROL_STEPS == 0:
+            self._switcher.answer()
             self._command()
 
     def _receive(self) -> None:
@@ -277,6 +282,8 @@ class SimulatedRobot:
                 continue
             if self._config.crc and crc(command) != command["crc"]:
                 self.outcome.refused += 1
+                continue
+            if self._switcher.controller:
                 continue
             self._last_command = self.time_s
             self.motors.follow(command)

@@ -12,14 +12,15 @@ from omniperception.hardware.operator import make_operator
 
 RANGES = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_z": [-1.5, 1.5]}
 CENTRED = Remote(frozenset(), 0.0, 0.0, 0.0, 0.0)
+START = np.zeros(3)
 
 
 def test_sticks_reach_the_ends_of_the_trained_ranges():
     """Left stick up is ahead, left is left; right stick left turns left."""
     sticks = make_operator("remote", RANGES)
-    assert sticks.poll(0.0, Remote(frozenset(), -1.0, -0.5, 0.0, 1.0))[0].tolist() == [1.0, 0.4, 0.75]
-    assert sticks.poll(0.0, Remote(frozenset(), 1.0, 1.0, 0.0, -0.5))[0].tolist() == [-0.25, -0.4, -1.5]
-    assert sticks.poll(0.0, Remote(frozenset(), 0.04, -0.04, 0.0, 0.04))[0].tolist() == [0.0, 0.0, 0.0]
+    assert sticks.poll(0.0, Remote(frozenset(), -1.0, -0.5, 0.0, 1.0), START)[0].tolist() == [1.0, 0.4, 0.75]
+    assert sticks.poll(0.0, Remote(frozenset(), 1.0, 1.0, 0.0, -0.5), START)[0].tolist() == [-0.25, -0.4, -1.5]
+    assert sticks.poll(0.0, Remote(frozenset(), 0.04, -0.04, 0.0, 0.04), START)[0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_datagrams_hold_for_half_a_second():
@@ -32,15 +33,27 @@ def test_datagrams_hold_for_half_a_second():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         for text in ("stand", "0.5 0.1 -0.2", "nan 0 0", "1 2", "hop", "walk", "stop"):
             other.sendto(text.encode(), ("127.0.0.1", port))
-    command, asked = operator.poll(10.0, CENTRED)
+    command, asked = operator.poll(10.0, CENTRED, START)
     assert command.tolist() == [0.5, 0.1, -0.2] and asked == [Request.STAND, Request.WALK, Request.STOP]
-    assert operator.poll(10.4, CENTRED)[0].tolist() == [0.5, 0.1, -0.2]
-    assert operator.poll(10.6, CENTRED) == (pytest.approx(np.zeros(3)), [])
+    assert operator.poll(10.4, CENTRED, START)[0].tolist() == [0.5, 0.1, -0.2]
+    assert operator.poll(10.6, CENTRED, START) == (pytest.approx(np.zeros(3)), [])
     operator.close()
 
 
 def test_one_command_for_good_and_wrong_words():
-    assert make_operator("0.5,0,-0.1", RANGES).poll(0.0, CENTRED)[0].tolist() == [0.5, 0.0, -0.1]
-    for text in ("joystick", "1,2", "udp:x"):
-        with pytest.raises(DeployError, match=f"steer={text}: remote, keyboard, udp:PORT or V_X,V_Y,YAW_RATE"):
+    assert make_operator("0.5,0,-0.1", RANGES).poll(0.0, CENTRED, START)[0].tolist() == [0.5, 0.0, -0.1]
+    expected = r"remote, keyboard, udp:PORT, goal:X,Y\[,SPEED\] or V_X,V_Y,YAW_RATE"
+    for text in ("joystick", "1,2", "udp:x", "goal:1", "goal:1,x", "goal:1,2,-1", "nan,0,0"):
+        with pytest.raises(DeployError, match=f"steer={text}: {expected}"):
             make_operator(text, RANGES)
+
+
+def test_a_goal_is_faced_and_stayed_at():
+    """Five metres to the left: half the speed aside, within the trained ranges; 0.5 m away half of that."""
+    goal = make_operator("goal:0,5,0.3", RANGES)
+    command, asked = goal.poll(0.0, CENTRED, START)
+    assert command == pytest.approx([0.0, 0.3, 1.5]) and not asked
+    assert goal.poll(0.0, CENTRED, np.array([0.0, 4.5, np.pi / 2]))[0] == pytest.approx([0.15, 0.0, 0.0])
+    assert goal.poll(0.0, CENTRED, np.array([0.1, 5.1, 2.0]))[0].tolist() == [0.0, 0.0, 0.0]
+    behind = make_operator("goal:-5,0,2.0", RANGES).poll(0.0, CENTRED, np.array([0.0, 0.0, 0.0]))[0]
+    assert behind[0] == -0.5 and abs(behind[2]) == 1.5
