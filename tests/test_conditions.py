@@ -10,6 +10,7 @@ from omniperception.env.mdp.randomization import Condition, RandomizationConfig
 
 NOTHING = {
     "lidar_device": False,
+    "lidar_measured": False,
     "lidar_mask": None,
     "lidar_distance": None,
     "lidar_gaussian": None,

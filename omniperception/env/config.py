@@ -92,6 +92,7 @@ class EnvConfig:
                 "randomization.lidar_device needs a sensor whose maker states its noise, but lidar.device is null; name"
                 " the device, or use randomization=lidar"
             )
+        self._check_measured_noise()
         if self.lidar is None:
             if self.sampler is not None:
                 raise ValueError(
@@ -103,6 +104,21 @@ class EnvConfig:
                     f"rewards or observations require {', '.join(unmet)} from the LiDAR, but lidar=none;"
                     " use lidar=mid360 or rewards=walk observations=walk"
                 )
+
+    def _check_measured_noise(self) -> None:
+        if not self.randomization.lidar_measured or self.lidar is None:
+            return
+        if self.randomization.lidar_device:
+            raise ValueError(
+                "randomization.lidar_device and lidar_measured are both true, two models of the same errors; set one of"
+                " them to false"
+            )
+        if self.lidar.device is None or not DEVICES[self.lidar.device].measured:
+            known = ", ".join(name for name, spec in DEVICES.items() if spec.measured)
+            raise ValueError(
+                f"randomization.lidar_measured needs a sensor of which there is a recording ({known}), but lidar.device"
+                f" is {self.lidar.device or 'null'}; use randomization=device"
+            )
 
     def requirements(self) -> frozenset[str]:
         """Sensors that must exist before the world is compiled, see `state.requires`."""
@@ -121,9 +137,12 @@ class EnvConfig:
 
     @property
     def lidar_noise(self) -> tuple[Noise, ...]:
-        """The device's own noise, where asked for, and the randomization's."""
-        device = self.lidar.device if self.lidar is not None else None
-        own = DEVICES[device].noise() if self.randomization.lidar_device and device is not None else ()
+        """The device's noise, stated or measured, where asked for, and the randomization's."""
+        own: tuple[Noise, ...] = ()
+        if self.lidar is not None and self.lidar.device is not None:
+            device = DEVICES[self.lidar.device]
+            own = device.noise() if self.randomization.lidar_device else own
+            own = device.measured if self.randomization.lidar_measured else own
         return (*own, *self.randomization.noise)
 
     @property

@@ -15,6 +15,7 @@ from .noise import (
     MaskNoise,
     MixedPixels,
     Noise,
+    TabulatedNoise,
     max_deviation,
 )
 from .patterns import (
@@ -102,6 +103,7 @@ __all__ = [
     "Selection",
     "Shape",
     "ShapeKind",
+    "TabulatedNoise",
     "TriangleMesh",
     "airy",
     "avia",

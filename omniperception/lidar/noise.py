@@ -1,16 +1,18 @@
 """Noise of the LiDAR: parameters of each model.
 
 They act in this order, whatever the order in which they are given: angular jitter turns the ray before it is cast;
-mixed pixels, Gaussian and distance noise change the distance of a hit, which then ends at the maximum range and is no
-point below the minimum range; the mask replaces it; dropout loses it. No model turns a miss into a hit; a ray that
-jitter turns may hit what the nominal one would have missed.
+mixed pixels, Gaussian, tabulated and distance noise change the distance of a hit, which then ends at the maximum range
+and is no point below the minimum range; the mask replaces it; tabulated and plain dropout lose it. No model turns a
+miss into a hit; a ray that jitter turns may hit what the nominal one would have missed.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 MAX_SIGMAS = 5.0
 """Jitter ends here, so that a ray stays within known bounds; exp(-12.5), or 4 in a million, would go beyond."""
@@ -103,6 +105,49 @@ class Dropout:
         _require_amount("dropout.ratio_per_metre", self.ratio_per_metre)
 
 
+TABLE_BINS = 8
+"""Most ranges that a `TabulatedNoise` tells apart."""
+
+
+@dataclass(frozen=True)
+class TabulatedNoise:
+    """What recordings of a device show, by range: normal noise, and the probability that a hit is lost.
+
+    It is constant from edge to edge. Outside of the edges there is no data: hits there are kept, with the maker's
+    noise.
+
+    Attributes:
+        edges: Limits of the ranges, ascending, metres, (n + 1).
+        sigma: Standard deviation of the distance, metres, (n).
+        dropout: Probability that a hit is lost, (n).
+        sigma_elsewhere: Standard deviation outside of the edges, metres.
+    """
+
+    edges: tuple[float, ...]
+    sigma: tuple[float, ...]
+    dropout: tuple[float, ...]
+    sigma_elsewhere: float = 0.0
+
+    def __post_init__(self) -> None:
+        n = len(self.edges) - 1
+        if not 1 <= n <= TABLE_BINS or len(self.sigma) != n or len(self.dropout) != n:
+            raise ValueError(
+                f"lidar.noise.table has {len(self.edges)} edges, {len(self.sigma)} sigma and {len(self.dropout)}"
+                f" dropout; for n ranges (at most {TABLE_BINS}) they must be n + 1, n and n"
+            )
+        if not self.edges[0] >= 0.0 or any(a >= b for a, b in pairwise(self.edges)) or self.edges[-1] == math.inf:
+            raise ValueError(f"lidar.noise.table.edges={self.edges} must ascend from 0 or more, and be finite")
+        for sigma in (*self.sigma, self.sigma_elsewhere):
+            _require_amount("table.sigma", sigma)
+        for share in self.dropout:
+            _require_share("table.dropout", share)
+
+    def dropout_at(self, distance: float) -> float:
+        """Probability that a hit at a distance (m) is lost."""
+        inside = self.edges[0] <= distance < self.edges[-1]
+        return self.dropout[bisect_right(self.edges, distance) - 1] if inside else 0.0
+
+
 @dataclass(frozen=True)
 class MixedPixels:
     """A beam that hits two surfaces at a depth edge measures a distance between them.
@@ -134,7 +179,7 @@ class MixedPixels:
         _require_share("mixed.foreground", self.foreground)
 
 
-Noise = MaskNoise | DistanceNoise | GaussianNoise | AngularJitter | Dropout | MixedPixels
+Noise = MaskNoise | DistanceNoise | GaussianNoise | AngularJitter | Dropout | TabulatedNoise | MixedPixels
 
 NAMES = {
     MaskNoise: "mask",
@@ -142,6 +187,7 @@ NAMES = {
     GaussianNoise: "gaussian",
     AngularJitter: "jitter",
     Dropout: "dropout",
+    TabulatedNoise: "table",
     MixedPixels: "mixed",
 }
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import mid360_fit, real_scans
+from benchmarks import mid360_fit, mid360_misses, real_scans
 from omniperception.lidar import (
     DEVICES,
     GaussianNoise,
@@ -56,6 +56,27 @@ def test_the_makers_table_does_not_fit_a_device_that_turns_the_other_way(frame_f
     shots = mid360_fit.read_shots(frame_file).every(5)
     motion = mid360_fit.start_phases(mid360_fit.TABLE, shots)
     assert np.median(mid360_fit.angles(motion, shots)) > 20.0
+
+
+def test_misses_are_told_by_what_surrounds_them():
+    """A wall 1.1 m ahead of a known scan; every second shot of a laser lost below 8 degrees, none above."""
+    motion, rows = MEASURED, 20_000
+    unit = mid360_model(motion).directions_s[:rows].numpy().astype(float)
+    distance = 1.1 / np.maximum(unit[:, 0], 1e-6)
+    xyz = np.where((distance < 4.0)[:, None], unit * distance[:, None], 0.0)
+    shot, laser = np.arange(rows) // 4, np.arange(rows) % 4
+    lost = (unit[:, 2] < math.sin(math.radians(8.0))) & ((shot + laser) % 2 == 0)
+    xyz[lost] = 0.0
+    rays = mid360_misses.look_around(xyz, (), motion)
+    inside = rays.smooth & (distance < 3.0)
+    np.testing.assert_allclose(rays.around_m[inside], distance[inside], rtol=0.05)
+    np.testing.assert_allclose(rays.incidence_deg[inside], np.degrees(np.arccos(unit[inside, 0])), atol=0.1)
+    by_elevation = [row for row in mid360_misses.by_angle(rays) if row["of"] == "elevation"]
+    shares = {row["from, deg"]: row["0.7 to 1.5 m: misses, %"] for row in by_elevation}
+    assert shares[-2.0] == pytest.approx(50.0, abs=3.0) and shares[18.0] == 0.0
+    low = next(row for row in mid360_misses.by_range(rays) if row["range from, m"] == 1.0)
+    assert low["of misses: laser's shot before missed, %"] == 0.0
+    assert low["shot before that missed, %"] == pytest.approx(100.0, abs=3.0)
 
 
 @pytest.fixture(scope="module")

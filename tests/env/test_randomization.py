@@ -274,6 +274,24 @@ def test_noise_of_a_sensor_without_a_maker_is_refused(make_config):
         make_config("randomization=device", "lidar=custom")
 
 
+def test_measured_noise_reaches_the_lidar(make_config):
+    (table,) = make_config("randomization=lidar_measured", "lidar=mid360").env.lidar_noise
+    assert table.dropout_at(0.6) == 0.53 and table.dropout_at(3.0) < 0.01 and table.dropout_at(5.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("lidar=avia",), "needs a sensor of which there is a recording .*but lidar.device is avia"),
+        (("lidar=custom",), "but lidar.device is null; use randomization=device"),
+        (("lidar=mid360", "randomization.lidar_device=true"), "both true"),
+    ],
+)
+def test_measured_noise_needs_a_recording(make_config, overrides, message):
+    with pytest.raises(ValueError, match=message):
+        make_config("randomization=lidar_measured", *overrides)
+
+
 def test_the_critic_sees_what_was_drawn(make_env):
     """As the model that the physics has now tells, and mirrored as bodies are."""
     env = make_env("experiment=gait", "terrain=flat", "randomization=paper", num_envs=6)

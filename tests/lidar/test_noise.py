@@ -17,6 +17,7 @@ from omniperception.lidar import (
     RayScene,
     Shape,
     ShapeKind,
+    TabulatedNoise,
     grid,
     mid360,
 )
@@ -104,6 +105,34 @@ def test_dropout_loses_its_share_of_the_hits(pattern, ratio, per_metre):
     assert lost == pytest.approx(expected, abs=4.0 * math.sqrt(expected * (1.0 - expected) / 20_000) + 1e-9)
     kept = frame.ranges < math.inf
     assert torch.equal(frame.ranges[kept], frame.true_ranges[kept])
+
+
+TABLE = TabulatedNoise((0.5, 1.0, 4.0), (0.01, 0.03), (0.6, 0.2), sigma_elsewhere=0.002)
+
+
+@pytest.mark.parametrize(
+    ("radius", "sigma", "lost"), [(0.4, 0.002, 0.0), (0.7, 0.01, 0.6), (2.0, 0.03, 0.2), (5.0, 0.002, 0.0)]
+)
+def test_tabulated_noise_is_that_of_each_range(pattern, radius, sigma, lost):
+    frame = make(pattern, TABLE, radius=radius).cast(NOW)
+    kept = frame.ranges < math.inf
+    assert (~kept).float().mean() == pytest.approx(lost, abs=4.0 * math.sqrt(lost * (1.0 - lost) / 20_000) + 1e-9)
+    error = (frame.ranges.double() - frame.true_ranges.double())[kept] / sigma
+    assert kolmogorov(error, normal_cdf) < 1.95  # whether a hit is lost says nothing of its error
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (((0.5, 1.0), (0.01, 0.02), (0.1,)), "2 edges, 2 sigma and 1 dropout"),
+        (((1.0, 0.5), (0.01,), (0.1,)), "must ascend"),
+        (((0.5, 1.0), (0.01,), (1.1,)), r"table.dropout=1.1 must be in 0..1"),
+        ((tuple(range(10)), (0.0,) * 9, (0.0,) * 9), "at most 8"),
+    ],
+)
+def test_a_table_that_cannot_be_is_refused(table, message):
+    with pytest.raises(ValueError, match=message):
+        TabulatedNoise(*table)
 
 
 def test_jitter_turns_the_ray_by_a_normal_variable_along_each_axis():

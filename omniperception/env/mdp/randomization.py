@@ -121,6 +121,7 @@ class RandomizationConfig:
 
     Attributes:
         lidar_device: whether ranges and directions have the noise that the maker of the LiDAR in use states.
+        lidar_measured: whether it has what recordings of the LiDAR in use show, within the ranges that they cover.
         lidar_mask: points replaced by short distances.
         lidar_distance: multiplicative noise of the measured distances.
         lidar_gaussian: normal noise of the measured distances.
@@ -154,6 +155,7 @@ class RandomizationConfig:
     """
 
     lidar_device: bool = False
+    lidar_measured: bool = False
     lidar_mask: MaskNoise | None = None
     lidar_distance: DistanceNoise | None = None
     lidar_gaussian: GaussianNoise | None = None
@@ -211,7 +213,7 @@ class RandomizationConfig:
 
     @property
     def noise(self) -> tuple[Noise, ...]:
-        """The LiDAR noise models, but for the device's own."""
+        """The LiDAR noise models, but for those of the device."""
         models = (getattr(self, item.name) for item in fields(self) if item.name.startswith("lidar_"))
         return tuple(model for model in models if not isinstance(model, bool | None))
 

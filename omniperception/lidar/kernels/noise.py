@@ -4,17 +4,30 @@ The random numbers are a function of seed, environment, frame, ray and model: no
 """
 
 import math
+from collections.abc import Sequence
 from functools import cache
 
 import warp as wp
 
-from ..noise import MAX_SIGMAS, AngularJitter, DistanceNoise, Dropout, GaussianNoise, MixedPixels, Noise
+from ..noise import (
+    MAX_SIGMAS,
+    TABLE_BINS,
+    AngularJitter,
+    DistanceNoise,
+    Dropout,
+    GaussianNoise,
+    MixedPixels,
+    Noise,
+    TabulatedNoise,
+)
 from .geometry import INF, PI
 
 wp.set_module_options({"enable_backward": False})
 
-JITTER, GAUSSIAN, DISTANCE, DROPOUT, MASK = (wp.constant(k) for k in range(5))
-MODELS = frozenset(("jitter", "mixed", "gaussian", "distance", "dropout", "mask"))
+JITTER, GAUSSIAN, DISTANCE, DROPOUT, MASK, TABLE = (wp.constant(k) for k in range(6))
+MODELS = frozenset(("jitter", "mixed", "gaussian", "distance", "dropout", "table", "mask"))
+BINS = wp.constant(TABLE_BINS)
+Bins = wp.types.vector(length=TABLE_BINS, dtype=wp.float32)
 GOLDEN_ANGLE = wp.constant(wp.float32(2.399963229728653))
 
 
@@ -35,6 +48,11 @@ class NoiseParameters:
     distance_ratio: float
     dropout_ratio: float
     dropout_ratio_per_metre: float
+    table_start: float
+    table_ends: Bins  # bins that are not used end where the last one does
+    table_sigma: Bins
+    table_dropout: Bins
+    table_sigma_elsewhere: float
     mask_ratio: float
     mask_low: float
     mask_high: float
@@ -57,9 +75,17 @@ def noise_parameters(named: dict[str, Noise], seed: int, min_range: float, max_r
             parameters.distance_ratio = model.ratio
         elif isinstance(model, Dropout):
             parameters.dropout_ratio, parameters.dropout_ratio_per_metre = model.ratio, model.ratio_per_metre
+        elif isinstance(model, TabulatedNoise):
+            parameters.table_start, parameters.table_sigma_elsewhere = model.edges[0], model.sigma_elsewhere
+            parameters.table_ends = _bins(model.edges[1:], model.edges[-1])
+            parameters.table_sigma, parameters.table_dropout = _bins(model.sigma), _bins(model.dropout)
         else:
             parameters.mask_ratio, parameters.mask_low, parameters.mask_high = model.ratio, model.low, model.high
     return parameters
+
+
+def _bins(values: Sequence[float], fill: float = 0.0) -> wp.types.vector:
+    return Bins(*values, *[fill] * (TABLE_BINS - len(values)))
 
 
 @wp.func
@@ -108,10 +134,22 @@ def mixed(noise: NoiseParameters, first: float, second: float):
     return near + (1.0 - noise.mixed_weight) * gap
 
 
+@wp.func
+def table_bin(noise: NoiseParameters, distance: float):
+    """The range of the table in which a distance lies, -1 outside of all."""
+    found = -1
+    if distance >= noise.table_start:
+        for k in range(BINS):
+            if found < 0 and distance < noise.table_ends[k]:
+                found = k
+    return found
+
+
 @cache
 def disturb_function(models: frozenset[str]) -> wp.Function:
     """(noise, distance, true distance, key) -> what is measured of a hit; mixed pixels are in ``distance`` already."""
     has_gaussian, has_distance = "gaussian" in models, "distance" in models
+    has_table = "table" in models
     has_dropout, has_mask = "dropout" in models, "mask" in models
 
     @wp.func
@@ -121,6 +159,16 @@ def disturb_function(models: frozenset[str]) -> wp.Function:
             gaussian = child_key(key, GAUSSIAN)
             sigma = noise.gaussian_sigma + noise.gaussian_sigma_per_metre * true_distance
             measured += sigma * wp.sqrt(-2.0 * wp.log(1.0 - wp.randf(gaussian))) * wp.cos(2.0 * PI * wp.randf(gaussian))
+        if wp.static(has_table):
+            table = child_key(key, TABLE)
+            at = table_bin(noise, true_distance)
+            table_sigma = noise.table_sigma_elsewhere
+            lost = 0.0
+            if at >= 0:
+                table_sigma = noise.table_sigma[at]
+                lost = noise.table_dropout[at]
+            measured += table_sigma * wp.sqrt(-2.0 * wp.log(1.0 - wp.randf(table))) * wp.cos(2.0 * PI * wp.randf(table))
+            is_lost = wp.randf(table) < lost
         if wp.static(has_distance):
             uniform = child_key(key, DISTANCE)
             measured *= 1.0 + noise.distance_ratio * (2.0 * wp.randf(uniform) - 1.0)
@@ -131,6 +179,8 @@ def disturb_function(models: frozenset[str]) -> wp.Function:
             mask = child_key(key, MASK)
             if wp.randf(mask) < noise.mask_ratio:
                 measured = noise.mask_low + (noise.mask_high - noise.mask_low) * wp.randf(mask)
+        if wp.static(has_table):
+            measured = wp.where(is_lost, INF, measured)
         if wp.static(has_dropout):
             dropout = child_key(key, DROPOUT)
             if wp.randf(dropout) < noise.dropout_ratio + noise.dropout_ratio_per_metre * true_distance:
