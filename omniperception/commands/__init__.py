@@ -16,6 +16,8 @@ COMMANDS = {
     "export": "exports a policy for a robot or another simulator",
     "robot": "runs an exported policy on a Go2, or on a simulated one",
     "robot-sim": "simulates a Go2 and its LiDAR on the robot's own wire",
+    "robot-trials": "tries a policy over the wire in real time, with and without faults; tables",
+    "replay-bag": "runs an exported policy on a recording or a ROS 2 bag, open loop, and draws it",
     "publish": "makes a small run directory, fit for a repository",
     "scan": "draws what a LiDAR sees",
     "robot-new": "writes a preset for a robot from its MJCF or URDF, and says what it guessed",

@@ -44,6 +44,8 @@ class Arguments:
     sport_mode: str = argument(
         "check", "the robot's own controller: refuse while it runs, end it, or do not ask", choices=CHOICES
     )
+    record: Path | None = argument(None, "file ending in .mcap, of state, clouds and what the policy did; null: none")
+    report: Path | None = argument(None, "file ending in .json, of what was measured; null: none")
     seconds: float | None = argument(None, "how long; null: until it is interrupted", positive=True)
 
 
@@ -64,6 +66,8 @@ def main(arguments: Arguments) -> None:
         steer=arguments.steer,
         check_crc=arguments.crc,
         sport_mode=arguments.sport_mode,
+        record=arguments.record,
+        report=arguments.report,
         seconds=arguments.seconds,
     )
     print(run(config))

@@ -15,11 +15,13 @@ wire has its own.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from omniperception import build, config
 from omniperception.cli import Command, argument, trust
 from omniperception.deploy.description import DeployError
 from omniperception.env.env import OmniEnv
+from omniperception.hardware.faults import FAULTS
 from omniperception.hardware.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
 
 
@@ -36,6 +38,9 @@ class Arguments:
     steer_to: int | None = argument(None, "UDP port that the world's commands are sent to; null: none are")
     hold_last: bool = argument(True, "whether motors go on with the last command when none comes")
     sport_mode: str = argument("", "name of a controller of its own that runs until it is released; empty: none")
+    fault: str = argument("", "fault of the wire a second after it has begun to walk", choices=("", *FAULTS))
+    fault_s: float = argument(2.0, "how long the fault lasts", positive=True)
+    report: Path | None = argument(None, "file ending in .json, of what became of the robot; null: none")
     seconds: float | None = argument(None, "simulated time; null: until the goal or an interrupt", positive=True)
     trust: tuple[str, ...] = trust()
 
@@ -54,6 +59,9 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         steer_to=arguments.steer_to,
         hold_last=arguments.hold_last,
         sport_mode=arguments.sport_mode,
+        fault=arguments.fault,
+        fault_s=arguments.fault_s,
+        report=arguments.report,
         seconds=arguments.seconds,
     )
     print(run(env, wire))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from omniperception.deploy import DeployError, ExportedPolicy, RobotState, Safet
 from omniperception.deploy.description import Description
 from omniperception.deploy.go2 import MOTORS
 from omniperception.deploy.odometry import Odometry
+from omniperception.hardware.clouds import Frame, Points
 from omniperception.hardware.dds import LOW_STATE_TOPIC, Network
 from omniperception.hardware.guard import GuardConfig, Link, StateReader, start
 from omniperception.hardware.legs import base_velocity
@@ -22,6 +25,7 @@ from omniperception.hardware.lidar import Frames, LidarSource
 from omniperception.hardware.machine import MachineConfig, Mode, Request
 from omniperception.hardware.messages import LOW_STATE, remote
 from omniperception.hardware.operator import Goal, Operator, make_operator
+from omniperception.hardware.recording import Recorder, Step
 from omniperception.hardware.switcher import ensure_released
 
 
@@ -37,6 +41,8 @@ class RobotConfig:
         steer: see `operator.make_operator`.
         check_crc: whether states with another checksum than theirs are refused.
         sport_mode: what is done about the robot's own controller, see `switcher.ensure_released`.
+        record: .mcap file of a recording; None: none is made.
+        report: .json file of what was measured, for `robot-trials`; None: none is written.
         seconds: how long it runs; None: until it is ended.
     """
 
@@ -47,6 +53,8 @@ class RobotConfig:
     steer: str = "remote"
     check_crc: bool = True
     sport_mode: str = "check"
+    record: Path | None = None
+    report: Path | None = None
     seconds: float | None = None
 
 
@@ -55,23 +63,37 @@ class Report:
     """What a run of the policy's process has measured.
 
     Attributes:
-        steps: control steps.
-        late: of them, begun more than half a period after their time.
-        step_ms: (steps,) duration of each, ms.
+        begin_ms: (steps,) from when a step was due to when it began.
+        step_ms: (steps,) duration of each.
+        period_ms: of control.
+        frames: of the LiDAR, that were complete.
         counts: what the limits and the LiDAR have counted, by name.
     """
 
-    steps: int
-    late: int
+    begin_ms: np.ndarray
     step_ms: np.ndarray
+    period_ms: float
+    frames: int
     counts: dict[str, int]
 
+    @property
+    def late(self) -> int:
+        """Steps begun more than half a period after their time."""
+        return int((self.begin_ms > self.period_ms / 2).sum())
+
+    def write(self, path: Path) -> None:
+        """As JSON."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        parts = {"begin_ms": self.begin_ms.round(3).tolist(), "step_ms": self.step_ms.round(3).tolist()}
+        parts |= {"period_ms": self.period_ms, "frames": self.frames, "counts": self.counts}
+        path.write_text(json.dumps(parts))
+
     def __str__(self) -> str:
-        if not self.steps:
+        if not len(self.step_ms):
             return "no state has come from the robot"
         p50, p99 = np.percentile(self.step_ms, (50, 99))
         counts = ", ".join(f"{value} {name}" for name, value in self.counts.items() if value) or "nothing else to tell"
-        return f"{self.steps} steps, {self.late} late; p50 {p50:.2f} ms, p99 {p99:.2f} ms; {counts}"
+        return f"{len(self.step_ms)} steps, {self.late} late; p50 {p50:.2f} ms, p99 {p99:.2f} ms; {counts}"
 
 
 def motor_order(description: Description) -> np.ndarray:
@@ -105,6 +127,45 @@ def machine_config(description: Description) -> MachineConfig:
     )
 
 
+class States(Protocol):
+    """The robot's."""
+
+    def newest(self) -> np.ndarray | None:
+        """() LOW_STATE that has come since the call before; None: none has."""
+
+
+class FrameSource(Protocol):
+    """The LiDAR's, see `lidar.Frames`."""
+
+    received: list[Points]
+
+    def new(self) -> list[Frame]:
+        """Complete since the call before."""
+
+
+class GuardLink(Protocol):
+    """To the guard, see `guard.Link`."""
+
+    mode: Mode
+    reason: str
+
+    def poll(self) -> None: ...
+
+    def ask(self, request: Request) -> None: ...
+
+    def send_targets(self, targets: np.ndarray) -> None: ...
+
+
+class Listener(Protocol):
+    """Who takes down what happens, see `recording.Recorder`."""
+
+    def points(self, now: float, points: Points) -> None: ...
+
+    def step(self, step: Step) -> None: ...
+
+    def stop(self, now: float, why: str) -> None: ...
+
+
 class Control:
     """The loop of a policy's process, a step at a time.
 
@@ -113,10 +174,17 @@ class Control:
     """
 
     def __init__(
-        self, policy: ExportedPolicy, states: StateReader, frames: Frames | None, operator: Operator, link: Link
+        self,
+        policy: ExportedPolicy,
+        states: States,
+        frames: FrameSource | None,
+        operator: Operator,
+        link: GuardLink,
+        listener: Listener | None = None,
     ) -> None:
-        """Args: policy: to run; states, frames, operator: what it hears; link: to the guard."""
+        """Args: policy: to run; states, frames, operator: what it hears; link: to the guard; listener: takes down."""
         self.policy, self._states, self._frames, self._operator, self._link = policy, states, frames, operator, link
+        self._listener = listener
         self._motors = motor_order(policy.description)
         described = policy.description
         observed = {term.quantity for group in described.observations for term in group.terms}
@@ -136,6 +204,9 @@ class Control:
         newest = self._states.newest()
         self._state = newest if newest is not None else self._state
         frames = [] if self._frames is None else self._frames.new()
+        if self._listener is not None and self._frames is not None:
+            for received in self._frames.received:
+                self._listener.points(now, received)
         self._link.poll()
         if self._state is None:
             return False
@@ -149,19 +220,34 @@ class Control:
             if self._mode is Mode.POLICY:
                 self.policy.reset()
                 self._begin_odometry()
-        if self._link.mode is not Mode.POLICY:
-            command = np.zeros(3)
+        given = command if self._link.mode is Mode.POLICY else np.zeros(3)
+        points = self._points(frames, now)
+        targets = self._decide(self._robot_state(self._state), given, points, now)
+        if targets is not None:
+            self._link.send_targets(targets)
+        if self._listener is not None:
+            mode = f"{self._mode}: {self._link.reason}"
+            action = np.zeros(len(MOTORS))
+            action[self._motors] = self.policy.action
+            self._listener.step(Step(now, self._state, mode, command, points, targets, action))
+        return True
+
+    def _decide(
+        self, state: RobotState, command: np.ndarray, points: np.ndarray | None, now: float
+    ) -> np.ndarray | None:
+        """(12,) rad, in the motors' order; None: the policy stops, and the guard has been asked to damp."""
         try:
-            targets = self.policy.step(self._robot_state(self._state), command, self._points(frames, now))
+            targets = self.policy.step(state, command, points)
         except SafetyStop as stop:
             if self._mode is Mode.POLICY:
                 print(f"stop: {stop}", file=sys.stderr, flush=True)
                 self._link.ask(Request.DAMP)
-            return True
+                if self._listener is not None:
+                    self._listener.stop(now, str(stop))
+            return None
         in_order = np.zeros(len(MOTORS))
         in_order[self._motors] = targets
-        self._link.send_targets(in_order)
-        return True
+        return in_order
 
     def _points(self, frames: list, now: float) -> np.ndarray | None:
         """The newest frame as training saw it; a period without one is a frame lost."""
@@ -221,36 +307,43 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
             raise DeployError("this policy sees: points=none is for a blind one")
         frames = Frames(config.lidar, description.lidar, network)
     ensure_released(network, config.sport_mode)
+    recorder = None if config.record is None else Recorder(config.record, description)
     link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
-    control = Control(policy, states, frames, operator, link)
+    control = Control(policy, states, frames, operator, link, recorder)
     try:
-        times, late = _loop(control, link, description.control_period_s, config.seconds, should_end)
+        begins, times = _loop(control, link, description.control_period_s, config.seconds, should_end)
     finally:
         operator.close()
         if link.mode in (Mode.STANDING, Mode.STANDING_UP, Mode.POLICY):
             link.ask(Request.LIE)
+        if recorder is not None:
+            recorder.close()
     if link.is_closed and guard.poll() not in (None, 0):
         raise DeployError("the guard has ended; its message stands above")
     counts = {} if policy.safety is None else dict(policy.safety.counts)
     counts |= {"states refused": states.refused} | ({} if frames is None else frames.counts())
-    return Report(len(times), late, np.array(times), counts)
+    number = 0 if frames is None else frames.number
+    report = Report(np.array(begins), np.array(times), 1e3 * description.control_period_s, number, counts)
+    if config.report is not None:
+        report.write(config.report)
+    return report
 
 
 def _loop(
     control: Control, link: Link, period_s: float, seconds: float | None, should_end: Callable[[], bool]
-) -> tuple[list[float], int]:
-    """Durations of the steps in ms, and how many began late."""
+) -> tuple[list[float], list[float]]:
+    """How long after their time the steps began, and how long they took, ms."""
     begin = due = time.monotonic()
+    begins: list[float] = []
     times: list[float] = []
-    late = 0
     try:
         while not (link.is_closed or should_end() or (seconds is not None and due - begin >= seconds)):
             now = time.monotonic()
             if control.step(now):
-                late += now - due > period_s / 2
+                begins.append(1e3 * (now - due))
                 times.append(1e3 * (time.monotonic() - now))
             due = max(due + period_s, time.monotonic() - period_s)
             time.sleep(max(0.0, due - time.monotonic()))
     except KeyboardInterrupt:
         print("ended: the guard lays the robot down", file=sys.stderr)
-    return times, late
+    return begins, times

@@ -60,7 +60,12 @@ class Source(Protocol):
 
 
 class Frames:
-    """Frames of a sensor, cut to the policy's period."""
+    """Frames of a sensor, cut to the policy's period.
+
+    Attributes:
+        number: of frames so far.
+        received: points that the newest call of `new` has read, message by message, in the sensor's own frame.
+    """
 
     def __init__(self, source: LidarSource, lidar: Lidar, network: Network) -> None:
         """Args: source: of the points; lidar: that the policy was trained with; network: of a topic."""
@@ -69,12 +74,14 @@ class Frames:
         is_topic = source.kind in ("PointCloud2", "CustomMsg")
         self._source: Source = _Topic(source, network) if is_topic else _Packets(source)
         self._cutter, self._extrinsic = FrameCutter(lidar.period_s), source.extrinsic
+        self.received: list[Points] = []
+        self.number = 0
 
     def new(self) -> list[Frame]:
         """Frames that have become complete since the call before, oldest first, in the sensor's own frame."""
-        frames = []
-        for points in self._source.read():
-            frames += self._cutter.add(Points(self._extrinsic.undo(points.points), points.times_ns))
+        self.received = [Points(self._extrinsic.undo(p.points), p.times_ns) for p in self._source.read()]
+        frames = [frame for points in self.received for frame in self._cutter.add(points)]
+        self.number += len(frames)
         return frames
 
     def counts(self) -> dict[str, int]:

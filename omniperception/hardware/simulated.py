@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import math
 import socket
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,6 +17,7 @@ from omniperception.deploy.description import DeployError
 from omniperception.deploy.go2 import MOTORS
 from omniperception.env.env import OmniEnv
 from omniperception.hardware.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
+from omniperception.hardware.faults import Faults
 from omniperception.hardware.livox import (
     CONFIGURE,
     POINT_PORT,
@@ -57,6 +61,10 @@ class SimulatedConfig:
         hold_last: whether the motors go on with the last command when none comes; otherwise they are limp after 0.1 s.
             What a Go2 does is not known here: the first is the worst case.
         sport_mode: name of a controller of its own, for which it ignores commands until it is released; empty: none.
+        fault: of faults.FAULTS, one second after it has begun to walk; empty: none.
+        fault_s: how long the fault lasts.
+        after_s: simulated time from the fault's beginning to the end.
+        report: .json file of the outcome, for `robot-trials`; None: none is written.
         seconds: simulated time; None: until it is ended.
     """
 
@@ -69,6 +77,10 @@ class SimulatedConfig:
     steer_to: int | None = None
     hold_last: bool = True
     sport_mode: str = ""
+    fault: str = ""
+    fault_s: float = 2.0
+    after_s: float = 6.0
+    report: Path | None = None
     seconds: float | None = None
 
 
@@ -81,6 +93,9 @@ class Outcome:
         touched: whether it has touched an obstacle.
         fell: whether the base leant by more than 60 degrees.
         reached: whether it has reached the world's goal.
+        reached_s: how long after standing up; None: it has not.
+        height: of the base over the ground at the end, m; a robot that lies is below 0.15.
+        speed: of the base at the end, m/s.
         largest_tilt_deg: of the base.
         path_m: length of its way.
         lag_s: most that the simulation was behind real time.
@@ -92,6 +107,9 @@ class Outcome:
     touched: bool = False
     fell: bool = False
     reached: bool = False
+    reached_s: float | None = None
+    height: float = 0.0
+    speed: float = 0.0
     largest_tilt_deg: float = 0.0
     path_m: float = 0.0
     lag_s: float = 0.0
@@ -164,8 +182,8 @@ class Scanner:
             self._control.setblocking(False)
             self._sensor = Sensor(config.host, config.detection_port, "robot-sim")
 
-    def scan(self, time_s: float) -> None:
-        """Sends the packets of the points measured since the call before; time_s: now."""
+    def scan(self, time_s: float, faults: Faults) -> None:
+        """Sends the packets of the points measured since the call before; time_s: now; faults: on their way."""
         if self._control is not None:
             self._answer(self._control)
         self._sensing.place_bodies()
@@ -176,13 +194,14 @@ class Scanner:
         first_ns = round(1e9 * time_s) - self._period_ns - round(len(self._left) * self._period_ns / self._rays)
         points = np.concatenate((self._left, new))
         interval = POINTS_PER_PACKET * self._period_ns // self._rays
-        whole = len(points) // POINTS_PER_PACKET
+        whole, packets = len(points) // POINTS_PER_PACKET, []
         for k in range(whole):
             part = points[k * POINTS_PER_PACKET : (k + 1) * POINTS_PER_PACKET]
-            if self._to is not None:
-                packet = write_points(part, max(first_ns + k * interval, 0), self._number, interval)
-                self._socket.sendto(packet, self._to)
+            packets.append(write_points(part, max(first_ns + k * interval, 0), self._number, interval))
             self._number += 1
+        for packet in faults.packets(time_s, packets):
+            if self._to is not None:
+                self._socket.sendto(packet, self._to)
         self._left = points[whole * POINTS_PER_PACKET :]
 
     def _answer(self, control: socket.socket) -> None:
@@ -220,6 +239,7 @@ class SimulatedRobot:
         outcome: what has become of it.
         time_s: simulated.
         up_since: simulated time at which it stood up; None before.
+        faults: of the wire.
     """
 
     def __init__(self, env: OmniEnv, config: SimulatedConfig, network: Network) -> None:
@@ -236,6 +256,7 @@ class SimulatedRobot:
         self._operator = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.outcome, self.time_s = Outcome(), 0.0
         self.up_since: float | None = None
+        self.faults, self._walks_since = Faults(config.fault, config.fault_s), math.inf
         self._ticks, self._last_command = 0, -1.0
         self._path: tuple[torch.Tensor, torch.Tensor | None] | None = None
 
@@ -265,9 +286,11 @@ class SimulatedRobot:
         self.time_s = self._ticks * STEP_S
         env.state.invalidate()
         self._judge(float((sim.qpos[0, :2] - before).norm()))
-        self._states.write(LOW_STATE.to_cdr(self._low_state()))
+        state = self.faults.state(self.time_s, self._low_state())
+        if state is not None:
+            self._states.write(state)
         if self.scanner is not None and self._ticks % SCAN_STEPS == 0:
-            self.scanner.scan(self.time_s)
+            self.scanner.scan(self.time_s, self.faults)
         if self._ticks % CONTROL_STEPS == 0:
             self._switcher.answer()
             self._command()
@@ -320,6 +343,11 @@ class SimulatedRobot:
         outcome.largest_tilt_deg = max(outcome.largest_tilt_deg, tilt)
         outcome.fell |= tilt > 60.0
         outcome.touched |= bool(self._env.state.obstacle_contact[0])
+        outcome.height, outcome.speed = height, moved / STEP_S
+        if self.has_walked:
+            self._walks_since = min(self._walks_since, self.time_s)
+            if self.time_s >= self._walks_since + 1.0:
+                self.faults.begin(self.time_s)
 
     def _command(self) -> None:
         """Sends what the world commands, and asks the robot to stand up and walk."""
@@ -328,7 +356,8 @@ class SimulatedRobot:
         if self.up_since is not None:
             env.command.advance(CONTROL_STEPS * STEP_S, kinematics)
             reached = env.command.reached(kinematics)
-            self.outcome.reached |= bool(reached is not None and reached[0])
+            if reached is not None and reached[0] and not self.outcome.reached:
+                self.outcome.reached, self.outcome.reached_s = True, self.time_s - self.up_since
         if port is None:
             return
         words = " ".join(f"{value:.6f}" for value in env.command.value[0].tolist())
@@ -336,6 +365,12 @@ class SimulatedRobot:
         if self._ticks % (50 * CONTROL_STEPS) == 0 and (self.up_since is None or not self.has_walked):
             self._operator.sendto(asked.encode(), ("127.0.0.1", port))
         self._operator.sendto(words.encode(), ("127.0.0.1", port))
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a fault has been looked at for long enough."""
+        began = self.faults.begun_s
+        return began is not None and self.time_s >= began + self._config.after_s
 
     @property
     def has_walked(self) -> bool:
@@ -353,9 +388,12 @@ def run(env: OmniEnv, config: SimulatedConfig, should_end: Callable[[], bool] = 
     """Simulates in real time until the goal is reached, `seconds` have passed, or an interrupt."""
     robot = SimulatedRobot(env, config, Network(config.interface, config.domain))
     print("robot-sim: ready", flush=True)
-    begin = time.monotonic()
+    begin, walks = time.monotonic(), False
     try:
-        while not (should_end() or robot.outcome.reached):
+        while not (should_end() or robot.outcome.reached or robot.is_over):
+            if robot.has_walked and not walks:
+                walks = True
+                print("robot-sim: walks", flush=True)
             if config.seconds is not None and robot.time_s >= config.seconds:
                 break
             robot.step()
@@ -367,4 +405,7 @@ def run(env: OmniEnv, config: SimulatedConfig, should_end: Callable[[], bool] = 
         pass
     finally:
         robot.close()
+    if config.report is not None:
+        config.report.parent.mkdir(parents=True, exist_ok=True)
+        config.report.write_text(json.dumps(asdict(robot.outcome)))
     return robot.outcome

@@ -17,6 +17,7 @@ from omniperception.hardware.guard import Guard, GuardConfig, Link, StateReader
 from omniperception.hardware.lidar import Frames, LidarSource
 from omniperception.hardware.messages import LOW_STATE
 from omniperception.hardware.operator import make_operator
+from omniperception.hardware.recording import Recorder
 from omniperception.hardware.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, SimulatedRobot
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,7 +62,7 @@ class Lockstep:
         time_s: simulated.
     """
 
-    def __init__(self, exported, *overrides, run_dir=ROOT / "pretrained" / "avoider", **changes):
+    def __init__(self, exported, *overrides, run_dir=ROOT / "pretrained" / "avoider", record=None, **changes):
         steps = [f"sim.timestep={STEP_S}", f"sim.decimation={CONTROL_STEPS}", "sim.num_threads=1", "num_envs=1"]
         env = OmniEnv(build.assemble(config.load(run_dir, [*overrides, *steps])).env)
         self.network, description = Memory(), ExportedPolicy.load(exported).description
@@ -76,7 +77,8 @@ class Lockstep:
         frames = Frames(source, description.lidar, self.network)
         states = StateReader(self.network.reader(LOW_STATE_TOPIC, LOW_STATE), crc)
         operator = make_operator(f"udp:{self.operator}", description.command)
-        self.control = Control(ExportedPolicy.load(exported), states, frames, operator, self.link)
+        self.recorder = None if record is None else Recorder(record, description)
+        self.control = Control(ExportedPolicy.load(exported), states, frames, operator, self.link, self.recorder)
         self.policy_lives, self.guard_lives = True, True
 
     @property

@@ -1,5 +1,6 @@
 """A simulated robot, its guard and the published policy together, step by step; and processes over DDS."""
 
+import importlib.util
 import socket
 import struct
 import subprocess
@@ -14,14 +15,17 @@ pytest.importorskip("onnx", reason="extra export")
 
 from lockstep import ROOT, Lockstep, Memory
 
-from omniperception.deploy import DeployError, Description
+from omniperception.deploy import DeployError, Description, ExportedPolicy
 from omniperception.deploy.export import export
 from omniperception.hardware import guard
+from omniperception.hardware.bags import Topics, events
 from omniperception.hardware.clouds import read_custom_msg
 from omniperception.hardware.control import machine_config, motor_order
 from omniperception.hardware.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
+from omniperception.hardware.faults import FAULTS, SENSORS
 from omniperception.hardware.machine import Mode, Request
 from omniperception.hardware.messages import LOW_CMD, LOW_STATE, crc, low_cmd, sealed
+from omniperception.hardware.replay import draw, replay
 
 
 @pytest.fixture(scope="session")
@@ -62,14 +66,35 @@ def is_lying(robot):
     return z < 0.15 and robot.machine.mode in (Mode.DAMPING, Mode.STOPPED)
 
 
-def test_it_stands_up_and_walks_and_lies_down_when_the_policy_dies(lockstep):
-    robot = walking(lockstep("scenario=static"), 1.5)
+def test_it_stands_up_and_walks_and_lies_down_when_the_policy_dies(lockstep, exported, tmp_path):
+    """And what was recorded meanwhile gives the same targets again."""
+    record = tmp_path / "run.mcap" if importlib.util.find_spec("mcap_ros2") else None
+    robot = walking(lockstep("scenario=static", record=record), 1.5)
     assert speed(robot) > 0.4 and robot.control.policy.frame_count == 5
     robot.policy_lives = False
     robot.run(0.05)
     assert robot.machine.mode is Mode.LYING_DOWN and "the policy is silent" in robot.machine.reason
     robot.run(2.3)
     assert is_lying(robot) and robot.robot.outcome.largest_tilt_deg < 30 and not robot.robot.outcome.fell
+    if record is not None:
+        robot.recorder.close()
+        replayed_is_recorded(record, exported)
+
+
+def replayed_is_recorded(record, exported):
+    """Bit by bit, and it is drawn."""
+    policy = ExportedPolicy.load(exported)
+    replayed = replay(policy, events(record, Topics()))
+    assert len(replayed.steps) > 100 and len(replayed.frames()) > 10 and not replayed.stops
+    np.testing.assert_array_equal(replayed.targets(), replayed.recorded)
+    walked = [step for step in replayed.steps if step.mode.startswith("policy")]
+    assert len(walked) >= 75 and np.linalg.norm(walked[-1].command[:2]) > 0.5
+    draw(replayed, policy, record.with_suffix(".png"))
+    assert record.with_suffix(".png").stat().st_size > 20_000
+    blind = replay(ExportedPolicy.load(exported), (event for event in events(record, Topics()) if event.points is None))
+    assert (
+        not blind.frames() and blind.sight[-1] == "stopped" and np.nanmax(abs(blind.targets() - blind.recorded)) > 0.05
+    )
 
 
 def unplugged(robot):
@@ -145,6 +170,28 @@ def test_an_e_stop_while_it_walks(lockstep):
     assert robot.machine.mode is Mode.STOPPED and is_lying(robot)
     robot.run(1.5)  # the operator still asks for standing and walking
     assert robot.machine.mode is Mode.STOPPED and is_lying(robot)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_while_it_walks(lockstep, fault):
+    """Those of the LiDAR pass; those of the state end in damping; none ends in a fall."""
+    robot = lockstep("scenario=static", fault=fault)
+    robot.run(20.0, lambda: robot.robot.is_over)
+    assert robot.robot.is_over and not robot.robot.outcome.fell, robot.machine.reason
+    if fault in SENSORS:
+        assert robot.machine.mode is Mode.POLICY and robot.robot.outcome.height > 0.2
+    else:
+        assert is_lying(robot) and robot.robot.outcome.speed < 0.05
+
+
+@pytest.mark.slow
+def test_commands_are_ignored_while_its_own_controller_runs(lockstep):
+    robot = lockstep("scenario=static", sport_mode="normal").run(3.0)
+    assert robot.robot.up_since is None and robot.robot.outcome.commands > 1000
+    robot.robot._switcher.controller = ""
+    robot.link.ask(Request.DAMP)
+    assert robot.run(5.0).robot.up_since is not None
 
 
 @pytest.mark.slow

@@ -1,0 +1,256 @@
+"""Trials over the wire in real time: a simulated robot, a policy and its guard as processes, and tables of them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from omniperception.deploy.description import FILE, DeployError
+from omniperception.evaluation.statistics import wilson
+from omniperception.hardware.faults import FAULTS, SENSORS
+
+PROCESS_FAULTS = {
+    "kill": "the policy's process is killed (SIGKILL) while the robot walks",
+    "swap": "policy.json is another policy's",
+}
+NO_FAULT = "none"
+KNOWN_FAULTS = (NO_FAULT, *PROCESS_FAULTS, *FAULTS)
+_STANDING_UP_S = 10.0
+_FIRST_DOMAIN, _DOMAINS = 100, 100
+_LYING = 0.2
+"""m: a base that is lower lies; it stands above 0.25."""
+
+
+@dataclass(frozen=True)
+class TrialsConfig:
+    """What is tried.
+
+    Attributes:
+        run: run directory of the world's robot.
+        policy: folder of the exported policy.
+        out: folder of the results, a file for each trial.
+        scenarios: of conf/scenario.
+        faults: of KNOWN_FAULTS.
+        trials: of each scenario and fault.
+        limit_s: time from standing up within which the goal has to be reached.
+        overrides: of the run's configuration.
+        startup_s: longest that the simulation may take to start.
+    """
+
+    run: str
+    policy: Path
+    out: Path
+    scenarios: Sequence[str]
+    faults: Sequence[str]
+    trials: int
+    limit_s: float
+    overrides: Sequence[str] = ()
+    startup_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        unknown = [fault for fault in self.faults if fault not in KNOWN_FAULTS]
+        if unknown:
+            raise DeployError(f"faults={unknown[0]}: {', '.join(KNOWN_FAULTS)} were expected")
+        if not (self.policy / FILE).is_file():
+            raise DeployError(f"policy={self.policy}: a folder that export has written was expected")
+
+
+def run(config: TrialsConfig) -> None:
+    """Makes every trial whose file is not there yet."""
+    config.out.mkdir(parents=True, exist_ok=True)
+    number = 0
+    for scenario in config.scenarios:
+        for fault in config.faults:
+            for trial in range(config.trials):
+                number += 1
+                path = config.out / f"{scenario}-{fault}-{trial:03d}.json"
+                if path.exists():
+                    continue
+                result = _trial(config, scenario, fault, trial, _FIRST_DOMAIN + number % _DOMAINS)
+                path.write_text(json.dumps(result))
+                print(f"{path.name}: {_told(result)}", flush=True)
+
+
+def _trial(config: TrialsConfig, scenario: str, fault: str, trial: int, domain: int) -> dict:
+    """One trial's result."""
+    work = config.out / "work"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    policy = _swapped(config.policy, work / "policy") if fault == "swap" else config.policy
+    lidar, steer = _free_port(), _free_port()
+    words = [f"run={config.run}", f"scenario={scenario}", f"seed={1_000_000 + trial}", *config.overrides]
+    words += [f"domain={domain}", f"point_to={lidar}", f"steer_to={steer}", f"report={work / 'outcome.json'}"]
+    words += [f"seconds={config.limit_s + _STANDING_UP_S}", f"fault={fault if fault in FAULTS else ''}"]
+    simulation = _start("robot-sim", words, subprocess.PIPE)
+    robot: subprocess.Popen | None = None
+    try:
+        _await_line(simulation, "robot-sim: ready", config.startup_s)
+        wire = [f"policy={policy}", "points=packets", "host=127.0.0.1", f"point_port={lidar}", f"steer=udp:{steer}"]
+        robot = _start("robot", [*wire, f"domain={domain}", f"report={work / 'robot.json'}"], None)
+        if fault == "swap":
+            robot.wait(config.startup_s)
+            simulation.send_signal(signal.SIGINT)
+        elif fault == "kill" and _await_line(simulation, "robot-sim: walks", config.startup_s):
+            time.sleep(1.0)
+            robot.kill()
+        simulation.wait(config.startup_s + 10 * config.limit_s)
+    finally:
+        for process in (robot, simulation):
+            if process is not None and process.poll() is None:
+                process.send_signal(signal.SIGINT)
+                process.wait(60.0)
+    return {
+        "scenario": scenario,
+        "fault": fault,
+        "trial": trial,
+        "limit_s": config.limit_s,
+        "outcome": _read(work / "outcome.json"),
+        "robot": _read(work / "robot.json"),
+        "robot_exit": None if robot is None else robot.returncode,
+    }
+
+
+def _swapped(policy: Path, folder: Path) -> Path:
+    """A copy of an exported policy whose description is not the network's: another scale of actions."""
+    shutil.copytree(policy, folder)
+    described = json.loads((folder / FILE).read_text())
+    described["joints"]["action_scale"] = 1.0
+    (folder / FILE).write_text(json.dumps(described))
+    return folder
+
+
+def _start(command: str, words: list[str], stdout: int | None) -> subprocess.Popen:
+    """A command as a process that an interrupt ends, also where this one was started in the background."""
+
+    def interruptible() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    words = [sys.executable, "-m", "omniperception", command, *words]
+    return subprocess.Popen(words, stdout=stdout, text=True, preexec_fn=interruptible)
+
+
+def _await_line(process: subprocess.Popen, line: str, timeout_s: float) -> bool:
+    """Whether a process has said a line before it ended.
+
+    Raises:
+        DeployError: it ended with an error, or has not said it in time.
+    """
+    assert process.stdout is not None
+    end = time.monotonic() + timeout_s
+    for said in process.stdout:
+        if said.strip() == line:
+            return True
+        if time.monotonic() > end:
+            break
+    if process.wait(10.0) != 0:
+        raise DeployError(f"robot-sim has ended with exit code {process.returncode}; its message stands above")
+    return False
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+def _read(path: Path) -> dict | None:
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def _told(result: dict) -> str:
+    """A trial in words."""
+    outcome = result["outcome"] or {}
+    if not outcome.get("stood"):
+        return "refused before a motor moved" if result["robot_exit"] == 2 else "never stood up"
+    did = [name for name in ("reached", "touched", "fell") if outcome[name]]
+    did.append("lay at the end" if outcome["height"] < _LYING else f"{outcome['speed']:.1f} m/s at the end")
+    return ", ".join(did)
+
+
+def results(folder: Path) -> list[dict]:
+    """Of all trials in a folder.
+
+    Raises:
+        DeployError: there is none.
+    """
+    found = [json.loads(path.read_text()) for path in sorted(folder.glob("*-*-*.json"))]
+    if not found:
+        raise DeployError(f"{folder} holds no results of trials")
+    return found
+
+
+def table(trials: Sequence[dict]) -> str:
+    """Outcomes and timing, in Markdown; rates with 95 % Wilson intervals."""
+    head = "| scenario | fault | trials | untouched at the goal | touched | fell | lay at the end | refused |"
+    rows = [head, "|---" * 8 + "|"]
+    timing = [
+        "| scenario | fault | steps | p50 | p99 | begin late: p50 | p99 | late steps | frames | packets lost | lag |"
+    ]
+    timing.append("|---" * 11 + "|")
+    keys = dict.fromkeys((trial["scenario"], trial["fault"]) for trial in trials)
+    for scenario, fault in keys:
+        group = [trial for trial in trials if (trial["scenario"], trial["fault"]) == (scenario, fault)]
+        cells = [_share(happened, len(group)) for happened in _counts(group)]
+        rows.append(f"| {scenario} | {fault} | {len(group)} | {' | '.join(cells)} |")
+        timing.append(f"| {scenario} | {fault} | {' | '.join(_timing(group))} |")
+    notes = (
+        "Steps and their beginnings in ms; late: more than half a period; lag: most behind real time, ms (median, max)."
+    )
+    return "\n".join([*rows, "", *timing, "", notes])
+
+
+def _counts(group: Sequence[dict]) -> list[int]:
+    """How many arrived untouched, touched, fell, lay, were refused."""
+    outcomes = [trial["outcome"] or {} for trial in group]
+    stood = [(trial, o) for trial, o in zip(group, outcomes, strict=True) if o.get("stood")]
+    arrived = [o for trial, o in stood if _arrived(o, trial["limit_s"])]
+    lying = [o for _, o in stood if o["height"] < _LYING and not o["fell"]]
+    refused = [
+        trial for trial, o in zip(group, outcomes, strict=True) if not o.get("stood") and trial["robot_exit"] == 2
+    ]
+    return [len(arrived), _sum(stood, "touched"), _sum(stood, "fell"), len(lying), len(refused)]
+
+
+def _arrived(outcome: dict, limit_s: float) -> bool:
+    """At the goal in time, untouched and on its feet."""
+    in_time = outcome["reached_s"] is not None and outcome["reached_s"] <= limit_s
+    return in_time and not outcome["touched"] and not outcome["fell"]
+
+
+def _sum(stood: Iterable[tuple[dict, dict]], key: str) -> int:
+    return sum(bool(outcome[key]) for _, outcome in stood)
+
+
+def _share(count: int, trials: int) -> str:
+    low, high = wilson(count, trials)
+    return f"{count} ({100 * count / trials:.0f} % [{100 * low:.0f}, {100 * high:.0f}])"
+
+
+def _timing(group: Sequence[dict]) -> list[str]:
+    """Cells of the second table."""
+    reports = [trial["robot"] for trial in group if trial["robot"] is not None and trial["robot"]["step_ms"]]
+    lags = [1e3 * trial["outcome"]["lag_s"] for trial in group if trial["outcome"] is not None]
+    lag = f"{np.median(lags):.0f}, {max(lags):.0f}" if lags else "-"
+    if not reports:
+        return ["-"] * 8 + [lag]
+    steps = np.concatenate([report["step_ms"] for report in reports])
+    begins = np.concatenate([report["begin_ms"] for report in reports])
+    late = np.concatenate([np.array(report["begin_ms"]) > report["period_ms"] / 2 for report in reports])
+    lost = sum(report["counts"].get("packets lost", 0) for report in reports)
+    numbers = [*np.percentile(steps, (50, 99)), *np.percentile(begins, (50, 99))]
+    frames = sum(report["frames"] for report in reports)
+    share = f"{int(late.sum())} ({100 * late.mean():.1f} %)"
+    return [str(len(steps)), *(f"{number:.2f}" for number in numbers), share, str(frames), str(lost), lag]
+
+
+__all__ = ["KNOWN_FAULTS", "NO_FAULT", "PROCESS_FAULTS", "SENSORS", "TrialsConfig", "results", "run", "table"]
