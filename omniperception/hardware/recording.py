@@ -35,6 +35,8 @@ from omniperception.hardware.clouds import Points
 SECTORS = 36
 HEIGHTS = (-0.15, 0.5)
 """m above the base, between which a point counts as an obstacle of /policy/obstacles."""
+OWN = (0.5, 0.3)
+"""m ahead and aside, within which a point is the robot's own and none."""
 _SEPARATOR = "=" * 80 + "\n"
 _CHUNK_BYTES = 256 * 1024
 """A killed process loses as much as has not been written yet."""
@@ -138,7 +140,7 @@ def nearest_by_sector(
         mount_quat: likewise.
     """
     x, y, z = levelled(points[points.any(axis=1)], base_quat, mount_pos, mount_quat).T
-    inside = (z > HEIGHTS[0]) & (z < HEIGHTS[1])
+    inside = (z > HEIGHTS[0]) & (z < HEIGHTS[1]) & ((abs(x) > OWN[0]) | (abs(y) > OWN[1]))
     sectors = ((np.arctan2(y, x)[inside] + math.pi) * (SECTORS / (2 * math.pi))).astype(int) % SECTORS
     nearest = np.full(SECTORS, np.inf)
     np.minimum.at(nearest, sectors, np.hypot(x, y)[inside])

@@ -181,6 +181,7 @@ def draw(replayed: Replayed, policy: ExportedPolicy, path: Path) -> None:
     figure = new_figure(14.0, 11.0)
     grid = figure.add_gridspec(3, VIEWS, height_ratios=(1.3, 1.0, 1.3))
     frames = replayed.frames()
+    frames = [step for step in frames if step.mode.startswith(Mode.POLICY)] or frames
     chosen = np.unique(np.linspace(0, len(frames) - 1, VIEWS).astype(int)) if frames else np.zeros(0, int)
     for k in range(VIEWS):
         axes = figure.add_subplot(grid[0, k])
@@ -190,7 +191,7 @@ def draw(replayed: Replayed, policy: ExportedPolicy, path: Path) -> None:
             axes.set_axis_off()
     times = np.array([step.time_s for step in replayed.steps])
     _draw_commands(figure.add_subplot(grid[1, : VIEWS // 2]), times, replayed)
-    _draw_hits(figure.add_subplot(grid[1, VIEWS // 2 :]), frames, times, replayed)
+    _draw_hits(figure.add_subplot(grid[1, VIEWS // 2 :]), replayed.frames(), times, replayed)
     for k, joint in enumerate(("hip", "thigh", "calf")):
         axes = figure.add_subplot(grid[2, k])
         _draw_joint(axes, times, replayed, joint)
@@ -260,15 +261,15 @@ def _draw_joint(axes, times: np.ndarray, replayed: Replayed, joint: str) -> None
         axes.plot(times, targets[:, k], color=color, linewidth=1.0, label=f"{leg}, asked for")
         axes.plot(times, positions[:, k], color=color, linewidth=0.8, linestyle=":", label=f"{leg}, was")
     axes.set(title=f"{joint} joints, rad", xlabel="s")
-    axes.legend(loc="upper right", fontsize="x-small")
+    axes.legend(loc="upper right", fontsize="xx-small", ncols=2)
 
 
 def _draw_error(axes, times: np.ndarray, replayed: Replayed) -> None:
     off = abs(replayed.targets() - replayed.recorded)
     if np.isfinite(off).any():
         axes.plot(times, np.nan_to_num(off, nan=np.nan).max(1), color="tab:purple")
-        axes.set(title="largest difference to recorded targets, rad", xlabel="s")
+        axes.set(title="largest difference to\nrecorded targets, rad", xlabel="s")
     else:
         positions = np.array([step.state["motor_state"]["q"][:12] for step in replayed.steps])
         axes.plot(times, abs(replayed.targets() - positions).max(1), color="tab:purple")
-        axes.set(title="largest distance of a target from its joint, rad", xlabel="s")
+        axes.set(title="largest distance of a\ntarget from its joint, rad", xlabel="s")

@@ -104,7 +104,9 @@ def test_points_in_the_levelled_base():
     expected = [1.3 * cos + 0.1 * sin, 0.0, 0.1 * cos - 1.3 * sin]
     assert levelled(point, (sin, 0, 0.5, 0), **MOUNT)[0] == pytest.approx(expected)
     assert levelled(point, (half, 0, 0, half), **MOUNT)[0] == pytest.approx([1.3, 0.0, 0.1])
-    near = nearest_by_sector(np.array([[1.7, 0.0, 0.0], [0.7, 0.01, 0.1], [0.2, 0.0, -0.3]]), (1, 0, 0, 0), **MOUNT)
+    near = nearest_by_sector(
+        np.array([[1.7, 0.0, 0.0], [0.7, 0.01, 0.1], [0.2, 0.0, -0.3], [0.1, 0.1, 0.0]]), (1, 0, 0, 0), **MOUNT
+    )
     assert near[18] == pytest.approx(np.hypot(1.0, 0.01)) and near[17] == np.inf and np.isfinite(near).sum() == 1
 
 
