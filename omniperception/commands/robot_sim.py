@@ -37,8 +37,8 @@ class Arguments:
     detection_port: int | None = argument(None, "UDP port on which it answers to searches; null: none")
     steer_to: int | None = argument(None, "UDP port that the world's commands are sent to; null: none are")
     hold_last: bool = argument(True, "whether motors go on with the last command when none comes")
-    sport_mode: str = argument("", "name of a controller of its own that runs until it is released; empty: none")
-    fault: str = argument("", "fault of the wire a second after it has begun to walk", choices=("", *FAULTS))
+    sport_mode: str | None = argument(None, "name of a controller of its own, which runs until it is released")
+    fault: str | None = argument(None, "fault of the wire a second after it has begun to walk", choices=tuple(FAULTS))
     fault_s: float = argument(2.0, "how long the fault lasts", positive=True)
     report: Path | None = argument(None, "file ending in .json, of what became of the robot; null: none")
     seconds: float | None = argument(None, "simulated time; null: until the goal or an interrupt", positive=True)
@@ -58,8 +58,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         point_to=None if arguments.detection_port is not None else ("127.0.0.1", arguments.point_to),
         steer_to=arguments.steer_to,
         hold_last=arguments.hold_last,
-        sport_mode=arguments.sport_mode,
-        fault=arguments.fault,
+        sport_mode=arguments.sport_mode or "",
+        fault=arguments.fault or "",
         fault_s=arguments.fault_s,
         report=arguments.report,
         seconds=arguments.seconds,

@@ -90,7 +90,7 @@ def _trial(config: TrialsConfig, scenario: str, fault: str, trial: int, domain: 
     lidar, steer = _free_port(), _free_port()
     words = [f"run={config.run}", f"scenario={scenario}", f"seed={1_000_000 + trial}", *config.overrides]
     words += [f"domain={domain}", f"point_to={lidar}", f"steer_to={steer}", f"report={work / 'outcome.json'}"]
-    words += [f"seconds={config.limit_s + _STANDING_UP_S}", f"fault={fault if fault in FAULTS else ''}"]
+    words += [f"seconds={config.limit_s + _STANDING_UP_S}", *([f"fault={fault}"] if fault in FAULTS else [])]
     simulation = _start("robot-sim", words, subprocess.PIPE)
     robot: subprocess.Popen | None = None
     try:
