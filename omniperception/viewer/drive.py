@@ -52,6 +52,10 @@ class DrivenVelocity(_Driven, VelocityCommand):
 class DrivenGoal(_Driven, GoalCommand):
     """Commands to a goal until somebody drives; the goal stays."""
 
+    def follow(self, env_ids: torch.Tensor, route: torch.Tensor, kinematics: Kinematics) -> None:
+        super().follow(env_ids, route, kinematics)
+        self.take_over()
+
 
 class DrivenVelocityConfig(VelocityCommandConfig):
     """Settings of `DrivenVelocity`."""

@@ -349,7 +349,7 @@ class Lab:
 
     def _build_scene(self) -> None:
         scene, room = self.server.scene, self._room
-        scene.configure_default_lights()
+        scene.configure_default_lights(cast_shadow=False)  # much to ask of a browser without a graphics card
         self.server.initial_camera.position = (-4.5, -4.5, 4.5)
         self.server.initial_camera.look_at = (0.8, 0.0, 0.5)
         for k, shape in enumerate(room.scene.shapes):
@@ -358,7 +358,7 @@ class Lab:
                 continue
             colour = room.colours[shape.class_id]
             parent = f"/body_{shape.body}" if shape.body >= 0 else "/room"
-            handle = scene.add_mesh_simple(
+            scene.add_mesh_simple(
                 f"{parent}/shape_{k}",
                 np.asarray(mesh.vertices),
                 np.asarray(mesh.faces),
@@ -368,7 +368,6 @@ class Lab:
                 flat_shading=True,
                 opacity=0.35 if shape.body < 0 else None,
             )
-            handle.receive_shadow = False
         moving = sorted({shape.body for shape in room.scene.shapes if shape.body >= 0})
         self._bodies = [(body, scene.add_frame(f"/body_{body}", show_axes=False)) for body in moving]
         self._points = scene.add_point_cloud(

@@ -125,6 +125,7 @@ class Panels:
         for name in SHOWN:
             box = gui.add_checkbox(name, name in stage.shows)
             self._on(box, partial(self._show, name))
+        self._on(gui.add_checkbox("shadows", False, hint="for browsers with a graphics card"), stage.cast_shadows)
         colour = gui.add_dropdown("points coloured by", POINT_COLOURS, initial_value=stage.points_by)
         self._on(colour, self._colour_points)
         size = gui.add_slider("point size (m)", min=0.005, max=0.08, step=0.005, initial_value=stage.point_size)

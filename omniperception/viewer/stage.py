@@ -60,9 +60,13 @@ class Stage:
         self._obstacles: dict[int, Any] = {}
         self._poses: dict[int, tuple] = {}
         self._sizes: dict[int, tuple[float, ...]] = {}
-        server.scene.configure_default_lights()
+        self.cast_shadows(False)
         server.initial_camera.position = (-3.2, -1.8, 2.2)
         server.initial_camera.look_at = (0.6, 0.0, 0.2)
+
+    def cast_shadows(self, on: bool) -> None:
+        """Shadows are nice, and much to ask of a browser without a graphics card."""
+        self.scene.configure_default_lights(cast_shadow=on)
 
     # ---- building ----------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
-SIZE = {"width": 900, "height": 500}
+SIZE = {"width": 760, "height": 320}
 PATIENCE_S = 120.0
 """Wall time: pictures without a graphics card on a busy machine take seconds each."""
 
