@@ -352,6 +352,8 @@ class Lab:
         scene.configure_default_lights(cast_shadow=False)  # much to ask of a browser without a graphics card
         self.server.initial_camera.position = (-4.5, -4.5, 4.5)
         self.server.initial_camera.look_at = (0.8, 0.0, 0.5)
+        moving = sorted({shape.body for shape in room.scene.shapes if shape.body >= 0})
+        self._bodies = [(body, scene.add_frame(f"/body_{body}", show_axes=False)) for body in moving]
         for k, shape in enumerate(room.scene.shapes):
             mesh = triangles(shape)
             if mesh is None or k in room.open_side:
@@ -368,8 +370,6 @@ class Lab:
                 flat_shading=True,
                 opacity=0.35 if shape.body < 0 else None,
             )
-        moving = sorted({shape.body for shape in room.scene.shapes if shape.body >= 0})
-        self._bodies = [(body, scene.add_frame(f"/body_{body}", show_axes=False)) for body in moving]
         self._points = scene.add_point_cloud(
             "/points",
             np.zeros((1, 3), np.float32),
