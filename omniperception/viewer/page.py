@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ def open_page(options: PageOptions, title: str) -> viser.ViserServer:
     import viser
 
     _check_free(options)
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # a stray connection is no traceback's worth
     console = rich.get_console()
     quiet, console.quiet = console.quiet, True  # the line below says it, and who can reach the page
     try:
