@@ -269,7 +269,7 @@ class Session:
     def perceived(self) -> Perceived | None:
         """What the network makes of its frames; None where it looks at none."""
         observations: TensorDict = self.env.get_observations()
-        return perceived(self._runner.alg.actor, observations, self.env.command.value)
+        return perceived(self._runner.alg.actor, observations, self.env.state.reference)
 
     def show_cloud(self, num_rays: int | None) -> None:
         """Chooses how many rays of a frame are shown; None: those that the task casts, so that points are those that

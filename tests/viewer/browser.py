@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 SIZE = {"width": 760, "height": 320}
 PATIENCE_S = 120.0
 """Wall time: pictures without a graphics card on a busy machine take seconds each."""
+PICTURE_S = 20.0
 
 
 @contextmanager
@@ -38,6 +40,16 @@ def open_tab(browser: Any) -> Any:
     page = browser.new_page(viewport=SIZE)
     page.set_default_timeout(1e3 * PATIENCE_S)
     return page
+
+
+def picture(page: Any, path: Path) -> None:
+    """Keeps a picture for people; where the machine is too busy to draw one, says so."""
+    from playwright.sync_api import TimeoutError as TooBusy
+
+    try:
+        page.screenshot(path=path, timeout=1e3 * PICTURE_S)
+    except TooBusy:
+        print(f"no {path.name}: the browser drew nothing in {PICTURE_S:g} s")
 
 
 def wait_for(happened: Callable[[], object], what: str, seconds: float = PATIENCE_S) -> Any:

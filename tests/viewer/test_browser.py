@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browser import chromium, control, open_tab, pixel, wait_for
+from browser import chromium, control, open_tab, picture, pixel, wait_for
 
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint, save_checkpoint
@@ -25,7 +25,7 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     page.goto(f"http://127.0.0.1:{PORT}")
     client = wait_for(lambda: next(iter(viewer.server.get_clients().values()), None), "the page connects")
     page.get_by_text("I command").wait_for()
-    page.screenshot(path=pictures / "1_opened.png")
+    picture(page, pictures / "1_opened.png")
 
     assert viewer.state()["driven"] is None
     start = np.array(viewer.state()["position"][:2])
@@ -46,7 +46,7 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     page.keyboard.press("Space")
     wait_for(lambda: viewer.state()["paused"], "Space pauses")
     drag(viewer, page, client, number)
-    page.screenshot(path=pictures / "2_dragged.png")
+    picture(page, pictures / "2_dragged.png")
 
     steps = viewer.state()["steps"]
     page.keyboard.press("n")
@@ -66,7 +66,7 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     wait_for(lambda: viewer.state()["time_s"] > start + 1.0, "time runs")
     state = viewer.state()
     assert state["driven"] == (0.2, 0.0, 0.0) and np.hypot(*state["velocity"]) < 0.1, "weights of zero stand still"
-    page.screenshot(path=pictures / "3_other_weights.png")
+    picture(page, pictures / "3_other_weights.png")
 
     second = page.context.browser.new_page(viewport={"width": 300, "height": 200})
     second.goto(f"http://127.0.0.1:{PORT}")

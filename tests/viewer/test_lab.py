@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 import torch
-from browser import chromium, control, open_tab, wait_for
+from browser import chromium, control, open_tab, picture, wait_for
 
 from omniperception import build, config
 from omniperception.commands.scan import NO_TASK, lab_room
@@ -109,7 +109,7 @@ def test_the_page_turns_knobs_refuses_what_cannot_be_and_writes_scans(task, room
                 noise.fill("0.1")
                 noise.press("Enter")
                 wait_for(lambda: math.isclose(lab.bench.knobs.gaussian, 0.1), "a knob is turned")
-                page.screenshot(path=tmp_path / "lab.png")
+                picture(page, tmp_path / "lab.png")
                 page.get_by_role("button", name="write this scan").click()
                 wait_for(lambda: list(tmp_path.glob("*.ply")), "a scan is written")
                 lab.ask(lambda: lab.set("min_range", 50.0))
