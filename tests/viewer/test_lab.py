@@ -95,6 +95,7 @@ def _turned(quat, points):
     return points + 2 * torch.linalg.cross(v, torch.linalg.cross(v, points) + w * points)
 
 
+@pytest.mark.slow
 def test_the_page_turns_knobs_refuses_what_cannot_be_and_writes_scans(task, room, tmp_path):
     pytest.importorskip("viser", reason="needs viser: pip install 'omniperception[viewer]'")
     lab = Lab(room, {"mid360": lambda: task.lidar}, tmp_path, PageOptions(port=PORT, stop_after_s=600))
