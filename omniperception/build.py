@@ -108,6 +108,12 @@ def _resolved(config: DictConfig) -> dict:
         return cast("dict", OmegaConf.to_container(config, resolve=True))
     except OmegaConfBaseException as error:
         message = one_line(error).partition(" full_key:")[0]
+        if "robot.gait" in message:
+            raise ConfigError(
+                "robot.gait is missing, and rewards or observations follow its clock; give it, with an offset for"
+                " each foot, such as robot.gait={frequency: 2, offsets: [0, 0.5, 0.5, 0], duty: 0.5, foot_height: 0.1},"
+                " or choose others (rewards=walk observations=walk)"
+            ) from None
         raise ConfigError(message.partition("raised while resolving interpolation: ")[2] or message) from None
 
 

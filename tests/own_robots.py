@@ -2,7 +2,19 @@
 
 from pathlib import Path
 
+import pytest
 import yaml
+
+from omniperception import config
+from omniperception.scene.fetched import SCHEME, cache
+
+
+def skip_if_not_fetched(robot: str) -> None:
+    """Skips a test of a preset whose file `robot-fetch` has not brought."""
+    file = yaml.safe_load((config.CONFIG_DIR / "robot" / f"{robot}.yaml").read_text())["file"]
+    if file.startswith(SCHEME) and not (cache() / file.removeprefix(SCHEME)).is_file():
+        pytest.skip(f"robot={robot} is downloaded, not shipped: omniperception robot-fetch")
+
 
 BIPED = """
 <mujoco model="biped">

@@ -22,6 +22,7 @@ COMMANDS = {
     "scan": "draws what a LiDAR sees",
     "robot-new": "writes a preset for a robot from its MJCF or URDF, and says what it guessed",
     "robot-check": "stands a robot: contacts, joints and their reach, what its LiDAR sees of it, a picture",
+    "robot-fetch": "downloads robots that presets name and this package does not ship: Go1, G1",
     "plan": "lists what a configuration consists of and what was left out",
 }
 EXTRAS = {

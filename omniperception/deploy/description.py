@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 FORMAT = "omniperception-policy"
-VERSION = 4
+VERSION = 5
 FILE = "policy.json"
 FINGERPRINT = "omniperception-description"
 """Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
@@ -80,18 +80,36 @@ class Group:
 
 
 @dataclass(frozen=True)
+class Turn:
+    """A joint between the base and the link that carries the LiDAR, the one nearer to the base first.
+
+    Attributes:
+        joint: its name, one of `Joints.names`.
+        quat: orientation of its link in the one before at the angle `rest`, (w, x, y, z).
+        axis: that it turns about, in its link's frame, of length 1.
+        rest: rad.
+    """
+
+    joint: str
+    quat: Sequence[float]
+    axis: Sequence[float]
+    rest: float
+
+
+@dataclass(frozen=True)
 class Lidar:
     """The sensor that the policy was trained with.
 
     Attributes:
         period_s: seconds between two frames.
-        mount_pos: of the sensor in the base frame, m.
-        mount_quat: of the sensor in the base frame, (w, x, y, z).
+        mount_pos: of the sensor in the frame of the link that carries it, m.
+        mount_quat: of the sensor in that frame, (w, x, y, z).
         min_range: nearest distance that it measures, m.
         max_range: points beyond are misses, m.
         num_rays: rays of a frame that training used.
         points_per_frame: points that the device measures in a frame.
         keep_every: training used every keep_every-th point of a frame; None where it chose otherwise.
+        carried_by: the joints that turn the link that carries it against the base; none: the base carries it.
     """
 
     period_s: float
@@ -102,6 +120,7 @@ class Lidar:
     num_rays: int
     points_per_frame: int
     keep_every: int | None
+    carried_by: Sequence[Turn] = ()
 
 
 @dataclass(frozen=True)
@@ -212,6 +231,9 @@ class Description:
             for group in parts.pop("observations")
         ]
         parts["joints"] = Joints(**parts["joints"])
+        if parts["lidar"] is not None:
+            turns = tuple(Turn(**turn) for turn in parts["lidar"]["carried_by"])
+            parts["lidar"] = {**parts["lidar"], "carried_by": turns}
         for name, kind in (("lidar", Lidar), ("perception", Perception)):
             parts[name] = kind(**parts[name]) if parts[name] is not None else None
         return cls(observations=tuple(groups), **parts)

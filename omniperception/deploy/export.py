@@ -11,6 +11,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import torch
 from rsl_rl.models import MLPModel
 from torch import nn
@@ -29,6 +31,7 @@ from omniperception.deploy.description import (
     Lidar,
     Perception,
     Term,
+    Turn,
     checksum,
 )
 from omniperception.env.env import MAX_ACTION, OmniEnv
@@ -132,7 +135,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         observations=tuple(_group(name, env) for name in run.env.observations.actor),
         command=_command_ranges(run),
         command_acceleration=run.env.observations.command_acceleration,
-        lidar=_lidar(run.env.lidar) if run.perception is not None and run.env.lidar is not None else None,
+        lidar=_lidar(run.env.lidar, robot) if run.perception is not None and run.env.lidar is not None else None,
         perception=_perception(run.perception) if run.perception is not None else None,
         estimated=_estimated(run),
     )
@@ -188,12 +191,7 @@ def _estimated(run: RunConfig) -> tuple[str, ...]:
     return ("base_lin_vel",)
 
 
-def _lidar(sensor: SensorConfig) -> Lidar:
-    if sensor.mount_body is not None:
-        raise ConfigError(
-            f"a LiDAR on {sensor.mount_body}, which moves against the base, cannot be exported: the runtime knows the"
-            " attitude of the base alone; mount it on the base (lidar.mount=...)"
-        )
+def _lidar(sensor: SensorConfig, robot: RobotConfig) -> Lidar:
     pattern = sensor.scan_pattern()
     every_kth = sensor.selection == "every_kth"
     return Lidar(
@@ -205,7 +203,32 @@ def _lidar(sensor: SensorConfig) -> Lidar:
         num_rays=sensor.num_rays,
         points_per_frame=pattern.points_per_frame(sensor.period_s),
         keep_every=pattern.stride(sensor.period_s, sensor.num_rays) if every_kth else None,
+        carried_by=() if sensor.mount_body is None else _turns(robot, sensor.mount_body),
     )
+
+
+def _turns(robot: RobotConfig, carrier: str) -> tuple[Turn, ...]:
+    """The joints from the base to the link that carries a sensor; a ConfigError if a passive one turns it."""
+    model = robot.compiled()
+    links = [model.body(carrier).id]
+    while (above := int(model.body_parentid[links[0]])) != model.body(robot.base).id:
+        links.insert(0, above)
+    found, quat = [], np.array([1.0, 0.0, 0.0, 0.0])
+    for link in links:
+        mujoco.mju_mulQuat(quat, quat.copy(), model.body_quat[link])
+        for joint in range(model.body_jntadr[link], model.body_jntadr[link] + model.body_jntnum[link]):
+            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+                continue
+            name = model.joint(joint).name
+            if name not in robot.joints:
+                raise ConfigError(
+                    f"a LiDAR on {carrier} cannot be exported: {name}, between it and {robot.base}, is passive, and its"
+                    " angle is not measured; mount it elsewhere (lidar.mount=...), or put the joint into robot.joints"
+                )
+            rest = float(model.qpos0[model.jnt_qposadr[joint]])
+            found.append(Turn(name, quat.tolist(), model.jnt_axis[joint].tolist(), rest))
+            quat = np.array([1.0, 0.0, 0.0, 0.0])
+    return tuple(found)
 
 
 def _perception(config: PerceptionConfig) -> Perception:

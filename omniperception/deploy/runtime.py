@@ -172,12 +172,13 @@ class ExportedPolicy:
         kept[rows[rows >= 0]] = np.asarray(points, np.float32)[inside][rows >= 0]
         return kept
 
-    def see(self, points: np.ndarray, base_quat: ArrayLike) -> None:
+    def see(self, points: np.ndarray, base_quat: ArrayLike, joint_pos: ArrayLike | None = None) -> None:
         """Appends a LiDAR frame to the history, unless it holds too few hits; :meth:`step` does it for its points.
 
         Args:
             points: (n, 3) m in the sensor frame, in the order of measurement.
             base_quat: (4,) orientation of the base at the end of the frame, (w, x, y, z).
+            joint_pos: (num_joints,) rad at that moment; needed where `description.lidar.carried_by` names joints.
         """
         lidar, sampler, frames = self._perception()
         points = np.asarray(points, np.float32)
@@ -185,12 +186,30 @@ class ExportedPolicy:
             raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
         if self.safety is not None and not self.safety.frame_is_good(points):
             return self.miss()
-        attitude = Attitude(_quaternion(base_quat), lidar.mount_pos, lidar.mount_quat)
+        attitude = Attitude(self._carrier_quat(lidar, base_quat, joint_pos), lidar.mount_pos, lidar.mount_quat)
         frames[:-1] = frames[1:]
         frames[-1, : sampler.num_points] = sampler(points, attitude)
         if self._odometry is not None:
             frames[-1, -1] = self._odometry.since_last_frame()
         self.frame_count = min(self.frame_count + 1, len(frames))
+
+    def _carrier_quat(self, lidar: Lidar, base_quat: ArrayLike, joint_pos: ArrayLike | None) -> np.ndarray:
+        """(4,) orientation of the link that carries the LiDAR."""
+        quat = _quaternion(base_quat)
+        if not lidar.carried_by:
+            return quat
+        names = list(self.description.joints.names)
+        angles = np.zeros(0) if joint_pos is None else np.asarray(joint_pos, np.float64)
+        if angles.shape != (len(names),):
+            raise DeployError(
+                f"joint_pos: the LiDAR is carried by {', '.join(turn.joint for turn in lidar.carried_by)}; angles of"
+                f" {len(names)} joints were expected, {len(angles) or 'none'} given"
+            )
+        for turn in lidar.carried_by:
+            half = 0.5 * (angles[names.index(turn.joint)] - turn.rest)
+            own = np.array([np.cos(half), *(np.sin(half) * np.asarray(turn.axis, np.float64))])
+            quat = _product(quat, _product(np.asarray(turn.quat, np.float64), own))
+        return quat
 
     def miss(self) -> None:
         """Repeats the last frame in the history, with no motion of the base, where one was due and did not come.
@@ -225,7 +244,7 @@ class ExportedPolicy:
         if self._odometry is not None:
             self._odometry.advance(_quaternion(state.base_quat), self._velocity(state))
         if points is not None:
-            self.see(points, state.base_quat)
+            self.see(points, state.base_quat, state.joint_pos)
         if self.safety is not None:
             command = self.safety.limit_command(command)
         self.observation = self._observe(state, command)
@@ -381,6 +400,12 @@ def _quaternion(given: ArrayLike) -> np.ndarray:
     if not abs(length - 1.0) < 1e-2:
         raise DeployError(f"base_quat: a unit quaternion (w, x, y, z) was expected, {quat.tolist()} given")
     return quat / length
+
+
+def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """(4,) the turn q, then p, both (w, x, y, z)."""
+    w, vector = p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
+    return np.array([w, *vector])
 
 
 QUANTITIES: dict[str, Quantity] = {

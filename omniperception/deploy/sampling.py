@@ -24,9 +24,10 @@ class Attitude:
     """Mount of the sensor.
 
     Attributes:
-        base_quat: (4,) orientation of the base in the world, (w, x, y, z); its heading does not matter.
-        mount_pos: (3,) sensor position in the base frame, m.
-        mount_quat: (4,) sensor orientation in the base frame, (w, x, y, z).
+        base_quat: (4,) orientation of the link that carries it, usually the base, in the world, (w, x, y, z); its
+            heading does not matter.
+        mount_pos: (3,) sensor position in that link's frame, m.
+        mount_quat: (4,) sensor orientation in that link's frame, (w, x, y, z).
     """
 
     base_quat: np.ndarray

@@ -128,7 +128,7 @@ def _whole_device(env: OmniEnv) -> Lidar:
         replace(config, num_rays=pattern.points_per_frame(config.period_s), selection="every_kth"),
         pattern,
         sensing.scene,
-        mount_body=sensing.base,
+        mount_body=sensing.carrier,
         seed=env.config.seed,
         outputs=("ranges", "directions_s"),
     )

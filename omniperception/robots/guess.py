@@ -26,6 +26,11 @@ _SAMPLES = 1500
 """Random poses in which pairs of links are looked for that can touch."""
 _STIFFER = (1.0, 1.5, 2.0, 3.0)
 """Factors on the gains, until the robot stands."""
+_PACE, _RISE = 2.5, 0.2
+"""Hz of the Go2's trot, at a base height of 0.33 m: others step as much slower as legs are longer (the same Froude
+number); and how high feet rise as a share of the base's height, ..."""
+_MOST_RISE = 0.1
+"""... at most so much (m)."""
 _FALL = 0.45
 """Share of the base's height below which it has fallen; the Go2's: 0.15 of 0.33 m."""
 
@@ -237,6 +242,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
     height = float(-body.ground())
     places = np.abs([foot.place(body)[:2] for foot in draft.feet]).mean(0)
     edges = [np.abs(body.bounds(body.geoms(foot.link))).max(0)[:2] for foot in draft.feet]
+    gait = _gait(draft, height)
     pairs = self_collisions(body, draft.pose) if draft.wishes.self_collision else []
     mounts, by_mount = _mounts(draft)
     preset: dict[str, object] = {
@@ -249,6 +255,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
         "footprint": [round(float(places[0]), 2), round(float(places[1]), 2)],
         "footing": round(float(np.linalg.norm(np.max(edges, 0))) + 0.05, 2),
         "foot_geoms": feet,
+        "gait": gait,
         "penalized_geoms": others,
         "self_collision": [list(pair) for pair in pairs],
         "mounts": mounts,
@@ -263,6 +270,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
         Finding("base_height", LIKELY, "the lowest point of the default pose"),
         Finding("min_base_height", GUESSED, f"{100 * _FALL:.0f} % of base_height"),
         Finding("footprint, footing", LIKELY, "where the feet are"),
+        Finding("gait", GUESSED, "feet beside and behind each other in turn, as fast as legs are long"),
         Finding("torque_limits", SURE if gains.said.all() else GUESSED, limits),
         Finding("kp, kv", GUESSED, f"springs of {rate:g} Hz, damping ratio {ratio:g}, or sag under {SAG:g} rad"),
         Finding("action_scale", GUESSED, f"{REACH:g} torque limit / kp"),
@@ -271,6 +279,26 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
         by_mount,
     ]
     return preset, findings
+
+
+def _gait(draft: _Draft, height: float) -> dict[str, object]:
+    """A rhythm in which feet beside and behind each other step in turn: a walk on two, a trot on four, tripods on six.
+
+    Args:
+        draft: the preset so far, its body in the default pose.
+        height: of the base (m).
+    """
+    body = draft.body
+    places = np.array([foot.place(body) for foot in draft.feet])
+    left = places[:, 1] > 0
+    before = [int(((left == left[k]) & (places[:, 0] > place[0] + 0.01)).sum()) for k, place in enumerate(places)]
+    offsets = [0.5 * ((rank + (not is_left)) % 2) for rank, is_left in zip(before, left, strict=True)]
+    return {
+        "frequency": round(_PACE * float(np.sqrt(0.33 / height)), 1),
+        "offsets": offsets,
+        "duty": 0.5,
+        "foot_height": round(height + float(places[:, 2].mean()) + min(_RISE * height, _MOST_RISE), 3),
+    }
 
 
 def _on_self_collision(draft: _Draft, pairs: list[tuple[str, str]]) -> Finding:

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from omniperception.scene.fetched import SCHEME, fetched
 from omniperception.scene.robot_file import FRAME, collides, compile_robot, drop_unseen, read_robot, rigid_geoms
 
 ByJoint = float | Mapping[str, float]
@@ -49,6 +50,33 @@ class Place:
 
 
 @dataclass(frozen=True)
+class Gait:
+    """The rhythm in which a robot walks, for rewards and observations that follow a clock.
+
+    Attributes:
+        frequency: steps of each foot per second (Hz).
+        offsets: when each foot's step begins after the clock's, in periods, in the order of the robot's feet.
+        duty: share of a step for which a foot is down.
+        foot_height: height (m) above the ground to which a foot's centre rises.
+    """
+
+    frequency: float
+    offsets: tuple[float, ...]
+    duty: float
+    foot_height: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "offsets", tuple(float(offset) for offset in self.offsets))
+        if self.frequency <= 0 or self.foot_height <= 0 or not 0 < self.duty < 1:
+            raise ValueError(
+                f"robot.gait: frequency={self.frequency} and foot_height={self.foot_height} must be positive,"
+                f" duty={self.duty} between 0 and 1"
+            )
+        if not all(0 <= offset < 1 for offset in self.offsets):
+            raise ValueError(f"robot.gait.offsets={list(self.offsets)} must be shares of a period, from 0 to below 1")
+
+
+@dataclass(frozen=True)
 class RobotConfig:
     """A legged robot.
 
@@ -56,8 +84,8 @@ class RobotConfig:
     `calf_geom_0`.
 
     Attributes:
-        file: MJCF or URDF: one of `omniperception/scene/assets`, or a path. Its actuators, sensors and keyframes are
-            not used; the root link of a URDF floats.
+        file: MJCF or URDF: one of `omniperception/scene/assets`, `fetched:` and a place in the cache of `robot-fetch`,
+            or a path. Its actuators, sensors and keyframes are not used; the root link of a URDF floats.
         base: name of the free-floating base body.
         joints: joints that are actuated, in the order of actions, joint observations and the exported policy; the file
             may have them in any order. All others but the base's are passive: nothing drives or observes them.
@@ -81,6 +109,7 @@ class RobotConfig:
             other; none: the robot never touches itself.
         ray_groups: geom groups of the file that LiDAR rays can hit; None: the geoms that can be touched.
         mounts: places for a LiDAR, by name.
+        gait: the rhythm in which it walks; None: nothing may ask for one.
     """
 
     file: str
@@ -103,6 +132,7 @@ class RobotConfig:
     self_collision: tuple[tuple[str, str], ...] = ()
     ray_groups: tuple[int, ...] | None = None
     mounts: Mapping[str, Mount] = field(default_factory=dict)
+    gait: Gait | None = None
 
     def __post_init__(self) -> None:
         for name in ("joints", "penalized_geoms"):
@@ -125,6 +155,10 @@ class RobotConfig:
         missing = sorted(set(self.joints) - set(self.default_joint_pos))
         if missing:
             raise ValueError(f"robot.default_joint_pos must name all of robot.joints; missing: {missing}")
+        if self.gait is not None and len(self.gait.offsets) != len(feet):
+            raise ValueError(
+                f"robot.gait.offsets={list(self.gait.offsets)} must have one for each of the {len(feet)} feet"
+            )
         for name in ("kp", "torque_limits", "action_scale"):
             self._check_by_joint(name, positive=True)
         for name in ("kv", "frictionloss", "armature", "damping"):
@@ -223,7 +257,9 @@ class RobotConfig:
         return Place(None if carrier == base else model.body(carrier).name, _vector(at + pos), _quaternion(moved))
 
     def path(self) -> Path:
-        """The robot's file; a packaged one by its name alone."""
+        """The robot's file; a packaged one by its name alone, a downloaded one as `fetched:...`."""
+        if self.file.startswith(SCHEME):
+            return fetched(self.file)
         asset = importlib.resources.files("omniperception.scene") / "assets" / self.file
         path = Path(str(asset)) if asset.is_file() else Path(self.file).expanduser()
         if not path.is_file():

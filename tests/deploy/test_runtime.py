@@ -16,6 +16,7 @@ import yaml
 
 from omniperception import build, config
 from omniperception.build import build_runner, load_policy
+from omniperception.deploy import export as export_module
 from omniperception.deploy.export import describe, export
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.episodes import run_episodes
@@ -29,6 +30,9 @@ from omniperception.deploy import DeployError, Description, ExportedPolicy, Robo
 from omniperception.deploy.deploy_yaml import deploy_yaml
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
 from omniperception.evaluation.exported import ExportedPolicies, raw_points, record
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from own_robots import BIPED, BIPED_PRESET, write_preset
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("num_envs=2", "ppo.hidden_dims=[32,16]", "seed=3")
@@ -159,6 +163,82 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
     )  # what it sees matters
 
 
+def test_a_policy_sees_with_a_head_that_turns(tmp_path):
+    """What it makes of points is what training made of them, with the neck turned."""
+    folder = write_preset(tmp_path)
+    given = ("robot=biped", "lidar.mount=eyes", "perception=proximity_gru", "obstacles=static", "lidar.num_rays=300")
+    run = build.assemble(config.compose([folder, *given, *SMALL]))
+    config.save(run.composed, tmp_path)
+    runner = build_runner(run, tmp_path)
+    stir(runner.alg.actor)
+    runner.save(str(checkpoint_path(tmp_path, 1)))
+    described = export(tmp_path, formats=("onnx",))
+    assert [turn.joint for turn in described.lidar.carried_by] == ["neck"]
+    side = trained(tmp_path, "num_envs=2")
+    env, policies = side.env, ExportedPolicies(side.env, plain(tmp_path))
+    neck = int(env.world.model.joint("neck").qposadr[0])
+    with torch.no_grad():
+        for step in range(11):
+            expected = side.policy(env.get_observations())
+            torch.testing.assert_close(policies(env.get_observations()), expected, atol=1e-5, rtol=0.0)
+            frames = torch.from_numpy(np.stack([robot.frames for robot in policies.robots]))
+            torch.testing.assert_close(frames, env.sensing.frames, atol=1e-5, rtol=0.0)
+            if step == 3:
+                env.sim.qpos[:, neck] = torch.tensor([1.2, -0.7], dtype=env.sim.qpos.dtype)
+            env.step(expected)
+    robot, points, seen = policies.robots[0], raw_points(env.sensing.frame)[0], []
+    assert robot.frame_count >= 2
+    for angle in (0.0, 1.0):  # of the neck, the third joint
+        robot.see(points, [1.0, 0.0, 0.0, 0.0], [0.2, 0.4, angle, -0.2, 0.4])
+        seen.append(robot.frames[-1].copy())
+    assert not np.allclose(*seen, atol=1e-2)
+    with pytest.raises(DeployError, match="carried by neck; angles of 5 joints were expected, none given"):
+        robot.see(points, [1.0, 0.0, 0.0, 0.0])
+
+
+GIMBAL = """<body name="gimbal" pos="0.04 0 0.08" euler="20 0 50">
+  <joint name="roll" axis="1 0.3 0" range="-2 2" ref="0.2"/><joint name="pitch" axis="0 1 0" range="-2 2"/>
+  <geom type="sphere" size="0.01" mass="0.1"/>
+</body>"""
+
+
+def _lidar_of(folder, text=BIPED, preset=BIPED_PRESET):
+    run = build.assemble(
+        config.compose([write_preset(folder, text, preset), "robot=biped", "lidar=vlp16", "perception=none"])
+    )
+    return export_module._lidar(run.env.lidar, run.env.robot), run.env.robot
+
+
+def test_the_link_that_carries_a_lidar_is_turned_as_in_mujoco(exported_run, tmp_path):
+    """Three joints of odd axes, one of them with an angle at rest, and a turned link: against mj_kinematics."""
+    joints = (*BIPED_PRESET["joints"], "roll", "pitch")
+    pose = {**BIPED_PRESET["default_joint_pos"], "roll": 0.0, "pitch": 0.0}
+    numbers = dict.fromkeys(("kp", "kv", "torque_limits", "action_scale"), 1.0)
+    mounts = {"back": {"pos": [0, 0, 0.1], "body": "gimbal"}}
+    preset = {**BIPED_PRESET, **numbers, "joints": list(joints), "default_joint_pos": pose, "mounts": mounts}
+    lidar, robot = _lidar_of(tmp_path, BIPED.replace('<body name="eyes" pos="0.04 0 0.08"/>', GIMBAL), preset)
+    assert [turn.joint for turn in lidar.carried_by] == ["neck", "roll", "pitch"]
+    policy = plain(exported_run("none"))
+    policy.description = replace(policy.description, joints=replace(policy.description.joints, names=joints))
+    model = robot.compiled()
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(5):
+        angles, quat = rng.uniform(-1.5, 1.5, len(joints)), rng.normal(size=4)
+        quat /= np.linalg.norm(quat)
+        data.qpos[3:7] = quat
+        for name, angle in zip(joints, angles, strict=True):
+            data.joint(name).qpos = angle
+        mujoco.mj_kinematics(model, data)
+        found = policy._carrier_quat(lidar, quat, angles)
+        assert abs(float(found @ data.body("gimbal").xquat)) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_lidar_that_a_passive_joint_turns_is_not_exported(tmp_path):
+    mounts = {"back": {"pos": [0, 0, 0.1], "body": "tail"}}
+    with pytest.raises(config.ConfigError, match="LiDAR on tail cannot .*: tail, between it and torso, is passive"):
+        _lidar_of(tmp_path, preset={**BIPED_PRESET, "mounts": mounts})
+
+
 @pytest.mark.slow
 def test_the_evaluation_result_is_that_of_torch(exported_run):
     """Two environments go their own ways, one driven by torch, the other by the exported policy."""
@@ -277,7 +357,7 @@ def test_wrong_points_are_named(exported_run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 99}, "format version 99, this program reads 4"),
+        ({"version": 99}, "format version 99, this program reads 5"),
         ({"format": "something"}, "describes no exported policy"),
         ({"joints": None}, "is incomplete"),
         ({"control_period_s": 0.03}, "policy.onnx and policy.json are not from the same export"),

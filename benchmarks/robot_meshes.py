@@ -1,0 +1,220 @@
+"""A robot's LiDAR with the robot as the meshes that it is drawn with, and as the primitives that it collides with.
+
+    python -m benchmarks.robot_meshes robot=g1
+    python -m benchmarks.robot_meshes robot=go1 num_envs=64,512 rays=2000 obstacles=moving
+
+What is cast are frames of the robot's own LiDAR, poses of all bodies new in each. Ratio: time with meshes over time
+with primitives, both timed in turn in one process. Errors: of both against mj_ray in float64 on the same geoms, and
+what primitives see otherwise than meshes do.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+
+from benchmarks.harness.table import Table, about, report
+from benchmarks.harness.timing import paired_ratio, paired_timings
+from omniperception import build, config
+from omniperception.cli import Command, argument
+from omniperception.commands.robot_check import NO_TASK
+from omniperception.env.sensing import SensorConfig
+from omniperception.lidar import Lidar, RayScene
+from omniperception.scene import World, build_world
+from omniperception.scene.rays import HitClass, RayShapes, ray_shapes
+
+POSES = 4
+"""Sets of poses that frames take in turn."""
+SWAY = 0.3
+"""Joints are up to so much (rad) off the default pose, bodies of obstacles within so many times 10 m."""
+OUTPUTS = ("true_ranges", "directions_s", "shape_id", "class_id")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command line."""
+
+    robot: str = argument("g1", "preset of conf/robot")
+    lidar: str = argument("mid360", "preset of conf/lidar")
+    obstacles: str = argument("moving", "preset of conf/obstacles")
+    groups: tuple[int, ...] = argument((2,), "geom groups of the robot's file that hold the meshes")
+    num_envs: tuple[int, ...] = argument((64, 256, 512), "environments", least=1)
+    rays: int = argument(1000, "rays of a frame", least=1)
+    threads: int = argument(1, "CPU threads", least=1)
+    rounds: int = argument(7, "rounds in which each form is timed once", least=1)
+    out: Path = argument(Path("outputs/robot_meshes"), "folder of the tables")
+
+
+@dataclass
+class Form:
+    """A robot in one form: what rays hit, its sensor, and poses of its bodies."""
+
+    world: World
+    shapes: RayShapes
+    sensor: SensorConfig
+    states: list[mujoco.MjData]
+    seconds: float
+
+    @classmethod
+    def of(cls, given: Arguments, groups: tuple[int, ...] | None) -> Form:
+        """The robot as geoms of some groups; None: as it collides."""
+        wanted = [] if groups is None else [f"robot.ray_groups=[{','.join(map(str, groups))}]"]
+        task = [*NO_TASK, f"robot={given.robot}", f"lidar={given.lidar}", f"obstacles={given.obstacles}"]
+        env = build.assemble(config.compose([*task, f"lidar.num_rays={given.rays}", *wanted])).env
+        assert env.lidar is not None  # asked for
+        begin = time.perf_counter()
+        world = build_world(env.robot, env.terrain, env.obstacles)
+        shapes = ray_shapes(world, [], env.lidar.mount_body)
+        for shape in shapes.shapes:
+            if shape.asset is not None and hasattr(shape.asset, "tree"):
+                _ = shape.asset.tree
+        seconds = time.perf_counter() - begin
+        return cls(world, shapes, env.lidar, _states(world, POSES), seconds)
+
+    def frames(self, num_envs: int, threads: int) -> tuple[Lidar, RayScene, list[tuple[torch.Tensor, torch.Tensor]]]:
+        """The sensor in many environments, and sets of poses."""
+        scene = RayScene(self.shapes.shapes, num_envs, len(self.shapes.bodies), num_threads=threads)
+        body, bodies = self.sensor.mount_body, list(self.shapes.bodies)
+        carrier = self.shapes.base if body is None else bodies.index(self.world.model.body(body).id)
+        lidar = Lidar(self.sensor, self.sensor.scan_pattern(), scene, carrier, outputs=OUTPUTS)
+        poses = [
+            tuple(torch.from_numpy(value[bodies]).float().expand(num_envs, -1, -1) for value in (data.xpos, data.xquat))
+            for data in self.states
+        ]
+        return lidar, scene, poses
+
+
+def _states(world: World, count: int) -> list[mujoco.MjData]:
+    """Poses near the default one, the same for every form of a robot."""
+    model, rng, found = world.model, np.random.default_rng(0), []
+    for _ in range(count):
+        data = mujoco.MjData(model)
+        data.qpos[:] = world.rest_positions
+        data.qpos[:7] = 0, 0, world.robot.base_height, 1, 0, 0, 0
+        for name in world.robot.joints:
+            data.joint(name).qpos += SWAY * rng.uniform(-1, 1)
+        places = rng.uniform(-1, 1, (model.nmocap, 3))
+        data.mocap_pos[:] = places * (10 * SWAY, 10 * SWAY, 0) + np.sign(places) * (1, 1, 0)
+        mujoco.mj_forward(model, data)
+        found.append(data)
+    return found
+
+
+def speed(given: Arguments, forms: dict[str, Form]) -> list[dict[str, object]]:
+    """Time of a frame of both forms, and their ratio, by number of environments."""
+    rows = []
+    for num_envs in given.num_envs:
+        calls = {}
+        for name, form in forms.items():
+            lidar, scene, poses = form.frames(num_envs, given.threads)
+
+            def call(k: int, lidar=lidar, scene=scene, poses=poses) -> None:
+                scene.body_pos.copy_(poses[k % POSES][0])
+                scene.body_quat.copy_(poses[k % POSES][1])
+                lidar.cast(0.1 * (k + 1))
+
+            calls[name] = call
+        times = paired_timings(calls, given.rounds)
+        row: dict[str, object] = {"environments": num_envs}
+        row |= {f"{name}, ms": 1e3 * times[name].median_cpu_s for name in forms}
+        rows.append(row | {"meshes / primitives": str(paired_ratio(times["meshes"], times["primitives"], "cpu"))})
+    return rows
+
+
+def errors(forms: dict[str, Form]) -> list[dict[str, object]]:
+    """Each form against mj_ray on the geoms that its rays can hit."""
+    rows = []
+    for name, form in forms.items():
+        lidar, scene, poses = form.frames(1, 1)
+        wrong, rays, own, worst = 0, 0, 0, 0.0
+        for k, data in enumerate(form.states):
+            scene.body_pos.copy_(poses[k][0])
+            scene.body_quat.copy_(poses[k][1])
+            frame = lidar.cast(0.1 * (k + 1))
+            assert frame.true_ranges is not None and frame.directions_s is not None and frame.class_id is not None
+            expected = _mj_rays(form, data, frame.directions_s[0].numpy())
+            found = frame.true_ranges[0].numpy().astype(np.float64)
+            both = np.isfinite(found) & np.isfinite(expected)
+            off = np.abs(found - expected)[both]
+            wrong += int((np.isfinite(found) != np.isfinite(expected)).sum() + (off > 1e-3).sum())
+            worst = max(worst, float(off[off <= 1e-3].max(initial=0.0)))
+            rays, own = rays + len(found), own + int((frame.class_id[0] == HitClass.ROBOT).sum())
+        rows.append(
+            {
+                "form": name,
+                "shapes": len(form.shapes.shapes),
+                "built in, s": form.seconds,
+                "on the robot, %": 100 * own / rays,
+                "other surface than mj_ray, %": 100 * wrong / rays,
+                "largest error of the others, m": worst,
+            }
+        )
+    return rows
+
+
+def _mj_rays(form: Form, data: mujoco.MjData, directions_s: np.ndarray) -> np.ndarray:
+    """(R,) ranges by mj_ray from the sensor, infinite beyond its range."""
+    model, sensor = form.world.model, form.sensor
+    carrier = form.world.base_body if sensor.mount_body is None else model.body(sensor.mount_body).id
+    kept = set(form.shapes.geom_names)
+    for k in range(model.ngeom):
+        model.geom_group[k] = 0 if model.geom(k).name in kept else 5
+    turn, origin = data.xmat[carrier].reshape(3, 3), np.empty(3)
+    mount = np.empty(9)
+    mujoco.mju_quat2Mat(mount, np.array(sensor.quat, np.float64))
+    origin = data.xpos[carrier] + turn @ np.array(sensor.mount_pos, np.float64)
+    rays = directions_s.astype(np.float64) @ (turn @ mount.reshape(3, 3)).T
+    groups, geom = np.array([1, 0, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
+    ranges = np.array([mujoco.mj_ray(model, data, origin, ray, groups, 1, -1, geom) for ray in rays])
+    return np.where((ranges < 0) | (ranges > sensor.max_range), np.inf, ranges)
+
+
+def differences(forms: dict[str, Form]) -> list[dict[str, object]]:
+    """What the same rays see with primitives and with meshes."""
+    seen = {}
+    for name, form in forms.items():
+        lidar, scene, poses = form.frames(1, 1)
+        ranges, own = [], []
+        for k in range(POSES):
+            scene.body_pos.copy_(poses[k][0])
+            scene.body_quat.copy_(poses[k][1])
+            frame = lidar.cast(0.1 * (k + 1))
+            assert frame.true_ranges is not None and frame.class_id is not None
+            ranges.append(frame.true_ranges[0].clone())
+            own.append(frame.class_id[0] == HitClass.ROBOT)
+        seen[name] = torch.cat(ranges), torch.cat(own)
+    (ranges, own), (others, others_own) = seen["meshes"], seen["primitives"]
+    both = own & others_own
+    off = (ranges - others)[both].abs()
+    return [
+        {
+            "robot in both, %": 100 * float(both.float().mean()),
+            "in meshes alone, %": 100 * float((own & ~others_own).float().mean()),
+            "in primitives alone, %": 100 * float((others_own & ~own).float().mean()),
+            "median difference, m": float(off.median()) if len(off) else 0.0,
+            "largest, m": float(off.max()) if len(off) else 0.0,
+        }
+    ]
+
+
+def main(given: Arguments) -> None:
+    """Measures, prints and writes."""
+    torch.set_num_threads(given.threads)
+    forms = {"primitives": Form.of(given, None), "meshes": Form.of(given, given.groups)}
+    tables = [
+        Table.of("speed", f"a frame of {given.rays} rays, CPU time", speed(given, forms)),
+        Table.of("errors", "against mj_ray in float64", errors(forms)),
+        Table.of("difference", "primitives beside meshes", differences(forms)),
+    ]
+    report(tables, about(given.threads), given.out)
+
+
+command = Command(main, Arguments, __doc__, errors=(ValueError,))
+
+if __name__ == "__main__":
+    command()
