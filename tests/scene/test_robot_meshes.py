@@ -141,7 +141,7 @@ def test_bodies_touch_the_hull_and_rays_pass_through_the_notch(robot):
     assert mujoco.mj_ray(model, data, origin, down, groups, 1, -1, geom) == -1
     shapes = geom_shapes(model, geoms=[trunk])
     scene = RayScene(shapes.shapes, 1, 1, num_threads=1)
-    scene.body_pos[0, 0], scene.body_quat[0, 0] = torch.tensor(data.body("base").xpos), torch.tensor([1.0, 0, 0, 0])
+    scene.body_pos[0, 0], scene.body_quat[0, 0] = torch.from_numpy(data.body("base").xpos), torch.tensor([1.0, 0, 0, 0])
     beside = origin - [0.09, 0, 0]  # over the arm of the L
     both = torch.tensor(np.array([[origin, beside], [down, down]]), dtype=torch.float32)
     hits = scene.cast(both[:1], both[1:])
