@@ -164,8 +164,8 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
 
 
 def test_a_policy_sees_with_a_head_that_turns(tmp_path):
-    """What it makes of points is what training made of them, with the neck turned."""
-    folder = write_preset(tmp_path)
+    """What it makes of points is what training made of them, with the neck bent."""
+    folder = write_preset(tmp_path, BIPED.replace('name="neck" axis="0 0 1"', 'name="neck" axis="0.3 1 0"'))
     given = ("robot=biped", "lidar.mount=eyes", "perception=proximity_gru", "obstacles=static", "lidar.num_rays=300")
     run = build.assemble(config.compose([folder, *given, *SMALL]))
     config.save(run.composed, tmp_path)
@@ -184,11 +184,11 @@ def test_a_policy_sees_with_a_head_that_turns(tmp_path):
             frames = torch.from_numpy(np.stack([robot.frames for robot in policies.robots]))
             torch.testing.assert_close(frames, env.sensing.frames, atol=1e-5, rtol=0.0)
             if step == 3:
-                env.sim.qpos[:, neck] = torch.tensor([1.2, -0.7], dtype=env.sim.qpos.dtype)
+                env.sim.qpos[:, neck] = torch.tensor([0.8, -0.5], dtype=env.sim.qpos.dtype)
             env.step(expected)
     robot, points, seen = policies.robots[0], raw_points(env.sensing.frame)[0], []
     assert robot.frame_count >= 2
-    for angle in (0.0, 1.0):  # of the neck, the third joint
+    for angle in (0.0, 0.7):  # of the neck, the third joint
         robot.see(points, [1.0, 0.0, 0.0, 0.0], [0.2, 0.4, angle, -0.2, 0.4])
         seen.append(robot.frames[-1].copy())
     assert not np.allclose(*seen, atol=1e-2)

@@ -1,13 +1,17 @@
 """Robots of meshes: bodies touch their convex hulls, rays hit their triangles, and instances share one tree."""
 
+import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+import yaml
 
+from benchmarks import robot_meshes
 from omniperception import build, config
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.lidar import RayScene
@@ -156,6 +160,21 @@ def test_instances_share_one_tree(robot):
     assert len(assets) == 2 and assets[0] is assets[1]
     shell = shapes.shapes[shapes.geom_names.index("shell")].asset
     assert shell is assets[0]
+
+
+def test_the_benchmark_compares_both_forms(robot, tmp_path, capsys):
+    """Both forms see what mj_ray sees; a robot that is a mesh in both differs by its shell and legs."""
+    preset = {**asdict(robot), "mounts": {"back": {"pos": [0.0, 0.0, 0.5]}}}
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot" / "meshy.yaml").write_text("# A robot.\n" + yaml.safe_dump(json.loads(json.dumps(preset))))
+    given = ("robot=meshy", "num_envs=2", "rays=100", "rounds=1", "obstacles=static", "lidar=vlp16", f"out={tmp_path}")
+    robot_meshes.command([*given, "--config-dir", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "meshes / primitives" in printed and "other surface than mj_ray" in printed
+    rows = json.loads((tmp_path / "errors.json").read_text())["rows"]
+    assert [row["form"] for row in rows] == ["primitives", "meshes"]
+    for row in rows:
+        assert row["other surface than mj_ray, %"] < 1.0 and row["largest error of the others, m"] < 1e-3
 
 
 @pytest.mark.slow
