@@ -143,7 +143,7 @@ def errors(forms: dict[str, Form]) -> list[dict[str, object]]:
             counted = ~(expected < form.sensor.min_range)  # nearer surfaces block a ray and return nothing
             found, expected = found[counted], expected[counted]
             both = np.isfinite(found) & np.isfinite(expected)
-            off = np.abs(found - expected)[both]
+            off = np.abs(found[both] - expected[both])
             wrong += int((np.isfinite(found) != np.isfinite(expected)).sum() + (off > 1e-3).sum())
             worst = max(worst, float(off[off <= 1e-3].max(initial=0.0)))
             rays, own = rays + len(found), own + int((frame.class_id[0] == HitClass.ROBOT).sum())
