@@ -131,7 +131,7 @@ class Caster:
     def distorted(self, time_s: float) -> LidarFrame:
         """The frame that ends at ``time_s``, with the poses at the ends of all its segments."""
         period, segments = self.config.period_s, self.config.motion_segments
-        self.lidar.forget_motion()
+        self.lidar.reset()
         for k in range(segments):
             self.rays.set_poses(*self.poses(time_s - period + k * period / segments))
             self.lidar.record_poses()

@@ -12,6 +12,8 @@ _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64
 _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
 _DRAWS_PER_EPISODE = 1 << 20
+_PER_SEED = 1_000_003
+"""Streams of a seed until the next one's begin."""
 
 
 class EnvRandom:
@@ -39,18 +41,29 @@ class EnvRandom:
         """
         self.counter[env_ids] = (self.counter[env_ids] // _DRAWS_PER_EPISODE + 1) * _DRAWS_PER_EPISODE
 
+    def seed(self, env_ids: torch.Tensor, seeds: torch.Tensor) -> None:
+        """Gives environments (n,) streams that follow from their seeds (n,) int64 alone; an episode has to begin next.
+
+        The stream of a seed is that of the first environment of as many as have this seed in common.
+        """
+        self._key[env_ids] = _mix((seeds + 1) * _PER_SEED)
+        self.counter[env_ids] = 0
+
     def state_dict(self) -> dict:
-        """How often each environment has drawn, here and in the branches."""
-        return {"counter": self.counter.clone(), "branches": {k: b.state_dict() for k, b in self._branches.items()}}
+        """How often each environment has drawn of which stream, here and in the branches."""
+        branches = {name: branch.state_dict() for name, branch in self._branches.items()}
+        return {"counter": self.counter.clone(), "key": self._key.clone(), "branches": branches}
 
     def load_state_dict(self, state: dict) -> None:
         self.counter.copy_(state["counter"])
+        if "key" in state:  # files from before there were seeded resets go on with the seed of all environments
+            self._key.copy_(state["key"])
         for name, branch in self._branches.items():
             branch.load_state_dict(state["branches"][name])
 
     def _keys(self, numbers: torch.Tensor) -> torch.Tensor:
         """Keys (n,) int64 of the streams with these numbers (n,)."""
-        return _mix(numbers + (self._seed + 1) * 1_000_003)
+        return _mix(numbers + (self._seed + 1) * _PER_SEED)
 
     def uniform(self, env_ids: torch.Tensor, shape: Sequence[int] = ()) -> torch.Tensor:
         """Draws from [0, 1) for environments `env_ids` (n,); the others' streams stay where they are.

@@ -50,7 +50,9 @@ def deploy_yaml(description: Description) -> str | None:
                 "joint_ids": None,
             }
         },
-        "observations": {_NAMES[term.quantity]: _term(group, term) for group, term in _terms(description)},
+        "observations": {
+            _NAMES.get(term.quantity, term.quantity): _term(group, term) for group, term in _terms(description)
+        },
     }
     comments = "".join(f"# {line}\n" for line in _caveats(description))
     return comments + yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
@@ -94,6 +96,9 @@ def _caveats(description: Description) -> list[str]:
         lines.append("It also reads 'frames' and 'frame_count' of a LiDAR, which this form has no place for.")
     if any(group.history > 1 and len(group.terms) > 1 for group in description.observations):
         lines.append("History is by time: all terms of the oldest step first, where Isaac Lab goes term by term.")
+    own = [term.quantity for _, term in _terms(description) if term.quantity not in _NAMES]
+    if own:
+        lines.append(f"Of unitree_rl_lab's observations none is {', '.join(own)}.")
     if any(term.quantity == "base_lin_vel" for _, term in _terms(description)):
         lines.append("base_lin_vel is no observation of unitree_rl_lab's controller; a state estimator must give it.")
     if description.command_acceleration is not None:

@@ -156,18 +156,26 @@ _MEASURABLE = {getattr(observations, name): name for name in (*_QUANTITIES, "pre
 """Observation terms that a robot can give, by function."""
 
 
+def own_quantity(function: Callable) -> str | None:
+    """What a robot measures for an observation term of one's own, by `measured_as`; None for what has no such name."""
+    quantity = getattr(function, "quantity", None)
+    return None if quantity in _MEASURABLE.values() else quantity
+
+
 def _group(name: str, env: OmniEnv) -> Group:
     group, widths = env.config.observations.groups[name], env.observation_widths(name)
     terms = []
     for term_name, term in group.terms.items():
         function, options = (term.func, dict(term.keywords)) if isinstance(term, partial) else (term, {})
-        if function not in _MEASURABLE or set(options) - {"scale", "frequency", "rest_s"}:
+        quantity, known = own_quantity(function), {"scale", "frequency", "rest_s"} if function in _MEASURABLE else set()
+        if (function in _MEASURABLE) == (quantity is not None) or set(options) - known:
             raise ConfigError(
                 f"observations.groups.{name}.terms.{term_name} cannot be exported: a robot can measure"
-                f" {', '.join(_MEASURABLE.values())}"
+                f" {', '.join(_MEASURABLE.values())}, and terms of your own without parameters that say"
+                " @measured_as(<another name>)"
             )
         scale, frequency, rest_s = options.get("scale", 1.0), options.get("frequency"), options.get("rest_s", 0.0)
-        terms.append(Term(_MEASURABLE[function], widths[term_name], scale, frequency, rest_s))
+        terms.append(Term(quantity or _MEASURABLE[function], widths[term_name], scale, frequency, rest_s))
     return Group(name, group.history, tuple(terms))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +32,7 @@ class RobotState:
         base_lin_vel: (3,) linear velocity in the base frame from a state estimator, m/s; None if the policy neither
             observes it nor follows the base's motion, or estimates it.
         joint_torque: (num_joints,) N m, measured; None: torques are not checked.
+        other: readings, by name, of what the policy observes besides: training's terms with `measured_as`.
     """
 
     joint_pos: ArrayLike
@@ -40,6 +41,7 @@ class RobotState:
     base_ang_vel: ArrayLike
     base_lin_vel: ArrayLike | None = None
     joint_torque: ArrayLike | None = None
+    other: Mapping[str, ArrayLike] | None = None
 
 
 DEFAULT_SAFETY = SafetyConfig()
@@ -312,7 +314,7 @@ class ExportedPolicy:
         values = []
         for term in group.terms:
             if term.frequency is None:
-                value = QUANTITIES[term.quantity](self, state, command)
+                value = (QUANTITIES.get(term.quantity) or _other(term.quantity))(self, state, command)
             else:
                 value = self._phase(term.frequency, term.rest_s, command)
             if value.shape != (term.size,):
@@ -337,9 +339,6 @@ class ExportedPolicy:
 
     def _check_network(self) -> None:
         """The network and its description belong together."""
-        for term in (term for group in self.description.observations for term in group.terms):
-            if term.quantity not in QUANTITIES and term.frequency is None:
-                raise DeployError(f"observation '{term.quantity}' is unknown; known: {', '.join(QUANTITIES)}")
         given = {item.name: tuple(item.shape[1:]) for item in self._session.get_inputs()}
         if given != self.description.inputs:
             raise DeployError(
@@ -376,6 +375,18 @@ def _vector(name: str) -> Quantity:
         value = getattr(state, name)
         if value is None:
             raise DeployError(f"{name}: this policy observes it, None was given")
+        return np.asarray(value, np.float32)
+
+    return read
+
+
+def _other(name: str) -> Quantity:
+    """Reads a quantity that only this policy's training knows."""
+
+    def read(policy: ExportedPolicy, state: RobotState, command: ArrayLike) -> np.ndarray:
+        value = (state.other or {}).get(name)
+        if value is None:
+            raise DeployError(f"{name}: this policy observes it; give RobotState(..., other={{'{name}': ...}})")
         return np.asarray(value, np.float32)
 
     return read

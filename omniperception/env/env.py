@@ -105,11 +105,11 @@ class OmniEnv(VecEnv):
         self.heights_each_step = self.state.has_computed("heights")
         if HEIGHT_TARGET in config.targets and not self.heights_each_step:
             self._frame_heights = torch.zeros_like(self.state.heights)
-        all_envs = torch.arange(self.num_envs, device=self.device)
-        self._reset(all_envs)
+        self._all_envs = torch.arange(self.num_envs, device=self.device)
+        self._reset(self._all_envs)
         self.healthy = ~self.sim.failed
         self._sense()
-        self.observations = self._observe(all_envs)
+        self.observations = self._observe(self._all_envs)
 
     @property
     def cfg(self) -> EnvConfig:
@@ -148,6 +148,36 @@ class OmniEnv(VecEnv):
         if self.step_count % self.config.log_interval == 0:
             extras["log"] = self._report()
         return self.observations, rewards, self.done.long(), extras
+
+    # ---- for other learners ------------------------------------------------------------------------------------------
+
+    def reset(self, env_ids: torch.Tensor | None = None, seeds: torch.Tensor | None = None) -> TensorDict:
+        """Begins new episodes in environments (n,) int64, or in all, wherever the last ones are.
+
+        Args:
+            env_ids: which; None: all.
+            seeds: (n,) int64: all that is drawn from now on follows from an environment's seed, whichever environment
+                it is, but for its column of a tiled terrain and the levels of curricula. Where all get seeds, time
+                begins anew, too. None: everything goes on, and no episode repeats another's noise.
+
+        Returns:
+            Observations.
+        """
+        env_ids = self._all_envs if env_ids is None else env_ids
+        if seeds is not None:
+            self.random.seed(env_ids, seeds)
+            if len(env_ids) == self.num_envs:
+                self.step_count = 0
+        self._reset(env_ids, seeds, interrupted=True)
+        self.healthy = ~self.sim.failed
+        if self.step_count == 0:
+            self._sense()
+        self.observations = self._observe(env_ids)
+        return self.observations
+
+    def final_observations(self) -> TensorDict:
+        """Observations at the end of a step before finished environments are reset; call it from a step hook."""
+        return self._collect({name: group.peek(self.state) for name, group in self._groups.items()})
 
     # ---- a step, in its order ----------------------------------------------------------------------------------------
 
@@ -258,14 +288,14 @@ class OmniEnv(VecEnv):
         self.metrics.record_contacts(self.contacts)
         self.metrics.record_ends(self.done, self.outcomes, self.sim.failure)
 
-    def _reset(self, env_ids: torch.Tensor) -> None:
-        """Starts new episodes in some environments (n,); the others are not touched."""
+    def _reset(self, env_ids: torch.Tensor, seeds: torch.Tensor | None = None, interrupted: bool = False) -> None:
+        """Starts new episodes in some environments (n,); the others are not touched. See `reset`."""
         self.random.start_episode(env_ids)
         low, high = self._spawn
         pose = low + self.random.uniform(env_ids, (3,)) * (high - low)
         height = torch.full((len(env_ids), 1), self.robot.base_height, device=self.device)
         if self.ground is not None and self.terrain_levels is not None:
-            self.terrain_levels.start(env_ids, pose[:, :2], self._completed(env_ids))
+            self.terrain_levels.start(env_ids, pose[:, :2], self._completed(env_ids, interrupted))
             height = height + self.ground.highest(pose[:, :2], self.robot.footing, env_ids)[:, None]
         joints = self.state.default_joint_pos.expand(len(env_ids), -1)
         qpos = torch.cat((pose[:, :2], height, yaw_quat(pose[:, 2]), joints), 1)
@@ -285,7 +315,7 @@ class OmniEnv(VecEnv):
                 self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
         self.episode_length_buf[env_ids] = 0
         if self.sensing is not None:
-            self.sensing.reset(env_ids, self.state.measured)
+            self.sensing.reset(env_ids, self.state.measured, seeds)
         if self.avoidance is not None:
             self.avoidance.reset(env_ids)
         if self._frame_heights is not None:
@@ -293,9 +323,11 @@ class OmniEnv(VecEnv):
         for manager in self._managers().values():
             manager.reset(env_ids)
 
-    def _completed(self, env_ids: torch.Tensor) -> torch.Tensor | None:
-        """(n,) bool: whether episodes that end now end as planned; None before the first ones."""
-        return None if self.step_count == 0 else (self.outcomes["time_out"] | self.outcomes["goal"])[env_ids]
+    def _completed(self, env_ids: torch.Tensor, interrupted: bool) -> torch.Tensor | None:
+        """(n,) bool: whether episodes that end now commanded no more; None before the first ones."""
+        if self.step_count == 0:
+            return None
+        return (self.outcomes["time_out"] | self.outcomes["goal"])[env_ids] | interrupted
 
     def _observe(self, fresh: torch.Tensor) -> TensorDict:
         """Observations, which begin an episode in the environments `fresh` (n,)."""

@@ -373,12 +373,13 @@ class LidarSensing:
             self._past.load_state_dict(state["past"])
         self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
 
-    def reset(self, env_ids: torch.Tensor, measured: Kinematics) -> None:
+    def reset(self, env_ids: torch.Tensor, measured: Kinematics, seeds: torch.Tensor | None = None) -> None:
         """Clears frames, sightings and recorded motion of environments (n,).
 
         Args:
             env_ids: which.
             measured: base of all environments as measured, where their episodes begin.
+            seeds: (n,) int64, of noise and scan phase from now on; None: they go on.
         """
         if self.odometry is not None:
             self.odometry.start(env_ids, measured)
@@ -386,7 +387,7 @@ class LidarSensing:
             self._delivery.reset(env_ids)
         if self._past is not None:
             self._past.reset(env_ids, *self._sim.body_poses(self._bodies))
-        self.lidar.forget_motion(env_ids)
+        self.lidar.reset(env_ids, seeds)
         self.frame_count[env_ids] = 0
         if self.frames is not None:
             self.frames[env_ids] = 0.0

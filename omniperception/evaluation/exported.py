@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from omniperception.deploy import DeployError, ExportedPolicy, RobotState, SafetyStop
+from omniperception.deploy.export import own_quantity
 from omniperception.deploy.latency import Reading
 from omniperception.env.env import OmniEnv
 from omniperception.lidar import Lidar, LidarFrame
@@ -81,7 +82,24 @@ def robot_states(env: OmniEnv) -> list[RobotState]:
         measured.base_ang_vel_b,
         measured.base_lin_vel_b,
     )
-    return [RobotState(*values) for values in zip(*(tensor.cpu().numpy() for tensor in tensors), strict=True)]
+    other = {name: value.cpu().numpy() for name, value in _other_readings(env).items()}
+    states = [RobotState(*values) for values in zip(*(tensor.cpu().numpy() for tensor in tensors), strict=True)]
+    if not other:
+        return states
+    return [replace(one, other={name: value[k] for name, value in other.items()}) for k, one in enumerate(states)]
+
+
+def _other_readings(env: OmniEnv) -> dict[str, torch.Tensor]:
+    """(num_envs, width) newest values of the actor's terms that are measured by names of their own."""
+    readings = {}
+    for name in env.config.observations.actor:
+        group, widths = env.config.observations.groups[name], env.observation_widths(name)
+        newest = env.observations[name][:, -sum(widths.values()) :].split(list(widths.values()), 1)
+        for term, value in zip(group.terms.values(), newest, strict=True):
+            quantity = own_quantity(term)
+            if quantity is not None:
+                readings[quantity] = value
+    return readings
 
 
 def raw_points(frame: LidarFrame) -> np.ndarray:

@@ -27,6 +27,8 @@ from .shapes import ShapeKind, finite_tuple
 
 _COVERED = 0.8
 """Share of a frame that evenly kept points should span."""
+_SEEDS = 0x7FFFFFFF
+"""Bits of a seed that the kernels read."""
 
 RAYS_PER_TASK = BLOCK
 """Rays of one environment that a CPU thread casts in one go."""
@@ -122,7 +124,7 @@ class Lidar:
     moments, which are the end of the last frame, K - 1 moments at which the caller writes the scene's poses and calls
     ``record_poses``, and this frame's end, for which ``cast`` takes the scene's poses itself. With a frame of five
     control steps and K = 5, call it after each of the first four. Bodies that were put somewhere else, as by a reset,
-    have not moved there: call ``forget_motion``.
+    have not moved there: call ``reset``.
 
     Attributes:
         config, pattern, scene: As given.
@@ -132,8 +134,8 @@ class Lidar:
         frame: The frame that ``cast`` fills and returns; with several ``env_slices``, that of the slice cast last.
         features: What the scan's kernel was compiled for, see ``scan_kernel``.
         phase_rows: Rows by which each environment's device is ahead, (num_envs,) int64, from the seed.
-        frame_count: Frames cast by each environment since its last ``reset``, (num_envs,) int32; the noise and a
-            stratified selection are functions of it, of the seed and of the environment.
+        frame_count: Frames cast by each environment since it was given a seed, (num_envs,) int32; the noise and a
+            stratified selection are functions of it, of the seed and, without a seed of its own, of the environment.
     """
 
     def __init__(
@@ -185,6 +187,8 @@ class Lidar:
         self._first_row = torch.zeros(scene.num_envs, dtype=torch.int64, device=scene.device)
         self._scratch = torch.zeros(scene.num_envs, dtype=torch.float64, device=scene.device)
         self.frame_count = torch.zeros(scene.num_envs, dtype=torch.int32, device=scene.device)
+        self._noise_seed = torch.full_like(self.frame_count, seed & _SEEDS)
+        self._noise_stream = torch.arange(scene.num_envs, dtype=torch.int32, device=scene.device)
         self._noise = noise_by_name(noise)
         self.frame = self._allocate_frame()
         self.slice_frames = tuple(self._first_rows(envs.stop - envs.start) for envs in self.env_slices)
@@ -195,7 +199,7 @@ class Lidar:
         if self._is_marched:
             self._allocate_marched()
         num_viewed = len(scene.shapes) - len(set(exclude_shapes))
-        self._casts = self._record_casts(seed, reflectivity or {}, num_viewed)
+        self._casts = self._record_casts(reflectivity or {}, num_viewed)
 
     def cast(self, time_s: torch.Tensor | np.ndarray | float) -> LidarFrame:
         """Casts the frame that ends at ``time_s`` from the scene's poses and, with motion, those recorded before.
@@ -238,12 +242,24 @@ class Lidar:
             yield envs, frame
         self.frame_count.add_(1)
 
-    def reset(self, env_ids: torch.Tensor | None = None) -> None:
-        """Starts the random numbers of some environments, or of all, again from the first frame's."""
-        if env_ids is None:
-            self.frame_count.zero_()
-        else:
-            self.frame_count[env_ids] = 0
+    def reset(self, env_ids: torch.Tensor | None = None, seeds: torch.Tensor | None = None) -> None:
+        """Begins an episode in some environments, or in all: their bodies have been all along where they are next.
+
+        Args:
+            env_ids: Indices, (n,) int64; None for all.
+            seeds: (n,) int64, of the noise and of the device's phase from now on, whichever environment it is; None:
+                both go on, so that no episode repeats another's noise.
+        """
+        if self._track is not None:
+            self._track.forget(env_ids)
+        if seeds is not None:
+            which = slice(None) if env_ids is None else env_ids
+            self._noise_seed[which] = (seeds & _SEEDS).int().to(self._noise_seed.device)
+            self._noise_stream[which] = 0
+            self.frame_count[which] = 0
+            generators = (torch.Generator().manual_seed(seed & _SEEDS) for seed in seeds.tolist())
+            phases = torch.cat([self._selection.draw_phases(1, generator) for generator in generators])
+            self.phase_rows[which] = phases.to(self.phase_rows.device)
 
     def record_poses(self) -> None:
         """Takes the scene's poses as those at the end of a segment within the frame, for all environments.
@@ -254,23 +270,20 @@ class Lidar:
         if self._track is not None:
             self._track.record()
 
-    def forget_motion(self, env_ids: torch.Tensor | None = None) -> None:
-        """Makes the next poses of some environments, or of all, those that their bodies have had all along.
-
-        Args:
-            env_ids: Indices, (n,) int64; None for all.
-        """
-        if self._track is not None:
-            self._track.forget(env_ids)
-
     def state_dict(self) -> dict:
         """State that the next frames depend on beside the scene's poses and the time."""
         track = None if self._track is None else self._track.state_dict()
-        return {"frame_count": self.frame_count.clone(), "track": track}
+        seeded = torch.stack((self._noise_seed.long(), self._noise_stream.long(), self.phase_rows))
+        return {"frame_count": self.frame_count.clone(), "seeded": seeded, "track": track}
 
     def load_state_dict(self, state: dict) -> None:
         """Resumes where ``state_dict`` was taken."""
         self.frame_count.copy_(state["frame_count"])
+        if "seeded" in state:  # files from before there were seeded resets go on with the seed of all environments
+            for own, saved in zip(
+                (self._noise_seed, self._noise_stream, self.phase_rows), state["seeded"], strict=True
+            ):
+                own.copy_(saved)
         if self._track is not None:
             self._track.load_state_dict(state["track"])
 
@@ -344,14 +357,16 @@ class Lidar:
         slots.marched_face = wp.zeros(shape, wp.int32, device=self.scene.wp_device)
         slots.marched_uncertain = wp.zeros(shape, wp.bool, device=self.scene.wp_device)
 
-    def _record_casts(self, seed: int, reflectivity: Mapping[int, float], num_viewed: int) -> list[SplitLaunch]:
+    def _record_casts(self, reflectivity: Mapping[int, float], num_viewed: int) -> list[SplitLaunch]:
         """A launch for each slice."""
         config, scene, rays = self.config, self.scene, self._rays
+        noise = noise_parameters(self._noise, config.min_range, config.max_range)
+        noise.seed, noise.stream = wp.from_torch(self._noise_seed), wp.from_torch(self._noise_stream)
         written = self.outputs - ({"true_ranges"} if self.frame.true_ranges is self.frame.ranges else set())
         args = [
             rays,
             self._view.viewpoint,
-            noise_parameters(self._noise, seed, config.min_range, config.max_range),
+            noise,
             scene.geometry,
             self._placed.slots,
             self._track.arrays if self._track is not None else Track(),

@@ -299,7 +299,7 @@ class Session:
         if lidar is None or env.sensing is None:
             return
         if bool(env.done[0]):
-            lidar.forget_motion(torch.zeros(1, dtype=torch.int64, device=env.device))
+            lidar.reset(torch.zeros(1, dtype=torch.int64, device=env.device))
             self.cloud, self._tick = None, env.sensing.tick
             return
         sensor = env.config.lidar

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -28,8 +29,9 @@ pytest.importorskip("onnx", reason="extra export")
 
 from omniperception.deploy import DeployError, Description, ExportedPolicy, RobotState
 from omniperception.deploy.deploy_yaml import deploy_yaml
+from omniperception.deploy.description import Term
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
-from omniperception.evaluation.exported import ExportedPolicies, raw_points, record
+from omniperception.evaluation.exported import ExportedPolicies, raw_points, record, robot_states
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from own_robots import BIPED, BIPED_PRESET, write_preset
@@ -474,3 +476,36 @@ def test_what_cannot_be_exported_is_named(exported_run, tmp_path):
     run = build.assemble(config.compose(privileged))
     with pytest.raises(config.ConfigError, match=r"privileged\.terms\.true_proprioception cannot be exported"):
         describe(run, OmniEnv(run.env))
+
+
+class Still:
+    """A network that reads flat observations and moves nothing."""
+
+    def __init__(self, width):
+        self.width = width
+
+    def get_inputs(self):
+        return [SimpleNamespace(name="observations", shape=["batch", self.width])]
+
+    def run(self, names, feed):
+        return [np.zeros((1, 12), np.float32)]
+
+
+def test_an_observation_of_ones_own_is_read_by_its_name(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "own_project"))
+    own = "observations.groups.proprioception.terms.foot_load={func: own_project.observations.foot_load}"
+    run = build.assemble(config.compose(("experiment=walk", "num_envs=2", f"+{own}")))
+    env = OmniEnv(run.env)
+    described = describe(run, env)
+    assert described.observations[0].terms[-1] == Term("foot_load", 4)
+    for _ in range(20):
+        env.step(torch.zeros(2, 12))
+    state, command = robot_states(env)[1], env.command.value[1].numpy()
+    policy = ExportedPolicy(described, Still(described.observation_size), safety=None)
+    policy.step(state, command)
+    observed = torch.cat([env.get_observations()[name] for name in run.env.observations.actor], 1)[1]
+    np.testing.assert_allclose(policy.observation, observed, rtol=1e-5, atol=1e-6)
+    weight = float(env.world.model.body_mass.sum()) * 9.81
+    assert sum(state.other["foot_load"]) == pytest.approx(weight, rel=0.2)  # it stands on its feet
+    with pytest.raises(DeployError, match="foot_load: this policy observes it"):
+        policy.step(replace(state, other=None), command)

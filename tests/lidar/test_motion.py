@@ -203,7 +203,7 @@ def test_a_reset_forgets_the_motion_of_its_environment_only():
         lidar.cast(now)
         scene.body_quat[:, 0] = yaw_quat(0.5)
         if which is not None:
-            lidar.forget_motion(which)
+            lidar.reset(which)
         ranges, flat = lidar.cast(now).ranges, still.cast(now).ranges
         bent = [not torch.allclose(ranges[env], flat[env], rtol=1e-5) for env in (0, 1)]
         assert bent == [True, which is None]
@@ -255,7 +255,7 @@ def test_a_sensor_that_goes_on_from_a_saved_state_casts_the_same():
             else:
                 lidar.record_poses()
         if moment == 3:
-            first.forget_motion(torch.tensor([1]))
+            first.reset(torch.tensor([1]))
             second.load_state_dict(first.state_dict())
     assert torch.equal(first.frame.ranges, second.frame.ranges)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 
 import torch
@@ -83,6 +84,13 @@ class ObservationManager:
         self._history = torch.cat((self._history[:, 1:], value[:, None]), 1)
         self._history[fresh] = value[fresh, None]
         return self._history.flatten(1)
+
+    def peek(self, state: EnvState) -> torch.Tensor:
+        """(num_envs, history * width) what `compute` would return, which leaves everything as it is."""
+        before = copy.deepcopy(self.state_dict())
+        values = self.compute(state, torch.zeros(0, dtype=torch.int64, device=state.device))
+        self.load_state_dict(before)
+        return values
 
     def reset(self, env_ids: torch.Tensor) -> None:
         """Resets the terms with memory for environments (n,) that begin an episode."""

@@ -67,6 +67,17 @@ def mirrors(*parts: str | Sequence[float]) -> Callable[[Marked], Marked]:
     return mark
 
 
+def measured_as(quantity: str) -> Callable[[Marked], Marked]:
+    """Declares that a robot measures what an observation term of one's own gives: an exported policy reads it, in the
+    same units, from `RobotState.other[quantity]`."""
+
+    def mark(term: Marked) -> Marked:
+        term.quantity = quantity  # type: ignore[attr-defined]  # functions and classes take attributes
+        return term
+
+    return mark
+
+
 @dataclass(frozen=True)
 class RewardTerm:
     """A weighted term; a weight of 0 means that the term, and what only it reads, does not exist in this run."""

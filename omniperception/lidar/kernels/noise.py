@@ -1,6 +1,6 @@
 """Noise of a LiDAR, compiled for the models that a sensor has.
 
-The random numbers are a function of seed, environment, frame, ray and model: none depends on what else is configured.
+The random numbers are a function of seed, stream, frame, ray and model: none depends on what else is configured.
 """
 
 import math
@@ -35,7 +35,8 @@ GOLDEN_ANGLE = wp.constant(wp.float32(2.399963229728653))
 class NoiseParameters:
     """The parameters of all models; those of models that a sensor does not have are not read."""
 
-    seed: int
+    seed: wp.array(dtype=wp.int32)  # (num_envs,)
+    stream: wp.array(dtype=wp.int32)  # (num_envs,) of that seed's
     min_range: float
     max_range: float
     jitter_sigma: float  # tangent of the angle
@@ -58,10 +59,10 @@ class NoiseParameters:
     mask_high: float
 
 
-def noise_parameters(named: dict[str, Noise], seed: int, min_range: float, max_range: float) -> NoiseParameters:
+def noise_parameters(named: dict[str, Noise], min_range: float, max_range: float) -> NoiseParameters:
     """The models as the kernels read them, angles as their tangents."""
     parameters = NoiseParameters()
-    parameters.seed, parameters.min_range, parameters.max_range = seed & 0x7FFFFFFF, min_range, max_range
+    parameters.min_range, parameters.max_range = min_range, max_range
     for model in named.values():
         if isinstance(model, AngularJitter):
             parameters.jitter_sigma = math.tan(math.radians(model.sigma_deg))

@@ -169,7 +169,7 @@ def scan_kernel(has: frozenset[str]) -> wp.Kernel:
             p_mount = wp.vec3(wp.transform_get_translation(viewpoint.pose))
             turn_mount = turn_of(viewpoint.pose)
         if wp.static(noisy):
-            env_key = child_key(child_key(wp.rand_init(noise.seed), env), labels.frame[env])
+            env_key = child_key(child_key(wp.rand_init(noise.seed[env]), noise.stream[env]), labels.frame[env])
         if wp.static("marched" in has):
             march_height_field(rays, geometry, slots, env, first, last)
 
