@@ -58,7 +58,9 @@ NAMES: dict[str, Kind] = {
     "observations.groups.*.terms.*": Kind("omniperception.env.mdp.observations", "func", built=False, given=1),
     "commands": Kind(_members("env.mdp.commands", velocity="VelocityCommandConfig", goal="GoalCommandConfig")),
     "terrain": Kind(
-        _members("scene.terrain", flat="TerrainConfig") | _members("scene.tiled_terrain", tiled="TiledTerrainConfig")
+        _members("scene.terrain", flat="TerrainConfig")
+        | _members("scene.tiled_terrain", tiled="TiledTerrainConfig")
+        | _members("scene.map_terrain", heights="HeightMapConfig", plan="FloorPlanConfig", place="PlaceConfig")
     ),
     "terrain.tiles.*": Kind(_members("scene.tiles", rough="Rough", slope="Slope", stairs="Stairs", stones="Stones")),
     "obstacles.groups.*.layout": Kind(

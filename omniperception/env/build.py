@@ -10,7 +10,7 @@ from omniperception.avoidance.velocity import MOTION_TARGET
 from omniperception.common.random import EnvRandom
 from omniperception.env.config import EnvConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
-from omniperception.scene import ObstacleField, TiledTerrainConfig
+from omniperception.scene import ObstacleField, TerrainConfig
 from omniperception.sim import Simulator
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def build_ground(
     config: EnvConfig, sim: Simulator, random: EnvRandom
 ) -> tuple[Ground | None, TerrainLevels | None, HeightLookup | None]:
     """A ground that is not flat, the curriculum over its tiles and the look-up of heights above it."""
-    if not isinstance(config.terrain, TiledTerrainConfig):
+    if isinstance(config.terrain, TerrainConfig):
         return None, None, None
     from omniperception.env.height_lookup import HeightLookup
     from omniperception.env.terrain_levels import TerrainLevels

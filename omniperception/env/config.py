@@ -13,7 +13,7 @@ from omniperception.env.mdp.terminations import TerminationsConfig
 from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
 from omniperception.lidar import DEVICES, Noise
-from omniperception.scene import ObstaclesConfig, RobotConfig, TerrainConfig, TiledTerrainConfig
+from omniperception.scene import MapTerrainConfig, ObstaclesConfig, RobotConfig, TerrainConfig, TiledTerrainConfig
 from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.sim import SimConfig
 
@@ -51,7 +51,7 @@ class EnvConfig:
     num_envs: int
     seed: int
     robot: RobotConfig
-    terrain: TerrainConfig | TiledTerrainConfig
+    terrain: TerrainConfig | TiledTerrainConfig | MapTerrainConfig
     obstacles: ObstaclesConfig
     commands: VelocityCommandConfig | GoalCommandConfig
     observations: ObservationsConfig

@@ -4,6 +4,7 @@
 """
 
 from omniperception.scene.build import World, build_world
+from omniperception.scene.map_terrain import MapTerrainConfig
 from omniperception.scene.obstacle_field import ObstacleField
 from omniperception.scene.obstacle_group import ApproachConfig, MotionConfig, ObstacleGroup
 from omniperception.scene.obstacles import FreePathConfig, ObstaclesConfig
@@ -15,6 +16,7 @@ from omniperception.scene.tiled_terrain import TerrainCurriculumConfig, TiledTer
 __all__ = [
     "ApproachConfig",
     "FreePathConfig",
+    "MapTerrainConfig",
     "MotionConfig",
     "Mount",
     "ObstacleField",

@@ -9,6 +9,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from omniperception.scene.map_terrain import MapTerrainConfig
 from omniperception.scene.obstacles import ObstaclesConfig
 from omniperception.scene.robot import RobotConfig
 from omniperception.scene.robot_file import collides, compile_robot, drop_unseen
@@ -38,7 +39,7 @@ class World:
 
     model: mujoco.MjModel
     robot: RobotConfig
-    terrain: TerrainConfig | TiledTerrainConfig
+    terrain: TerrainConfig | TiledTerrainConfig | MapTerrainConfig
     obstacles: ObstaclesConfig
     sensors: frozenset[str]
 
@@ -83,7 +84,7 @@ class World:
 
 def build_world(
     robot: RobotConfig,
-    terrain: TerrainConfig | TiledTerrainConfig,
+    terrain: TerrainConfig | TiledTerrainConfig | MapTerrainConfig,
     obstacles: ObstaclesConfig,
     sensors: Collection[str] = (),
 ) -> World:

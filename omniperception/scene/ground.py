@@ -10,11 +10,10 @@ import warp as wp
 
 from omniperception.common.launch import launch_over_envs, view
 from omniperception.scene import ground_kernels as kernels
+from omniperception.scene.height_field import EDGE
+from omniperception.scene.map_terrain import MapTerrainConfig
 from omniperception.scene.terrain import GROUND
 from omniperception.scene.tiled_terrain import TiledTerrainConfig
-
-EDGE = 1.0
-"""Distance (m) from the outer edge of the terrain at which an environment counts as outside."""
 
 _LOOKUPS_PER_THREAD = 4096
 """Heights per thread: looking up this many takes about 40 microseconds, which outweighs waking another thread."""
@@ -22,9 +21,10 @@ _REAL = {torch.float32: (wp.float32, wp.vec2), torch.float64: (wp.float64, wp.ve
 
 
 class Ground:
-    """Tile on which each environment starts, and height of the ground in that environment's frame.
+    """Where each environment starts, and height of the ground in that environment's frame.
 
-    The origin of an environment's frame is the middle of its tile, at the height of the ground there. The surface is
+    The origin of an environment's frame is the middle of its tile, or one of a map's places to start, at the height of
+    the ground there. A map has a row for each place and one column. The surface is
     the one that MuJoCo collides and rays hit: two triangles to a cell, divided from (row, col) to (row + 1, col + 1).
 
     Attributes:
@@ -34,7 +34,11 @@ class Ground:
     """
 
     def __init__(
-        self, config: TiledTerrainConfig, model: mujoco.MjModel, pos_w: torch.Tensor, num_threads: int | None = None
+        self,
+        config: TiledTerrainConfig | MapTerrainConfig,
+        model: mujoco.MjModel,
+        pos_w: torch.Tensor,
+        num_threads: int | None = None,
     ) -> None:
         """
         Args:
@@ -53,7 +57,7 @@ class Ground:
         self._heights = (data * scale + float(geom.pos[2])).float().to(device)
         self._half = torch.tensor(model.hfield_size[field, :2], dtype=pos_w.dtype, device=device)
         self._last = torch.tensor([self._cols - 2, self._rows - 2], device=device)
-        self._pos_w = pos_w
+        self._pos_w, self._starts = pos_w, torch.as_tensor(config.starts(), device=device)
         num_envs = pos_w.shape[0]
         self.level = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.column = torch.arange(num_envs, device=device) * config.columns // num_envs
@@ -66,9 +70,7 @@ class Ground:
     def move(self, env_ids: torch.Tensor, level: torch.Tensor) -> None:
         """Puts environments `env_ids` (n,) on the tiles of levels (n,) in their columns."""
         self.level[env_ids] = level
-        grid, border = self.config.grid, self.config.border_cells
-        tile = torch.stack((level, self.column[env_ids]), -1)
-        middle = border + (2 * tile + 1) * grid.half
+        middle = self._starts[self.column[env_ids], level]
         height = self._heights[middle[:, 1] * self._cols + middle[:, 0]]
         self._middle[env_ids] = middle
         self._middle_height[env_ids] = height

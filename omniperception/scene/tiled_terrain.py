@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from omniperception.scene.terrain import GROUND, check_contact, set_contact
+from omniperception.scene.height_field import add_height_field
+from omniperception.scene.terrain import check_contact
 from omniperception.scene.tiles import Tile, TileGrid
-
-_BASE = 0.5
-"""Thickness (m) of the solid under the lowest point."""
 
 
 @dataclass(frozen=True)
@@ -147,19 +145,11 @@ class TiledTerrainConfig:
                 heights[row : row + side + 1, col : col + side + 1] += tile
         return heights
 
+    def starts(self) -> np.ndarray:
+        """(columns, levels, 2) int64 grid points (column, row) in the middles of the tiles, which are origins."""
+        tile = np.stack(np.meshgrid(np.arange(self.levels), np.arange(self.columns)), -1)
+        return self.border_cells + (2 * tile + 1) * self.grid.half
+
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Adds the height field on a kinematic body, so that every environment can have its own tile at its origin."""
-        heights = self.height_map()
-        low, span = heights.min(), max(np.ptp(heights), 1e-3)
-        rows, cols = heights.shape
-        half_x, half_y = (cols - 1) * self.cell / 2, (rows - 1) * self.cell / 2
-        spec.add_hfield(
-            name=GROUND,
-            size=[half_x, half_y, span, _BASE],
-            nrow=rows,
-            ncol=cols,
-            userdata=((heights - low) / span).astype(np.float32).ravel(),
-        )
-        body = spec.worldbody.add_body(name=GROUND, mocap=True)
-        geom = body.add_geom(name=GROUND, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=GROUND, pos=[0, 0, low])
-        set_contact(geom, self.friction, self.restitution)
+        add_height_field(spec, self.height_map(), self.cell, self.friction, self.restitution)

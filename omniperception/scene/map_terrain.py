@@ -1,0 +1,392 @@
+"""Terrain from files: height maps, floor plans and meshes of whole places, as one height field with places to start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from omniperception.scene.height_field import EDGE, add_height_field
+from omniperception.scene.terrain import check_contact
+
+MAX_POINTS = 16_000_000
+"""Grid points of a map."""
+_OFF_LINE = (1.3e-4, 0.7e-4)
+"""Share of a cell by which a mesh is looked at beside the grid, so that points lie on no edge of it."""
+
+
+@dataclass(frozen=True)
+class StartsConfig:
+    """Places where robots start: level, free of walls, on ground that hangs together.
+
+    Attributes:
+        num: places, one of which is drawn at every reset; fewer where fewer are found.
+        radius: half side (m) of the free square around a place.
+        step: largest difference (m) of heights in that square.
+        climb: largest difference (m) of neighbouring grid points of ground that hangs together; walls have more.
+        inside: (x, y) m of a point on the ground that is meant; None: the ground of the largest area.
+        seed: of the choice.
+    """
+
+    num: int = 64
+    radius: float = 0.5
+    step: float = 0.05
+    climb: float = 0.2
+    inside: Sequence[float] | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.num < 1:
+            raise ValueError(f"terrain.start.num={self.num} must be at least 1")
+        for key in ("radius", "step", "climb"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"terrain.start.{key}={getattr(self, key)} must be positive")
+        if self.inside is not None and len(self.inside) != 2:
+            raise ValueError(f"terrain.start.inside={list(self.inside)} must be [x, y] (m) or null")
+
+
+@dataclass(frozen=True)
+class MapTerrainConfig:
+    """A height field from a file; what kind of file, a subclass says.
+
+    An environment starts at one of the places found, which is the origin of its frame, at the height of the ground
+    there. Where it leaves the file's area, its episode ends as a time-out; the ground goes on for a metre as at the
+    edge.
+
+    Attributes:
+        file: path, relative to the working directory.
+        cell: distance (m) of grid points.
+        start: where robots start.
+        friction: sliding friction coefficient of the ground; it holds for every contact with the ground.
+        restitution: coefficient of restitution e in [0, 1].
+    """
+
+    file: str
+    cell: float = 0.05
+    start: StartsConfig = StartsConfig()
+    friction: float = 0.8
+    restitution: float = 0.0
+
+    suffixes = (".png",)
+    columns, curriculum = 1, None
+
+    def __post_init__(self) -> None:
+        check_contact(self.friction, self.restitution)
+        if not 0 < self.cell <= 0.5:
+            raise ValueError(f"terrain.cell={self.cell} must lie in (0, 0.5]")
+        if Path(self.file).suffix.lower() not in self.suffixes:
+            raise ValueError(f"terrain.file={self.file} must end with {' or '.join(self.suffixes)}")
+        if not Path(self.file).is_file():
+            raise ValueError(f"terrain.file={self.file} does not exist (working directory: {Path.cwd()})")
+
+    def read(self) -> tuple[np.ndarray, tuple[float, float]]:
+        """(rows, cols) heights (m), x along columns, y along rows, and where (m) the first point is in the file."""
+        raise NotImplementedError
+
+    def floor(self, heights: np.ndarray) -> np.ndarray:
+        """(rows, cols) bool: which points of (rows, cols) heights (m) may belong to the ground that is meant."""
+        return np.ones(heights.shape, bool)
+
+    @cached_property
+    def _map(self) -> tuple[np.ndarray, tuple[float, float]]:
+        heights, first = self.read()
+        least = 1 + 2 * round(self.start.radius / self.cell)
+        if min(heights.shape) < least or heights.size > MAX_POINTS:
+            raise ValueError(
+                f"terrain.file={self.file} has {heights.shape[1]} x {heights.shape[0]} points {self.cell} m apart;"
+                f" {least} x {least} to {MAX_POINTS} in all were expected; change terrain.cell"
+            )
+        if not np.isfinite(heights).all():
+            raise ValueError(f"terrain.file={self.file} holds heights that are not finite; fill them")
+        border = round(EDGE / self.cell)
+        return np.pad(heights, border, mode="edge"), (first[0] - border * self.cell, first[1] - border * self.cell)
+
+    def height_map(self) -> np.ndarray:
+        """(rows, cols) float64 heights (m), x along columns, y along rows."""
+        return self._map[0]
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """(num, 2) int64 grid points (column, row) where robots start."""
+        heights, (x, y) = self._map
+        near = None
+        if self.start.inside is not None:
+            near = tuple(round((at - low) / self.cell) for at, low in zip(self.start.inside, (x, y), strict=True))
+            if not (0 <= near[0] < heights.shape[1] and 0 <= near[1] < heights.shape[0]):
+                raise ValueError(f"terrain.start.inside={list(self.start.inside)} lies beside the map")
+        found = free_places(heights, self.cell, self.start, near, self.floor(heights))
+        if not len(found):
+            raise ValueError(
+                f"terrain.file={self.file} has no place to start: nowhere is ground level to {self.start.step} m within"
+                f" {self.start.radius} m; lower terrain.start.radius, raise terrain.start.step, or change terrain.cell"
+            )
+        return found
+
+    @property
+    def levels(self) -> int:
+        """Number of places."""
+        return len(self.places)
+
+    def starts(self) -> np.ndarray:
+        """(columns, levels, 2) int64 grid points (column, row) at which environments have their origins."""
+        return self.places[None]
+
+    def column_kinds(self) -> tuple[str, ...]:
+        return ("map",)
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Adds the height field on a kinematic body, so that every environment can have a place of its own."""
+        add_height_field(spec, self.height_map(), self.cell, self.friction, self.restitution)
+
+
+@dataclass(frozen=True)
+class HeightMapConfig(MapTerrainConfig):
+    """Heights from a grey PNG or a NumPy file, a grid point for each pixel; (0, 0) is the map's middle.
+
+    A picture lies as it is seen: x to its right, y to its top. Rows of a NumPy file go along y.
+
+    Attributes:
+        heights: of a picture: heights (m) of black and of white. A NumPy file has metres.
+    """
+
+    heights: Sequence[float] | None = None
+
+    suffixes = (".png", ".npy")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.heights is not None) != (Path(self.file).suffix.lower() == ".png"):
+            raise ValueError(
+                f"terrain.heights={self.heights} with terrain.file={self.file}: a PNG needs the heights [black, white]"
+                " (m), a .npy file has metres and takes null"
+            )
+        if self.heights is not None and len(self.heights) != 2:
+            raise ValueError(f"terrain.heights={list(self.heights)} must be the heights [black, white] (m)")
+
+    def read(self) -> tuple[np.ndarray, tuple[float, float]]:
+        if self.heights is None:
+            heights = read_array(self.file)
+        else:
+            black, white = self.heights
+            heights = black + (white - black) * read_image(self.file)
+        return heights, _first_of(heights, self.cell)
+
+
+@dataclass(frozen=True)
+class FloorPlanConfig(MapTerrainConfig):
+    """Walls from a PNG of a floor plan, a grid point for each pixel: dark is wall. The frame is that of a height map.
+
+    Attributes:
+        wall_height: (m) above the floor, which is at 0.
+        threshold: a pixel darker than this (0 black, 1 white) is wall.
+    """
+
+    wall_height: float = 1.5
+    threshold: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.wall_height > self.start.climb:
+            raise ValueError(
+                f"terrain.wall_height={self.wall_height} must be above terrain.start.climb={self.start.climb}: walls"
+                " are what cannot be climbed"
+            )
+        if not 0 < self.threshold < 1:
+            raise ValueError(f"terrain.threshold={self.threshold} must lie in (0, 1)")
+
+    def read(self) -> tuple[np.ndarray, tuple[float, float]]:
+        heights = np.where(read_image(self.file) < self.threshold, float(self.wall_height), 0.0)
+        return heights, _first_of(heights, self.cell)
+
+    def floor(self, heights: np.ndarray) -> np.ndarray:
+        return heights == 0.0
+
+
+@dataclass(frozen=True)
+class PlaceConfig(MapTerrainConfig):
+    """A whole place from a mesh, seen from above: a height field has no overhangs, so what is above `ceiling` is left
+    out, and below a table's top it is solid. x and y are the mesh's.
+
+    Attributes:
+        scale: metres per unit of the file.
+        up: axis of the file that points up, 'z' or 'y'; with 'y' its -z is y here.
+        ceiling: height (m) in the file's frame above which nothing counts; a wall that goes on above ends there.
+        outside: height (m) where there is nothing; None: that of the lowest point.
+    """
+
+    scale: float = 1.0
+    up: str = "z"
+    ceiling: float | None = None
+    outside: float | None = None
+
+    suffixes = (".stl", ".obj", ".ply", ".glb")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.up not in ("z", "y"):
+            raise ValueError(f"terrain.up={self.up} must be z or y")
+        if not self.scale > 0:
+            raise ValueError(f"terrain.scale={self.scale} must be positive")
+
+    def read(self) -> tuple[np.ndarray, tuple[float, float]]:
+        from omniperception.lidar.meshes import TriangleMesh
+
+        mesh = TriangleMesh.from_file(self.file, self.scale)
+        corners = mesh.vertices.astype(np.float64)[mesh.triangles]
+        if self.up == "y":
+            corners = np.stack((corners[..., 0], -corners[..., 2], corners[..., 1]), -1)
+        low, high = corners.min((0, 1)), corners.max((0, 1))
+        cols, rows = (int((high[k] - low[k]) / self.cell + 1e-6) + 1 for k in (0, 1))
+        if cols * rows > MAX_POINTS:
+            raise ValueError(
+                f"terrain.file={self.file} is {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, too large for"
+                f" terrain.cell={self.cell}; change it or terrain.scale={self.scale}"
+            )
+        x, y = (low[k] + self.cell * np.arange(num) for k, num in ((0, cols), (1, rows)))
+        heights = seen_from_above(corners, x, y, self.ceiling)
+        empty = np.isneginf(heights)
+        if empty.all():
+            raise ValueError(f"terrain.file={self.file} has nothing below terrain.ceiling={self.ceiling}")
+        heights[empty] = heights[~empty].min() if self.outside is None else self.outside
+        return heights, (float(low[0]), float(low[1]))
+
+
+def _first_of(heights: np.ndarray, cell: float) -> tuple[float, float]:
+    """Where (m) the first point of a map is that has (0, 0) in its middle."""
+    rows, cols = heights.shape
+    return -(cols - 1) * cell / 2, -(rows - 1) * cell / 2
+
+
+def read_image(file: str) -> np.ndarray:
+    """(rows, cols) float64 brightness, 0 black to 1 white, of a picture; the first row is its lowest.
+
+    Raises:
+        ImportError: pillow is not installed.
+        ValueError: it is no picture.
+    """
+    try:
+        from PIL import Image
+    except ImportError:
+        raise ImportError(f"reading {file} needs pillow: pip install 'omniperception[maps]'") from None
+    try:
+        with Image.open(file) as image:
+            deep = image.mode.startswith("I")  # 16 bit
+            values = np.asarray(image if deep else image.convert("L"), dtype=np.float64)
+    except OSError as error:
+        raise ValueError(f"terrain.file={file} is no picture that can be read ({str(error).splitlines()[0]})") from None
+    return values[::-1] / (65535.0 if deep else 255.0)
+
+
+def read_array(file: str) -> np.ndarray:
+    """(rows, cols) float64 heights (m) of a NumPy file; a ValueError of one line if it holds something else."""
+    try:
+        heights = np.load(file, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"terrain.file={file} is no NumPy array ({str(error).splitlines()[0]})") from None
+    if not isinstance(heights, np.ndarray) or heights.ndim != 2 or heights.dtype.kind not in "fiu":
+        shape = getattr(heights, "shape", "several arrays")
+        raise ValueError(f"terrain.file={file} holds {shape}; (rows, cols) heights in m were expected")
+    return heights.astype(np.float64)
+
+
+def seen_from_above(corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: float | None) -> np.ndarray:
+    """Heights (R, C) of the highest surface of a mesh above points x (C,), y (R,), evenly spaced; -inf above nothing.
+
+    With a ceiling, surfaces above it do not count, and where an odd number of them is above a point, the point is
+    within a solid that goes through the ceiling: there the height is the ceiling's.
+
+    Args:
+        corners: (T, 3, 3) m, of triangles.
+        x, y: m.
+        ceiling: m, or None.
+    """
+    heights, within = np.full((len(y), len(x)), -np.inf), np.zeros((len(y), len(x)), bool)
+    spacing = x[1] - x[0], y[1] - y[0]
+    x, y = (at + share * step for at, share, step in zip((x, y), _OFF_LINE, spacing, strict=True))
+    first, last = (
+        np.stack([np.searchsorted(at, reduce(corners[:, :, k], axis=1), side) for k, at in ((0, x), (1, y))], 1)
+        for reduce, side in ((np.min, "left"), (np.max, "right"))
+    )
+    a, b, c = (corners[:, k] for k in range(3))
+    ab, ac = b - a, c - a
+    area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
+    for k in np.flatnonzero((area != 0.0) & (last > first).all(1)):  # the others are upright or between points
+        window = slice(first[k, 1], last[k, 1]), slice(first[k, 0], last[k, 0])
+        dx, dy = x[window[1]][None] - a[k, 0], y[window[0]][:, None] - a[k, 1]
+        u = (dx * ac[k, 1] - dy * ac[k, 0]) / area[k]
+        v = (dy * ab[k, 0] - dx * ab[k, 1]) / area[k]
+        inside = (u >= 0) & (v >= 0) & (u + v <= 1)
+        z = a[k, 2] + u * ab[k, 2] + v * ac[k, 2]
+        above = inside & (z > ceiling) if ceiling is not None else np.zeros_like(inside)
+        heights[window] = np.where(inside & ~above, np.maximum(heights[window], z), heights[window])
+        within[window] ^= above
+    return heights if ceiling is None else np.where(within, ceiling, heights)
+
+
+def free_places(
+    heights: np.ndarray,
+    cell: float,
+    config: StartsConfig,
+    near: tuple[int, ...] | None = None,
+    floor: np.ndarray | None = None,
+) -> np.ndarray:
+    """(n, 2) int64 grid points (column, row) that are free by `config`, in random order; see `StartsConfig`.
+
+    Args:
+        heights: (rows, cols) m.
+        cell: m.
+        config: what is free.
+        near: a grid point (column, row) on the ground that is meant; None: that of the largest area.
+        floor: (rows, cols) bool, which points may belong to it; None: all.
+    """
+    region = connected(heights, config.climb)
+    region = region if floor is None else np.where(floor, region, region.size)
+    area = np.bincount(region.ravel(), minlength=region.size)[: region.size]
+    chosen = region[near[1], near[0]] if near is not None else area.argmax()
+    reach, margin = round(config.radius / cell), round((EDGE + config.radius) / cell)
+    level = _around(heights, reach, np.maximum) - _around(heights, reach, np.minimum) <= config.step
+    free = level & _around((region == chosen) & (region < region.size), reach, np.logical_and)
+    inner = np.zeros_like(free)
+    inner[margin:-margin, margin:-margin] = True
+    rows, cols = np.nonzero(free & inner)
+    found = np.stack((cols, rows), -1).astype(np.int64)
+    return np.random.default_rng(config.seed).permutation(found)[: config.num]
+
+
+def connected(heights: np.ndarray, climb: float) -> np.ndarray:
+    """(rows, cols) int64 number of the ground that each point belongs to: one can walk between points of the same
+    number from neighbour to neighbour, whose heights differ by at most `climb`."""
+    rows, cols = heights.shape
+    right, up = (np.zeros(heights.shape, bool) for _ in range(2))
+    right[:, :-1] = np.abs(np.diff(heights, axis=1)) <= climb
+    up[:-1] = np.abs(np.diff(heights, axis=0)) <= climb
+    right, up = right.ravel(), up.ravel()
+    number = np.full(rows * cols, -1, np.int64)
+    for start in range(rows * cols):
+        if number[start] >= 0:
+            continue
+        number[start], front = start, np.array([start])
+        while len(front):
+            left, down = front - 1, front - cols
+            after = [front[right[front]] + 1, left[(left >= 0) & right[left]]]
+            after += [front[up[front]] + cols, down[(down >= 0) & up[down]]]
+            front = np.concatenate(after)
+            front = np.unique(front[number[front] < 0])
+            number[front] = start
+    return number.reshape(rows, cols)
+
+
+def _around(values: np.ndarray, reach: int, combine: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """`combine` of all values within a square of `reach` grid points to each side, as far as there are any."""
+    for axis in (0, 1):
+        turned = np.moveaxis(values, axis, 0)
+        padded = np.concatenate((turned[:1].repeat(reach, 0), turned, turned[-1:].repeat(reach, 0)))
+        made = padded[: len(turned)]
+        for shift in range(1, 2 * reach + 1):
+            made = combine(made, padded[shift : shift + len(turned)])
+        values = np.moveaxis(made, 0, axis)
+    return values
