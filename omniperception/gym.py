@@ -44,6 +44,11 @@ class OmniVectorEnv:
         env: the environments behind it.
     """
 
+    single_observation_space: gymnasium.Space
+    observation_space: gymnasium.Space
+    single_action_space: gymnasium.Space
+    action_space: gymnasium.Space
+
     def __init__(self, env: OmniEnv, arrays: Arrays = "numpy", critic: bool = False) -> None:
         """
         Args:
@@ -168,6 +173,9 @@ class OmniSingleEnv:
     Attributes:
         vector: the vector of one behind it.
     """
+
+    observation_space: gymnasium.Space
+    action_space: gymnasium.Space
 
     def __init__(self, vector: OmniVectorEnv) -> None:
         """Args: vector: of one environment, in NumPy's arrays."""

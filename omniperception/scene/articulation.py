@@ -9,7 +9,7 @@ import torch
 
 from omniperception.common.rotations import matrix_of, multiply, rotate, yaw_quat
 from omniperception.scene.part_shapes import quat_about, quat_of_rpy
-from omniperception.scene.parts import AXES, Part, PartConfig
+from omniperception.scene.parts import Part, PartConfig
 
 Rows = torch.Tensor | slice
 """Some environments, (n,) int64, or all."""
@@ -42,7 +42,7 @@ class Articulation:
         num_obstacles = int(self.obstacle.max()) + 1
         self._joint, self._hang = column([form.pos for form in forms]), column([form.hang for form in forms])
         self._rest = column([quat_of_rpy(form.rpy_deg) for form in forms])
-        self._axis = column([AXES[swing.axis if swing else "x"] for swing in swings])
+        self._axis = column([swing.direction if swing else (1.0, 0.0, 0.0) for swing in swings])
         self._amplitude = torch.deg2rad(column([swing.amplitude_deg if swing else 0.0 for swing in swings]))
         self._frequency = column([swing.frequency if swing else 0.0 for swing in swings])
         self._per_metre = column([swing.per_metre if swing else 0.0 for swing in swings])

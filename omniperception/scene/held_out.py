@@ -36,6 +36,10 @@ def held_out(config: ObstaclesConfig) -> ObstaclesConfig:
 def _others(name: str, group: ObstacleGroup, larger_first: bool, clearance: float) -> Mapping[str, ObstacleGroup]:
     """Held-out groups in place of one; of an odd number of obstacles there is one larger one more, or one smaller."""
     new = (group.count + 1) // 2 if group.kind in ("box", "cylinder", "sphere") else 0
+    if group.files:
+        raise ValueError(
+            f"obstacles: {name} has files={list(group.files)}, of which there are no held-out ones; use split=dev"
+        )
     found = {}
     for count, changes in ((new, True), (group.count - new, False)):
         first, larger_now = (count + 1) // 2, larger_first == changes

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -71,8 +72,9 @@ class MapTerrainConfig:
     friction: float = 0.8
     restitution: float = 0.0
 
-    suffixes = (".png",)
-    columns, curriculum = 1, None
+    suffixes: ClassVar[tuple[str, ...]] = (".png",)
+    columns: ClassVar[int] = 1
+    curriculum: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         check_contact(self.friction, self.restitution)
@@ -155,7 +157,7 @@ class HeightMapConfig(MapTerrainConfig):
 
     heights: Sequence[float] | None = None
 
-    suffixes = (".png", ".npy")
+    suffixes: ClassVar[tuple[str, ...]] = (".png", ".npy")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -223,7 +225,7 @@ class PlaceConfig(MapTerrainConfig):
     ceiling: float | None = None
     outside: float | None = None
 
-    suffixes = (".stl", ".obj", ".ply", ".glb")
+    suffixes: ClassVar[tuple[str, ...]] = (".stl", ".obj", ".ply", ".glb")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -307,10 +309,9 @@ def seen_from_above(corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: 
     heights, within = np.full((len(y), len(x)), -np.inf), np.zeros((len(y), len(x)), bool)
     spacing = x[1] - x[0], y[1] - y[0]
     x, y = (at + share * step for at, share, step in zip((x, y), _OFF_LINE, spacing, strict=True))
-    first, last = (
-        np.stack([np.searchsorted(at, reduce(corners[:, :, k], axis=1), side) for k, at in ((0, x), (1, y))], 1)
-        for reduce, side in ((np.min, "left"), (np.max, "right"))
-    )
+    low, high = corners.min(1), corners.max(1)
+    first = np.stack([np.searchsorted(at, low[:, k], "left") for k, at in ((0, x), (1, y))], 1)
+    last = np.stack([np.searchsorted(at, high[:, k], "right") for k, at in ((0, x), (1, y))], 1)
     a, b, c = (corners[:, k] for k in range(3))
     ab, ac = b - a, c - a
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
@@ -364,18 +365,19 @@ def connected(heights: np.ndarray, climb: float) -> np.ndarray:
     right, up = (np.zeros(heights.shape, bool) for _ in range(2))
     right[:, :-1] = np.abs(np.diff(heights, axis=1)) <= climb
     up[:-1] = np.abs(np.diff(heights, axis=0)) <= climb
-    right, up = right.ravel(), up.ravel()
+    to_right, to_up = right.ravel(), up.ravel()
     number = np.full(rows * cols, -1, np.int64)
     for start in range(rows * cols):
         if number[start] >= 0:
             continue
-        number[start], front = start, np.array([start])
+        number[start] = start
+        front = np.full(1, start)
         while len(front):
             left, down = front - 1, front - cols
-            after = [front[right[front]] + 1, left[(left >= 0) & right[left]]]
-            after += [front[up[front]] + cols, down[(down >= 0) & up[down]]]
-            front = np.concatenate(after)
-            front = np.unique(front[number[front] < 0])
+            after = [front[to_right[front]] + 1, left[(left >= 0) & to_right[left]]]
+            after += [front[to_up[front]] + cols, down[(down >= 0) & to_up[down]]]
+            reached = np.concatenate(after)
+            front = np.unique(reached[number[reached] < 0])
             number[front] = start
     return number.reshape(rows, cols)
 

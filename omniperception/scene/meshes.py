@@ -51,7 +51,7 @@ MESHES: dict[str, Callable[[], np.ndarray]] = {"rock": rock, "wedge": wedge, "he
 
 def check_mesh(file: str) -> None:
     """Raises a ValueError in one line if `file` is neither a packaged mesh nor a file."""
-    if file not in MESHES and not Path(file).is_file():
+    if file not in MESHES and not Path(file.partition("#")[0]).is_file():
         raise ValueError(f"obstacles: file={file} is neither a packaged mesh ({', '.join(MESHES)}) nor a file")
 
 
@@ -60,7 +60,8 @@ def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
     """Points of a mesh, whose convex hull is meant.
 
     Args:
-        file: name of a packaged mesh, or path of a file in any format that trimesh reads (extra `meshes`).
+        file: name of a packaged mesh, path of a file in any format that trimesh reads (extra `meshes`), or the path of
+            an MJCF or URDF and, after `#`, the name of a mesh in it.
 
     Returns:
         Vertices (V, 3) that fill the box from -1 to 1, and the half extents (m) of the mesh as it is; packaged ones are
@@ -68,6 +69,10 @@ def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
     """
     if file in MESHES:
         points, unit = MESHES[file](), 0.25
+    elif "#" in file:
+        from omniperception.scene.thing_file import mesh_vertices
+
+        points, unit = mesh_vertices(*file.split("#", 1)), None
     else:
         from omniperception.lidar.meshes import TriangleMesh
 

@@ -100,7 +100,8 @@ class ObstacleField:
         self._faces = flags([group.moves and group.kind == COMPOUND for group in groups])
         self._any_faces = bool(self._faces.any())
         self._scale = column(*(group.scale for group in groups))
-        self._reach = column(*(reach(group.parts) if group.kind == COMPOUND else 0.0 for group in groups))
+        compounds = (own if own.group.kind == COMPOUND else None for own in obstacles)
+        self._reach = column(*(reach(own.group.parts_of(own.index)) if own else 0.0 for own in compounds))
         self.velocity_w = torch.zeros(n, len(self.parts), 2, dtype=self._dtype, device=device)
         self.active = torch.zeros(n, len(self.parts), dtype=torch.bool, device=device)
         self.articulation: Articulation | None = None

@@ -10,6 +10,7 @@ from omniperception.scene.layouts import Layout
 from omniperception.scene.meshes import mesh_points
 from omniperception.scene.part_shapes import reach
 from omniperception.scene.parts import SIZES, Part, PartConfig, check_kind, check_sizes
+from omniperception.scene.thing_file import SUFFIXES, is_thing, parts_of
 
 COMPOUND = "compound"
 """Kind of an obstacle of several parts."""
@@ -95,6 +96,9 @@ class ObstacleGroup:
             boundary nor heading apply.
         motion: None: it keeps its heading.
         file: of a mesh: one of the packaged ones (see `scene.meshes`) or a path. Rays and contacts are with its hull.
+            Of a compound: an MJCF or URDF, in place of `parts`; see `thing_file`.
+        files: of several obstacles that differ, in turn, in place of `file`; by `present` each environment has its own.
+        swing_frequency: cycles per second of the hinges in the file of a compound.
         parts: of a compound, by name.
         scale: (low, high) range of a compound's size.
         present: (low, high) range of how many of them take part in an episode, which ones is random; None: all.
@@ -113,13 +117,15 @@ class ObstacleGroup:
     approach: ApproachConfig | None = None
     motion: MotionConfig | None = None
     file: str | None = None
+    files: Sequence[str] = ()
+    swing_frequency: float = 0.2
     parts: Mapping[str, PartConfig] = field(default_factory=dict)
     scale: Sequence[float] = (1.0, 1.0)
     present: Sequence[int] | None = None
     layout: Layout | None = None
 
     def __post_init__(self) -> None:
-        check_kind(self.kind, self.file, (*SIZES, COMPOUND))
+        self._check_files()
         if self.count < 1:
             raise ValueError(f"obstacles: count={self.count} must be at least 1; leave the group out instead")
         for key in ("speed", "bottom", "heading_deg", "yaw_deg", "scale"):
@@ -135,20 +141,51 @@ class ObstacleGroup:
         self._check_places()
         self._check_motion()
 
+    def _check_files(self) -> None:
+        object.__setattr__(self, "files", tuple(self.files))
+        if self.files and (self.file is not None or len(self.files) > self.count):
+            raise ValueError(
+                f"obstacles: files={list(self.files)} with file={self.file} and count={self.count}; give either, and at"
+                " least as many obstacles as files"
+            )
+        if self.swing_frequency < 0:
+            raise ValueError(f"obstacles: swing_frequency={self.swing_frequency} must not be negative")
+        own = self.files or (self.file,)
+        if self.kind != COMPOUND:
+            for file in own:
+                check_kind(self.kind, file, (*SIZES, COMPOUND))
+        elif own != (None,):
+            wrong = [file for file in own if file is None or not is_thing(file)]
+            if wrong or self.parts:
+                raise ValueError(
+                    f"obstacles: a compound with file={', '.join(map(str, own))} and parts={list(self.parts)}; give"
+                    f" parts, or files that end with {', '.join(SUFFIXES)}"
+                )
+
+    def file_of(self, index: int) -> str | None:
+        """File of obstacle number `index`."""
+        return self.files[index % len(self.files)] if self.files else self.file
+
+    def parts_of(self, index: int) -> Mapping[str, PartConfig]:
+        """Parts of obstacle number `index` of compounds."""
+        file = self.file_of(index)
+        return self.parts if file is None else parts_of(file, self.swing_frequency)
+
     def _check_shape(self) -> None:
         object.__setattr__(self, "parts", dict(self.parts))
         if self.kind != COMPOUND:
             if self.parts or self.scale != (1.0, 1.0):
                 raise ValueError(f"obstacles: a {self.kind} has no parts and no scale; use kind=compound")
-            own_size = self.layout is not None or self.file is not None
+            own_size = self.layout is not None or self.file_of(0) is not None
             if self.size or not own_size:
                 object.__setattr__(self, "size", check_sizes(self.kind, self.size))
             return
-        if not self.parts or self.size:
+        every = [self.parts_of(index) for index in range(len(self.files) or 1)]
+        if not all(every) or self.size:
             raise ValueError("obstacles: a compound has parts, and each of them its size; give parts, leave out size")
         if self.scale[0] <= 0:
             raise ValueError(f"obstacles: scale={list(self.scale)} must be a range 0 < low <= high")
-        meshes = [name for name, part in self.parts.items() if part.kind == "mesh"]
+        meshes = [name for parts in every for name, part in parts.items() if part.kind == "mesh"]
         if meshes and self.scale[0] < self.scale[1]:
             raise ValueError(
                 f"obstacles: scale={list(self.scale)} cannot vary with a mesh among the parts: {meshes[0]}"
@@ -191,18 +228,20 @@ class ObstacleGroup:
     def largest_radius(self) -> float:
         """Radius (m) of the circle around the footprint of its largest obstacle."""
         if self.kind == COMPOUND:
-            return self.scale[1] * reach(self.parts)
-        sizes = self.sizes_of(self.count - 1)
-        return math.hypot(sizes[0][1], sizes[1][1] if self.kind in ("box", "mesh") else 0.0)
+            return self.scale[1] * max(reach(self.parts_of(index)) for index in range(len(self.files) or 1))
+        alike = range(self.count - len(self.files), self.count) if self.files else [self.count - 1]
+        sizes = [self.sizes_of(index) for index in alike]
+        return max(math.hypot(x[1], rest[0][1] if self.kind in ("box", "mesh") else 0.0) for x, *rest in sizes)
 
     def sizes_of(self, index: int) -> tuple[tuple[float, float], ...]:
         """(low, high) range (m) of each size of obstacle number `index`."""
         if self.layout is not None:
             return ((0.1, 0.1),) * 3  # until the first reset
-        if self.file is None:
+        file = self.file_of(index)
+        if file is None:
             return tuple((low, high) for low, high in self.size)
         if not self.size:
-            return tuple((half, half) for half in mesh_points(self.file)[1])
+            return tuple((half, half) for half in mesh_points(file)[1])
         share = index / max(self.count - 1, 1)
         return tuple((low + share * (high - low),) * 2 for low, high in self.size)
 
@@ -215,7 +254,7 @@ class ObstacleGroup:
             index: its number in the group.
         """
         if self.kind != COMPOUND:
-            return (Part(name, obstacle, self, self.kind, self.sizes_of(index), self.file),)
+            return (Part(name, obstacle, self, self.kind, self.sizes_of(index), self.file_of(index)),)
         low, high = self.scale
         return tuple(
             Part(
@@ -227,7 +266,7 @@ class ObstacleGroup:
                 form.file,
                 form,
             )
-            for key, form in self.parts.items()
+            for key, form in self.parts_of(index).items()
         )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from omniperception.common.rotations import matrix_of, multiply, rotate
-from omniperception.scene.parts import AXES, Part, PartConfig
+from omniperception.scene.parts import Part, PartConfig
 
 
 class SizeRanges:
@@ -67,7 +67,7 @@ def reach(parts: Mapping[str, PartConfig]) -> float:
 def _reach(form: PartConfig) -> float:
     amplitude = 0.0 if form.swing is None else math.radians(form.swing.amplitude_deg)
     angle = torch.linspace(-amplitude, amplitude, 37, dtype=torch.float64)
-    axis = torch.tensor(AXES["x" if form.swing is None else form.swing.axis], dtype=torch.float64)
+    axis = torch.tensor((1.0, 0.0, 0.0) if form.swing is None else form.swing.direction, dtype=torch.float64)
     turned = multiply(torch.tensor(quat_of_rpy(form.rpy_deg), dtype=torch.float64), quat_about(axis, angle))
     pos, hang = (torch.tensor(value, dtype=torch.float64) for value in (form.pos, form.hang))
     size = torch.tensor([[*form.size, 0.0, 0.0][:3]], dtype=torch.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -38,22 +39,24 @@ class SwingConfig:
     All of an obstacle's parts begin at the same c, drawn at every reset.
 
     Attributes:
-        axis: 'x', 'y' or 'z' of the part's own frame.
+        axis: 'x', 'y' or 'z' of the part's own frame, or a direction (x, y, z) in it.
         amplitude_deg: (deg).
         frequency: cycles per second.
         per_metre: cycles per metre that the obstacle moves.
         phase_deg: (deg).
     """
 
-    axis: str
+    axis: str | Sequence[float]
     amplitude_deg: float
     frequency: float = 0.0
     per_metre: float = 0.0
     phase_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.axis not in AXES:
-            raise ValueError(f"obstacles: swing.axis={self.axis} must be one of {', '.join(AXES)}")
+        if self.axis not in AXES if isinstance(self.axis, str) else len(self.axis) != 3 or not any(self.axis):
+            raise ValueError(f"obstacles: swing.axis={self.axis} must be one of {', '.join(AXES)}, or [x, y, z]")
+        if not isinstance(self.axis, str):
+            object.__setattr__(self, "axis", tuple(float(x) for x in self.axis))
         if not 0 < self.amplitude_deg <= 180:
             raise ValueError(f"obstacles: swing.amplitude_deg={self.amplitude_deg} must lie above 0, up to 180")
         if self.frequency < 0 or self.per_metre < 0 or (self.frequency > 0) == (self.per_metre > 0):
@@ -61,6 +64,13 @@ class SwingConfig:
                 f"obstacles: swing has frequency={self.frequency} and per_metre={self.per_metre}; give one of them,"
                 " positive"
             )
+
+    @property
+    def direction(self) -> tuple[float, ...]:
+        """(3,) of unit length: the axis in the part's own frame."""
+        x, y, z = AXES[self.axis] if isinstance(self.axis, str) else self.axis
+        length = math.hypot(x, y, z)
+        return x / length, y / length, z / length
 
 
 @dataclass(frozen=True)
