@@ -14,10 +14,16 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
-SIZE = {"width": 760, "height": 320}
+SIZE = {"width": 900, "height": 400}
 PATIENCE_S = 120.0
 """Wall time: pictures without a graphics card on a busy machine take seconds each."""
 PICTURE_S = 20.0
+WITHOUT_NOTICES = """addEventListener("DOMContentLoaded", () => {
+    const style = document.createElement("style");
+    style.textContent = ".mantine-Notifications-root { display: none }";
+    document.head.append(style);
+})"""
+"""viser says that there is no graphics card in a notice that lies over the scene, where the mouse has to go."""
 
 
 @contextmanager
@@ -39,6 +45,7 @@ def open_tab(browser: Any) -> Any:
     """A page that waits as long for the browser as `wait_for` does for what happens."""
     page = browser.new_page(viewport=SIZE)
     page.set_default_timeout(1e3 * PATIENCE_S)
+    page.add_init_script(WITHOUT_NOTICES)
     return page
 
 
