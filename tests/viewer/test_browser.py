@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,8 @@ PORT = 18231
 
 
 def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
-    """The joystick, an obstacle, the weights, and time."""
+    """Keys, an obstacle that is brought, time, and the weights."""
     page.goto(f"http://127.0.0.1:{PORT}")
-    client = wait_for(lambda: next(iter(viewer.server.get_clients().values()), None), "the page connects")
     page.get_by_text("I command").wait_for()
     picture(page, pictures / "1_opened.png")
 
@@ -38,15 +38,9 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     page.keyboard.press("x")
     wait_for(lambda: viewer.state()["driven"] == (0.0, 0.0, 0.0), "X stands")
 
-    there = viewer.state()["present"]
-    page.keyboard.press("b")
-    number = wait_for(
-        lambda: [k for k, p in enumerate(viewer.state()["present"]) if p and not there[k]], "B brings one"
-    )[0]
+    bring(viewer, page)
     page.keyboard.press("Space")
     wait_for(lambda: viewer.state()["paused"], "Space pauses")
-    drag(viewer, page, client, number)
-    picture(page, pictures / "2_dragged.png")
 
     steps = viewer.state()["steps"]
     page.keyboard.press("n")
@@ -68,6 +62,27 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     assert state["driven"] == (0.2, 0.0, 0.0) and np.hypot(*state["velocity"]) < 0.1, "weights of zero stand still"
     picture(page, pictures / "3_other_weights.png")
 
+
+def bring(viewer: Viewer, page: Any) -> int:
+    """Brings an obstacle by its key; its number."""
+    there = viewer.state()["present"]
+    page.keyboard.press("b")
+
+    def brought() -> list[int]:
+        return [k for k, present in enumerate(viewer.state()["present"]) if present and not there[k]]
+
+    return wait_for(brought, "B brings an obstacle")[0]
+
+
+def disturb(viewer: Viewer, page: Any, pictures: Path) -> None:
+    """The mouse on an obstacle, and a second browser."""
+    page.goto(f"http://127.0.0.1:{PORT}")
+    client = wait_for(lambda: next(iter(viewer.server.get_clients().values()), None), "the page connects")
+    page.get_by_text("I command").wait_for()
+    page.keyboard.press("x")
+    number = bring(viewer, page)
+    drag(viewer, page, client, number)
+    picture(page, pictures / "2_dragged.png")
     second = page.context.browser.new_page(viewport={"width": 300, "height": 200})
     second.goto(f"http://127.0.0.1:{PORT}")
     wait_for(lambda: len(viewer.server.get_clients()) == 2, "a second browser looks")
@@ -94,25 +109,30 @@ def write_still_weights(path: Path) -> None:
 
 
 def drag(viewer: Viewer, page: Any, client: Any, obstacle: int) -> None:
-    """Pulls an obstacle aside with the mouse, and lets time run meanwhile."""
+    """Pulls an obstacle aside with the mouse; again where the browser's picture was too old to take hold of it."""
     before = np.array(viewer.state()["obstacles"][obstacle])
-    box = page.locator("canvas").first.bounding_box()
-    middle = np.array([*(before[:2] - viewer.stage.origin), 0.3])
-    x, y = pixel(client.camera, middle, box["width"], box["height"])
-    page.mouse.move(box["x"] + x, box["y"] + y)
-    page.mouse.down()
-    page.mouse.move(box["x"] + x + 40, box["y"] + y, steps=5)
-    viewer.ask(lambda: viewer.pause(False))
-    wait_for(
-        lambda: np.hypot(*(np.array(viewer.state()["obstacles"][obstacle]) - before)[:2]) > 0.1,
-        f"obstacle {obstacle} follows the mouse",
-    )
-    assert viewer.state()["trials"] == 0  # a new one would have put it elsewhere
-    page.mouse.up()
-    viewer.ask(lambda: viewer.pause(True))
+
+    def follows() -> bool:
+        now = viewer.state()
+        assert now["trials"] == 0  # a new one would have put it elsewhere
+        return bool(np.hypot(*(np.array(now["obstacles"][obstacle]) - before)[:2]) > 0.1)
+
+    def pulled() -> bool:
+        box = page.locator("canvas").first.bounding_box()
+        middle = np.array([*(before[:2] - viewer.stage.origin), 0.3])
+        x, y = pixel(client.camera, middle, box["width"], box["height"])
+        page.mouse.move(box["x"] + x, box["y"] + y)
+        page.mouse.down()
+        page.mouse.move(box["x"] + x + 40, box["y"] + y, steps=5)
+        time.sleep(1.0)
+        page.mouse.up()
+        return follows()
+
+    wait_for(pulled, f"obstacle {obstacle} follows the mouse", 300.0)
 
 
-def test_a_person_drives_drags_and_switches_in_a_browser(tmp_path):
+@pytest.mark.parametrize("act", [operate, pytest.param(disturb, marks=pytest.mark.slow)])
+def test_a_person_takes_hold_in_a_browser(tmp_path, act):
     pytest.importorskip("viser", reason="needs viser: pip install 'omniperception[viewer]'")
     endless = ("episode_length_s=10000", "min_base_height=0", "max_tilt_deg=180")  # whatever happens is one trial
     overrides = ("scenario=static", "condition=ideal", *(f"terminations.{setting}" for setting in endless))
@@ -123,7 +143,7 @@ def test_a_person_drives_drags_and_switches_in_a_browser(tmp_path):
     def work() -> None:
         try:
             with chromium() as browser:
-                operate(viewer, open_tab(browser), tmp_path)
+                act(viewer, open_tab(browser), tmp_path)
         except BaseException as failure:  # of the other thread: raised in this one
             failures.append(failure)
         finally:
