@@ -136,7 +136,7 @@ LINES = [
     # the other commands
     ("play run=nowhere", "run=nowhere"),
     ("play run=EMPTY", "is not a run directory"),
-    ("play run=RUN viewer=hologram", "viewer=hologram must be one of video, none"),
+    ("play run=RUN viewer=hologram", "viewer=hologram must be one of video, web, none"),
     ("play run=RUN trials=many", "trials=many must be a whole number >= 1"),
     ("play run=RUN trails=3", "did you mean trials?"),
     ("play run=RUN video_s=0", "video_s=0"),

@@ -93,6 +93,7 @@ def feature_cases() -> dict[str, dict]:
         "angular jitter": lidar.AngularJitter(0.05),
         "dropout": lidar.Dropout(0.05, 0.001),
         "mixed pixels": lidar.MixedPixels(),
+        "noise and dropout by range": lidar.TabulatedNoise((0.2, 2.0, 20.0), (0.01, 0.02), (0.02, 0.1), 0.02),
     }
     cases = {f"output {name}": {"outputs": ("ranges", name)} for name in lidar.OUTPUTS if name != "ranges"}
     cases["all outputs"] = {"outputs": lidar.OUTPUTS}

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, cast
+
 import torch
 
 from omniperception.common.random import EnvRandom
 from omniperception.env.kinematics import Kinematics
 from omniperception.scene.ground import Ground
-from omniperception.scene.tiled_terrain import TiledTerrainConfig
+
+if TYPE_CHECKING:
+    from omniperception.scene.tiled_terrain import TiledTerrainConfig
 
 _MIN_SPEED = 1e-3
 """Commands slower than this (m/s) have no direction."""
@@ -82,8 +86,9 @@ class TerrainLevels:
 
     def steps_up(self, env_ids: torch.Tensor, complete: torch.Tensor) -> torch.Tensor:
         """(n,) int64: 1 for environments that move up a level, -1 for those that move down; see `start`."""
-        config, curriculum = self._ground.config, self._ground.config.curriculum
-        assert isinstance(config, TiledTerrainConfig) and curriculum is not None  # without one levels are drawn
+        config = cast("TiledTerrainConfig", self._ground.config)  # without a curriculum, as on maps, levels are drawn
+        curriculum = config.curriculum
+        assert curriculum is not None
         walked, commanded, reach, steps = (
             values[env_ids] for values in (self.walked, self.commanded, self.reach, self._steps)
         )

@@ -112,7 +112,7 @@ CALF = '<joint name="RR_calf_joint"'
         (GO2.replace("<freejoint", "<joint"), [], "bodies with a free joint: none"),
         (GO2.replace(CALF, CALF + ' type="ball" range="0 1"'), [], "robot.joints names RR_calf_joint: .* not balls"),
         (GO2.replace("RR_calf_joint", "knee"), [], "robot.joints names RR_calf_joint, which .* known: .*knee"),
-        (GO2, ["robot.foot_geoms=[FL_foot,paw]"], "robot.foot_geoms names paw; known: .*FL_foot"),
+        (GO2, ["robot.foot_geoms=[FL_foot,paw]", "robot.gait=null"], "robot.foot_geoms names paw; known: .*FL_foot"),
         (GO2, ["robot.penalized_geoms=[nose]"], "robot.penalized_geoms names nose; known: .*trunk"),
     ],
 )
