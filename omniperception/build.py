@@ -22,7 +22,7 @@ from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.learning.estimator import EstimatorConfig
 from omniperception.learning.memory import check_fits
-from omniperception.scene import Mount, RobotConfig
+from omniperception.scene import Mount, RobotConfig, SteppingConfig
 from omniperception.scene.held_out import held_out
 from omniperception.schema import ANYTHING, make, types_of
 
@@ -95,7 +95,8 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         seen |= {"base_motion": perception.base_motion, "targets": tuple(perception.supervision)}
     try:
         lidar = _sensor(composed["lidar"], task["robot"], trusted) if composed["lidar"] else None
-        env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, **seen)
+        stepping = make(SteppingConfig | None, composed.get("stepping"), "stepping")
+        env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, stepping=stepping, **seen)
         condition = make(Condition | None, composed.get("condition"), "condition")
         return RunConfig(env, perception, ppo, _names(composed.get("init")), condition, composed)
     except ValueError as error:

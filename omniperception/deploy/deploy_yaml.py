@@ -105,6 +105,9 @@ def _caveats(description: Description) -> list[str]:
         lines.append(
             f"velocity_commands follow the command at {list(description.command_acceleration)} m/s^2, rad/s^2."
         )
+    if description.stepping is not None:
+        lines.append("NOT TO BE USED AS IT IS: targets lack the stepping motion of policy.json, which this form has no")
+        lines.append("place for.")
     return lines
 
 

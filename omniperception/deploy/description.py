@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 FORMAT = "omniperception-policy"
-VERSION = 5
+VERSION = 6
 FILE = "policy.json"
 FINGERPRINT = "omniperception-description"
 """Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
@@ -63,6 +63,22 @@ class Term:
     scale: float = 1.0
     frequency: float | None = None
     rest_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """A motion to which the policy's targets are added: the robot steps on the spot.
+
+    Attributes:
+        frequency: of the clock (Hz), which starts with the policy.
+        rest_s: how long (s) the command has to be to stand until the motion rests.
+        offsets: of the joint targets, rad, a row of numbers for each of equal parts of the clock's period; in between
+            they are interpolated linearly.
+    """
+
+    frequency: float
+    rest_s: float
+    offsets: Sequence[Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -151,6 +167,7 @@ class Description:
         command: range of each commanded value that training drew from, by name (m/s, rad/s).
         command_acceleration: how fast (m/s^2, rad/s^2) the command that is observed follows the one given; None: at
             once.
+        stepping: added to the targets; None: nothing is.
         lidar: the sensor; None for a blind policy.
         perception: what is made of its frames; None for a blind policy.
         estimated: quantities of the robot's state that the network gives in the output `estimate` and nobody measures:
@@ -165,6 +182,7 @@ class Description:
     observations: Sequence[Group]
     command: Mapping[str, Sequence[float]]
     command_acceleration: Sequence[float] | None = None
+    stepping: Stepping | None = None
     lidar: Lidar | None = None
     perception: Perception | None = None
     estimated: Sequence[str] = ()
@@ -234,7 +252,7 @@ class Description:
         if parts["lidar"] is not None:
             turns = tuple(Turn(**turn) for turn in parts["lidar"]["carried_by"])
             parts["lidar"] = {**parts["lidar"], "carried_by": turns}
-        for name, kind in (("lidar", Lidar), ("perception", Perception)):
+        for name, kind in (("lidar", Lidar), ("perception", Perception), ("stepping", Stepping)):
             parts[name] = kind(**parts[name]) if parts[name] is not None else None
         return cls(observations=tuple(groups), **parts)
 

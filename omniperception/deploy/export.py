@@ -30,6 +30,7 @@ from omniperception.deploy.description import (
     Joints,
     Lidar,
     Perception,
+    Stepping,
     Term,
     Turn,
     checksum,
@@ -44,6 +45,7 @@ from omniperception.learning.models import PerceptionActor
 from omniperception.learning.read_out import MotionReadOut
 from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler
 from omniperception.scene import RobotConfig
+from omniperception.scene.stepping import stepping_offsets
 
 FOLDER = "exported"
 """Folder of a run directory for an exported policy."""
@@ -135,6 +137,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         observations=tuple(_group(name, env) for name in run.env.observations.actor),
         command=_command_ranges(run),
         command_acceleration=run.env.observations.command_acceleration,
+        stepping=_stepping(run),
         lidar=_lidar(run.env.lidar, robot) if run.perception is not None and run.env.lidar is not None else None,
         perception=_perception(run.perception) if run.perception is not None else None,
         estimated=_estimated(run),
@@ -186,6 +189,13 @@ def _command_ranges(run: RunConfig) -> dict[str, list[float]]:
         return {name: list(getattr(commands, name)) for name in names}
     speed, turn = commands.speed, commands.max_ang_vel_z
     return {"lin_vel_x": [-speed, speed], "lin_vel_y": [-speed, speed], "ang_vel_z": [-turn, turn]}
+
+
+def _stepping(run: RunConfig) -> Stepping | None:
+    if run.env.stepping is None or run.env.robot.gait is None:
+        return None
+    offsets = stepping_offsets(run.env.robot, run.env.stepping.lift).round(6).tolist()
+    return Stepping(run.env.robot.gait.frequency, run.env.stepping.rest_s, offsets)
 
 
 def _estimated(run: RunConfig) -> tuple[str, ...]:

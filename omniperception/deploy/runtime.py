@@ -134,6 +134,7 @@ class ExportedPolicy:
     def reset(self) -> None:
         """Clears all histories, as at the start of an episode: the next step's observation fills them."""
         self.action = np.zeros(len(self._default_pos), np.float32)
+        self.pose = self._default_pos
         for history in self._histories.values():
             history.clear()
         self.frame_count = self._steps = self._steps_stood = 0
@@ -260,9 +261,10 @@ class ExportedPolicy:
         if estimates:
             self.base_lin_vel = estimates[0]
         self._steps += 1
-        self._steps_stood = 0 if np.any(command) else self._steps_stood + 1
         self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
-        targets = self._default_pos + np.asarray(joints.action_scale, np.float32) * self.action
+        self.pose = self._default_pos + self._stepping_offset(command)
+        self._steps_stood = 0 if np.any(command) else self._steps_stood + 1
+        targets = self.pose + np.asarray(joints.action_scale, np.float32) * self.action
         if self.safety is None:
             return targets
         return self.safety.limit_targets(targets, np.asarray(state.joint_pos, np.float32))
@@ -326,10 +328,24 @@ class ExportedPolicy:
 
     def _phase(self, frequency: float, rest_s: float, command: ArrayLike) -> np.ndarray:
         """(2,) sine and cosine of the clock since the last reset; 0 once the command has been to stand for `rest_s`."""
-        stood_s = self._steps_stood * self.description.control_period_s
-        rests = not np.any(command) and stood_s > rest_s - 1e-3
         angle = 2 * np.pi * frequency * self._steps * self.description.control_period_s
-        return np.array([np.sin(angle), np.cos(angle)], np.float32) * (not rests)
+        return np.array([np.sin(angle), np.cos(angle)], np.float32) * (not self._rests(rest_s, command))
+
+    def _rests(self, rest_s: float, command: ArrayLike) -> bool:
+        """Tell whether the command has been to stand for `rest_s`."""
+        stood_s = self._steps_stood * self.description.control_period_s
+        return not np.any(command) and stood_s > rest_s - 1e-3
+
+    def _stepping_offset(self, command: ArrayLike) -> np.ndarray | float:
+        """(num_joints,) rad: what lifts the feet at the end of the step that begins; see `Stepping`."""
+        stepping = self.description.stepping
+        if stepping is None or self._rests(stepping.rest_s, command):
+            return 0.0
+        rows = np.asarray(stepping.offsets, np.float32)
+        place = stepping.frequency * self._steps * self.description.control_period_s % 1.0 * len(rows)
+        row = int(place)
+        now, following = rows[row % len(rows)], rows[(row + 1) % len(rows)]
+        return now + np.float32(place - row) * (following - now)
 
     def _perception(self) -> tuple[Lidar, CloudSampler, np.ndarray]:
         """The sensor, the sampler and the history of frames of a policy that sees."""

@@ -13,7 +13,14 @@ from omniperception.env.mdp.terminations import TerminationsConfig
 from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
 from omniperception.lidar import DEVICES, Noise
-from omniperception.scene import MapTerrainConfig, ObstaclesConfig, RobotConfig, TerrainConfig, TiledTerrainConfig
+from omniperception.scene import (
+    MapTerrainConfig,
+    ObstaclesConfig,
+    RobotConfig,
+    SteppingConfig,
+    TerrainConfig,
+    TiledTerrainConfig,
+)
 from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.sim import SimConfig
 
@@ -38,6 +45,7 @@ class EnvConfig:
         lidar: the sensor, or None.
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
+        stepping: the motion to which actions are added; None: they are added to the default pose.
         base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
         shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
@@ -62,6 +70,7 @@ class EnvConfig:
     lidar: SensorConfig | None = None
     sampler: Callable | None = None
     frame_history: int = 0
+    stepping: SteppingConfig | None = None
     base_motion: bool = False
     targets: Sequence[str] = ()
     shows_frames: bool = True

@@ -93,6 +93,7 @@ class OmniEnv(VecEnv):
             self.episode_length_buf,
             config.observations.command_acceleration,
             self.difficulty,
+            config.stepping,
         )
         if config.initial_level is not None:
             self.curriculum_levels = (config.initial_level,) * len(self._curricula())
@@ -188,7 +189,7 @@ class OmniEnv(VecEnv):
 
     def _advance_physics(self, actions: torch.Tensor) -> None:
         self.state.begin_step(actions)
-        target = self.state.default_joint_pos + self.state.action_scale * actions
+        target = self.state.targets[0]
         if self.randomizer.joint_offset is not None:
             target = target + self.randomizer.joint_offset
         path = turn = None

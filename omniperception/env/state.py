@@ -16,6 +16,7 @@ from omniperception.env.heights import flat_heights
 from omniperception.env.kinematics import Kinematics
 from omniperception.env.mdp.curriculum import FULL, Curriculum
 from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE
+from omniperception.scene.stepping import stepping_offsets
 
 if TYPE_CHECKING:  # parts that not every task has
     from omniperception.avoidance.avoidance import Avoidance
@@ -25,7 +26,7 @@ if TYPE_CHECKING:  # parts that not every task has
     from omniperception.env.measurement import MeasurementErrors
     from omniperception.env.sensing import LidarSensing
     from omniperception.lidar import LidarFrame
-    from omniperception.scene import ObstacleField
+    from omniperception.scene import ObstacleField, RobotConfig, SteppingConfig
     from omniperception.sim import Simulator
 
 AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD = "avoidance", "distal_range", "cloud", "measured_cloud"
@@ -92,6 +93,9 @@ class EnvState:
 
     Attributes:
         actions: (num_envs, num_actions) each: those applied, the newest first, and the two before; 0 after a reset.
+        pose: (num_envs, num_joints) rad: to which the actions of the control step are added.
+        targets: (num_envs, num_joints) rad each: of the control step, and of the one before; the default pose after a
+            reset.
         before: kinematics at the start of the control step.
         default_joint_pos, joint_lower, joint_upper: (num_joints,) rad; joints without limits have infinite ones.
         action_scale: (num_joints,) rad.
@@ -115,6 +119,7 @@ class EnvState:
         episode_steps: torch.Tensor | None = None,
         command_acceleration: Sequence[float] | None = None,
         difficulty: Curriculum = FULL,
+        stepping: SteppingConfig | None = None,
     ) -> None:
         """
         Args:
@@ -130,6 +135,7 @@ class EnvState:
             episode_steps: (num_envs,) int64 control steps since the episodes began, the environment's own.
             command_acceleration: of `reference`; see `ObservationsConfig`.
             difficulty: share of the randomization; the less of it, the faster `reference` follows.
+            stepping: of `pose`; None: it is the default pose.
         """
         self._errors = errors
         steps = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
@@ -157,12 +163,18 @@ class EnvState:
         self.stand_s = torch.zeros(self.num_envs, device=self.device)
         self._command_acceleration, self._difficulty = command_acceleration, difficulty
         self._reference = torch.zeros(self.num_envs, 3, device=self.device)
+        self.pose = self.default_joint_pos.expand(self.num_envs, -1)
+        self.targets = (self.pose, self.pose)
+        self._stepping = None if stepping is None else Stepping(stepping, robot, self.device)
 
     # ---- followed by the environment ---------------------------------------------------------------------------------
 
     def begin_step(self, actions: torch.Tensor) -> None:
         """Takes in the actions (num_envs, num_actions) of the control step that begins."""
         self.before, self.actions = self.kinematics, (actions, *self.actions[:-1])
+        if self._stepping is not None:
+            self.pose = self.default_joint_pos + self._stepping(self)
+        self.targets = (self.pose + self.action_scale * actions, self.targets[0])
 
     def end_step(self) -> None:
         """Takes in the physics steps of the control step."""
@@ -182,6 +194,9 @@ class EnvState:
         """Clears the history of environments (n,) whose physics has been reset."""
         self.invalidate()
         self.actions = tuple(action.index_fill(0, env_ids, 0.0) for action in self.actions)
+        fresh = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device).index_fill(0, env_ids, True)
+        last, before = (torch.where(fresh, self.default_joint_pos, targets) for targets in self.targets)
+        self.targets = (last, before)
         self.stand_s = self.stand_s.index_fill(0, env_ids, 0.0)
         self._reference = self._reference.index_fill(0, env_ids, 0.0)
         if self._history is not None:
@@ -395,6 +410,22 @@ class EnvState:
 def rests(state: EnvState, after_s: float) -> torch.Tensor:
     """(num_envs,) bool: whose command is to stand, and has been for `after_s` (s)."""
     return (state.command == 0).all(1) & (state.stand_s > after_s - 1e-3)  # sums of time steps are not exact
+
+
+class Stepping:
+    """Joint angles that lift the feet in turn, as `scene.stepping.stepping_offsets` over the clock's period."""
+
+    def __init__(self, config: SteppingConfig, robot: RobotConfig, device: torch.device) -> None:
+        assert robot.gait is not None  # or there are no offsets
+        rows = torch.tensor(stepping_offsets(robot, config.lift), dtype=torch.float32, device=device)
+        self._rows, self._frequency, self._rest_s = torch.cat((rows, rows[:1])), robot.gait.frequency, config.rest_s
+
+    def __call__(self, state: EnvState) -> torch.Tensor:
+        """(num_envs, num_joints) rad, at the episodes' present time; 0 once the robot should rest."""
+        place = torch.remainder(self._frequency * state.time_s, 1.0) * (len(self._rows) - 1)
+        row = place.long().clamp(max=len(self._rows) - 2)
+        offsets = torch.lerp(self._rows[row], self._rows[row + 1], (place - row)[:, None])
+        return offsets * ~rests(state, self._rest_s)[:, None]
 
 
 def moved_towards(now: torch.Tensor, there: torch.Tensor, linear: float, angular: float) -> torch.Tensor:

@@ -69,7 +69,7 @@ def _action(robot: ExportedPolicy, state: RobotState, command: np.ndarray, cloud
         targets = np.asarray(state.joint_pos, np.float32)
     if robot.safety is None:
         return robot.action
-    return (targets - np.asarray(joints.default_pos, np.float32)) / np.asarray(joints.action_scale, np.float32)
+    return (targets - robot.pose) / np.asarray(joints.action_scale, np.float32)
 
 
 def robot_states(env: OmniEnv) -> list[RobotState]:

@@ -86,7 +86,7 @@ class WalkingTally:
         joint_pos, joint_speed = kinematics.joint_pos, kinematics.joint_vel.abs()
         stop = (joint_pos < state.joint_lower + AT_STOP) | (joint_pos > state.joint_upper - AT_STOP)
         limited = state.joint_torque.abs() >= AT_LIMIT * state.joint_torque_limit
-        change = (state.action_scale * (state.actions[0] - state.actions[1]).abs()).mean(1)
+        change = (state.targets[0] - state.targets[1]).abs().mean(1)
         speed = kinematics.base_lin_vel_yaw.norm(dim=1)
         step = {
             "steps": torch.ones_like(settled),

@@ -10,6 +10,7 @@ from omniperception.scene.obstacle_group import ApproachConfig, MotionConfig, Ob
 from omniperception.scene.obstacles import FreePathConfig, ObstaclesConfig
 from omniperception.scene.parts import PartConfig, SwingConfig
 from omniperception.scene.robot import Mount, RobotConfig
+from omniperception.scene.stepping import SteppingConfig
 from omniperception.scene.terrain import TerrainConfig
 from omniperception.scene.tiled_terrain import TerrainCurriculumConfig, TiledTerrainConfig
 
@@ -24,6 +25,7 @@ __all__ = [
     "ObstaclesConfig",
     "PartConfig",
     "RobotConfig",
+    "SteppingConfig",
     "SwingConfig",
     "TerrainConfig",
     "TerrainCurriculumConfig",

@@ -51,7 +51,7 @@ RECIPES = {
     "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
     "clock": (
         *("experiment=walk", "observations=gait", "commands.standing=0.5", "commands.resample_s=[0.1,0.3]"),
-        "observations.groups.clock.terms.gait_phase.rest_s=0.1",
+        *("observations.groups.clock.terms.gait_phase.rest_s=0.1", "+stepping={lift: 1.4, rest_s: 0.1}"),
     ),
     "estimated": ("experiment=walk", "observations=gait_without_velocity"),
     "polar_rings_estimated": ("experiment=avoid", "init=unread", "observations=gait_without_velocity"),
@@ -284,6 +284,23 @@ def test_a_robot_in_plain_mujoco_goes_where_the_training_environment_goes(export
     assert policy.frame_count == 8 and abs(policy.action).max() > 0.05
 
 
+def test_targets_are_those_of_the_training_environment_where_a_robot_steps(exported_run):
+    """Over an episode's end, with commands to stand that let it rest and others that let it step on."""
+    run_dir = exported_run("clock")
+    side = trained(run_dir, "num_envs=2", "terminations.episode_length_s=0.7")
+    env, policies = side.env, ExportedPolicies(side.env, plain(run_dir))
+    moved, rested, asked = 0, 0, []
+    env.step_hooks.append(lambda: asked.append(env.state.targets[0].numpy().copy()))
+    for _ in range(60):
+        actions = policies(env.get_observations())
+        wanted = np.stack([robot.pose + 0.25 * robot.action for robot in policies.robots])
+        resting = [not (robot.pose != np.float32(DEFAULT_POS)).any() for robot in policies.robots]
+        env.step(actions)
+        np.testing.assert_allclose(wanted, asked[-1], atol=1e-5)
+        moved, rested = moved + resting.count(False), rested + resting.count(True)
+    assert moved > 40 and rested > 10
+
+
 def test_histories_are_filled_by_the_first_observation_and_then_move(exported_run):
     policy = plain(exported_run("none")).another()
     described = policy.description
@@ -361,7 +378,7 @@ def test_wrong_points_are_named(exported_run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 99}, "format version 99, this program reads 5"),
+        ({"version": 99}, "format version 99, this program reads 6"),
         ({"format": "something"}, "describes no exported policy"),
         ({"joints": None}, "is incomplete"),
         ({"control_period_s": 0.03}, "policy.onnx and policy.json are not from the same export"),
@@ -464,6 +481,7 @@ def test_deploy_yaml_names_what_it_has_no_place_for(exported_run):
     assert "# It also reads 'frames' and 'frame_count'" in text
     described = Description.read(exported_run("none") / "exported")
     assert "base_lin_vel is no observation of unitree_rl_lab's controller" in deploy_yaml(described)
+    assert "NOT TO BE USED" in (exported_run("clock") / "exported" / "deploy.yaml").read_text()
     other = replace(described.joints, names=[f"leg_{k}" for k in range(12)])
     assert deploy_yaml(replace(described, joints=other)) is None
 

@@ -65,6 +65,23 @@ def test_policies_see_and_rewards_ask_for_no_more_acceleration_than_was_said(mak
     assert plain.state.reference is plain.command.value
 
 
+def test_a_robot_without_actions_trots_on_and_rests(make_env):
+    """Zero actions lift its feet at the rhythm of its gait; once the command has been to stand, it stays down."""
+    env = make_env(*GAIT, "+stepping={lift: 1.6, rest_s: 0.5}", blind=True, num_envs=2)
+    up, targets = [], []
+    for step in range(150):
+        env.command.value[:] = torch.tensor([0.3, 0.0, 0.0]) if step < 100 else 0.0
+        env.step(torch.zeros(2, 12))
+        up.append(env.state.foot_height[0] > 0.035)
+        targets.append(env.state.targets[0][0])
+    first, second = torch.stack(up[25:100])[:, 0], torch.stack(up[25:100])[:, 1]
+    assert 10 < int(first.sum()) < 40 and 10 < int(second.sum()) < 40 and not (first & second).any()
+    lifts = (first[1:] & ~first[:-1]).sum()
+    assert 3 <= int(lifts) <= 4  # 2.5 Hz for 1.5 s
+    assert not torch.stack(up[140:]).any() and torch.equal(targets[-1], env.state.default_joint_pos)
+    assert not env.done.any()
+
+
 def _with(env, clock):
     observations = env.get_observations().clone()
     observations["clock"] = clock

@@ -190,8 +190,8 @@ def action_acceleration_squared(state: EnvState) -> torch.Tensor:
 
 
 def default_pose_deviation(state: EnvState) -> torch.Tensor:
-    """Squared distance (rad^2) of the joints from the default pose."""
-    return (state.kinematics.joint_pos - state.default_joint_pos).square().sum(1)
+    """Squared distance (rad^2) of the joints from `EnvState.pose`, the default one where the robot does not step."""
+    return (state.kinematics.joint_pos - state.pose).square().sum(1)
 
 
 def alive(state: EnvState) -> torch.Tensor:
