@@ -22,7 +22,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from omniperception import build, config
 from omniperception.cli import Command, argument, fail, trust
@@ -101,6 +101,8 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
         runner.load(str(latest_checkpoint(run_dir)))
         report(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
     else:
+        if run.init:
+            _check_motion(OmegaConf.create(run.composed), run.init[-1])
         for name in run.init:
             runner.start_from(config.find_run(name, "init"))
         report(f"run directory: {run_dir}")
@@ -114,6 +116,18 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
     report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
     distributed.disconnect()
+
+
+def _check_motion(composed: DictConfig, source: str) -> None:
+    """Refuses weights whose actions meant another motion in the run that they come from; nothing in them shows it."""
+    other = config.read(config.find_run(source, "init"))
+    for key in ("stepping", "robot.joints", "robot.default_joint_pos", "robot.action_scale"):
+        own, given = OmegaConf.select(composed, key), OmegaConf.select(other, key)
+        if own != given:
+            wanted = "null" if given is None else str(given).replace("'", "").replace(": ", ":")
+            raise config.ConfigError(
+                f"init={source}: its actions meant another motion, that of '{key}={wanted}'; give the same here"
+            )
 
 
 def report(text: str) -> None:
