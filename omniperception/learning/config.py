@@ -13,6 +13,7 @@ from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, S
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.env.config import HEIGHT_TARGET
 from omniperception.learning.estimator import EstimatorConfig
+from omniperception.learning.precision import bfloat16_is_faster
 from omniperception.perception import PerceptionNetwork, Sampler
 
 
@@ -120,8 +121,8 @@ class PPOConfig:
         hidden_dims: hidden layers of the actor and of the critic.
         init_std: initial standard deviation of the actions.
         obs_normalization: whether observations are normalised by running statistics.
-        mixed_precision: whether updates multiply matrices in bfloat16; None where the CPU has units for it (AMX, or
-            AVX-512 BF16), on a GPU not.
+        mixed_precision: whether updates multiply matrices in bfloat16; None where that is measured to be faster on a
+            CPU, on a GPU not.
         final_entropy_coef: entropy_coef at the last iteration, to which it changes evenly; None: it stays as it is.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
         The others are rsl_rl's PPO arguments.
@@ -188,16 +189,12 @@ class PPOConfig:
             "obs_normalization": self.obs_normalization,
         }
 
-    @property
-    def algorithm(self) -> dict[str, Any]:
-        """Arguments of rsl_rl's `PPO`."""
-        mixed = _cpu_multiplies_bfloat16() if self.mixed_precision is None else self.mixed_precision
+    def algorithm(self, device: torch.device | str) -> dict[str, Any]:
+        """Arguments of rsl_rl's `PPO` for networks on a device."""
+        mixed = self.mixed_precision
+        if mixed is None:
+            mixed = torch.device(device).type == "cpu" and bfloat16_is_faster(torch.get_num_threads())
         return {name: getattr(self, name) for name in _RSL_RL} | {"use_mixed_precision": mixed}
-
-
-def _cpu_multiplies_bfloat16() -> bool:
-    """Tell whether the CPU has units for bfloat16; older versions of PyTorch know of fewer kinds."""
-    return any(getattr(torch.cpu, f"_is_{kind}_supported", bool)() for kind in ("amx_tile", "avx512_bf16"))
 
 
 _RSL_RL = (

@@ -133,7 +133,7 @@ class PerceptivePpo(PPO):
             device=device,
             symmetry_cfg=symmetry if config.mirror is not None else None,
             multi_gpu_cfg=multi_gpu,
-            **ppo.algorithm,
+            **ppo.algorithm(device),
         )
         if ppo.final_entropy_coef is not None:
             algorithm.anneal_entropy(ppo.final_entropy_coef, ppo.max_iterations)
