@@ -2,6 +2,7 @@
 
 <!-- table: before -->                                          all figures, of docs/lab/data/before.json(.gz)
 <!-- table: before view=policies condition=robot split=test --> untouched: a row for each world
+<!-- table: before view=worlds policy=run -->                   the same with a column for each condition
 <!-- table: before view=conditions policy=run,blind -->         untouched and falls: a row for each policy
 <!-- table: gait view=walking -->                              figures of a gait: a row for each ground
 <!-- end -->
@@ -62,14 +63,21 @@ def data_file(name: str, data: Path) -> Path:
 
 def by_policy(records: Sequence[Record]) -> str:
     """How often each policy arrived untouched: a row for each world."""
-    policies = [policy for (policy,) in grouped(records, "policy")]
+    return _by_world(records, "policy", ("world", "terrain", "condition"))
+
+
+def by_world(records: Sequence[Record]) -> str:
+    """How often it was arrived untouched under each condition: a row for each world."""
+    return _by_world(records, "condition", ("world", "terrain", "policy"))
+
+
+def _by_world(records: Sequence[Record], column: str, keys: Sequence[str]) -> str:
+    columns = [name for (name,) in grouped(records, column)]
     rows = []
-    for (world, terrain, condition), here in grouped(records, "world", "terrain", "condition").items():
-        cells = [_untouched([record for record in here if record.policy == policy]) for policy in policies]
-        rows.append([world, terrain, condition, *cells])
-    return _titled(
-        records, "reached, untouched and without a fall, %", ["world", "terrain", "condition"], policies, rows
-    )
+    for key, here in grouped(records, *keys).items():
+        cells = [_untouched([record for record in here if getattr(record, column) == name]) for name in columns]
+        rows.append([*key, *cells])
+    return _titled(records, "reached, untouched and without a fall, %", list(keys), columns, rows)
 
 
 def by_condition(records: Sequence[Record]) -> str:
@@ -94,6 +102,7 @@ def by_condition(records: Sequence[Record]) -> str:
 VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
     "all": table,
     "policies": by_policy,
+    "worlds": by_world,
     "conditions": by_condition,
     "walking": walking_table,
 }

@@ -58,6 +58,9 @@ def test_views(data):
     cells = [[cell.strip() for cell in row] for row in rows]
     assert cells[0] == ["world", "run", "blind"] and cells[3] == ["rod", "25.0 [7.1, 59.1]", "–"]
     assert cells[2] == ["corridor", "25.0 [7.1, 59.1]", "0.0 [0.0, 32.4]"]
+    text = rendered(page("first view=worlds policy=run"), data)
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
+    assert rows[0] == ["world", "ideal", "robot"] and rows[3] == ["rod", "25.0 [7.1, 59.1]", "–"]
     text = rendered(page("first view=conditions world=corridor"), data)
     assert "| run    | 25.0 / 25.0 | 25.0 / 25.0 |" in text and "| blind  | 0.0 / 25.0  | –           |" in text
 
