@@ -34,6 +34,9 @@ PLANES, PLANE_POINTS, PLANE_RADIUS = 1500, 24, 0.06
 """Places looked at, points that a plane needs, and its radius over the range."""
 FLAT = 0.02
 """Largest rms distance from a plane that counts as one, metres and share of the radius."""
+SEARCHED, KEPT, BLOCK, LACKING = 300, 50, 480, 3
+"""To find a frame's place in a pattern: returns compared everywhere, places looked at again with all; returns over
+which no point is lacking, and how many a file may lack."""
 EDGE, GHOST = 0.3, 0.1
 """A jump of the range from one return to the next but one is an edge; a ghost is so far from both, metres."""
 
@@ -131,6 +134,7 @@ def summary(frame: Frame, spec: DeviceSpec, pattern: ScanPattern) -> list[dict]:
         {"figure": "lowest elevation, deg", "recording": _edge(frame, 0.1), "preset": spec.elevation_deg[0]},
         {"figure": "highest elevation, deg", "recording": _edge(frame, 99.9), "preset": spec.elevation_deg[1]},
         *_channel_errors(frame, pattern),
+        *(against_grid(frame, pattern) if len(channel_elevations(pattern)) else against_order(frame, pattern)),
     ]
 
 
@@ -172,6 +176,82 @@ def _channel_errors(frame: Frame, pattern: ScanPattern) -> list[dict]:
     ]
 
 
+def against_grid(frame: Frame, pattern: ScanPattern) -> list[dict]:
+    """Directions against a spinning preset: even steps of azimuth, their start and size fitted to each laser."""
+    step, channels, angles = _model_steps(pattern), channel_elevations(pattern), []
+    for line in frame.lines:
+        k = line[frame.seen[line]]
+        if len(k) < 3:
+            continue
+        change = (np.diff(frame.azimuth[k]) + 180.0) % 360.0 - 180.0
+        shot = np.concatenate(([0.0], np.cumsum(np.rint(change / abs(step)))))
+        azimuth = np.concatenate(([0.0], np.cumsum(change)))
+        aside = azimuth - np.polyval(np.polyfit(shot, azimuth, 1), shot)
+        off = np.abs(frame.elevation[k][:, None] - channels).min(axis=1)
+        angles.append(np.hypot(off, aside * np.cos(np.radians(frame.elevation[k]))))
+    return _angle_rows(np.concatenate(angles)) if angles else []
+
+
+def against_order(frame: Frame, pattern: ScanPattern) -> list[dict]:
+    """Directions in order of measurement against the pattern's, from the place in it and at the yaw that fit best.
+
+    Only of files that keep every ray: one that leaves misses out does not say which rays its points were.
+    """
+    if frame.seen.all():
+        return []
+    rows = np.flatnonzero(frame.seen)
+    begin = _place_in_pattern(frame, pattern, rows)
+    yaw = _yaw(frame, pattern, begin + rows, rows)
+    angles = []
+    for block in np.array_split(rows, max(len(rows) // BLOCK, 1)):  # from some on, a file may lack points
+        tried = [_angles(frame, pattern, begin + block + lacking, block, yaw) for lacking in range(LACKING + 1)]
+        angles.append(min(tried, key=np.median))
+    first_s = begin / pattern.points_per_second
+    return [
+        *_angle_rows(np.concatenate(angles)),
+        {"figure": "the frame begins at this time of the pattern, s", "recording": first_s, "preset": None},
+        {"figure": "and is turned about z by, deg", "recording": yaw, "preset": 0.0},
+    ]
+
+
+def _angle_rows(angles: np.ndarray) -> list[dict]:
+    return [
+        {"figure": "direction off the preset's, mean, deg", "recording": float(angles.mean()), "preset": 0.0},
+        {"figure": "the same, 99 % of the returns", "recording": float(np.percentile(angles, 99)), "preset": 0.0},
+    ]
+
+
+def _place_in_pattern(frame: Frame, pattern: ScanPattern, rows: np.ndarray) -> int:
+    """Number of the ray with which a frame begins: by elevations, which no yaw changes, then by directions."""
+    few = rows[:: max(len(rows) // SEARCHED, 1)]
+    model, starts = np.degrees(pattern.elevation.numpy()), np.arange(0, len(pattern.elevation), pattern.num_lasers)
+    off = np.zeros(len(starts))
+    for row in few:  # bounded, so that points on another ray do not decide
+        off += np.minimum(np.abs(model[(starts + row) % len(model)] - frame.elevation[row]), 10.0)
+    best = starts[np.argsort(off)[:KEPT]]
+    trials = [
+        (_angles(frame, pattern, begin + rows, rows, _yaw(frame, pattern, begin + rows, rows)), begin) for begin in best
+    ]
+    return int(min(trials, key=lambda trial: float(np.median(trial[0])))[1])
+
+
+def _yaw(frame: Frame, pattern: ScanPattern, rays: np.ndarray, rows: np.ndarray) -> float:
+    """How far (deg) rows of a frame are turned about z from rays of a pattern: the median."""
+    aside = np.radians(frame.azimuth[rows]) - pattern.azimuth.numpy()[rays % len(pattern.azimuth)]
+    middle = np.angle(np.exp(1j * aside).mean())
+    return float(np.degrees(middle + np.median(np.angle(np.exp(1j * (aside - middle))))))
+
+
+def _angles(frame: Frame, pattern: ScanPattern, rays: np.ndarray, rows: np.ndarray, yaw: float) -> np.ndarray:
+    """Between rows of a frame and rays of a pattern turned by a yaw, degrees."""
+    rays = rays % len(pattern.azimuth)
+    azimuth, elevation = pattern.azimuth.numpy()[rays] + np.radians(yaw), pattern.elevation.numpy()[rays]
+    flat = np.cos(elevation)
+    unit = np.stack((flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), axis=1)
+    cosine = (unit * frame.xyz[rows]).sum(axis=1) / frame.ranges[rows]
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
 def by_elevation(frame: Frame, spec: DeviceSpec, pattern: ScanPattern) -> list[dict]:
     """Rays and returns for each band of equal height: the preset's rays, the recording's, and how many came back."""
     low, high = spec.elevation_deg
@@ -185,11 +265,15 @@ def by_elevation(frame: Frame, spec: DeviceSpec, pattern: ScanPattern) -> list[d
         inside = (frame.elevation >= start) & (frame.elevation < end)
         share = float(((model >= start) & (model < end)).mean())
         seen = inside & frame.seen
+        edges = np.radians((max(start, low), min(end, high)))
+        solid_angle = 2.0 * np.pi * float(np.sin(edges[1]) - np.sin(edges[0]))
         rows.append(
             {
                 "elevation from, deg": max(float(start), low),
                 "rays of the preset": whole * share,
                 "rays of the recording": int(inside.sum()),
+                "per sr: preset": whole * share / solid_angle,
+                "recording": inside.sum() / solid_angle,
                 "returns": int(seen.sum()),
                 "misses, %": 100.0 * float(1.0 - seen.sum() / max(inside.sum(), 1)) if kept else None,
                 "median range, m": float(np.median(frame.ranges[seen])) if seen.any() else None,
@@ -229,7 +313,7 @@ def on_planes(frame: Frame, seed: int = 0) -> list[dict]:
     return [row for row in rows if any(value is not None for value in list(row.values())[1:])]
 
 
-def at_edges(frame: Frame, pattern: ScanPattern) -> dict:
+def at_edges(frame: Frame, pattern: ScanPattern) -> list[dict]:
     """Edges along the lines, and returns between both surfaces; only of neighbours, between which none is missing."""
     beside = 3.0 * abs(_model_steps(pattern))
     edges = ghosts = 0
@@ -243,7 +327,7 @@ def at_edges(frame: Frame, pattern: ScanPattern) -> dict:
         edge = whole & (far - near > EDGE)
         edges += int(edge.sum())
         ghosts += int((edge & (r[1:-1] > near + GHOST) & (r[1:-1] < far - GHOST)).sum())
-    return {"edges": edges, "ghosts": ghosts, "ghosts per edge, %": 100.0 * ghosts / max(edges, 1)}
+    return [{"edges": edges, "returns between both surfaces": ghosts, "share, %": 100.0 * ghosts / max(edges, 1)}]
 
 
 def by_range(frame: Frame) -> list[dict]:
@@ -282,7 +366,8 @@ def main(given: Arguments) -> None:
     tables = [
         Table.of("summary", title, summary(found, spec, pattern)),
         Table.of("elevation", f"{title}: rays by elevation", by_elevation(found, spec, pattern)),
-        Table.of("ranges", f"{title}: returns by range", by_range(found), [f"at edges: {at_edges(found, pattern)}"]),
+        Table.of("ranges", f"{title}: returns by range", by_range(found)),
+        Table.of("edges", f"{title}: neighbours across an edge", at_edges(found, pattern)),
         Table.of("planes", f"{title}: sigma along the ray on planes, mm, by incidence", on_planes(found)),
     ]
     report([table for table in tables if table.rows], about(1), given.out or Path("outputs/real_scans") / given.device)

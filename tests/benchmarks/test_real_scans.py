@@ -1,6 +1,7 @@
 """The study of real recordings, against simulated ones whose errors are known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from omniperception.lidar import (
     RayScene,
     Shape,
     ShapeKind,
+    read_points,
     vlp16,
     write_points,
 )
@@ -110,6 +112,31 @@ def test_counts_sense_and_channels(room):
     assert rows["elevation off the nearest laser's, mean, deg"]["recording"] < 1e-3
 
 
+def test_a_spinning_sensor_is_on_its_grid_and_off_it_by_what_was_added(room):
+    frame, pattern, _ = room
+    mean, most = (row["recording"] for row in real_scans.against_grid(frame, pattern))
+    assert mean < most < 2e-3
+    tilted = replace(frame, elevation=frame.elevation + 0.1)
+    mean, _ = (row["recording"] for row in real_scans.against_grid(tilted, pattern))
+    assert mean == pytest.approx(0.1, abs=2e-3)
+
+
+def test_the_place_in_the_pattern_is_found_around_a_lost_point(frame_file):
+    """The frame of the fixture, which begins at ray 41,000, turned about z by 25 degrees."""
+    rows, pattern = read_points(frame_file).xyz, DEVICES["mid360_measured"].pattern()
+    cos, sin = math.cos(math.radians(25.0)), math.sin(math.radians(25.0))
+    turned = rows @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    frame = real_scans.frame_of(table_of(dict(zip("xyz", turned.astype(np.float32).T, strict=True))), pattern)
+    found = {row["figure"]: row["recording"] for row in real_scans.against_order(frame, pattern)}
+    assert found["the frame begins at this time of the pattern, s"] == pytest.approx(41_000 / 2e5, abs=1e-9)
+    assert found["and is turned about z by, deg"] == pytest.approx(25.0, abs=1e-3)
+    assert found["direction off the preset's, mean, deg"] < 0.05
+    other = real_scans.against_order(frame, DEVICES["mid360"].pattern())
+    assert other[0]["recording"] > 20.0  # a device that turns the other way
+    whole = replace(frame, seen=np.ones_like(frame.seen))
+    assert real_scans.against_order(whole, pattern) == []
+
+
 def test_noise_on_walls_is_found_again(room):
     frame, *_ = room
     cells = [v for row in real_scans.on_planes(frame) for key, v in row.items() if key != "range from, m" and v]
@@ -130,8 +157,8 @@ def test_a_ghost_between_two_surfaces_is_counted():
     ranges[50] = 3.0  # between both
     xyz = ranges[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(100)], axis=1)
     table = table_of({**dict(zip("xyz", xyz.T, strict=True)), "ring": np.zeros(100, np.uint8)})
-    found = real_scans.at_edges(real_scans.frame_of(table, vlp16()), vlp16())
-    assert found["ghosts"] == 1 and found["edges"] == 3
+    (found,) = real_scans.at_edges(real_scans.frame_of(table, vlp16()), vlp16())
+    assert found["returns between both surfaces"] == 1 and found["edges"] == 3
 
 
 def test_the_command_reads_a_file_and_writes_tables(frame_file, tmp_path, capsys):
