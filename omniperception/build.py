@@ -13,6 +13,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from omniperception import config as configs
+from omniperception.common.errors import DoesNotFit
+from omniperception.common.provenance import made_at
 from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
@@ -82,7 +85,7 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
     composed = _resolved(config)
     for key in {*_TASK, "lidar", "perception", "ppo"} - composed.keys():
-        raise ConfigError(f"the configuration has no {key}")
+        raise DoesNotFit(f"the configuration has no {key}")
     hints = types_of(EnvConfig)
     task = {key: make(hints[key], composed[key], key, trusted) for key in _TASK}
     if task["obstacles"].split == "test":
@@ -101,6 +104,33 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         return RunConfig(env, perception, ppo, _names(composed.get("init")), condition, composed)
     except ValueError as error:
         raise ConfigError(one_line(error)) from None
+
+
+def load_run(run_dir: Path, overrides: Sequence[str] = (), trust: Sequence[str] = ()) -> RunConfig:
+    """A run's configuration, changed by overrides, as objects; see `config.load` and `assemble`.
+
+    Raises:
+        ConfigError: one line that says what to change; where the run's own file is of a version of this program with
+            other keys, that it is.
+    """
+    try:
+        return assemble(configs.load(run_dir, overrides), trust)
+    except ConfigError:
+        check_version(run_dir, trust)
+        raise
+
+
+def check_version(run_dir: Path, trust: Sequence[str] = ()) -> None:
+    """Refuses a run whose configuration, without overrides, has keys that this program does not know, or lacks some."""
+    try:
+        assemble(configs.load(run_dir), trust)
+    except DoesNotFit as error:
+        raise ConfigError(
+            f"{run_dir / configs.CONFIG_FILE} is of another version of this program ({error}); train again, or use the"
+            f" version that made it: {made_at(run_dir)}"
+        ) from None
+    except ConfigError:
+        return  # it fits; what else is wrong is told by whoever asked
 
 
 def _resolved(config: DictConfig) -> dict:

@@ -158,7 +158,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
     """Sets, adds (+key=value) and deletes (~key) values as Hydra does.
 
-    A key below a group that a preset leaves at its default need not be added: whether something takes it is checked
+    A key that a preset or a run's file leaves at its default need not be added: whether something takes it is checked
     where it is built.
     """
     for override in overrides:
@@ -180,7 +180,9 @@ def _exists(config: DictConfig, override: Override) -> bool:
             node = node[int(name)]
         elif isinstance(node, DictConfig) and name in node:
             node = OmegaConf.select(node, name)
-        elif isinstance(node, DictConfig) and 0 < depth == len(names) - 1 and not override.is_delete():
+        elif isinstance(node, DictConfig) and depth == len(names) - 1 and not override.is_delete():
+            if depth == 0 and name not in _keys():
+                raise UnknownKey(text, _keys(), name)
             return False
         elif isinstance(node, DictConfig):
             raise UnknownKey(text, _keys() if depth == 0 else map(str, node), name)

@@ -21,7 +21,7 @@ from typing import Any
 
 import yaml
 
-from omniperception.config import ConfigError, UnknownKey, suggest
+from omniperception.common.errors import ConfigError, DoesNotFit, UnknownKey, suggest
 from omniperception.env.mdp.terms import RewardTerm
 
 ANYTHING = None
@@ -111,7 +111,7 @@ def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -
             if isinstance(option, type) and dataclasses.is_dataclass(option):
                 return call(option, arguments(option, value, key, trust), key)
     if not _fits(value, hint):
-        raise ConfigError(f"{key}={_shown(value)} must be {_expected(hint)}")
+        raise DoesNotFit(f"{key}={_shown(value)} must be {_expected(hint)}")
     return tuple(make(Any, item, key, trust) for item in value) if isinstance(value, list) else value
 
 
@@ -141,7 +141,7 @@ def arguments(
                 raise UnknownKey(f"{key}.{name}", (*named, *others))
     missing = [p.name for p in parameters if p.default is p.empty and p.name in named and p.name not in values]
     if missing and given is not None:
-        raise ConfigError(f"{key} lacks {', '.join(missing)}: give {key}.{missing[0]}=...")
+        raise DoesNotFit(f"{key} lacks {', '.join(missing)}: give {key}.{missing[0]}=...")
     hints = types_of(target)
     return {name: make(hints.get(name, Any), item, f"{key}.{name}", trust) for name, item in values.items()}
 
@@ -169,9 +169,7 @@ def look_up(kind: Kind, name: str, key: str, trust: Sequence[str] | None = ()) -
         return _imported(names.get(name, name), key)
     if "." not in name:
         given = key if key.endswith(f".{name}") else f"{key}={name}"
-        raise ConfigError(
-            f"{given} is unknown; {suggest(name, tuple(names))}, or {kind.tag}: a dotted path to your own"
-        )
+        raise DoesNotFit(f"{given} is unknown; {suggest(name, tuple(names))}, or {kind.tag}: a dotted path to your own")
     if trust is not ANYTHING and not any(name.startswith(f"{prefix}.") for prefix in trust):
         raise ConfigError(
             f"{key}={name} is not built: a run's file names it, and it is outside of this package; if you trust it, add"
@@ -187,9 +185,9 @@ def _named(kind: Kind, hint: Any, values: dict[str, object], key: str, trust: Se
         own = next(iter(names))
     name = values.pop(kind.tag, own)
     if not isinstance(name, str):
-        raise ConfigError(f"{key}.{kind.tag}={_shown(name)} must be text")
+        raise DoesNotFit(f"{key}.{kind.tag}={_shown(name)} must be text")
     if name == own not in names and key in NAMES:
-        raise ConfigError(f"{key} lacks its {kind.tag}: give {key}.{kind.tag}=..., one of {', '.join(names)}")
+        raise DoesNotFit(f"{key} lacks its {kind.tag}: give {key}.{kind.tag}=..., one of {', '.join(names)}")
     target = look_up(kind, name, key if name == own else f"{key}.{kind.tag}", trust)
     if hint is RewardTerm:
         return _reward(kind, target, values, key, trust)
@@ -201,7 +199,7 @@ def _named(kind: Kind, hint: Any, values: dict[str, object], key: str, trust: Se
 def _reward(kind: Kind, target: Callable, values: dict[str, object], key: str, trust: Sequence[str] | None) -> Any:
     """A weighted term; None where its weight is 0 or null."""
     if "weight" not in values:
-        raise ConfigError(f"{key} lacks its weight: give {key}.weight=...")
+        raise DoesNotFit(f"{key} lacks its weight: give {key}.weight=...")
     weight = make(float | None, values.pop("weight"), f"{key}.weight")
     if not weight:
         return None

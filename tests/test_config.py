@@ -4,9 +4,12 @@ import os
 from pathlib import Path
 
 import pytest
+import yaml
 
 from omniperception import build, config
+from omniperception.commands import main
 from omniperception.commands.train import check_jobs
+from omniperception.common import provenance
 from omniperception.config import ConfigError
 
 
@@ -64,6 +67,49 @@ class TestRunDirectories:
         assert config.load(tmp_path, ["obstacles=mine"]).obstacles.spacing == 0.3
         with pytest.raises(ConfigError, match="obstacles=mine is unknown"):
             config.compose(["obstacles=mine"])
+
+    @pytest.mark.parametrize(
+        ("change", "named"),
+        [
+            (lambda saved: saved["robot"].update(shape_seed=3), r"robot\.shape_seed is unknown"),
+            (lambda saved: saved["robot"].pop("footing"), r"robot lacks footing"),
+            (lambda saved: saved["robot"].update(foot_geoms=4), r"robot\.foot_geoms=4 must be"),
+            (
+                lambda saved: saved["rewards"]["terms"].update(grace={"weight": 1.0}),
+                r"rewards\.terms\.grace is unknown",
+            ),
+            (lambda saved: saved.update(sensors={}), r"sensors is unknown"),
+            (lambda saved: saved.pop("terrain"), r"the configuration has no terrain"),
+        ],
+    )
+    def test_a_run_of_another_version_is_said_to_be_one(self, run_dir, change, named, capsys):
+        path = run_dir / config.CONFIG_FILE
+        saved = yaml.safe_load(path.read_text())
+        change(saved)
+        path.write_text(config.as_yaml(saved))
+        with pytest.raises(ConfigError, match=rf"of another version.*{named}.*train again.* no commit is noted"):
+            build.load_run(run_dir)
+        provenance.write(run_dir, {"commit": "0123abc"})
+        with pytest.raises(ConfigError, match=rf"of another version.*{named}.*train again.*: commit 0123abc$"):
+            build.load_run(run_dir, ["num_envs=0"])
+        with pytest.raises(SystemExit, match="2"):
+            main(["play", f"run={run_dir}"])
+        error = capsys.readouterr().err
+        assert "of another version" in error and error.count("\n") == 1
+
+    def test_faults_of_overrides_are_told_as_such(self, run_dir):
+        for override in ("robot.shape_seed=3", "num_envs=0", "~robot.footing"):
+            with pytest.raises(ConfigError) as error:
+                build.load_run(run_dir, [override])
+            assert "version" not in str(error.value)
+
+    def test_a_file_without_a_key_that_has_a_default_takes_it(self, run_dir):
+        path = run_dir / config.CONFIG_FILE
+        saved = yaml.safe_load(path.read_text())
+        del saved["stepping"]
+        path.write_text(config.as_yaml(saved))
+        assert build.load_run(run_dir).env.stepping is None
+        assert build.load_run(run_dir, ["stepping={lift: 1.2, rest_s: 1.0}"]).env.stepping.lift == 1.2
 
     def test_latest_is_the_newest(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

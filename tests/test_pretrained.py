@@ -8,6 +8,7 @@ import torch
 
 from omniperception import build, config
 from omniperception.build import build_runner, load_policy
+from omniperception.common import provenance
 from omniperception.deploy import publish
 from omniperception.evaluation.baselines import blind
 from omniperception.evaluation.episodes import run_episodes
@@ -51,7 +52,7 @@ def test_it_is_small_and_says_where_it_comes_from(run_dir):
     checkpoint = latest_checkpoint(run_dir)
     assert checkpoint.stat().st_size < 1.1 * publish.LIMIT
     assert set(torch.load(checkpoint, weights_only=True)) >= {"actor_state_dict", "iteration"}
-    record = json.loads((run_dir / publish.PROVENANCE).read_text())
+    record = json.loads((run_dir / provenance.FILE).read_text())
     assert record["iterations"] > 0 and record["training_hours"] > 0 and record["versions"]["torch"]
 
 

@@ -7,6 +7,7 @@ import torch
 
 from omniperception import build, config
 from omniperception.build import build_runner, load_policy
+from omniperception.common import provenance
 from omniperception.deploy import publish
 from omniperception.learning.checkpoint import checkpoint_path, latest_checkpoint
 
@@ -22,12 +23,18 @@ def run(make_config, tmp_path):
 
 def test_the_published_policy_acts_alike(run, tmp_path):
     record = publish.publish(run, tmp_path / "published")
-    assert json.loads((tmp_path / "published" / publish.PROVENANCE).read_text()) == record
+    assert json.loads((tmp_path / "published" / provenance.FILE).read_text()) == record
     assert latest_checkpoint(tmp_path / "published").stat().st_size < latest_checkpoint(run).stat().st_size
     replays = [load_policy(build.assemble(config.load(folder)), folder) for folder in (run, tmp_path / "published")]
     obs = [trained.env.get_observations() for trained in replays]
     with torch.no_grad():
         assert torch.equal(*(trained.policy(o) for trained, o in zip(replays, obs, strict=True)))
+
+
+def test_it_comes_from_where_the_run_does(run, tmp_path):
+    provenance.write(run, {"commit": "0123abc", "date": "2026-01-31"})
+    record = publish.publish(run, tmp_path / "published")
+    assert record["commit"] == "0123abc" and record["run"] == str(run) and record["iterations"] == 0
 
 
 def test_another_run_starts_from_it(run, tmp_path, make_config):

@@ -11,6 +11,7 @@ import yaml
 
 from omniperception import config
 from omniperception.commands import main
+from omniperception.common import provenance
 from omniperception.learning import load_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,6 +46,7 @@ def test_the_configuration_is_saved_before_anything_uses_it(tmp_path, monkeypatc
     assert "nose" in capsys.readouterr().err
     saved = config.load(tmp_path / "here")
     assert saved.num_envs == 5 and list(saved.robot.mounts.head.exclude_geoms) == ["nose"]
+    assert provenance.read(tmp_path / "here")["seed"] == saved.seed
 
 
 def test_a_sweep_gives_every_run_a_directory(tmp_path, monkeypatch, capsys):

@@ -89,7 +89,7 @@ def watched(arguments: Arguments, run_dir: Path, overrides: list[str]) -> Footfa
 def policy_on_free_ground(arguments: Arguments, run_dir: Path, overrides: list[str]) -> build.TrainedPolicy:
     """The run's policy under the condition, without pushes."""
     given = [] if arguments.condition is None else [f"condition={arguments.condition}"]
-    run = build.assemble(config.load(run_dir, ["scenario=walk", *given, *overrides]), arguments.trust)
+    run = build.load_run(run_dir, ["scenario=walk", *given, *overrides], arguments.trust)
     calm = replace(run.env.randomization, pushes=None)
     return build.load_policy(
         replace(run, env=replace(run.env, randomization=calm, read_besides=(FOOT_FORCE,))), run_dir

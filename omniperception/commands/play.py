@@ -11,7 +11,7 @@ the run directory.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omniperception import build, config
@@ -47,10 +47,9 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     if arguments.viewer == "web":
         shown = Shown(run_dir, tuple(overrides), trust=arguments.trust)
         return serve(shown, PageOptions(arguments.host, arguments.port))
-    composed = config.load(run_dir, overrides)
+    run = build.load_run(run_dir, overrides, arguments.trust)
     if not any(override.startswith("num_envs=") for override in overrides):
-        composed.num_envs = min(composed.num_envs, arguments.trials)
-    run = build.assemble(composed, arguments.trust)
+        run = replace(run, env=replace(run.env, num_envs=min(run.env.num_envs, arguments.trials)))
     trained = build.load_policy(run, run_dir)
     if arguments.viewer == "video":
         episodes = _film(arguments, run_dir, trained.env, trained.policy)

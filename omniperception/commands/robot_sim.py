@@ -48,8 +48,7 @@ class Arguments:
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Simulates, and prints what became of the robot."""
     steps = [f"sim.timestep={STEP_S}", f"sim.decimation={CONTROL_STEPS}", "sim.num_threads=1", "num_envs=1"]
-    composed = config.load(config.find_run(arguments.run), [*overrides, *steps])
-    env = OmniEnv(build.assemble(composed, arguments.trust).env)
+    env = OmniEnv(build.load_run(config.find_run(arguments.run), [*overrides, *steps], arguments.trust).env)
     wire = SimulatedConfig(
         interface=arguments.interface,
         domain=arguments.domain,

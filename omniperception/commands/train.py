@@ -26,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from omniperception import build, config
 from omniperception.cli import Command, argument, fail, trust
+from omniperception.common import provenance
 from omniperception.learning import (
     CheckpointError,
     RolloutTooSmall,
@@ -56,7 +57,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         if flags:
             raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
         run_dir = config.find_run(arguments.run)
-        learn(assemble(config.load(run_dir, values), arguments.trust), run_dir, resume=True)
+        learn(_trainable(build.load_run(run_dir, values, arguments.trust)), run_dir, resume=True)
     elif flags & SHOW:
         print(config.as_yaml(assemble(config.compose(values)).composed), end="")
     elif flags:
@@ -68,13 +69,17 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         train(config.without_hydra(composed), run_dir)
 
 
-def assemble(composed: DictConfig, trust: Sequence[str] = ()) -> build.RunConfig:
+def assemble(composed: DictConfig) -> build.RunConfig:
     """Builds and validates a run that may be trained; see `build.assemble`.
 
     Raises:
         ConfigError: it would see obstacles of the test split.
     """
-    run = build.assemble(composed, trust)
+    return _trainable(build.assemble(composed))
+
+
+def _trainable(run: build.RunConfig) -> build.RunConfig:
+    """Refuses a run that would see obstacles of the test split."""
     if run.env.obstacles.split != "dev":
         raise config.ConfigError(
             f"obstacles.split={run.env.obstacles.split} is for reports, and no training may see it; use"
@@ -91,6 +96,8 @@ def train(composed: DictConfig, run_dir: Path) -> None:
     begun = distributed.of_first(config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir)))
     if distributed.rank() == 0:
         config.save(run.composed, run_dir)
+        if not begun:
+            provenance.write(run_dir, provenance.provenance(run.env.sim.torch_device, seed=run.env.seed))
     learn(run, run_dir, resume=begun)
 
 

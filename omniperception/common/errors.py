@@ -10,7 +10,11 @@ class ConfigError(ValueError):
     """A configuration that cannot run; the message is one line that says what to change."""
 
 
-class UnknownKey(ConfigError):
+class DoesNotFit(ConfigError):
+    """A configuration that has keys, names or kinds of values which this program does not know, or lacks some."""
+
+
+class UnknownKey(DoesNotFit):
     """A key that nothing takes.
 
     Attributes:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
@@ -16,6 +18,8 @@ import torch
 
 ROOT = Path(__file__).resolve().parents[2]
 """The checkout, or the folder that the package is installed in."""
+FILE = "provenance.json"
+"""Name of the file in a run directory that says where the run comes from."""
 LIBRARIES = ("omniperception", "torch", "mujoco-core", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
 
 
@@ -41,6 +45,23 @@ def provenance(device: object = "cpu", libraries: tuple[str, ...] = LIBRARIES, *
         "versions": {"python": platform.python_version(), **versions(libraries)},
         **facts,
     }
+
+
+def write(run_dir: Path, facts: Mapping) -> None:
+    """Writes where a run comes from into its directory."""
+    (run_dir / FILE).write_text(json.dumps(facts, indent=2) + "\n")
+
+
+def read(run_dir: Path) -> dict:
+    """What a run directory says of where the run comes from; empty: nothing."""
+    path = run_dir / FILE
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def made_at(run_dir: Path) -> str:
+    """The commit that a run was made at, in words."""
+    found = read(run_dir).get("commit")
+    return f"commit {found}" if found else f"no commit is noted in {run_dir / FILE}"
 
 
 @cache

@@ -17,7 +17,7 @@ import torch
 from rsl_rl.models import MLPModel
 from torch import nn
 
-from omniperception import build, config
+from omniperception import build
 from omniperception.build import RunConfig
 from omniperception.common.provenance import provenance
 from omniperception.config import ConfigError
@@ -80,7 +80,7 @@ def export(
         ConfigError: the policy observes what no robot measures, a written network acts otherwise, or onnx is missing.
         CheckpointError: the run has no checkpoint.
     """
-    run = build.assemble(config.load(run_dir, ["num_envs=1"]), trust)
+    run = build.load_run(run_dir, ["num_envs=1"], trust)
     trained = build.load_policy(run, run_dir)
     sizes = {name: trained.env.get_observations()[name].shape[1] for name in run.env.observations.actor}
     network = network_of(trained.policy, sizes)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
 from omegaconf import OmegaConf
 
 from omniperception import config
-from omniperception.common.provenance import provenance
+from omniperception.common import provenance
 from omniperception.config import ConfigError
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 
-PROVENANCE = "provenance.json"
 LIMIT = 4_000_000
 """Most bytes of a published checkpoint: it goes into a repository."""
 
@@ -55,13 +53,13 @@ def publish(run_dir: Path, folder: Path) -> dict:
     save_checkpoint(checkpoint_path(folder, state["iteration"]), {**weights, "iteration": state["iteration"]})
     steps = state["iteration"] * composed.num_envs * composed.ppo.num_steps_per_env
     record = {
+        **(provenance.read(run_dir) or provenance.provenance("cpu")),
         "run": str(run_dir),
         "init": composed.get("init"),
         "seed": composed.seed,
         "iterations": state["iteration"],
         "control_steps": steps,
         "training_hours": round(state["total_time"] / 3600, 3),
-        **provenance("cpu"),
     }
-    (folder / PROVENANCE).write_text(json.dumps(record, indent=2) + "\n")
+    provenance.write(folder, record)
     return record

@@ -241,7 +241,11 @@ class Task:
 
     def assembled(self) -> RunConfig:
         """The environment's configuration, checked."""
-        return build.assemble(self.composed, self.evaluation.trust)
+        try:
+            return build.assemble(self.composed, self.evaluation.trust)
+        except ConfigError:
+            build.check_version(self.walker, self.evaluation.trust)
+            raise
 
     def _contender(self) -> TrainedPolicy:
         """The policy in a fresh environment of the world."""
@@ -262,7 +266,7 @@ class Task:
     @cached_property
     def _own(self) -> EnvConfig:
         """The run's task, whoever walks: its LiDAR and its avoidance controller."""
-        return build.assemble(config.load(self.run_dir), self.evaluation.trust).env
+        return build.load_run(self.run_dir, trust=self.evaluation.trust).env
 
     def _limits(self) -> Limits | None:
         """Ranges (m/s) of what the gait has learned to follow; None where it is the run's own, made for V_avoid."""

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from omniperception.deploy import DeployError, ExportedPolicy, RobotState, SafetyStop
-from omniperception.deploy.description import Description
+from omniperception.deploy.description import FILE, Description
 from omniperception.deploy.go2 import MOTORS
 from omniperception.deploy.odometry import Odometry
 from omniperception.hardware.clouds import Frame, Points
@@ -110,8 +110,19 @@ def motor_order(description: Description) -> np.ndarray:
 
 
 def machine_config(description: Description) -> MachineConfig:
-    """The guard's machine for a policy: its gains, its default pose to stand in, its limits, in the motors' order."""
+    """The guard's machine for a policy: its gains, its default pose to stand in, its limits, in the motors' order.
+
+    Raises:
+        DeployError: the policy moves another robot, or a joint has no limits to keep targets within.
+    """
     joints, motors = description.joints, motor_order(description)
+    ranges = zip(joints.names, joints.lower, joints.upper, strict=True)
+    free = [name for name, lower, upper in ranges if lower is None or upper is None]
+    if free:
+        raise DeployError(
+            f"joints without limits in the policy's {FILE}: {', '.join(free)}; the guard keeps targets within limits:"
+            " give these joints a range in the robot's file (robot.file) and export again"
+        )
 
     def in_motors_order(values: object) -> list[float]:
         ordered = np.zeros(len(MOTORS))

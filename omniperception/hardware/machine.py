@@ -91,8 +91,8 @@ class MachineConfig:
             value = getattr(self, item.name)
             if isinstance(value, int | float) and not (math.isfinite(value) and value > 0):
                 raise DeployError(f"machine.{item.name}={value}: a number above 0 was expected")
-            if not isinstance(value, int | float) and np.shape(value) != (12,):
-                raise DeployError(f"machine.{item.name}: 12 numbers were expected, {np.shape(value)} given")
+            if not isinstance(value, int | float) and not _is_pose(value):
+                raise DeployError(f"machine.{item.name}={list(value)}: 12 finite numbers were expected")
 
 
 @dataclass(frozen=True)
@@ -256,6 +256,11 @@ class Machine:
         led = self.mode not in (Mode.DAMPING, Mode.STOPPED)
         self._from = self._held if led or self._sensed is None else self._sensed.joint_pos
         self.mode, self.reason, self._since = mode, reason, now
+
+
+def _is_pose(values: Sequence[float]) -> bool:
+    """Tell whether there is a finite number for each of 12 motors."""
+    return len(values) == 12 and all(value is not None and math.isfinite(value) for value in values)
 
 
 def _along(time: float, times: Sequence[float], poses: Sequence[np.ndarray]) -> np.ndarray:

@@ -70,8 +70,7 @@ class Session:
             ConfigError, CheckpointError: it cannot be shown; one line says why.
         """
         self.shown = shown
-        composed = config.load(shown.run_dir, [*shown.overrides, "num_envs=1"])
-        run = build.assemble(composed, shown.trust)
+        run = build.load_run(shown.run_dir, [*shown.overrides, "num_envs=1"], shown.trust)
         if shown.policy != "run" and shown.policy not in BASELINES:
             raise ConfigError(f"policy={shown.policy} is unknown; known: run, {', '.join(BASELINES)}")
         self._runner: Runner = build.build_runner(replace(run, env=_watched(run.env, shown.policy)), None)

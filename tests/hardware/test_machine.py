@@ -198,5 +198,8 @@ def test_nothing_outvotes_an_e_stop(before):
 def test_wrong_settings_are_named():
     with pytest.raises(DeployError, match="machine.silence_s=0: a number above 0"):
         MachineConfig(STAND, STAND, STAND, 25.0, 0.6, silence_s=0)
-    with pytest.raises(DeployError, match=r"machine.stand_pose: 12 numbers were expected, \(3,\) given"):
+    with pytest.raises(DeployError, match=r"machine.stand_pose=\[0.0, 0.0, 0.0\]: 12 finite numbers were"):
         MachineConfig([0.0] * 3, STAND, STAND, 25.0, 0.6)
+    for nothing in (None, float("nan")):
+        with pytest.raises(DeployError, match=r"machine.upper=\[1.0, .*(None|nan)\]: 12 finite numbers were expected"):
+            MachineConfig(STAND, [-1.0] * 12, [1.0] * 11 + [nothing], 25.0, 0.6)

@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -204,6 +205,16 @@ def test_another_robot_is_refused_before_a_motor_moves(exported):
     described = Description.read(exported)
     object.__setattr__(described.joints, "names", [f"leg_{k}" for k in range(12)])
     with pytest.raises(DeployError, match="the policy moves another robot than a Go2"):
+        machine_config(described)
+
+
+def test_joints_without_limits_are_named(exported):
+    described = Description.read(exported)
+    lower, upper = list(described.joints.lower), list(described.joints.upper)
+    lower[3], upper[3], upper[7] = None, None, None
+    object.__setattr__(described, "joints", replace(described.joints, lower=lower, upper=upper))
+    names = f"{described.joints.names[3]}, {described.joints.names[7]}"
+    with pytest.raises(DeployError, match=rf"without limits in .*policy\.json: {names}; .*robot\.file.*export again$"):
         machine_config(described)
 
 
