@@ -15,7 +15,7 @@ from omniperception.evaluation.outcomes import CLEARANCE_CAP, GRAVITY, Episodes
 from omniperception.evaluation.tracks import Tracks
 
 CLEARANCE_EVERY = 2
-"""Control steps between two measurements of the clearance, which take as long as a fifth of a control step."""
+"""Control steps between two measurements of the clearance."""
 
 _SUMS = (
     *("steps", "velocity_error", "yaw_rate_error", "free", "free_velocity_error"),

@@ -7,32 +7,33 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.evaluation.clearance import (
-    BOX,
-    CAPSULE,
-    CYLINDER,
-    TOLERANCE,
-    Clearance,
-    Geoms,
-    Shapes,
-    convex_distance,
-)
+from omniperception.evaluation.clearance import Clearance, Geoms, clearances
+from omniperception.evaluation.clearance_kernels import BOX, TOLERANCE
 
 BLIND = ("experiment=walk", "rewards=walk")
 
 
 def distance(a, b, pos, mat=None):
-    """Between two shapes (kind, size) with B at `pos` in the frame of A."""
-    a, b = (Shapes(torch.tensor([kind]), torch.tensor([size])) for kind, size in (a, b))
-    mat = torch.eye(3) if mat is None else torch.tensor(mat)
-    return convex_distance(a, b, torch.tensor([pos]), mat[None], torch.tensor([10.0])).item()
+    """Between two shapes (kind, size) with B at `pos` in the frame of A, and between B and A."""
+    geoms = []
+    for kind, size in (a, b):
+        spec = mujoco.MjSpec()
+        spec.worldbody.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), size=size)
+        geoms.append(Geoms(spec.compile(), [0], 1, torch.device("cpu")))
+    frame_b = torch.eye(3) if mat is None else torch.tensor(mat)
+    at_a, at_b = (torch.zeros(1, 1, 3), torch.eye(3)[None, None]), (torch.tensor([[pos]]), frame_b[None, None])
+    below = torch.tensor([10.0])
+    a, b = (geoms[0], *at_a), (geoms[1], *at_b)
+    there, back = clearances(*a, *b, below), clearances(*b, *a, below)
+    assert there.item() == pytest.approx(back.item(), abs=TOLERANCE) and below.item() == 10.0
+    return there.item()
 
 
 QUARTER_ABOUT_X = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-BALL = CAPSULE, (0.1, 0.0, 0.0)
-ROD = CAPSULE, (0.1, 0.5, 0.0)
-PILLAR = CYLINDER, (0.3, 1.0, 0.0)
-CRATE = BOX, (0.2, 0.3, 0.4)
+BALL = "SPHERE", (0.1, 0.0, 0.0)
+ROD = "CAPSULE", (0.1, 0.5, 0.0)
+PILLAR = "CYLINDER", (0.3, 1.0, 0.0)
+CRATE = "BOX", (0.2, 0.3, 0.4)
 
 
 @pytest.mark.parametrize(
@@ -56,17 +57,6 @@ CRATE = BOX, (0.2, 0.3, 0.4)
 )
 def test_by_hand(a, b, pos, mat, expected):
     assert distance(a, b, pos, mat) == pytest.approx(expected, abs=TOLERANCE)
-
-
-def test_support_by_hand():
-    direction = torch.tensor([[0.6, 0.0, 0.8]])
-    for (kind, size), expected in (
-        (ROD, 0.8 * 0.5 + 0.1),
-        (PILLAR, 0.8 * 1.0 + 0.6 * 0.3),
-        (CRATE, 0.6 * 0.2 + 0.8 * 0.4),
-    ):
-        shape = Shapes(torch.tensor([kind]), torch.tensor([size]))
-        assert shape.support(direction).item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("scenario", ["static", "aerial", "rod"])
@@ -144,30 +134,21 @@ def test_convex_hulls_as_mujoco_measures_them():
         body = spec.worldbody.add_body(mocap=True)
         body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), size=rng.uniform(0.05, 0.2, 3))
     model = spec.compile()
-    data, geoms = mujoco.MjData(model), Geoms(model, range(model.ngeom), 1, torch.device("cpu"))
-    first, second = (torch.tensor(x) for x in np.triu_indices(model.ngeom, 1))
-    keep = first < 8
-    first, second, zeros = first[keep], second[keep], torch.zeros(int(keep.sum()), dtype=torch.int64)
+    data = mujoco.MjData(model)
+    geoms = [Geoms(model, [k], 1, torch.device("cpu")) for k in range(model.ngeom)]
+    couples = [(a, b) for a in range(model.ngeom) for b in range(model.ngeom) if a != b and min(a, b) < 8]
     expected, got = [], []
     for _ in range(10):
         data.mocap_pos[:] = rng.uniform(-0.6, 0.6, (model.nmocap, 3))
         data.mocap_quat[:] = rng.normal(size=(model.nmocap, 4))
         data.mocap_quat[:] /= np.linalg.norm(data.mocap_quat, axis=1, keepdims=True)
         mujoco.mj_kinematics(model, data)
-        pairs = zip(first.tolist(), second.tolist(), strict=True)
-        expected += [max(mujoco.mj_geomDistance(model, data, a, b, 5.0, None), 0.0) for a, b in pairs]
-        mat = torch.tensor(data.geom_xmat, dtype=torch.float32).view(1, -1, 3, 3)
-        at = geoms.centres(torch.tensor(data.geom_xpos, dtype=torch.float32)[None], mat)[0]
-        frame_a, frame_b = mat[0, first], mat[0, second]
-        got.append(
-            convex_distance(
-                geoms.shapes(zeros, first),
-                geoms.shapes(zeros, second),
-                (frame_a.mT @ (at[second] - at[first])[..., None])[..., 0],
-                frame_a.mT @ frame_b,
-                torch.full((len(first),), 5.0),
-            )
-        )
-    expected, got = np.array(expected), torch.cat(got).numpy()
+        pos = torch.tensor(data.geom_xpos, dtype=torch.float32)[None, :, None]
+        mat = torch.tensor(data.geom_xmat, dtype=torch.float32).view(1, -1, 1, 3, 3)
+        for a, b in couples:
+            expected.append(max(mujoco.mj_geomDistance(model, data, a, b, 5.0, None), 0.0))
+            pair = (geoms[a], pos[:, a], mat[:, a], geoms[b], pos[:, b], mat[:, b])
+            got.append(clearances(*pair, torch.tensor([5.0])).item())
+    expected = np.array(expected)
     assert 0.05 < (expected == 0).mean() < 0.6
     np.testing.assert_allclose(got, expected, atol=TOLERANCE + 1e-5)

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from benchmarks.harness.reference import mujoco_ranges
-from omniperception.evaluation.clearance import TOLERANCE, Clearance
+from omniperception.evaluation.clearance import Clearance
+from omniperception.evaluation.clearance_kernels import TOLERANCE
 from omniperception.lidar import ShapeKind
 from omniperception.scene.rays import ray_shapes
 
