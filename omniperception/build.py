@@ -24,6 +24,7 @@ from omniperception.env.mirror import Mirror
 from omniperception.learning import Runner, distributed, latest_checkpoint
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.learning.estimator import EstimatorConfig
+from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.memory import check_fits
 from omniperception.scene import Mount, RobotConfig, SteppingConfig
 from omniperception.scene.held_out import held_out
@@ -42,6 +43,7 @@ class RunConfig:
         env: the task.
         perception: the actor's view of the LiDAR, or None.
         ppo: the learning settings.
+        logger: where scalars of the training go, or None.
         init: the runs whose weights this one starts from; where two have the same, the later one's.
         condition: under which the robot walks, where its randomization is one of conf/condition as it stands.
         composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
@@ -50,6 +52,7 @@ class RunConfig:
     env: EnvConfig
     perception: PerceptionConfig | None
     ppo: PPOConfig
+    logger: LoggerConfig | None
     init: tuple[str, ...]
     condition: Condition | None
     composed: dict
@@ -101,7 +104,8 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         stepping = make(SteppingConfig | None, composed.get("stepping"), "stepping")
         env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, stepping=stepping, **seen)
         condition = make(Condition | None, composed.get("condition"), "condition")
-        return RunConfig(env, perception, ppo, _names(composed.get("init")), condition, composed)
+        logger = _logger(composed, trusted)
+        return RunConfig(env, perception, ppo, logger, _names(composed.get("init")), condition, composed)
     except ValueError as error:
         raise ConfigError(one_line(error)) from None
 
@@ -166,6 +170,12 @@ def _sensor(preset: object, robot: RobotConfig, trust: Sequence[str] | None) -> 
     for name in settings.keys() & mounted.keys():
         raise ConfigError(f"lidar.{name} is unknown; a mount has it: lidar.mount=... or robot.mounts.<name>=...")
     return make(SensorConfig, settings | mounted, "lidar", trust)
+
+
+def _logger(composed: dict, trust: Sequence[str] | None) -> LoggerConfig | None:
+    """What logs a run; runs of before there was a choice have TensorBoard files."""
+    preset = composed.get("logger", {"type": "tensorboard"})
+    return make(LoggerConfig, preset, "logger", trust) if preset else None
 
 
 def _names(value: object) -> tuple[str, ...]:
@@ -240,6 +250,8 @@ def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
         run.env.rewards.avoidance.risk,
         Mirror(env) if run.ppo.symmetry else None,
         estimator=EstimatorConfig(run.env.observations.estimated) if run.env.observations.estimated else None,
+        logger=run.logger,
+        settings=run.composed,
     )
 
 

@@ -26,6 +26,8 @@ _SHIPPED = Path(__file__).resolve().parent / "conf"
 CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"
 """Presets: inside an installed package, at the top of a checkout."""
 CONFIG_FILE = "config.yaml"
+RECIPE_FILE = "overrides.yaml"
+"""In a run directory: the command line's overrides."""
 OUTPUTS = Path("outputs")
 SEARCH_PATH = "search_path"
 """Key of a configuration: the user's folders of presets, from `--config-dir` or `hydra.searchpath`."""
@@ -299,6 +301,19 @@ def save(composed: dict, run_dir: Path) -> None:
     (run_dir / CONFIG_FILE).write_text(as_yaml(composed))
 
 
+def save_recipe(overrides: Sequence[str], run_dir: Path) -> None:
+    """Writes the overrides that a run was begun with beside its configuration."""
+    (run_dir / RECIPE_FILE).write_text(yaml.safe_dump(list(overrides)))
+
+
+def recipe(run_dir: Path) -> str | None:
+    """The overrides that a run was begun with, but for where it is; None: it was begun before they were kept."""
+    path = run_dir / RECIPE_FILE
+    if not path.is_file():
+        return None
+    return " ".join(text for text in yaml.safe_load(path.read_text()) if not text.startswith("hydra."))
+
+
 def as_yaml(composed: dict) -> str:
     """A resolved configuration as it is saved."""
     return yaml.safe_dump(composed, sort_keys=False)
@@ -338,7 +353,13 @@ def find_run(name: str, key: str = "run") -> Path:
         if not path.is_dir():
             raise ConfigError(f"{key}={name} does not exist; give a run directory or {key}=latest")
         return path
-    runs = sorted(OUTPUTS.glob(f"**/{CONFIG_FILE}"), key=lambda path: path.stat().st_mtime)
+    runs = find_runs(OUTPUTS)
     if not runs:
         raise ConfigError(f"{key}=latest finds no run under outputs/; train one first")
-    return runs[-1].parent
+    return runs[-1]
+
+
+def find_runs(folder: Path) -> list[Path]:
+    """Run directories in a folder, the newest last."""
+    found = sorted(folder.glob(f"**/{CONFIG_FILE}"), key=lambda path: path.stat().st_mtime)
+    return [path.parent for path in found]

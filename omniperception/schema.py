@@ -69,6 +69,10 @@ NAMES: dict[str, Kind] = {
     "sim": Kind(
         _members("sim.mujoco", mujoco="SimConfig") | _members("sim.mujoco_warp", mujoco_warp="MujocoWarpConfig")
     ),
+    "logger": Kind(
+        _members("learning.log_writers", tensorboard="LoggerConfig", wandb="WandbConfig", mlflow="MlflowConfig")
+        | _members("learning.log_writers", trackio="TrackioConfig")
+    ),
     "lidar.pattern": Kind(_members("lidar", **{name: name for name in _PATTERNS.split()}), built=False),
     "perception.sampler": Kind(
         _members("perception", raw="RawSampler", fps="FpsSampler", pd="PdSampler", proximity="ProximitySampler"),

@@ -177,6 +177,10 @@ LINES = [
     ("scan rays=0", "rays=0 must be a whole number >= 1"),
     ("scan seed=-1", "seed=-1 must be a whole number >= 0"),
     ("plan num_envs=x", "num_envs=x"),
+    ("runs nowhere", "folder=nowhere does not exist"),
+    ("curves runs=nowhere", "runs=nowhere is no run directory"),
+    ("train logger.video_interval=0", "logger.video_interval=0 must be at least 1"),
+    ("train logger.project=legs", "logger.project is unknown"),
     *((f"train {group}=dragons", f"{group}=dragons is unknown") for group in GROUPS),
     *((f"{command} --wrong", "--wrong is unknown") for command in COMMANDS),
 ]

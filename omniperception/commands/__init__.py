@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 COMMANDS = {
     "train": "trains a policy, or goes on with a run",
+    "runs": "lists runs: recipe, iterations, newest rates",
+    "curves": "draws learning curves of runs, mean and spread over seeds",
     "play": "replays a run: rates over whole episodes, and a video",
     "evaluate": "evaluates runs in fixed worlds, beside baselines",
     "gait": "looks at a gait: where it breaks, which kicks it survives, when its feet are down",
@@ -40,6 +42,7 @@ EXTRAS = {
     "cyclonedds": "robot",
     "trimesh": "meshes",
     "viser": "viewer",
+    **{name: name for name in ("mlflow", "trackio", "wandb")},
     **dict.fromkeys(("laspy", "mcap", "mcap_ros2", "pypcd4", "rosbags"), "clouds"),
 }
 """Extra of this package that brings each library."""

@@ -35,9 +35,10 @@ from omniperception.learning import (
     latest_checkpoint,
     list_checkpoints,
 )
+from omniperception.learning.log_writers import LoggerError
 from omniperception.plan import Plan, Watch
 
-ERRORS = (CheckpointError, RolloutTooSmall, TrainingDiverged)
+ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
 SWEEP, SHOW = {"-m", "--multirun"}, {"--cfg", "job"}
 
 
@@ -66,7 +67,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         composed = config.compose(values, with_hydra=True)
         HydraConfig.instance().set_config(composed)  # for ${hydra:...} in hydra.run.dir
         run_dir = Path(os.path.relpath(composed.hydra.run.dir))
-        train(config.without_hydra(composed), run_dir)
+        train(config.without_hydra(composed), run_dir, values)
 
 
 def assemble(composed: DictConfig) -> build.RunConfig:
@@ -74,22 +75,25 @@ def assemble(composed: DictConfig) -> build.RunConfig:
 
     Raises:
         ConfigError: it would see obstacles of the test split.
+        LoggerError: a library is missing.
     """
     return _trainable(build.assemble(composed))
 
 
 def _trainable(run: build.RunConfig) -> build.RunConfig:
-    """Refuses a run that would see obstacles of the test split."""
+    """Refuses a run that would see obstacles of the test split, or whose logger lacks its library."""
     if run.env.obstacles.split != "dev":
         raise config.ConfigError(
             f"obstacles.split={run.env.obstacles.split} is for reports, and no training may see it; use"
             " obstacles.split=dev"
         )
+    if run.logger is not None:
+        run.logger.check()
     return run
 
 
-def train(composed: DictConfig, run_dir: Path) -> None:
-    """Trains one composed configuration in its directory."""
+def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str]) -> None:
+    """Trains the configuration that overrides composed, in its directory."""
     run = assemble(composed)
     distributed.connect(run.env.sim.torch_device)
     run_dir = distributed.of_first(run_dir)
@@ -98,6 +102,7 @@ def train(composed: DictConfig, run_dir: Path) -> None:
         config.save(run.composed, run_dir)
         if not begun:
             provenance.write(run_dir, provenance.provenance(run.env.sim.torch_device, seed=run.env.seed))
+            config.save_recipe(overrides, run_dir)
     learn(run, run_dir, resume=begun)
 
 
@@ -116,10 +121,16 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
 
     def save(plan: Plan) -> None:
         plan.save(run_dir)
-        report(plan.summary())
+        runner.logger.say(plan.summary())
 
     if distributed.rank() == 0:
         Watch(runner, save)
+        if run.logger is not None and run.logger.video_interval is not None:
+            from omniperception.evaluation.training_videos import TrainingVideos
+
+            videos = TrainingVideos(runner, run_dir, run.logger.video_interval, run.logger.video_s)
+            runner.step_hooks.append(videos.step)
+            runner.end_hooks.append(videos.close)
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
     report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
     distributed.disconnect()
@@ -152,7 +163,7 @@ def sweep(overrides: Sequence[str]) -> None:
         folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
         try:
             composed = config.compose([*settings.overrides.task, *folders])
-            train(composed, Path(os.path.relpath(settings.runtime.output_dir)))
+            train(composed, Path(os.path.relpath(settings.runtime.output_dir)), list(settings.overrides.task))
         except (config.ConfigError, *ERRORS) as error:
             fail(error)
 

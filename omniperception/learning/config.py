@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, S
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.env.config import HEIGHT_TARGET
 from omniperception.learning.estimator import EstimatorConfig
+from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.precision import bfloat16_is_faster
 from omniperception.perception import PerceptionNetwork, Sampler
 
@@ -228,6 +229,8 @@ class LearningConfig:
         mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
         command_group: the group that begins with the commanded velocity (v_x, v_y).
         estimator: of what the actor does not observe; None: it estimates nothing.
+        logger: where scalars go; None: nowhere.
+        settings: the run's composed configuration, for what is logged.
     """
 
     ppo: PPOConfig
@@ -239,3 +242,5 @@ class LearningConfig:
     mirror: Callable | None = None
     command_group: str = "command"
     estimator: EstimatorConfig | None = None
+    logger: LoggerConfig | None = field(default_factory=LoggerConfig)
+    settings: Mapping[str, Any] = field(default_factory=dict)

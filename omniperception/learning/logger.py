@@ -1,4 +1,4 @@
-"""Training log: TensorBoard scalars under rsl_rl's names, and one console line per iteration."""
+"""Training log: scalars under rsl_rl's names, and one console line per iteration."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.utils.log_writer import LogWriter
+
+from omniperception.learning.log_writers import LoggerConfig
+from omniperception.learning.progress import ProgressLine, save_progress
 
 METRICS, ANOMALIES = "Metrics/", "Anomalies/"
 """Keys of ``extras["log"]`` that begin so are shown on the console; anomalies only if there are any."""
@@ -19,17 +23,32 @@ CONSOLE_METRICS = ("velocity_error", "yaw_rate_error", "collision_rate", "fall_r
 
 
 class Logger:
-    """Returns and lengths of episodes, TensorBoard scalars, and the console's line.
+    """Returns and lengths of episodes, scalars, and the console's line.
 
     Attributes:
-        log_dir: where the TensorBoard file goes; None writes and prints nothing.
+        log_dir: run directory; None writes and prints nothing.
         total_steps: control steps of all environments and iterations.
         returns: of the last 100 episodes.
         lengths: of these, control steps.
     """
 
-    def __init__(self, log_dir: Path | None, num_envs: int, device: str) -> None:
-        self.log_dir, self.num_envs = log_dir, num_envs
+    def __init__(
+        self,
+        log_dir: Path | None,
+        num_envs: int,
+        device: str,
+        config: LoggerConfig | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        """
+        Args:
+            log_dir: run directory; None writes and prints nothing.
+            num_envs: number of environments.
+            device: of what they return.
+            config: where scalars go; None: nowhere.
+            settings: the run's composed configuration.
+        """
+        self.log_dir, self.num_envs, self.config, self.settings = log_dir, num_envs, config, settings or {}
         self.total_steps = 0
         self.returns: deque[float] = deque(maxlen=100)
         self.lengths: deque[float] = deque(maxlen=100)
@@ -38,25 +57,39 @@ class Logger:
         self._infos: list[Mapping] = []
         self._ended: list[torch.Tensor] = []  # by step: whether episodes ended, their returns and lengths
         self._recent: deque[float] = deque(maxlen=20)  # s, of iterations
-        self._writer: Any = None  # a SummaryWriter; evaluation needs no tensorboard
+        self._line: ProgressLine | None = None  # between open and close
+        self._writer: LogWriter | None = None
 
     def open(self, first_iteration: int) -> None:
-        """Open the TensorBoard file; scalars of iterations that will be repeated after a resume are dropped."""
+        """Begin to log; scalars of iterations that will be repeated after a resume are dropped."""
         if self.log_dir is not None:
-            from torch.utils.tensorboard import SummaryWriter
-
-            purge = first_iteration if first_iteration > 0 else None
-            self._writer = SummaryWriter(log_dir=str(self.log_dir), flush_secs=10, purge_step=purge)
+            self._line = ProgressLine()
+            if self.config is not None:
+                self._writer = self.config.open(self.log_dir, first_iteration, self.settings)
 
     def close(self) -> None:
-        """Close the TensorBoard file."""
+        """End the log."""
+        if self._line is not None:
+            self._line.end()
+            self._line = None
         if self._writer is not None:
-            self._writer.close()
+            self._writer.stop()
             self._writer = None
+
+    def say(self, text: str) -> None:
+        """Print a line of its own beside the console's line."""
+        if self._line is not None:
+            self._line.end()
+        print(text, flush=True)
+
+    def save_video(self, path: Path, iteration: int) -> None:
+        """Hand a video on to the service that logs."""
+        if self._writer is not None:
+            self._writer.save_video(path, iteration)
 
     def add_step(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping) -> None:
         """Note a control step; finished episodes are read out by :meth:`log`, so no step waits for a GPU."""
-        if self._writer is None:
+        if self._line is None:
             return
         if "log" in extras:
             self._infos.append(extras["log"])
@@ -90,7 +123,7 @@ class Logger:
             scalars: what else to write, by tag.
             time_left: s until the time budget is spent; None without one.
         """
-        if self._writer is None:
+        if self._line is None or self.log_dir is None:
             return
         self.total_steps += num_steps
         self._read_out_episodes()
@@ -107,8 +140,9 @@ class Logger:
         if self.returns:
             values["Train/mean_reward"] = statistics.mean(self.returns)
             values["Train/mean_episode_length"] = statistics.mean(self.lengths)
-        for tag, value in values.items():
-            self._writer.add_scalar(tag, value, iteration)
+        if self._writer is not None:
+            for tag, value in values.items():
+                self._writer.add_scalar(tag, value, iteration)
 
         self._recent.append(collect_time + learn_time)
         remaining = statistics.mean(self._recent) * (total - iteration - 1)
@@ -116,17 +150,21 @@ class Logger:
             remaining = min(remaining, max(time_left, 0.0))
         parts = [
             f"{iteration + 1:>{len(str(total))}}/{total}",
+            f"ETA {datetime.timedelta(seconds=round(remaining))}",
             f"{steps_per_s:,} steps/s",
             f"collect {collect_time:.2f} s, learn {learn_time:.2f} s",
         ]
         if self.returns:
             parts.append(f"reward {statistics.mean(self.returns):.3f}, length {statistics.mean(self.lengths):.0f}")
         shown = {name: loss for name, loss in losses.items() if name == "value" or name.endswith("_target")}
-        shown |= {name: means[METRICS + name] for name in CONSOLE_METRICS if METRICS + name in means}
+        rates = {name: means[METRICS + name] for name in CONSOLE_METRICS if METRICS + name in means}
+        shown |= rates
         anomalies = {key.removeprefix(ANOMALIES): n for key, n in means.items() if key.startswith(ANOMALIES)}
         shown |= {name: count for name, count in anomalies.items() if count > 0}
         parts += [f"{name} {value:.3g}" for name, value in shown.items()]
-        print(" | ".join([*parts, f"ETA {datetime.timedelta(seconds=round(remaining))}"]), flush=True)
+        self._line.show(" | ".join(parts))
+        reward = {"reward": statistics.mean(self.returns)} if self.returns else {}
+        save_progress(self.log_dir, iteration + 1, total, reward | rates)
 
     def state_dict(self) -> dict:
         """Counters and running episode sums, to continue the same curves after a resume."""

@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -47,6 +47,8 @@ class Runner:
         alg: the algorithm with its models and storage.
         current_learning_iteration: completed iterations.
         total_time: seconds of training, all resumed runs together.
+        step_hooks: called after each control step.
+        end_hooks: called when learning ends, before the log is closed.
         stop_reason: why the last :meth:`learn` ended: "completed" or "time budget".
     """
 
@@ -66,7 +68,9 @@ class Runner:
             actor = self.alg.actor
             env.state.measure_velocity_by(lambda: actor.estimate)
         log_dir = Path(log_dir) if log_dir is not None and distributed.rank() == 0 else None
-        self.logger = Logger(log_dir, env.num_envs, device)
+        self.logger = Logger(log_dir, env.num_envs, device, config.logger, config.settings)
+        self.step_hooks: list[Callable[[], None]] = []
+        self.end_hooks: list[Callable[[], None]] = []
         self.current_learning_iteration = 0
         self.total_time = 0.0
         self.stop_reason = ""
@@ -93,8 +97,8 @@ class Runner:
         if self.alg.is_multi_gpu:
             self.alg.broadcast_parameters()
         self.stop_reason = "completed"
-        self.logger.open(first)
         try:
+            self.logger.open(first)
             with self._interrupts_noted():
                 for _ in range(first, last):
                     obs = self._iterate(obs, last)
@@ -105,6 +109,8 @@ class Runner:
                         self._save_checkpoint()
             self._save_checkpoint()
         finally:
+            for hook in self.end_hooks:
+                hook()
             self.logger.close()
         if self._interrupted:
             self._interrupted = False
@@ -118,6 +124,8 @@ class Runner:
         obs, rewards, dones = obs.to(self.device), rewards.to(self.device), dones.to(self.device)
         self.alg.process_env_step(obs, rewards, dones, extras)
         self.logger.add_step(rewards, dones, extras)
+        for hook in self.step_hooks:
+            hook()
         return obs
 
     @property
@@ -249,7 +257,7 @@ class Runner:
         def note(signum, frame) -> None:
             self._interrupted = True
             signal.signal(signal.SIGINT, previous)
-            print("interrupted: finishing this iteration, then saving (Ctrl-C again stops at once)", flush=True)
+            self.logger.say("interrupted: finishing this iteration, then saving (Ctrl-C again stops at once)")
 
         previous = signal.signal(signal.SIGINT, note)
         try:

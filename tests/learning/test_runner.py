@@ -213,7 +213,7 @@ class TestLearn:
         return runner.env.get_observations()
 
     def eta(self, capsys):
-        hours, minutes, seconds = capsys.readouterr().out.strip().rpartition("ETA ")[2].split(":")
+        hours, minutes, seconds = capsys.readouterr().out.strip().partition("ETA ")[2].partition(" |")[0].split(":")
         return 3600 * int(hours) + 60 * int(minutes) + int(seconds)
 
     def test_interrupt_saves_and_leaves(self, tmp_path):

@@ -1,0 +1,123 @@
+"""Learning curves of runs that differ by their seeds alone: mean over the seeds, and the range of all of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from omniperception import config
+from omniperception.common.errors import ConfigError
+from omniperception.common.figures import new_figure
+
+SAME_IN_NOTHING = ("seed", "logger", config.SEARCH_PATH)
+"""Keys of a configuration in which runs of one curve may differ."""
+UNITS = {
+    "velocity_error": "m/s",
+    "calm_velocity_error": "m/s",
+    "yaw_rate_error": "rad/s",
+    "mean_reward": "sum over an episode",
+    "mean_episode_length": "control steps",
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A recipe's scalar over its trainings.
+
+    Attributes:
+        label: the recipe.
+        steps: (n,) iterations that all of its runs have.
+        values: (runs, n).
+    """
+
+    label: str
+    steps: np.ndarray
+    values: np.ndarray
+
+    def smoothed(self, width: int) -> np.ndarray:
+        """Means (runs, n) over the last `width` iterations, over fewer at the beginning."""
+        sums = np.cumsum(np.pad(self.values, ((0, 0), (1, 0))), 1)
+        ends = np.arange(1, self.values.shape[1] + 1)
+        begins = np.maximum(ends - width, 0)
+        return (sums[:, ends] - sums[:, begins]) / (ends - begins)
+
+
+def by_recipe(runs: Sequence[Path]) -> dict[str, list[Path]]:
+    """Runs by what they were trained with, but for the seed; the names are their recipes, or a run directory."""
+    groups: dict[str, list[Path]] = {}
+    for run in runs:
+        made = OmegaConf.to_container(config.read(run))
+        assert isinstance(made, dict)
+        kept = {key: value for key, value in made.items() if key not in SAME_IN_NOTHING}
+        groups.setdefault(json.dumps(kept, sort_keys=True), []).append(run)
+    named: dict[str, list[Path]] = {}
+    for same in groups.values():
+        label = _label(same[0])
+        named[label if label not in named else f"{label} ({same[0]})"] = same
+    return named
+
+
+def _label(run: Path) -> str:
+    words = (config.recipe(run) or str(run)).split()
+    return " ".join(word for word in words if not word.startswith(("seed=", "logger"))) or str(run)
+
+
+def read_scalars(run: Path, tags: Sequence[str]) -> dict[str, dict[int, float]]:
+    """Values by iteration of each tag that the TensorBoard files of a run have."""
+    from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
+
+    events = EventAccumulator(str(run), size_guidance={SCALARS: 0})
+    events.Reload()
+    known = set(events.Tags()[SCALARS])
+    return {tag: {event.step: event.value for event in events.Scalars(tag)} for tag in tags if tag in known}
+
+
+def curves_of(runs: Sequence[Path], tags: Sequence[str]) -> dict[str, list[Curve]]:
+    """Curves of each tag.
+
+    Raises:
+        ConfigError: no run has a tag, or runs of one curve have no iteration in common.
+    """
+    scalars = {run: read_scalars(run, tags) for run in runs}
+    found: dict[str, list[Curve]] = {tag: [] for tag in tags}
+    for label, group in by_recipe(runs).items():
+        for tag in tags:
+            having = [scalars[run][tag] for run in group if tag in scalars[run]]
+            if having:
+                found[tag].append(_curve(label, having))
+    for tag, curves in found.items():
+        if not curves:
+            raise ConfigError(f"tags={tag}: none of the {len(runs)} runs has it; see `tensorboard --logdir {runs[0]}`")
+    return found
+
+
+def _curve(label: str, runs: Sequence[Mapping[int, float]]) -> Curve:
+    steps = sorted(set(runs[0]).intersection(*runs[1:]))
+    if not steps:
+        raise ConfigError(f"runs of {label} have no iteration in common; draw them apart")
+    return Curve(label, np.array(steps), np.array([[run[step] for step in steps] for run in runs]))
+
+
+def draw_curves(path: Path, curves: Mapping[str, Sequence[Curve]], smooth: int) -> None:
+    """Draws a panel for each tag: a line for the mean of a recipe's runs, a band from the least to the greatest."""
+    figure = new_figure(5.2 * len(curves), 4.0)
+    for axis, (tag, shown) in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
+        for curve in shown:
+            values = curve.smoothed(smooth)
+            count = len(values)
+            seeds = "one training" if count == 1 else f"{count} trainings"
+            (line,) = axis.plot(curve.steps, values.mean(0), lw=1.5, label=f"{curve.label}: {seeds}")
+            if count > 1:
+                axis.fill_between(curve.steps, values.min(0), values.max(0), color=line.get_color(), alpha=0.2, lw=0)
+        name = tag.rpartition("/")[2]
+        unit = UNITS.get(name, "share" if name.endswith("_rate") else "")
+        axis.set(xlabel="iteration", ylabel=f"{name.replace('_', ' ')} ({unit})" if unit else name.replace("_", " "))
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7, loc="best")
+    figure.suptitle(f"mean of the last {smooth} iterations; band: least to greatest of the trainings", fontsize=9)
+    figure.savefig(path, dpi=120)

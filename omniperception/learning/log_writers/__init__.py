@@ -1,0 +1,115 @@
+"""Where the numbers of a training go: TensorBoard, Weights & Biases, MLflow, Trackio, or a writer of one's own."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from rsl_rl.utils.log_writer import LogWriter
+
+
+class LoggerError(Exception):
+    """A service that does not take what is logged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoggerConfig:
+    """TensorBoard files in the run directory; the other loggers write them as well, and more.
+
+    Attributes:
+        video_interval: iterations between two videos of environment 0; None makes none.
+        video_s: their length (s).
+    """
+
+    video_interval: int | None = None
+    video_s: float = 10.0
+    extra: ClassVar[str] = ""
+    """Extra of this package, and library, that it needs."""
+
+    def __post_init__(self) -> None:
+        if self.video_interval is not None and self.video_interval < 1:
+            raise ValueError(f"logger.video_interval={self.video_interval} must be at least 1, or null for no videos")
+        if self.video_s <= 0:
+            raise ValueError(f"logger.video_s={self.video_s} must be positive")
+
+    def check(self) -> None:
+        """Raises LoggerError where the library is missing."""
+        if self.extra and importlib.util.find_spec(self.extra) is None:
+            raise LoggerError(f"logger={self.extra} needs {self.extra}: pip install 'omniperception[{self.extra}]'")
+
+    def open(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> LogWriter:
+        """Begins to log, or goes on.
+
+        Args:
+            run_dir: run directory.
+            first_iteration: what is logged begins there; scalars from there on are dropped, as they will come again.
+            settings: the run's composed configuration.
+
+        Raises:
+            LoggerError: the service refuses.
+        """
+        from omniperception.learning.log_writers.tensorboard import TensorBoardWriter
+
+        return TensorBoardWriter(run_dir, first_iteration, settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WandbConfig(LoggerConfig):
+    """Weights & Biases. Its own environment variables hold, such as WANDB_MODE=offline.
+
+    Attributes:
+        project: in which the run appears.
+    """
+
+    project: str = "omniperception"
+    extra: ClassVar[str] = "wandb"
+
+    def open(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> LogWriter:
+        """See `LoggerConfig.open`."""
+        from omniperception.learning.log_writers.wandb import WandbWriter
+
+        return WandbWriter(run_dir, first_iteration, settings, self.project)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MlflowConfig(LoggerConfig):
+    """MLflow. Its own environment variables hold, such as MLFLOW_TRACKING_URI.
+
+    Attributes:
+        project: name of the experiment in which the run appears.
+    """
+
+    project: str = "omniperception"
+    extra: ClassVar[str] = "mlflow"
+
+    def open(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> LogWriter:
+        """See `LoggerConfig.open`."""
+        from omniperception.learning.log_writers.mlflow import MlflowWriter
+
+        return MlflowWriter(run_dir, first_iteration, settings, self.project)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackioConfig(LoggerConfig):
+    """Trackio. Its own environment variables hold, such as TRACKIO_DIR.
+
+    Attributes:
+        project: in which the run appears.
+    """
+
+    project: str = "omniperception"
+    extra: ClassVar[str] = "trackio"
+
+    def open(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> LogWriter:
+        """See `LoggerConfig.open`."""
+        from omniperception.learning.log_writers.trackio import TrackioWriter
+
+        return TrackioWriter(run_dir, first_iteration, settings, self.project)
+
+
+def run_name(run_dir: Path) -> str:
+    """A run's name in a service: the last two folders of its directory, which are its date and time."""
+    return "_".join(run_dir.resolve().parts[-2:])
