@@ -14,6 +14,8 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
+
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.records import Record, read
@@ -73,29 +75,28 @@ def by_world(records: Sequence[Record]) -> str:
 
 def _by_world(records: Sequence[Record], column: str, keys: Sequence[str]) -> str:
     columns = [name for (name,) in grouped(records, column)]
+    if column == "condition":
+        columns.sort()  # ideal, paper, robot
     rows = []
-    for key, here in grouped(records, *keys).items():
+    for key, here in sorted(grouped(records, *keys).items()):
         cells = [_untouched([record for record in here if getattr(record, column) == name]) for name in columns]
         rows.append([*key, *cells])
     return _titled(records, "reached, untouched and without a fall, %", list(keys), columns, rows)
 
 
 def by_condition(records: Sequence[Record]) -> str:
-    """How often each policy arrived untouched, and how often it fell, in the mean over all worlds."""
-    conditions = [condition for (condition,) in grouped(records, "condition")]
+    """How often each policy arrived untouched, and how often it fell, in the trials of all worlds."""
+    conditions = sorted({record.condition for record in records})
     rows = []
     for (policy,), theirs in grouped(records, "policy").items():
         cells = []
         for condition in conditions:
-            there = [record for record in theirs if record.condition == condition]
-            shares = [
-                sum(float(r.episodes.happened()[name].double().mean()) for r in there) / max(len(there), 1)
-                for name in ("untouched", "fall")
-            ]
-            cells.append(f"{100 * shares[0]:.1f} / {100 * shares[1]:.1f}" if there else "–")
+            there = [r.episodes.happened() for r in theirs if r.condition == condition]
+            shares = [torch.cat([happened[name] for happened in there]) for name in ("untouched", "fall") if there]
+            cells.append(" / ".join(rate_cell([share]) for share in shares) or "–")
         rows.append([policy, *cells])
     worlds = len({(record.world, record.terrain) for record in records})
-    what = f"reached, untouched and without a fall / falls, %, mean over {worlds} worlds"
+    what = f"reached, untouched and without a fall / falls, %, over {worlds} worlds"
     return _titled(records, what, ["policy"], conditions, rows)
 
 

@@ -62,7 +62,10 @@ def test_views(data):
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
     assert rows[0] == ["world", "ideal", "robot"] and rows[3] == ["rod", "25.0 [7.1, 59.1]", "–"]
     text = rendered(page("first view=conditions world=corridor"), data)
-    assert "| run    | 25.0 / 25.0 | 25.0 / 25.0 |" in text and "| blind  | 0.0 / 25.0  | –           |" in text
+    assert "| run    | 25.0 [7.1, 59.1] / 25.0 [7.1, 59.1] | 25.0 [7.1, 59.1] / 25.0 [7.1, 59.1] |" in text
+    assert "| blind  | 0.0 [0.0, 32.4] / 25.0 [7.1, 59.1]  | –                                   |" in text
+    text = rendered(page("first view=conditions policy=run condition=ideal"), data)
+    assert "| run    | 25.0 [10.2, 49.5] / 25.0 [10.2, 49.5] |" in text  # 4 of 16 trials in two worlds
 
 
 @pytest.mark.parametrize(
