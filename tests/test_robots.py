@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from own_robots import BIPED, HEXAPOD
 
 LEGS = ("left_hip", "left_knee", "right_hip", "right_knee")
+DATA = Path(__file__).parent / "data"
 GO2 = Path(build.__file__).parent / "scene" / "assets" / "go2.xml"
 
 
@@ -93,6 +94,15 @@ def test_neighbouring_feet_step_in_turn(guesses):
         assert found == offsets, name
     assert guesses["go2"].preset["gait"]["frequency"] == pytest.approx(2.5, abs=0.11)
     assert guesses["go2"].preset["gait"]["foot_height"] == pytest.approx(0.09, abs=0.01)
+
+
+def test_flat_feet_stand_flat_whose_knees_bend_one_way():
+    """The knees' range begins at 0. Soles are 3 cm thick boxes; a foot's centre rises by 0.1 m from 1.5 cm."""
+    found = guess(DATA / "strider.urdf", str(DATA / "strider.urdf")).preset
+    angles = found["default_joint_pos"]
+    assert angles["left_knee"] > 0.3
+    assert sum(angles[f"left_{joint}"] for joint in ("hip_pitch", "knee", "ankle")) == pytest.approx(0.0, abs=0.01)
+    assert found["gait"]["foot_height"] == pytest.approx(0.115, abs=0.002)
 
 
 def test_a_urdf_says_its_torques_and_where_its_lidar_is(guesses):

@@ -290,6 +290,7 @@ def _gait(draft: _Draft, height: float) -> dict[str, object]:
     """
     body = draft.body
     places = np.array([foot.place(body) for foot in draft.feet])
+    centre = float(np.mean([body.data.geom_xpos[body.soles(foot.link), 2].mean() for foot in draft.feet]))
     left = places[:, 1] > 0
     before = [int(((left == left[k]) & (places[:, 0] > place[0] + 0.01)).sum()) for k, place in enumerate(places)]
     offsets = [0.5 * ((rank + (not is_left)) % 2) for rank, is_left in zip(before, left, strict=True)]
@@ -297,7 +298,7 @@ def _gait(draft: _Draft, height: float) -> dict[str, object]:
         "frequency": round(_PACE * float(np.sqrt(0.33 / height)), 1),
         "offsets": offsets,
         "duty": 0.5,
-        "foot_height": round(height + float(places[:, 2].mean()) + min(_RISE * height, _MOST_RISE), 3),
+        "foot_height": round(height + centre + min(_RISE * height, _MOST_RISE), 3),
     }
 
 

@@ -61,8 +61,8 @@ def first_pose(body: Body) -> dict[int, float]:
 
 
 def standing_pose(body: Body, start: dict[int, float], feet: list[Foot]) -> dict[int, float]:
-    """Angles (rad) of all joints; those of no leg stay as in `start`."""
-    body.place(start)
+    """Angles (rad) of all joints; those of no leg stay as in `start`. Soles are as flat as in the file's own pose."""
+    body.place({})
     upright = {foot.link: body.data.xmat[foot.link].reshape(3, 3).copy() for foot in feet}
     ratio = BENT[len(feet) > 2]
     goals = {}

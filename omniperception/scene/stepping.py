@@ -13,7 +13,9 @@ from omniperception.scene.robot import RobotConfig
 ROWS = 40
 """Rows of a table of `stepping_offsets`; in between, angles are interpolated linearly."""
 _DAMPING = 1e-6
-_ITERATIONS = 20
+_ITERATIONS = 30
+_LARGEST = 0.3
+"""rad: a joint's way in an iteration."""
 _TOLERANCE = 1e-3
 """m: of where a foot is lifted to."""
 
@@ -43,10 +45,11 @@ def stepping_offsets(robot: RobotConfig, lift: float) -> np.ndarray:
     order of `robot.joints`; row k is at the share k / ROWS of a period.
 
     A foot that swings is (lift * foot_height - its height in the default pose) sin^2(pi s) higher at a share s of it;
-    its leg's joints take it there, the base being held. What the position leaves free keeps the foot's orientation.
+    its leg's joints take it there, the base being held. What the position leaves free keeps the foot's orientation,
+    as far as joints reach.
 
     Raises:
-        ValueError: the robot has no gait, or a leg cannot lift its foot so high.
+        ValueError: the robot has no gait, or a leg cannot lift its foot so high, or not straight up.
     """
     gait = robot.gait
     if gait is None:
@@ -80,8 +83,9 @@ class _Legs:
         joints = [model.joint(name) for name in robot.joints]
         body = int(model.geom_bodyid[self._feet[foot][0]])
         carries = [_above(model, body, int(joint.bodyid[0])) for joint in joints]
-        dofs = [int(joint.dofadr[0]) for joint, has in zip(joints, carries, strict=True) if has]
-        places = [int(joint.qposadr[0]) for joint, has in zip(joints, carries, strict=True) if has]
+        own = [joint for joint, has in zip(joints, carries, strict=True) if has]
+        dofs, places = [int(joint.dofadr[0]) for joint in own], [int(joint.qposadr[0]) for joint in own]
+        low, high = np.array([joint.range if joint.limited[0] else (-np.inf, np.inf) for joint in own]).T
         data.qpos[:] = self._pose
         start = self._foot(foot)
         target = start + share * np.array((0.0, 0.0, lift * self._foot_height - start[2]))
@@ -92,15 +96,17 @@ class _Legs:
             turned = np.empty(3)
             mujoco.mju_subQuat(turned, upright, data.xquat[body])
             turned = data.xmat[body].reshape(3, 3) @ turned
-            inverse = _damped_inverse(moves)
-            step = inverse @ (target - here)
-            free = np.eye(len(dofs)) - inverse @ moves
-            step += free @ _damped_inverse(turns @ free) @ (turned - turns @ step)
-            data.qpos[places] += step
+            angles, step = data.qpos[places], _step(moves, turns, target - here, turned)
+            beyond = (angles + step < low) | (angles + step > high)
+            if beyond.any():  # those go to their stops, the others do what is left
+                moves[:, beyond] = turns[:, beyond] = 0.0
+                step = np.where(beyond, step, _step(moves, turns, target - here, turned))
+            data.qpos[places] = np.clip(angles + step, low, high)
         if np.abs(self._foot(foot) - target).max() > _TOLERANCE:
             raise ValueError(
-                f"stepping.lift={lift}: the leg of {robot.foot_names[foot]} does not lift it to {target[2]:.3f} m from"
-                " the default pose; lower it, or robot.gait.foot_height"
+                f"stepping.lift={lift}: the leg of {robot.foot_names[foot]} does not lift it straight up to"
+                f" {target[2]:.3f} m within the ranges of its joints; lower it or robot.gait.foot_height, bend the leg"
+                " more in robot.default_joint_pos, or use stepping=null"
             )
         change = np.zeros(robot.num_joints)
         change[carries] = (data.qpos - self._pose)[places]
@@ -117,6 +123,16 @@ class _Legs:
         moves, turns = np.empty((2, 3, self._model.nv))
         mujoco.mj_jac(self._model, self._data, moves, turns, self._data.geom_xpos[self._feet[foot]].mean(0), body)
         return moves[:, dofs], turns[:, dofs]
+
+
+def _step(moves: np.ndarray, turns: np.ndarray, way: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """(J,) rad, at most _LARGEST: change of angles that moves a foot by `way` (3,) m and, where that leaves a choice,
+    turns it by `turned` (3,) rad."""
+    inverse = _damped_inverse(moves)
+    step = inverse @ way
+    free = np.eye(len(step)) - inverse @ moves
+    step += free @ _damped_inverse(turns @ free) @ (turned - turns @ step)
+    return step * min(1.0, _LARGEST / max(float(np.abs(step).max()), _LARGEST))
 
 
 def _damped_inverse(matrix: np.ndarray) -> np.ndarray:

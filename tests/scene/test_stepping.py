@@ -1,6 +1,8 @@
 """Stepping on the spot: feet rise in turn, straight up, in the order and at the height of the robot's gait."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -8,12 +10,26 @@ import pytest
 
 from omniperception import build
 from omniperception.config import compose
+from omniperception.robots.guess import guess
+from omniperception.scene import RobotConfig
 from omniperception.scene.stepping import ROWS, SteppingConfig, stepping_offsets
+from omniperception.schema import make
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from own_robots import HEXAPOD
+
+DATA = Path(__file__).parents[1] / "data"
 BLIND = ("lidar=none", "perception=none", "observations=walk", "rewards=walk", "obstacles=none")
 
 
+def guessed(file):
+    return make(RobotConfig, guess(file, str(file)).preset, "robot")
+
+
 def robot_of(name):
+    """A preset, or what is guessed for a robot of the tests."""
+    if (DATA / f"{name}.urdf").is_file():
+        return guessed(DATA / f"{name}.urdf")
     return build.assemble(compose([f"robot={name}", *BLIND])).env.robot
 
 
@@ -28,12 +44,12 @@ def feet_of(robot, angles):
     return np.array([np.mean([data.geom(geom).xpos for geom in foot], axis=0) for foot in robot.feet])
 
 
-@pytest.mark.parametrize("name", ["go2", "anymal"])
+@pytest.mark.parametrize("name", ["go2", "anymal", "strider", "spider"])
 def test_feet_go_straight_up_one_after_the_other(name):
     robot, lift = robot_of(name), 1.3
     stand = np.array(robot.by_joint("default_joint_pos"))
     offsets, default = stepping_offsets(robot, lift), feet_of(robot, stand)
-    highest = np.zeros(4)
+    highest = np.zeros(len(robot.feet))
     for row in range(ROWS):
         raised = feet_of(robot, stand + offsets[row]) - default
         swing = [(row / ROWS - offset) % 1.0 for offset in robot.gait.offsets]
@@ -43,6 +59,31 @@ def test_feet_go_straight_up_one_after_the_other(name):
         np.testing.assert_allclose(raised[:, :2], 0.0, atol=1e-4)
         highest = np.maximum(highest, raised[:, 2])
     np.testing.assert_allclose(highest, way, rtol=0.02)
+
+
+def test_soles_stay_level():
+    """Hip, knee and ankle turn about the same axis: the sole is level where their angles add up to 0."""
+    robot = robot_of("strider")
+    stand = np.array(robot.by_joint("default_joint_pos"))
+    for row in stepping_offsets(robot, 1.6):
+        angles = dict(zip(robot.joints, stand + row, strict=True))
+        for side in ("left", "right"):
+            assert sum(angles[f"{side}_{joint}"] for joint in ("hip_pitch", "knee", "ankle")) == pytest.approx(
+                0, abs=0.01
+            )
+
+
+def test_joints_stay_within_their_ranges(tmp_path):
+    """A foot whose ankle turns no further tilts; one whose knee does not bend enough is not lifted."""
+    file, text = tmp_path / "strider.urdf", (DATA / "strider.urdf").read_text()
+    file.write_text(text.replace('lower="-1.2" upper="1.2"', 'lower="-0.6" upper="0.6"'))
+    robot = guessed(file)
+    angles = np.array(robot.by_joint("default_joint_pos")) + stepping_offsets(robot, 1.6)
+    assert angles[:, robot.joints.index("left_ankle")].min() == pytest.approx(-0.6)
+    assert angles[:, robot.joints.index("left_knee")].max() > 1.5
+    file.write_text(text.replace('upper="2.4"', 'upper="1.2"'))
+    with pytest.raises(ValueError, match="the leg of right_foot_geom_0 does not lift it .* within the ranges"):
+        stepping_offsets(guessed(file), 1.6)
 
 
 def test_other_rhythms_and_orders_of_joints():
@@ -56,9 +97,16 @@ def test_other_rhythms_and_orders_of_joints():
     assert [int(moving[:, foot].nonzero()[0].mean()) for foot in range(4)] == [5, 35, 15, 25]
 
 
-def test_what_no_leg_can_do_is_named():
-    with pytest.raises(ValueError, match=r"stepping.lift=9: the leg of FR_foot does not lift it to 0"):
-        stepping_offsets(robot_of("go2"), 9)
+def test_what_no_leg_can_do_is_named(tmp_path):
+    """Two joints on a leg take its foot up along an arc."""
+    (tmp_path / "hexapod.urdf").write_text(HEXAPOD)
+    arcs = guessed(tmp_path / "hexapod.urdf")
+    for robot, lift, foot in ((robot_of("go2"), 9, "RL_foot"), (arcs, 1.6, "l1_foot_geom_0")):
+        message = (
+            rf"stepping.lift={lift}: the leg of {foot} does not lift it straight up to 0\..*, or use stepping=null$"
+        )
+        with pytest.raises(ValueError, match=message):
+            stepping_offsets(robot, lift)
     with pytest.raises(ValueError, match=r"robot.gait, which is null"):
         stepping_offsets(replace(robot_of("go2"), gait=None), 1)
     with pytest.raises(ValueError, match="lift=0.0 must be positive"):
