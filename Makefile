@@ -1,9 +1,9 @@
-# make setup | train | test | test-fast | lint      overrides and options go in ARGS, e.g. make train ARGS="seed=3"
+# make setup | train | test | test-fast | lint | docs      overrides and options go in ARGS, e.g. make train ARGS="seed=3"
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin/python
 
-.PHONY: setup train test test-fast lint
+.PHONY: setup train test test-fast lint docs
 setup: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml requirements.txt requirements-no-deps.txt
@@ -28,3 +28,6 @@ lint: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
+
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
