@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -105,19 +107,21 @@ def _curve(label: str, runs: Sequence[Mapping[int, float]]) -> Curve:
 
 def draw_curves(path: Path, curves: Mapping[str, Sequence[Curve]], smooth: int) -> None:
     """Draws a panel for each tag: a line for the mean of a recipe's runs, a band from the least to the greatest."""
-    figure = new_figure(5.2 * len(curves), 4.0)
+    labels = list(dict.fromkeys(curve.label for shown in curves.values() for curve in shown))
+    figure = new_figure(5.2 * max(len(curves), 2), 4.2 + 0.3 * len(labels))
+    lines: dict[str, Any] = {}
     for axis, (tag, shown) in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves.items(), strict=True):
         for curve in shown:
-            values = curve.smoothed(smooth)
-            count = len(values)
-            seeds = "one training" if count == 1 else f"{count} trainings"
-            (line,) = axis.plot(curve.steps, values.mean(0), lw=1.5, label=f"{curve.label}: {seeds}")
-            if count > 1:
-                axis.fill_between(curve.steps, values.min(0), values.max(0), color=line.get_color(), alpha=0.2, lw=0)
+            values, colour = curve.smoothed(smooth), f"C{labels.index(curve.label) % 10}"
+            seeds = "one training" if len(values) == 1 else f"{len(values)} trainings"
+            (line,) = axis.plot(curve.steps, values.mean(0), lw=1.5, color=colour)
+            lines.setdefault("\n".join(textwrap.wrap(f"{curve.label}: {seeds}", 130)), line)
+            if len(values) > 1:
+                axis.fill_between(curve.steps, values.min(0), values.max(0), color=colour, alpha=0.2, lw=0)
         name = tag.rpartition("/")[2]
         unit = UNITS.get(name, "share" if name.endswith("_rate") else "")
         axis.set(xlabel="iteration", ylabel=f"{name.replace('_', ' ')} ({unit})" if unit else name.replace("_", " "))
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=7, loc="best")
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", fontsize=7, frameon=False)
     figure.suptitle(f"mean of the last {smooth} iterations; band: least to greatest of the trainings", fontsize=9)
     figure.savefig(path, dpi=120)
