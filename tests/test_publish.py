@@ -49,3 +49,10 @@ def test_too_large_a_policy_is_refused(run, tmp_path, monkeypatch):
     monkeypatch.setattr(publish, "LIMIT", 1000)
     with pytest.raises(config.ConfigError, match=r"MB of weights, at most 0 MB are published"):
         publish.publish(run, tmp_path / "published")
+
+
+def test_a_published_policy_is_not_published_again(run, tmp_path):
+    publish.publish(run, tmp_path / "published")
+    with pytest.raises(config.ConfigError, match="was published already"):
+        publish.publish(tmp_path / "published", tmp_path / "again")
+    assert not (tmp_path / "again").exists()

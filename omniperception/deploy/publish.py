@@ -31,11 +31,13 @@ def publish(run_dir: Path, folder: Path) -> dict:
         What provenance.json holds.
 
     Raises:
-        ConfigError: the weights are larger than LIMIT.
+        ConfigError: the weights are larger than LIMIT, or the run is a published one.
         CheckpointError: the run has no checkpoint.
     """
     newest = latest_checkpoint(run_dir)
     state = load_checkpoint(newest, "cpu")
+    if "total_time" not in state:
+        raise ConfigError(f"run={run_dir} was published already: it holds weights alone; give the run it came from")
     weights = {name: state[name] for name in ("actor_state_dict", "critic_state_dict")}
     size = sum(tensor.numel() * tensor.element_size() for part in weights.values() for tensor in part.values())
     if size > LIMIT:
