@@ -141,7 +141,7 @@ class TestTerms:
             joint_upper=torch.tensor([1.2, 1.0, 1.0]),
             joint_torque=tensor([3.0, -4.0, 0.0], [0.0, 0.0, 0.0]),
             joint_acc=tensor([1.0, -2.0, 0.0], [0.0, 1.0, 0.0]),
-            default_joint_pos=torch.tensor([1.2, -0.7, 0.8]),
+            pose=torch.tensor([1.2, -0.7, 0.8]),
             actions=(tensor([1.0, 0.0], [0.0, 0.0]), tensor([0.5, 1.0], [0.0, 0.0]), tensor([0.0, -1.0], [0.0, 1.0])),
             obstacle_contact=torch.tensor([True, False]),
             num_envs=2,
