@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin/python
+IN_PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: setup train test test-fast lint docs
 setup: $(VENV)/.installed
@@ -19,10 +20,10 @@ train: setup
 	$(RUN) train.py experiment=quickstart $(ARGS)
 
 test: setup
-	$(RUN) -m pytest -m "not slow" $(ARGS)
+	$(RUN) -m pytest -m "not slow" $(IN_PARALLEL) $(ARGS)
 
 test-fast: setup
-	$(RUN) -m pytest -m "not slow and not integration" $(ARGS)
+	$(RUN) -m pytest -m "not slow and not integration" $(IN_PARALLEL) $(ARGS)
 
 lint: setup
 	$(RUN) -m ruff check .

@@ -11,6 +11,7 @@ import torch
 
 from omniperception import build, config
 from omniperception.commands import COMMANDS, main
+from omniperception.common import provenance
 from omniperception.learning import Runner
 from omniperception.lidar.sensor import Lidar  # noqa: F401  Warp asks for the processor in a process of its own
 
@@ -205,6 +206,7 @@ def one_line(monkeypatch, tmp_path, run_dir, capfd):
         monkeypatch.syspath_prepend(str(tmp_path))
         monkeypatch.setattr(Runner, "learn", never)
         monkeypatch.setattr(subprocess, "Popen", never)
+        monkeypatch.setattr(provenance, "commit", lambda: None)  # which asks git
         shutil.copy(__file__, tmp_path / "wrong_input_terms.py")
         (tmp_path / "EMPTY").mkdir()
         words = [word.replace("=RUN", f"={run_dir}") for word in text.split()]
