@@ -124,6 +124,8 @@ class PPOConfig:
         obs_normalization: whether observations are normalised by running statistics.
         mixed_precision: whether updates multiply matrices in bfloat16; None where that is measured to be faster on a
             CPU, on a GPU not.
+        critic_warmup: iterations at the beginning in which only the critic learns, for a policy that starts from weights
+            of another run (init=): advantages by a critic that knows nothing destroy it.
         final_entropy_coef: entropy_coef at the last iteration, to which it changes evenly; None: it stays as it is.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
         The others are rsl_rl's PPO arguments.
@@ -152,6 +154,7 @@ class PPOConfig:
     obs_normalization: bool
     mixed_precision: bool | None = False
     final_entropy_coef: float | None = None
+    critic_warmup: int = 0
     symmetry: bool = False
 
     def __post_init__(self) -> None:
@@ -164,8 +167,9 @@ class PPOConfig:
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be at least 1")
-        if self.num_learning_epochs < 0:
-            raise ValueError(f"ppo.num_learning_epochs={self.num_learning_epochs} must not be negative")
+        for name in ("num_learning_epochs", "critic_warmup"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"ppo.{name}={getattr(self, name)} must not be negative")
         for name in ("clip_param", "learning_rate", "max_grad_norm", "init_std", "desired_kl"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive")

@@ -67,7 +67,10 @@ class DivergenceGuard:
 
     def _check_policy(self) -> None:
         for name, model in (("actor", self._algorithm.actor), ("critic", self._algorithm.critic)):
-            has_gradient = self.check_gradients(name, list(model.parameters())) > 0.0
+            learning = [p for p in model.parameters() if p.requires_grad]
+            if not learning:  # kept as it is while the other one warms up
+                continue
+            has_gradient = self.check_gradients(name, learning) > 0.0
             self._has_gradient[name] = self._has_gradient.get(name, False) or has_gradient
 
     def _diagnosis(self) -> str:

@@ -43,6 +43,7 @@ class PerceptivePpo(PPO):
 
     Attributes:
         num_updates: completed updates.
+        critic_warmup: number of updates, the first ones, in which of policy and critic only the critic learns.
         learns_policy: whether PPO changes the policy.
         perception_optimizer: of the perception network and its read-out; None where PPO trains them, or there is none.
         estimator_optimizer: of the actor's estimator; None where there is none, or it stays as it is.
@@ -60,6 +61,7 @@ class PerceptivePpo(PPO):
             self.symmetry: Symmetry | None = MirrorImages(**kwargs["symmetry_cfg"])
         self.num_updates = 0
         self._entropy = (self.entropy_coef, self.entropy_coef, 1)
+        self.critic_warmup = 0
         self.learns_policy = self.num_learning_epochs > 0
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)  # rsl_rl's is not fused
@@ -137,6 +139,7 @@ class PerceptivePpo(PPO):
         )
         if ppo.final_entropy_coef is not None:
             algorithm.anneal_entropy(ppo.final_entropy_coef, ppo.max_iterations)
+        algorithm.critic_warmup = ppo.critic_warmup
         if config.estimator is not None and algorithm.learns_policy:
             algorithm.fit_estimator(config.estimator)
         if perception is not None and perception.supervised_epochs > 0:
@@ -181,7 +184,7 @@ class PerceptivePpo(PPO):
             self.storage.window_features = acted_on  # PPO sees what the policy acted on
         losses = {}
         if self.learns_policy:
-            losses = super().update()
+            losses = self._update_policy()
             losses |= self.train_estimator()  # afterwards: PPO saw what the policy acted on
         else:
             self.storage.clear()
@@ -192,6 +195,14 @@ class PerceptivePpo(PPO):
         self.guard.check_parameters()
         self.actor.reset()  # what it has embedded, it embedded with other weights
         return losses
+
+    def _update_policy(self) -> dict[str, float]:
+        """rsl_rl's update, while the critic warms up without the actor."""
+        self.actor.requires_grad_(self.num_updates >= self.critic_warmup)
+        try:
+            return super().update()
+        finally:
+            self.actor.requires_grad_(True)
 
     def train_perception(self) -> None:
         """Fit the supervised targets on the frames of a rollout; one without a frame teaches nothing.

@@ -128,6 +128,24 @@ def test_the_entropy_coefficient_falls():
     assert algorithm(env, frames=False, entropy_coef=0.01).entropy_coef == 0.01
 
 
+def test_the_critic_warms_up_alone():
+    env = ToyEnv(4)
+    alg = algorithm(env, critic_warmup=2)
+    changed = []
+    for _ in range(3):
+        before = [{n: p.clone() for n, p in model.named_parameters()} for model in (alg.actor, alg.critic)]
+        collect(alg, env, 8)
+        alg.update()
+        now = [dict(model.named_parameters()) for model in (alg.actor, alg.critic)]
+        changed.append(
+            [any(not torch.equal(old[n], new[n]) for n in old) for old, new in zip(before, now, strict=True)]
+        )
+    assert changed == [[False, True], [False, True], [True, True]]
+    assert all(p.requires_grad for p in alg.actor.parameters())
+    with pytest.raises(ValueError, match="ppo.critic_warmup=-1 must not be negative"):
+        algorithm(env, critic_warmup=-1)
+
+
 class TestPrecision:
     @pytest.mark.parametrize(("seconds", "chosen"), [((1.0, 0.5), True), ((1.0, 0.9), False), ((1.0, 1.6), False)])
     def test_the_clearly_faster_one_is_chosen_and_seeds_give_what_they_gave(self, monkeypatch, seconds, chosen):
