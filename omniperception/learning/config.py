@@ -124,8 +124,8 @@ class PPOConfig:
         obs_normalization: whether observations are normalised by running statistics.
         mixed_precision: whether updates multiply matrices in bfloat16; None where that is measured to be faster on a
             CPU, on a GPU not.
-        critic_warmup: iterations at the beginning in which only the critic learns, for a policy that starts from weights
-            of another run (init=): advantages by a critic that knows nothing destroy it.
+        critic_warmup: iterations at the beginning in which only the critic learns, for a policy that starts from
+            another run's weights (init=): advantages by a critic that knows nothing destroy it.
         final_entropy_coef: entropy_coef at the last iteration, to which it changes evenly; None: it stays as it is.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
         The others are rsl_rl's PPO arguments.
