@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from mujoco.batch import Batch, SimulationError
 
+from omniperception.lidar.launch import default_num_threads
 from omniperception.scene import World
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointColumns, Simulator, SizedGeoms
 
@@ -35,7 +36,7 @@ class SimConfig:
         iterations: iterations of the constraint solver.
         ls_iterations: line-search iterations of the solver.
         cone: friction cone, 'pyramidal' or 'elliptic'.
-        num_threads: CPU threads; 0 uses every core.
+        num_threads: CPU threads; 0 uses every core, or this process's share of them under torchrun.
     """
 
     timestep: float = 0.005
@@ -87,7 +88,7 @@ class MujocoSimulator:
         self.world, self.config, self.num_envs = world, config, num_envs
         self.device = torch.device("cpu")
         apply_options(world.model, config)
-        self.batch = Batch(world.model, num_envs, config.num_threads)
+        self.batch = Batch(world.model, num_envs, config.num_threads or default_num_threads())
         self.qpos = torch.from_numpy(self.batch.bind("qpos"))
         self.qvel = torch.from_numpy(self.batch.bind("qvel"))
         self._kinematic = tuple(torch.from_numpy(self.batch.bind(name)) for name in ("mocap_pos", "mocap_quat"))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from omniperception.lidar.launch import CHUNKS_PER_THREAD, MIN_CHUNK_WORK, split
+from omniperception.lidar.launch import CHUNKS_PER_THREAD, MIN_CHUNK_WORK, default_num_threads, split
 
 
 @pytest.mark.parametrize(("num_envs", "work", "threads"), [(1, 1, 2), (7, MIN_CHUNK_WORK, 2), (1000, 500, 3)])
@@ -17,3 +17,13 @@ def test_work_that_is_not_worth_a_thread_stays_together():
     assert len(split(100, MIN_CHUNK_WORK, 1)) == 1
     assert len(split(100, -(-MIN_CHUNK_WORK // 25), 8)) == 4
     assert len(split(100, MIN_CHUNK_WORK, 8)) == 8 * CHUNKS_PER_THREAD
+
+
+@pytest.mark.parametrize(("processes", "expected"), [(None, 4), ("1", 4), ("2", 2), ("3", 1), ("16", 1)])
+def test_processes_of_one_machine_share_its_cores(monkeypatch, processes, expected):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2, 5}, raising=False)
+    if processes is None:
+        monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
+    else:
+        monkeypatch.setenv("LOCAL_WORLD_SIZE", processes)
+    assert default_num_threads() == expected
