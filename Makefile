@@ -1,10 +1,10 @@
-# make setup | train | test | test-fast | lint | docs      overrides and options go in ARGS, e.g. make train ARGS="seed=3"
+# make setup | demo | train | test | test-fast | lint | docs      overrides and options go in ARGS, e.g. make train ARGS="seed=3"
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin/python
 IN_PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup train test test-fast lint docs
+.PHONY: setup demo train test test-fast lint docs
 setup: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml requirements.txt requirements-no-deps.txt
@@ -15,6 +15,9 @@ $(VENV)/.installed: pyproject.toml requirements.txt requirements-no-deps.txt
 	$(RUN) -m pip install --quiet --no-deps --requirement requirements-no-deps.txt
 	$(RUN) -m pip install --quiet --no-deps --editable .
 	@touch $@
+
+demo: setup
+	$(RUN) -m omniperception demo $(ARGS)
 
 train: setup
 	$(RUN) train.py experiment=quickstart $(ARGS)

@@ -1,13 +1,14 @@
-"""Puts conf/, at the top of a checkout, into the package as omniperception/conf; all else is in pyproject.toml."""
+"""Puts conf/ and pretrained/, at the top of a checkout, into the package; all else is in pyproject.toml."""
 
 from setuptools import find_namespace_packages, setup
 
-presets = [f"omniperception.conf.{group}" for group in find_namespace_packages("conf")]
+data = [f"omniperception.{top}.{below}" for top in ("conf", "pretrained") for below in find_namespace_packages(top)]
 setup(
     packages=[
         *find_namespace_packages(include=["omniperception*"], exclude=["*__pycache__*"]),
         "omniperception.conf",
-        *presets,
+        "omniperception.pretrained",
+        *data,
     ],
-    package_dir={"omniperception.conf": "conf"},
+    package_dir={"omniperception.conf": "conf", "omniperception.pretrained": "pretrained"},
 )

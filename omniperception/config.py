@@ -25,6 +25,8 @@ from omniperception.common.errors import ConfigError, UnknownKey, one_line, sugg
 _SHIPPED = Path(__file__).resolve().parent / "conf"
 CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"
 """Presets: inside an installed package, at the top of a checkout."""
+SHIPPED_RUNS = CONFIG_DIR.parent / "pretrained"
+"""Published policies, likewise."""
 CONFIG_FILE = "config.yaml"
 RECIPE_FILE = "overrides.yaml"
 """In a run directory: the command line's overrides."""

@@ -84,7 +84,7 @@ def test_the_console_command_lists_and_explains_all_commands(capsys):
 @pytest.mark.slow
 def test_the_wheel_trains_and_plays_in_an_empty_folder(tmp_path):
     source, site, empty = tmp_path / "source", tmp_path / "site", tmp_path / "empty"
-    for name in ("omniperception", "conf"):
+    for name in ("omniperception", "conf", "pretrained"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "setup.py", "README.md"):
         shutil.copy(ROOT / name, source)
@@ -93,20 +93,23 @@ def test_the_wheel_trains_and_plays_in_an_empty_folder(tmp_path):
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(site)
-    presets = {path.relative_to(ROOT) for path in (ROOT / "conf").rglob("*.yaml")}
-    assert {path.relative_to(site / "omniperception") for path in site.rglob("*.yaml")} == presets
+    package = site / "omniperception"
+    for top in ("conf", "pretrained"):
+        shipped = {path.relative_to(ROOT / top) for path in (ROOT / top).rglob("*") if path.is_file()}
+        assert {path.relative_to(package / top) for path in (package / top).rglob("*") if path.is_file()} == shipped
     (entry,) = site.glob("*.dist-info/entry_points.txt")
     assert "omniperception = omniperception.commands:main" in entry.read_text()
     empty.mkdir()
     for line in (
         ["train", "experiment=walk", "ppo.max_iterations=1", "num_envs=4", "ppo.num_steps_per_env=4"],
         ["play", "trials=2", "viewer=none", "terminations.episode_length_s=0.2"],
+        ["demo", "viewer=video", "video_s=0.2"],
     ):
         code = f"import omniperception.commands as c; print(c.__file__); c.main({line})"
         done = python(code, cwd=empty, env={**os.environ, "PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"})
         assert done.returncode == 0 and done.stderr == "", done.stderr
         assert done.stdout.startswith(str(site))
-    assert list(empty.glob("outputs/*/*/replay.json"))
+    assert list(empty.glob("outputs/*/*/replay.json")) and (empty / "demo.mp4").stat().st_size > 0
 
 
 @pytest.mark.parametrize(

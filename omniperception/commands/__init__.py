@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 COMMANDS = {
+    "demo": "shows the published policy among moving obstacles, in the browser or as a film",
     "train": "trains a policy, or goes on with a run",
     "runs": "lists runs: recipe, iterations, newest rates",
     "curves": "draws learning curves of runs, mean and spread over seeds",

@@ -27,11 +27,13 @@ class PageOptions:
         host: address; the default is reached from this machine alone.
         port: TCP port.
         stop_after_s: s of wall time after which the viewer ends by itself; None: never.
+        open_browser: whether the page is opened in this machine's browser.
     """
 
     host: str = LOCALHOST
     port: int = PORT
     stop_after_s: float | None = None
+    open_browser: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.port < 65536:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import socket
+import webbrowser
 from typing import TYPE_CHECKING
 
 from omniperception.viewer.options import LOCALHOST, PageOptions, ViewerError
@@ -35,6 +36,8 @@ def open_page(options: PageOptions, title: str) -> viser.ViserServer:
     server.gui.main_panel.dock_right()
     server.gui.main_panel.set_width(PANEL_PIXELS)
     print(announcement(options), flush=True)
+    if options.open_browser:
+        webbrowser.open(f"http://{options.host}:{options.port}")
     return server
 
 

@@ -6,9 +6,10 @@ import socket
 import sys
 from pathlib import Path
 
+import imageio_ffmpeg
 import pytest
 
-from omniperception.commands import main
+from omniperception.commands import demo, main
 
 RUN = f"run={Path(__file__).parents[2] / 'pretrained' / 'avoider'}"
 
@@ -36,6 +37,31 @@ def test_a_taken_port(capsys, taken, line):
     pytest.importorskip("viser", reason="needs viser: pip install 'omniperception[viewer]'")
     message = said(capsys, *line, "viewer=web", f"port={taken}")
     assert f"cannot listen on 127.0.0.1:{taken}" in message and f"port={taken + 1}" in message
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("line", [[], ["viewer=video", "scenario=static"]])
+def test_without_a_display_the_demo_is_a_film(capsys, monkeypatch, tmp_path, line):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(demo, "has_display", lambda: False)
+    main(["demo", "video_s=0.2", *line])
+    said = capsys.readouterr().out
+    assert "wrote demo.mp4 and demo.png" in said and ("no display" in said) == (not line)
+    frames = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "demo.mp4"))[0]
+    assert frames == 5 and (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("line", "scenario"), [([], "moving"), (["scenario=corridor"], "corridor")])
+def test_with_a_display_the_demo_opens_the_browser(monkeypatch, line, scenario):
+    pytest.importorskip("viser", reason="needs viser: pip install 'omniperception[viewer]'")
+    opened = []
+    monkeypatch.setattr(demo, "has_display", lambda: True)
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr(demo, "serve", lambda shown, options: opened.append((shown, options)))
+    main(["demo", *line])
+    ((shown, options),) = opened
+    assert options.open_browser and options.is_local
+    assert shown.run_dir.name == "avoider" and shown.overrides == (f"scenario={scenario}",)
 
 
 def test_the_test_split_is_not_looked_at(capsys):

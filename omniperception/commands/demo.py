@@ -1,0 +1,81 @@
+"""Shows the published policy among moving obstacles: live in the browser, or as a film where there is none.
+
+demo
+demo scenario=corridor condition=robot     # overrides, as play takes them
+demo viewer=video video_s=10               # a film: demo.mp4 and demo.png in this folder
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from omniperception import build, config
+from omniperception.cli import Command, argument
+from omniperception.learning import CheckpointError
+from omniperception.viewer import PageOptions, Shown, ViewerError, serve
+from omniperception.viewer.options import LOCALHOST, PORT
+
+RUN, SCENARIO = "avoider", "scenario=moving"
+FILM = Path("demo.mp4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command's own arguments."""
+
+    viewer: str | None = argument(
+        None, "how it is shown; null: in the browser where there is a display", choices=("web", "video")
+    )
+    video_s: float = argument(20.0, "length of the film (s)", positive=True)
+    host: str = argument(LOCALHOST, "address of the page; the default is reached from this machine alone")
+    port: int = argument(PORT, "port of the page", least=1)
+    stop_after_s: float | None = argument(None, "s after which the page is taken down; null: by Ctrl-C", positive=True)
+
+
+def main(arguments: Arguments, overrides: list[str]) -> None:
+    """Opens the page, or writes the film."""
+    run_dir = config.SHIPPED_RUNS / RUN
+    if not any(override.startswith(("scenario=", "obstacles=")) for override in overrides):
+        overrides = [SCENARIO, *overrides]
+    viewer = arguments.viewer or ("web" if has_display() and importlib.util.find_spec("viser") else "video")
+    if viewer == "web":
+        options = PageOptions(arguments.host, arguments.port, arguments.stop_after_s, open_browser=has_display())
+        return serve(Shown(run_dir, tuple(overrides)), options)
+    film(run_dir, overrides, arguments.video_s)
+    if arguments.viewer is None:
+        why = (
+            "viser is not installed (pip install 'omniperception[viewer]')" if has_display() else "there is no display"
+        )
+        print(f"a film, because {why}; viewer=web serves the page on {arguments.host}:{arguments.port}")
+
+
+def film(run_dir: Path, overrides: list[str], seconds: float) -> None:
+    """Films one environment."""
+    from omniperception.evaluation.video import Recorder
+
+    trained = build.load_policy(build.load_run(run_dir, [*overrides, "num_envs=1"]), run_dir)
+    recorder = Recorder(trained.env, FILM, seconds)
+    try:
+        with torch.no_grad():
+            observations = trained.env.get_observations()
+            while recorder.frames_left:
+                observations = trained.env.step(trained.policy(observations))[0]
+                recorder()
+    finally:
+        recorder.close()
+    recorder.write_still(FILM.with_suffix(".png"))
+    print(f"wrote {FILM} and {FILM.with_suffix('.png')}")
+
+
+def has_display() -> bool:
+    """Tell whether a browser could be opened here."""
+    return sys.platform in ("darwin", "win32") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError, ViewerError))
