@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from omniperception import config as configs
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET
 from omniperception.common.errors import DoesNotFit
 from omniperception.common.provenance import made_at
 from omniperception.config import ConfigError, is_composed, one_line
@@ -21,9 +22,10 @@ from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import Condition
 from omniperception.env.mirror import Mirror
-from omniperception.learning import Runner, distributed, latest_checkpoint
+from omniperception.learning import CheckpointError, Runner, distributed, latest_checkpoint, load_checkpoint
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
-from omniperception.learning.estimator import EstimatorConfig
+from omniperception.learning.distillation import DistillationConfig, Teacher
+from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.memory import check_fits
 from omniperception.scene import Mount, RobotConfig, SteppingConfig
@@ -45,6 +47,7 @@ class RunConfig:
         ppo: the learning settings.
         logger: where scalars of the training go, or None.
         init: the runs whose weights this one starts from; where two have the same, the later one's.
+        distillation: of a teacher at the beginning, or None.
         condition: under which the robot walks, where its randomization is one of conf/condition as it stands.
         composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
     """
@@ -54,6 +57,7 @@ class RunConfig:
     ppo: PPOConfig
     logger: LoggerConfig | None
     init: tuple[str, ...]
+    distillation: DistillationConfig | None
     condition: Condition | None
     composed: dict
 
@@ -99,13 +103,17 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     if perception is not None:
         seen = {"sampler": perception.sampler, "frame_history": perception.history}
         seen |= {"base_motion": perception.base_motion, "targets": tuple(perception.supervision)}
+    distillation = make(DistillationConfig | None, composed.get("distillation"), "distillation")
+    if distillation is not None:
+        seen["targets"] = tuple(dict.fromkeys((*seen.get("targets", ()), AVOIDANCE_TARGET)))
     try:
         lidar = _sensor(composed["lidar"], task["robot"], trusted) if composed["lidar"] else None
         stepping = make(SteppingConfig | None, composed.get("stepping"), "stepping")
         env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, stepping=stepping, **seen)
         condition = make(Condition | None, composed.get("condition"), "condition")
         logger = _logger(composed, trusted)
-        return RunConfig(env, perception, ppo, logger, _names(composed.get("init")), condition, composed)
+        init = _names(composed.get("init"))
+        return RunConfig(env, perception, ppo, logger, init, distillation, condition, composed)
     except ValueError as error:
         raise ConfigError(one_line(error)) from None
 
@@ -233,6 +241,42 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
     return TrainedPolicy(runner.env, runner.policy, checkpoint)
 
 
+def load_teacher(run_dir: Path, env: OmniEnv) -> Teacher:
+    """The blind policy of a run, to teach in an environment with the same observations.
+
+    Raises:
+        ConfigError, CheckpointError: it perceives, or does not fit.
+    """
+    run, observations = load_run(run_dir), env.get_observations()
+    if run.perception is not None:
+        raise ConfigError(f"distillation.teacher={run_dir} perceives; give a run of experiment=gait or walk")
+    groups = run.env.observations.actor
+    missing = sorted(set(groups) - set(observations.keys()))
+    if missing:
+        raise ConfigError(
+            f"distillation.teacher={run_dir} reads the observations {', '.join(missing)}, which this run has not; give"
+            " both the same preset of observations"
+        )
+    estimated = run.env.observations.estimated
+    actor = EstimatingModel(
+        observations,
+        {"actor": list(groups)},
+        "actor",
+        env.num_actions,
+        EstimatorConfig(estimated) if estimated else None,
+        distribution_cfg={"class_name": "GaussianDistribution", "init_std": run.ppo.init_std},
+        **run.ppo.mlp,
+    ).to(env.device)
+    try:
+        actor.load_state_dict(load_checkpoint(latest_checkpoint(run_dir), str(env.device))["actor_state_dict"])
+    except RuntimeError as error:
+        raise CheckpointError(
+            f"distillation.teacher={run_dir} does not fit ({one_line(error)[:200]}); give both the same preset of"
+            " observations and history"
+        ) from None
+    return Teacher(actor, "command")
+
+
 def steps_per_frame(run: RunConfig) -> int:
     """Control steps between two LiDAR frames."""
     assert run.env.lidar is not None  # a network looks at its frames
@@ -250,6 +294,7 @@ def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
         run.env.rewards.avoidance.risk,
         Mirror(env) if run.ppo.symmetry else None,
         estimator=EstimatorConfig(run.env.observations.estimated) if run.env.observations.estimated else None,
+        distillation=run.distillation,
         logger=run.logger,
         settings=run.composed,
     )

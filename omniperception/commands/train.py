@@ -118,6 +118,10 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
         for name in run.init:
             runner.start_from(config.find_run(name, "init"))
         report(f"run directory: {run_dir}")
+    if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
+        name = run.distillation.teacher
+        _check_motion(OmegaConf.create(run.composed), name, "distillation.teacher")
+        runner.learn_from(build.load_teacher(config.find_run(name, "distillation.teacher"), runner.env))
 
     def save(plan: Plan) -> None:
         plan.save(run_dir)
@@ -136,15 +140,15 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
     distributed.disconnect()
 
 
-def _check_motion(composed: DictConfig, source: str) -> None:
+def _check_motion(composed: DictConfig, source: str, name: str = "init") -> None:
     """Refuses weights whose actions meant another motion in the run that they come from; nothing in them shows it."""
-    other = config.read(config.find_run(source, "init"))
+    other = config.read(config.find_run(source, name))
     for key in ("stepping", "robot.joints", "robot.default_joint_pos", "robot.action_scale"):
         own, given = OmegaConf.select(composed, key), OmegaConf.select(other, key)
         if own != given:
             wanted = "null" if given is None else str(given).replace("'", "").replace(": ", ":")
             raise config.ConfigError(
-                f"init={source}: its actions meant another motion, that of '{key}={wanted}'; give the same here"
+                f"{name}={source}: its actions meant another motion, that of '{key}={wanted}'; give the same here"
             )
 
 

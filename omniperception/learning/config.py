@@ -12,6 +12,7 @@ from rsl_rl.utils import resolve_nn_activation
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.env.config import HEIGHT_TARGET
+from omniperception.learning.distillation import DistillationConfig
 from omniperception.learning.estimator import EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.precision import bfloat16_is_faster
@@ -233,6 +234,7 @@ class LearningConfig:
         mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
         command_group: the group that begins with the commanded velocity (v_x, v_y).
         estimator: of what the actor does not observe; None: it estimates nothing.
+        distillation: of a teacher, which :meth:`Runner.learn_from` gives; None: there is none.
         logger: where scalars go; None: nowhere.
         settings: the run's composed configuration, for what is logged.
     """
@@ -246,5 +248,6 @@ class LearningConfig:
     mirror: Callable | None = None
     command_group: str = "command"
     estimator: EstimatorConfig | None = None
+    distillation: DistillationConfig | None = None
     logger: LoggerConfig | None = field(default_factory=LoggerConfig)
     settings: Mapping[str, Any] = field(default_factory=dict)

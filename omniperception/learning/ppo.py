@@ -10,13 +10,16 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import nn
+from torch.nn import functional
 
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET
 from omniperception.learning.config import LearningConfig
+from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.distributed import average_gradients
 from omniperception.learning.divergence import DivergenceGuard
 from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
 from omniperception.learning.models import PerceptionActor
-from omniperception.learning.storage import PerceptiveStorage
+from omniperception.learning.storage import PerceptiveStorage, WindowedObservations
 
 
 class RolloutTooSmall(ValueError):
@@ -44,6 +47,8 @@ class PerceptivePpo(PPO):
     Attributes:
         num_updates: completed updates.
         critic_warmup: number of updates, the first ones, in which of policy and critic only the critic learns.
+        distillation: of how many updates a teacher teaches the actor instead of PPO, and how; None: of none.
+        teacher: that does.
         learns_policy: whether PPO changes the policy.
         perception_optimizer: of the perception network and its read-out; None where PPO trains them, or there is none.
         estimator_optimizer: of the actor's estimator; None where there is none, or it stays as it is.
@@ -53,6 +58,8 @@ class PerceptivePpo(PPO):
     entropy_coef: float
     perception_optimizer: torch.optim.Adam | None = None
     estimator_optimizer: torch.optim.Adam | None = None
+    distillation: DistillationConfig | None
+    teacher: Teacher | None = None
 
     def __init__(self, *args, **kwargs) -> None:
         """Arguments of rsl_rl's PPO."""
@@ -61,7 +68,7 @@ class PerceptivePpo(PPO):
             self.symmetry: Symmetry | None = MirrorImages(**kwargs["symmetry_cfg"])
         self.num_updates = 0
         self._entropy = (self.entropy_coef, self.entropy_coef, 1)
-        self.critic_warmup = 0
+        self.critic_warmup, self.distillation = 0, None
         self.learns_policy = self.num_learning_epochs > 0
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)  # rsl_rl's is not fused
@@ -117,6 +124,8 @@ class PerceptivePpo(PPO):
         stored = {*config.actor_groups, *config.critic_groups, *(perception.supervision if perception else ())}
         if config.estimator is not None:
             stored.add(config.estimator.group)
+        if config.distillation is not None:
+            stored.add(AVOIDANCE_TARGET)
         storage = PerceptiveStorage(
             env.num_envs,
             ppo.num_steps_per_env,
@@ -139,7 +148,7 @@ class PerceptivePpo(PPO):
         )
         if ppo.final_entropy_coef is not None:
             algorithm.anneal_entropy(ppo.final_entropy_coef, ppo.max_iterations)
-        algorithm.critic_warmup = ppo.critic_warmup
+        algorithm.critic_warmup, algorithm.distillation = ppo.critic_warmup, config.distillation
         if config.estimator is not None and algorithm.learns_policy:
             algorithm.fit_estimator(config.estimator)
         if perception is not None and perception.supervised_epochs > 0:
@@ -197,12 +206,58 @@ class PerceptivePpo(PPO):
         return losses
 
     def _update_policy(self) -> dict[str, float]:
-        """rsl_rl's update, while the critic warms up without the actor."""
+        """rsl_rl's update, while the critic warms up without the actor; first of all a teacher's lessons."""
+        if self.distillation is not None and self.num_updates < self.distillation.iterations:
+            return self._imitate(self.distillation.learning_rate)
         self.actor.requires_grad_(self.num_updates >= self.critic_warmup)
         try:
             return super().update()
         finally:
             self.actor.requires_grad_(True)
+
+    def learn_from(self, teacher: Teacher) -> None:
+        """Lets a teacher teach the first updates.
+
+        Raises:
+            ValueError: it reads what the rollouts of this run do not hold.
+        """
+        missing = sorted(set(teacher.groups) - set(self.storage.stored_groups))
+        if missing:
+            raise ValueError(
+                f"distillation.teacher reads the observations {', '.join(missing)}, which neither actor nor critic of"
+                " this run does; give both the same preset of observations"
+            )
+        self.teacher = teacher
+
+    def _imitate(self, learning_rate: float) -> dict[str, float]:
+        """Fits the actor to what the teacher would have done where the actor was, and the critic to the returns."""
+        if self.teacher is None:
+            raise RuntimeError("distillation needs a teacher: Runner.learn_from")
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate
+        device_type, losses = torch.device(self.device).type, []
+        for batch in self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
+            obs = batch.observations
+            wanted = self.teacher.actions(obs.groups if isinstance(obs, WindowedObservations) else obs)
+            with torch.autocast(device_type, dtype=torch.bfloat16, enabled=self.use_mixed_precision):
+                error = functional.mse_loss(self.actor(obs), wanted)
+                value_error = functional.mse_loss(self.critic(obs), batch.returns)
+                loss = error + self.value_loss_coef * value_error
+            self.optimizer.zero_grad()
+            loss.backward()
+            for model in (self.actor, self.critic):
+                average_gradients(list(model.parameters()))
+                nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+            self.optimizer.step()
+            losses.append(torch.stack((error.detach(), value_error.detach())))
+        observed = self.storage.observations.flatten(0, 1)
+        self.actor.update_normalization(observed)
+        self.critic.update_normalization(observed)
+        self.storage.clear()
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate
+        imitation, value = torch.stack(losses).mean(0).tolist()
+        return {"imitation": imitation, "value": value}
 
     def train_perception(self) -> None:
         """Fit the supervised targets on the frames of a rollout; one without a frame teaches nothing.

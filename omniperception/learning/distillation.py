@@ -1,0 +1,57 @@
+"""Learning from a teacher that is told what the student has to see (DAgger on actions)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+from torch.nn import functional
+
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET
+
+
+@dataclass(frozen=True)
+class DistillationConfig:
+    """Configuration of the beginning of a training in which the actor is fitted to a teacher's actions.
+
+    Attributes:
+        teacher: run directory of a policy that walks blind.
+        iterations: how many. After them PPO learns alone.
+        learning_rate: of actor and critic in them.
+    """
+
+    teacher: str
+    iterations: int
+    learning_rate: float = 1.0e-3
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"distillation.iterations={self.iterations} must be at least 1, or distillation=null")
+        if self.learning_rate <= 0:
+            raise ValueError(f"distillation.learning_rate={self.learning_rate} must be positive")
+
+
+class Teacher:
+    """A blind policy that follows the commanded velocity and the true avoidance velocity together.
+
+    Attributes:
+        groups: observation groups that it reads, the target among them.
+    """
+
+    def __init__(self, actor: MLPModel, command_group: str) -> None:
+        """
+        Args:
+            actor: reads one-dimensional groups, one of them `command_group`, which begins with (v_x, v_y).
+        """
+        self._actor, self._command = actor.eval().requires_grad_(False), command_group
+        self.groups = (*actor.obs_groups, AVOIDANCE_TARGET)
+
+    @torch.no_grad()
+    def actions(self, groups: TensorDict) -> torch.Tensor:
+        """(B, num_actions) actions without noise for observation groups of batch size B."""
+        groups = groups.clone(recurse=False)
+        command, avoidance = groups[self._command], groups[AVOIDANCE_TARGET]
+        groups[self._command] = command + functional.pad(avoidance, (0, command.shape[-1] - avoidance.shape[-1]))
+        return self._actor(groups)
