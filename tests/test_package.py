@@ -78,7 +78,7 @@ def test_the_console_command_lists_and_explains_all_commands(capsys):
         assert shown.startswith(f"usage: omniperception {name} ") and module.__doc__.splitlines()[0] in shown
     with pytest.raises(SystemExit, match="2"):
         main(["trian"])
-    assert "trian is unknown; known: train, " in capsys.readouterr().err
+    assert "trian is unknown; known: demo, train, " in capsys.readouterr().err
 
 
 @pytest.mark.slow
