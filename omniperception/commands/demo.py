@@ -1,8 +1,10 @@
 """Shows the published policy among moving obstacles: live in the browser, or as a film where there is none.
 
-demo
-demo scenario=corridor condition=robot     # overrides, as play takes them
-demo viewer=video video_s=10               # a film: demo.mp4 and demo.png in this folder
+    demo
+    demo scenario=corridor condition=robot     # overrides, as play takes them
+    demo viewer=video video_s=10
+
+A film is demo.mp4 and demo.png in the current folder.
 """
 
 from __future__ import annotations

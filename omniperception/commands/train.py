@@ -121,7 +121,7 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
         name = run.distillation.teacher
         _check_motion(OmegaConf.create(run.composed), name, "distillation.teacher")
-        runner.learn_from(build.load_teacher(config.find_run(name, "distillation.teacher"), runner.env))
+        runner.alg.learn_from(build.load_teacher(config.find_run(name, "distillation.teacher"), runner.env))
 
     def save(plan: Plan) -> None:
         plan.save(run_dir)

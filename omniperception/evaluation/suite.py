@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -32,6 +31,7 @@ from omniperception.evaluation.report import progress_line, table
 from omniperception.evaluation.tracks import Tracks
 from omniperception.evaluation.walking_report import walking_table
 from omniperception.learning import CheckpointError, latest_checkpoint
+from omniperception.lidar.launch import default_num_threads
 
 POLICIES = {
     "run": "the run's policy",
@@ -353,9 +353,8 @@ def _workers(tasks: Sequence[Task]) -> int:
     """Processes; 1 where one of them drives a GPU."""
     if not tasks:
         return 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     on_gpu = tasks[0].assembled().env.sim.torch_device.type != "cpu"
-    return min(tasks[0].evaluation.jobs or (1 if on_gpu else cores), len(tasks))
+    return min(tasks[0].evaluation.jobs or (1 if on_gpu else default_num_threads()), len(tasks))
 
 
 def _in_worker(task: Task, facts: dict) -> Record:

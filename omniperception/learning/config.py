@@ -234,7 +234,7 @@ class LearningConfig:
         mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
         command_group: the group that begins with the commanded velocity (v_x, v_y).
         estimator: of what the actor does not observe; None: it estimates nothing.
-        distillation: of a teacher, which :meth:`Runner.learn_from` gives; None: there is none.
+        distillation: of a teacher, which :meth:`PerceptivePpo.learn_from` gives; None: there is none.
         logger: where scalars go; None: nowhere.
         settings: the run's composed configuration, for what is logged.
     """

@@ -232,7 +232,7 @@ class PerceptivePpo(PPO):
     def _imitate(self, learning_rate: float) -> dict[str, float]:
         """Fits the actor to what the teacher would have done where the actor was, and the critic to the returns."""
         if self.teacher is None:
-            raise RuntimeError("distillation needs a teacher: Runner.learn_from")
+            raise RuntimeError("distillation needs a teacher: learn_from")
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         device_type, losses = torch.device(self.device).type, []

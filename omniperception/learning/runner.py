@@ -26,7 +26,6 @@ from omniperception.learning.checkpoint import (
     set_rng_state,
 )
 from omniperception.learning.config import LearningConfig
-from omniperception.learning.distillation import Teacher
 from omniperception.learning.divergence import TrainingDiverged
 from omniperception.learning.logger import Logger
 from omniperception.learning.ppo import PerceptivePpo
@@ -168,10 +167,6 @@ class Runner:
         self.alg.actor.reset()
         with contextlib.suppress(CheckpointError):
             start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
-
-    def learn_from(self, teacher: Teacher) -> None:
-        """Gives the teacher that the configuration's `distillation` asks for; see :meth:`PerceptivePpo.learn_from`."""
-        self.alg.learn_from(teacher)
 
     def _iterate(self, obs: TensorDict, last: int) -> TensorDict:
         """One iteration: rollout, returns, update, log; returns the observations to go on from."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
-from toy_env import ToyEnv, config
+from toy_env import ToyEnv, collect, config
 
 from omniperception.learning import PerceptivePpo, WindowedObservations
 from omniperception.learning.distillation import DistillationConfig, Teacher
@@ -24,15 +24,6 @@ def algorithm(env, frames, **distillation):
     wanted = DistillationConfig("somewhere", **{"iterations": 20, "learning_rate": 1e-2, **distillation})
     settings = replace(config(frames, num_learning_epochs=4), distillation=wanted, command_group="policy")
     return PerceptivePpo.build(env, settings, "cpu")
-
-
-def collect(alg, env, steps=8):
-    obs = env.get_observations()
-    with torch.inference_mode():
-        for _ in range(steps):
-            obs, rewards, dones, extras = env.step(alg.act(obs))
-            alg.process_env_step(obs, rewards, dones, extras)
-        alg.compute_returns(obs)
 
 
 def test_a_teacher_follows_command_and_avoidance_together():
@@ -55,14 +46,14 @@ def test_the_student_comes_to_do_what_the_teacher_does(frames):
     critic = [p.clone() for p in alg.critic.parameters()]
     imitation = []
     for _ in range(20):
-        collect(alg, env)
+        collect(alg, env, 8)
         imitation.append(alg.update()["imitation"])
     assert imitation[-1] < 0.1 * imitation[0]
     assert not any(torch.equal(p, was) for p, was in zip(alg.critic.parameters(), critic, strict=True))
     assert alg.learning_rate == alg.optimizer.param_groups[0]["lr"] == 1e-3  # PPO's own
     assert all(torch.equal(p, before[name]) for name, p in actor.named_parameters())
 
-    collect(alg, env)
+    collect(alg, env, 8)
     batch = next(iter(alg.storage.mini_batch_generator(1, 1))).observations
     groups = batch.groups if isinstance(batch, WindowedObservations) else batch
     with torch.no_grad():
@@ -75,7 +66,7 @@ def test_the_student_comes_to_do_what_the_teacher_does(frames):
 def test_what_does_not_fit_is_refused():
     env = ToyEnv(4)
     alg = algorithm(env, frames=True)
-    collect(alg, env)
+    collect(alg, env, 8)
     with pytest.raises(RuntimeError, match="needs a teacher"):
         alg.update()
     stranger = Teacher(teacher(env), "policy")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from toy_env import ToyEnv, config
+from toy_env import ToyEnv, collect, config
 
 from omniperception.learning import PerceptivePpo, TrainingDiverged, precision
 from omniperception.learning import config as learning_config
@@ -13,15 +13,6 @@ from omniperception.learning import config as learning_config
 def algorithm(env, num_steps=8, frames=True, **options):
     torch.manual_seed(0)
     return PerceptivePpo.build(env, config(frames, num_steps_per_env=num_steps, **options), "cpu")
-
-
-def collect(alg, env, steps):
-    obs = env.get_observations()
-    with torch.inference_mode():
-        for _ in range(steps):
-            obs, rewards, dones, extras = env.step(alg.act(obs))
-            alg.process_env_step(obs, rewards, dones, extras)
-        alg.compute_returns(obs)
 
 
 def collected(num_envs=4, frames=True, num_steps=8, **options):

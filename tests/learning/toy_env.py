@@ -124,6 +124,16 @@ def config(frames=True, supervised=False, **ppo):
     return LearningConfig(PPOConfig(**defaults | ppo), perception if frames else None, groups, groups, PERIOD)
 
 
+def collect(alg, env, steps):
+    """Let an algorithm act for a rollout of so many steps."""
+    obs = env.get_observations()
+    with torch.inference_mode():
+        for _ in range(steps):
+            obs, rewards, dones, extras = env.step(alg.act(obs))
+            alg.process_env_step(obs, rewards, dones, extras)
+        alg.compute_returns(obs)
+
+
 def rollout(env, storage, num_steps):
     """Fill the storage; returns copies of the observations of every step."""
     seen = []
