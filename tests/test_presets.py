@@ -34,7 +34,7 @@ LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
 
 
 def test_no_preset_is_missed():
-    assert len(PRESETS) == 118
+    assert len(PRESETS) == 124
     groups = {preset.split("/")[0] for preset in PRESETS}
     assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()} - {"suite"}
     assert set(COMPANIONS) <= set(PRESETS)

@@ -17,13 +17,9 @@ from omniperception.evaluation.records import Record, of_run
 from omniperception.evaluation.statistics import pooled
 from omniperception.evaluation.suite import Evaluation, World, evaluate
 
-_FEWER = ("perception.history=5", "perception.sampler.num_points=280")
 _NO_PROXIMAL = ("perception.height_weight=0", "perception.sampler.num_proximal=0", "perception.network.proximal_dim=0")
 _NO_DISTAL = ("perception.sampler.num_distal=0", "perception.network.distal_dim=0")
 VARIANTS: dict[str, tuple[str, ...]] = {
-    "direct_mlp_small": ("perception=direct_mlp", "perception.history=5"),
-    "fps_mlp_small": ("perception=fps_mlp", *_FEWER),
-    "fps_gru_small": ("perception=fps_gru", *_FEWER),
     "pd_risknet_no_proximal": ("perception=pd_risknet", *_NO_PROXIMAL),
     "pd_risknet_no_distal": ("perception=pd_risknet", *_NO_DISTAL),
     "proximity_gru_no_proximal": ("perception=proximity_gru", *_NO_PROXIMAL),
@@ -31,8 +27,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "polar_rings_no_height": ("perception=polar_rings", "perception.height_weight=0"),
     "polar_rings_no_match": ("perception=polar_rings", "perception.network.rings.match=null"),
 }
-"""Overrides of the variants that are no presets of `perception` themselves. `_small` has as many frames and points as
-proximity_gru; what the perception is supervised with is the experiment's."""
+"""Overrides of the variants that are no presets of `perception` themselves; what the perception is supervised with is the
+experiment's."""
 
 RATES = {
     "untouched": "reached, untouched",

@@ -16,6 +16,9 @@ AT_LIMIT = 0.999
 AT_STOP = math.radians(0.5)
 """Angle (rad) from the end of its range up to which a joint counts as at its stop."""
 
+SWING_S = 0.06
+"""Time (s) off the ground from which on a foot has swung; one that is down sooner has bounced."""
+
 COLUMNS = {
     "settled_s": "time (s) later than commands.SETTLE_S after a new command",
     "settled_velocity_error": "mean error (m/s) of the horizontal velocity in that time",
@@ -25,8 +28,8 @@ COLUMNS = {
     "joint_speed": "highest speed (rad/s) of any joint",
     "target_change": "mean change (rad) of a joint's target from one control step to the next",
     "foot_slip": "mean horizontal speed (m/s) of feet in contact",
-    "swing_height": "mean over steps of the highest point (m) that the foot rose above where it left the ground",
-    "impact": "mean over touch-downs of the foot's force over the robot's weight",
+    "swing_height": "mean over swings of at least SWING_S of the highest point (m) that the foot rose above where it left the ground",
+    "impact": "mean over the ends of those swings of the foot's force over the robot's weight",
     "standing_s": "time (s) commanded to stand, later than commands.SETTLE_S after that command",
     "standing_speed": "mean horizontal speed (m/s) in that time",
     "standing_joint_speed": "mean speed (rad/s) of a joint in that time",
@@ -61,7 +64,8 @@ class WalkingTally:
         self._tile = torch.zeros(num_trials, 2, dtype=torch.int64, device=device)
         feet = len(env.robot.foot_geoms)
         self._left_at, self._peak = torch.zeros(2, n, feet, device=device).unbind(0)
-        self._was_down, self._swings = torch.zeros(2, n, feet, dtype=torch.bool, device=device).unbind(0)
+        self._was_down = torch.zeros(n, feet, dtype=torch.bool, device=device)
+        self._swung_s = torch.full((n, feet), torch.nan, device=device)  # since it left the ground, if that was seen
         self._weight = float(env.world.model.body_subtreemass[env.world.base_body]) * GRAVITY
         _ = env.state.joint_torque, env.state.foot_force, env.state.foot_vel_w  # recorded from now on
 
@@ -109,12 +113,14 @@ class WalkingTally:
         """Sums over the feet in this control step."""
         state = self._env.state
         down, height = state.foot_contact, state.foot_pos_w[..., 2]
-        landed, lifted = down & self._swings, ~down & self._was_down
+        lifted = ~down & self._was_down
+        landed = down & (self._swung_s > SWING_S - 0.5 * self._env.control_dt)
         self._left_at = torch.where(lifted, height, self._left_at)
         self._peak = torch.where(lifted, height, torch.maximum(self._peak, height))
         force = state.foot_force.norm(dim=-1) / self._weight
         rise = self._peak - self._left_at
-        self._was_down, self._swings = down, (self._swings | lifted) & ~down
+        self._swung_s = (torch.where(lifted, 0.0, self._swung_s) + self._env.control_dt).masked_fill(down, torch.nan)
+        self._was_down = down
         return {
             "contact": down.sum(1),
             "slip": (state.foot_vel_w[..., :2].norm(dim=-1) * down).sum(1),
@@ -131,7 +137,8 @@ class WalkingTally:
             self._filed_fastest[self._trial[filed]] = self._fastest[filed]
         self._sums *= ~env.done[:, None]
         self._fastest *= ~env.done
-        self._was_down, self._swings = self._was_down & ~env.done[:, None], self._swings & ~env.done[:, None]
+        self._was_down &= ~env.done[:, None]
+        self._swung_s.masked_fill_(env.done[:, None], torch.nan)
 
     def columns(self) -> dict[str, torch.Tensor]:
         """(num_trials,) float64 each, by the names in COLUMNS."""

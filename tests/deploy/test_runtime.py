@@ -58,6 +58,7 @@ RECIPES = {
     "motion_by_proximal": ("experiment=avoid", "init=unread", *overrides_of("pd_risknet_no_distal")),
 }
 ALIKE = {
+    "pd_risknet_small": "pd_risknet",
     "fps_mlp_small": "fps_mlp",
     "fps_gru_small": "fps_gru",
     "direct_mlp_small": "direct_mlp",

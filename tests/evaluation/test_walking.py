@@ -1,5 +1,6 @@
 """Figures of a gait, against robots whose motion is known, and against a second reckoning step by step."""
 
+import itertools
 import math
 
 import pytest
@@ -20,6 +21,23 @@ def wave(observations):
     wave.step += 1
     phase = 0.25 * wave.step + math.pi * torch.tensor([0.0, 1.0, 1.0, 0.0]).repeat_interleave(3)
     return (2.0 * torch.sin(phase)).expand(len(observations["command"]), 12)
+
+
+def swings(steps):
+    """Highest rise of each swing of three control steps or more, and the force (N) in the step that ends it."""
+    rises, impacts = [], []
+    for foot in range(4):
+        since = None
+        for before, now in itertools.pairwise(range(len(steps))):
+            if steps[before]["down"][foot] and not steps[now]["down"][foot]:
+                since = now
+            if steps[now]["down"][foot] and since is not None:
+                if now - since >= 3:
+                    heights = [float(step["height"][foot]) for step in steps[since:now]]
+                    rises.append(max(heights) - heights[0])
+                    impacts.append(float(steps[now]["force"][foot]))
+                since = None
+    return rises, impacts
 
 
 @pytest.fixture
@@ -57,6 +75,9 @@ def test_figures_are_those_of_a_second_reckoning(walking_env):
                 "limited": (env.state.joint_torque.abs() > 0.9985 * limits).any(1),
                 "stop": ((pos - lower < AT_STOP) | (upper - pos < AT_STOP)).any(1),
                 "speed": k.joint_vel.abs().amax(1),
+                "down": env.state.foot_contact.clone(),
+                "height": env.state.foot_pos_w[..., 2].clone(),
+                "force": env.state.foot_force.norm(dim=-1),
                 "change": 0.25 * (env.state.actions[0] - env.state.actions[1]).abs().mean(1),
             }
         )
@@ -79,7 +100,10 @@ def test_figures_are_those_of_a_second_reckoning(walking_env):
         assert found["at_stop"][trial] == mean("stop", mine)
         assert found["target_change"][trial] == mean("change", mine)
         assert found["joint_speed"][trial] == pytest.approx(max(float(step["speed"]) for step in mine))
-    assert (found["swing_height"] > 0).all() and (found["impact"] > 0).all()
+        rises, impacts = swings(mine)
+        assert found["swing_height"][trial] == pytest.approx(sum(rises) / len(rises), rel=1e-4)
+        weight = 9.81 * float(env.world.model.body_subtreemass[env.world.base_body])
+        assert found["impact"][trial] == pytest.approx(sum(impacts) / len(impacts) / weight, rel=1e-3)
     again = Episodes.from_columns(episodes.columns())
     for name, values in found.items():
         torch.testing.assert_close(again.walking[name], values, rtol=1e-4, atol=1e-6, equal_nan=True)
