@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from omniperception import config
+from omniperception import build, config
 from omniperception.commands import main
 from omniperception.common import provenance
 from omniperception.learning import load_checkpoint
@@ -62,6 +62,37 @@ def test_a_sweep_gives_every_run_a_directory(tmp_path, monkeypatch, capsys):
 def test_the_composed_configuration_is_printed(capsys):
     main(["train", "--cfg", "job", "num_envs=7"])
     assert yaml.safe_load(capsys.readouterr().out)["num_envs"] == 7
+
+
+def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    quick = ("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1", "ppo.hidden_dims=[32,16]")
+    main(["train", "experiment=gait", *quick, "ppo.max_iterations=1", "hydra.run.dir=gait"])
+    main(["train", "experiment=walk", *quick, "ppo.max_iterations=1", "hydra.run.dir=walk"])
+    student = ("experiment=end_to_end", "init=gait", *quick, "lidar.num_rays=200", "terrain=flat")
+
+    run = build.assemble(config.compose(list(student)))
+    env = build.build_runner(run, None).env
+    groups = env.get_observations()
+    groups["avoidance_target"] = torch.tensor([[0.0, 0.0], [0.3, -0.2]])
+    teacher = build.load_teacher(tmp_path / "gait", env)
+    walks = build.load_policy(build.load_run(tmp_path / "gait"), tmp_path / "gait").policy
+    told = groups.clone()
+    told["command"][1, :2] += torch.tensor([0.3, -0.2])
+    with torch.no_grad():
+        torch.testing.assert_close(teacher.actions(groups), walks(told))
+
+    taught = "distillation={teacher: gait, iterations: 1}"
+    main(["train", *student, taught, "ppo.max_iterations=2", "hydra.run.dir=end"])
+    before, after = (checkpoint(tmp_path, name, n)["actor_state_dict"] for name, n in (("gait", 1), ("end", 2)))
+    assert torch.equal(before["mlp.2.weight"], after["mlp.2.weight"])  # nothing near: it did what its teacher did
+    capsys.readouterr()
+    for name in ("walk", "end"):
+        with pytest.raises(SystemExit, match="2"):
+            main(
+                ["train", *student, f"distillation={{teacher: {name}, iterations: 1}}", f"hydra.run.dir={name}_taught"]
+            )
+        assert f"distillation.teacher={name}" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "polar_rings_no_height": ("perception=polar_rings", "perception.height_weight=0"),
     "polar_rings_no_match": ("perception=polar_rings", "perception.network.rings.match=null"),
 }
-"""Overrides of the variants that are no presets of `perception` themselves; what the perception is supervised with is the
+"""Overrides of the variants that are no presets of `perception`; what the perception is supervised with is the
 experiment's."""
 
 RATES = {

@@ -28,7 +28,7 @@ COLUMNS = {
     "joint_speed": "highest speed (rad/s) of any joint",
     "target_change": "mean change (rad) of a joint's target from one control step to the next",
     "foot_slip": "mean horizontal speed (m/s) of feet in contact",
-    "swing_height": "mean over swings of at least SWING_S of the highest point (m) that the foot rose above where it left the ground",
+    "swing_height": "mean over swings of SWING_S or more of the highest point (m) above where the foot left the ground",
     "impact": "mean over the ends of those swings of the foot's force over the robot's weight",
     "standing_s": "time (s) commanded to stand, later than commands.SETTLE_S after that command",
     "standing_speed": "mean horizontal speed (m/s) in that time",

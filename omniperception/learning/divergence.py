@@ -42,11 +42,12 @@ class DivergenceGuard:
     def check_learning(self, losses: dict[str, float]) -> None:
         """Stop if no step of the update had a gradient: one whose norm overflows is made 0 where it is clipped.
 
-        In the first step nothing is clipped by PPO, so that the actor has one unless all advantages are 0.
+        In the first step nothing is clipped by PPO, so that the actor has one unless all advantages are 0, or it does
+        already what a teacher does.
         """
         storage = self._algorithm.storage
         idle = [name for name, has_gradient in self._has_gradient.items() if not has_gradient]
-        if "actor" in idle and not bool(storage.advantages.any()):
+        if "actor" in idle and (not bool(storage.advantages.any()) or losses.get("imitation") == 0.0):
             idle.remove("actor")
         if idle:
             raise TrainingDiverged(
