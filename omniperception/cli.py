@@ -190,13 +190,13 @@ def _value(field: dataclasses.Field, hint: Any, text: str) -> Any:
     if typing.get_origin(hint) is not tuple:
         return _single(field, hint, text)
     parts = text.strip("[]").split(",")
-    values = tuple(_single(field, hint.__args__[0], part.strip()) for part in parts)
+    values = tuple(_single(field, hint.__args__[0], part.strip(), ", or several with commas between") for part in parts)
     if hint.__args__[0] is str and len(set(values)) < len(values):
         raise ConfigError(f"{field.name}={text} names one twice")
     return values
 
 
-def _single(field: dataclasses.Field, kind: type, text: str) -> Any:
+def _single(field: dataclasses.Field, kind: type, text: str, several: str = "") -> Any:
     limits = field.metadata
     if limits["choices"] and text not in limits["choices"]:
         raise ConfigError(f"{field.name}={text} must be one of {', '.join(limits['choices'])}")
@@ -213,7 +213,7 @@ def _single(field: dataclasses.Field, kind: type, text: str) -> Any:
         if not (inside and math.isfinite(value)):
             raise ValueError
     except ValueError:
-        raise ConfigError(f"{field.name}={text} must be {_KINDS[kind]}{bound}") from None
+        raise ConfigError(f"{field.name}={text} must be {_KINDS[kind]}{bound}{several}") from None
     return value
 
 

@@ -23,6 +23,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 MODULES = {
     "hydra-core": "hydra",
     "mujoco-core": "mujoco",
+    "pillow": "PIL",
     "pyyaml": "yaml",
     "rsl-rl-lib": "rsl_rl",
     "warp-lang": "warp",

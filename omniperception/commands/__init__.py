@@ -29,6 +29,7 @@ COMMANDS = {
     "plan": "lists what a configuration consists of and what was left out",
 }
 EXTRAS = {
+    "PIL": "train",
     "hydra": "train",
     "imageio_ffmpeg": "train",
     "mujoco": "train",
@@ -62,12 +63,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         _fail(f"{name} is unknown; known: {', '.join(COMMANDS)}")
     try:
         command = importlib.import_module(f"omniperception.commands.{name.replace('-', '_')}").command
+        command(rest, f"omniperception {name}")
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         if library not in EXTRAS:
             raise
         _fail(f"{name} needs {library}: pip install 'omniperception[{EXTRAS[library]}]'")
-    command(rest, f"omniperception {name}")
 
 
 def _fail(message: str) -> None:

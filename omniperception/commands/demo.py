@@ -2,9 +2,9 @@
 
     demo
     demo scenario=corridor condition=robot     # overrides, as play takes them
-    demo viewer=video video_s=10
+    demo viewer=video video_s=10 camera=side
 
-A film is demo.mp4 and demo.png in the current folder.
+A film is demo.mp4 and demo.png in the current folder; with scenario=corridor, demo-corridor.mp4 and demo-corridor.png.
 """
 
 from __future__ import annotations
@@ -19,22 +19,21 @@ import torch
 
 from omniperception import build, config
 from omniperception.cli import Command, argument
+from omniperception.commands.filming import FilmArguments, file_stem, film
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PORT
 
 RUN, SCENARIO = "avoider", "scenario=moving"
-FILM = Path("demo.mp4")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(FilmArguments):
     """The command's own arguments."""
 
     viewer: str | None = argument(
         None, "how it is shown; null: in the browser where there is a display", choices=("web", "video")
     )
-    video_s: float = argument(20.0, "length of the film (s)", positive=True)
     host: str = argument(LOCALHOST, "address of the page; the default is reached from this machine alone")
     port: int = argument(PORT, "port of the page", least=1)
     stop_after_s: float | None = argument(None, "s after which the page is taken down; null: by Ctrl-C", positive=True)
@@ -42,37 +41,26 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Opens the page, or writes the film."""
-    run_dir = config.SHIPPED_RUNS / RUN
+    run_dir, path = config.SHIPPED_RUNS / RUN, Path(f"{file_stem('demo', overrides)}.mp4")
+    num_envs = max(arguments.video.env_ids) + 1
     if not any(override.startswith(("scenario=", "obstacles=")) for override in overrides):
         overrides = [SCENARIO, *overrides]
     viewer = arguments.viewer or ("web" if has_display() and importlib.util.find_spec("viser") else "video")
     if viewer == "web":
         options = PageOptions(arguments.host, arguments.port, arguments.stop_after_s, open_browser=has_display())
         return serve(Shown(run_dir, tuple(overrides)), options)
-    film(run_dir, overrides, arguments.video_s)
+    trained = build.load_policy(build.load_run(run_dir, [*overrides, f"num_envs={num_envs}"]), run_dir)
+    with film(arguments, trained.env, trained.policy, path) as recorder, torch.no_grad():
+        observations = trained.env.get_observations()
+        while recorder.frames_left:
+            observations = trained.env.step(trained.policy(observations))[0]
+            recorder()
+    print(f"wrote {path} and {path.with_suffix('.png')}")
     if arguments.viewer is None:
         why = (
             "viser is not installed (pip install 'omniperception[viewer]')" if has_display() else "there is no display"
         )
         print(f"a film, because {why}; viewer=web serves the page on {arguments.host}:{arguments.port}")
-
-
-def film(run_dir: Path, overrides: list[str], seconds: float) -> None:
-    """Films one environment."""
-    from omniperception.evaluation.video import Recorder
-
-    trained = build.load_policy(build.load_run(run_dir, [*overrides, "num_envs=1"]), run_dir)
-    recorder = Recorder(trained.env, FILM, seconds)
-    try:
-        with torch.no_grad():
-            observations = trained.env.get_observations()
-            while recorder.frames_left:
-                observations = trained.env.step(trained.policy(observations))[0]
-                recorder()
-    finally:
-        recorder.close()
-    recorder.write_still(FILM.with_suffix(".png"))
-    print(f"wrote {FILM} and {FILM.with_suffix('.png')}")
 
 
 def has_display() -> bool:

@@ -29,6 +29,12 @@ CAMERA_LIGHT = 0.36
 TO_SUN = (-0.42, 0.46, 0.78)
 FOG_M = 28.0
 """Distance (m) at which the ground has faded to 1/e into the horizon."""
+POINT_M = 0.011
+"""Radius of a LiDAR point as if it were a thing in the world."""
+POINT_PX = 0.7, 2.6
+"""Least and most of it in a picture of 720 lines."""
+FAINT_M, LEAST_OPACITY = 7.0, 0.35
+"""Distance (m) at which a point's opacity has faded to 1/e, and what it never falls below."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,7 @@ class Renderer:
         device = self._scene.device
         classes = [shape.class_id for shape in shapes.shapes]
         self._terrain = tuple(k for k, c in enumerate(classes) if c == HitClass.TERRAIN)
+        self._robot = tuple(k for k, c in enumerate(classes) if c == HitClass.ROBOT)
         self._class = torch.tensor([*classes, -1], device=device)  # a miss, shape -1, takes the last entry
         self._albedo = torch.tensor([*(COLOURS[HitClass(c)] for c in classes), (0.0,) * 3], device=device)
         x = torch.arange(self._columns, device=device) + 0.5 - self._columns / 2
@@ -118,19 +125,34 @@ class Renderer:
         self._rays_c = rays / rays.norm(dim=1, keepdim=True)
         self._to_sun = _vector(TO_SUN, device) / math.hypot(*TO_SUN)
 
+    def place(self, body_pos: torch.Tensor, body_quat: torch.Tensor, sizes: torch.Tensor | None) -> None:
+        """Puts the bodies where a view has them, for `free_share`."""
+        self._scene.body_pos.copy_(body_pos)
+        self._scene.body_quat.copy_(body_quat)
+        if self._sized:
+            assert sizes is not None  # which a view is to give
+            self._scene.set_sizes(self._sized, sizes)
+
+    def free_share(self, start_w: torch.Tensor, ends_w: torch.Tensor) -> torch.Tensor:
+        """Shares (n,) of the ways from `start_w` (3,) to `ends_w` (n, 3) that are free, 1 where nothing is in the way.
+
+        Terrain and obstacles are in the way, the robot is not.
+        """
+        ways = (ends_w - start_w).expand(self._scene.num_envs, -1, -1)
+        hits = self._scene.cast(start_w.expand_as(ways), ways, exclude_shapes=self._robot)
+        return (hits.ranges[0] / ways[0].norm(dim=1)).clamp(max=1.0)
+
     def render(self, view: View) -> torch.Tensor:
         """The picture, (height, width, 3) uint8 on the CPU."""
-        self._scene.body_pos.copy_(view.body_pos)
-        self._scene.body_quat.copy_(view.body_quat)
-        if self._sized:
-            assert view.sizes is not None  # which it is to give
-            self._scene.set_sizes(self._sized, view.sizes)
+        self.place(view.body_pos, view.body_quat, view.sizes)
         axes = _camera_axes(view.eye_w, view.target_w)
         rays = self._rays_c @ axes
         ranges, classes, colour = self._shade(view, rays)
         colour = torch.where((classes >= 0)[:, None], colour, _sky(rays))
-        colour = colour.clamp(0.0, 1.0).pow(1 / 2.2).unflatten(0, (self._rows, self._columns))
-        self._draw_points(colour, ranges.unflatten(0, (self._rows, self._columns)), view, axes)
+        shape = self._rows, self._columns
+        colour = colour.clamp(0.0, 1.0).pow(1 / 2.2).unflatten(0, shape)
+        slack = torch.where(classes == HitClass.ROBOT, 0.02, 0.06 + 0.02 * ranges)
+        self._draw_points(colour, (ranges + slack).unflatten(0, shape), view, axes)
         if self._samples > 1:
             colour = torch.nn.functional.avg_pool2d(colour.permute(2, 0, 1), self._samples).permute(1, 2, 0)
         return (colour * 255.0 + 0.5).to(torch.uint8).cpu()
@@ -188,26 +210,39 @@ class Renderer:
         shadowed[ids] = hits.shape_id.flatten() >= 0
         return shadowed
 
-    def _draw_points(self, colour: torch.Tensor, ranges: torch.Tensor, view: View, axes: torch.Tensor) -> None:
-        """Draws the LiDAR points that nothing hides, nearer ones over farther ones."""
+    def _draw_points(self, colour: torch.Tensor, seen_to: torch.Tensor, view: View, axes: torch.Tensor) -> None:
+        """Draws discs where LiDAR points are, nearer ones over farther ones, the smaller and fainter the farther.
+
+        Args:
+            colour: (rows, columns, 3) picture, drawn into.
+            seen_to: (rows, columns) distance (m) up to which a point is before what a pixel shows.
+            view: what is drawn.
+            axes: (3, 3) of the camera.
+        """
         offset = view.points_w - view.eye_w
-        distance = offset.norm(dim=1)
+        order = offset.norm(dim=1).argsort(descending=True)
+        offset, proximal = offset[order], view.proximal[order]
         right, down, ahead = (offset @ axes.T).unbind(1)
-        column = (self._focal * right / ahead.clamp(min=1e-6) + self._columns / 2).floor().long()
-        row = (self._focal * down / ahead.clamp(min=1e-6) + self._rows / 2).floor().long()
-        radius = max(1, round(self._rows / 360))
-        inside = (ahead > 0.1) & (column >= radius) & (column < self._columns - radius)
-        inside &= (row >= radius) & (row < self._rows - radius)
-        column, row, distance, proximal = column[inside], row[inside], distance[inside], view.proximal[inside]
-        seen = distance <= ranges[row, column] * 1.02 + 0.06
-        order = distance[seen].argsort(descending=True)
-        column, row, proximal = column[seen][order], row[seen][order], proximal[seen][order]
+        column = self._focal * right / ahead.clamp(min=1e-6) + self._columns / 2
+        row = self._focal * down / ahead.clamp(min=1e-6) + self._rows / 2
+        least, most = (px * self._rows / 720 for px in POINT_PX)
+        reach = math.ceil(max(most, 1.0))
+        inside = (ahead > 0.1) & (column >= reach) & (column < self._columns - reach)
+        inside &= (row >= reach) & (row < self._rows - reach)
+        row, column, proximal = row[inside], column[inside], proximal[inside]
+        distance = offset[inside].norm(dim=1)
+        radius = (self._focal * POINT_M / distance).clamp(max(least, 0.5), max(most, 1.0))
+        opacity = torch.exp(-distance / FAINT_M).clamp(min=LEAST_OPACITY)
         device = colour.device
         dots = torch.where(proximal[:, None], _vector(PROXIMAL, device), _vector(DISTAL, device)).pow(1 / 2.2)
-        for down_px in range(-radius, radius + 1):
-            for right_px in range(-radius, radius + 1):
-                if math.hypot(down_px, right_px) <= radius + 0.25:
-                    colour[row + down_px, column + right_px] = dots
+        for down_px in range(-reach, reach + 1):
+            for right_px in range(-reach, reach + 1):
+                i, j = row.long() + down_px, column.long() + right_px
+                away = torch.hypot(i + 0.5 - row, j + 0.5 - column)
+                cover = opacity * (radius + 0.5 - away).clamp(0.0, 1.0) * (distance <= seen_to[i, j])
+                drawn = cover > 0
+                i, j, cover = i[drawn], j[drawn], cover[drawn, None]
+                colour[i, j] += cover * (dots[drawn] - colour[i, j])
 
 
 def _camera_axes(eye_w: torch.Tensor, target_w: torch.Tensor) -> torch.Tensor:
@@ -252,3 +287,9 @@ def _arrow_distance(xy_w: torch.Tensor, arrow: Arrow) -> torch.Tensor:
 
 def _vector(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
     return torch.tensor(values, device=device)
+
+
+def shown(colour: tuple[float, float, float]) -> tuple[int, int, int]:
+    """A linear colour as a picture shows it, 0 to 255."""
+    red, green, blue = (round(255 * c ** (1 / 2.2)) for c in colour)
+    return red, green, blue

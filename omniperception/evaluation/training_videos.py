@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from omniperception.evaluation.video import Recorder
+from omniperception.evaluation.video_options import VideoOptions
 from omniperception.learning import Runner
 
 FOLDER = "videos"
+OPTIONS = VideoOptions(size=(640, 360))
+"""Small, since the training waits for each picture."""
 
 
 class TrainingVideos:
@@ -33,7 +36,7 @@ class TrainingVideos:
             self._begun = iteration
             self._path = self._folder / f"{iteration}.mp4"
             self._folder.mkdir(exist_ok=True)
-            self._recorder = Recorder(self._runner.env, self._path, self._duration_s)
+            self._recorder = Recorder(self._runner.env, self._path, self._duration_s, OPTIONS)
         if self._recorder is not None:
             self._recorder()
             if not self._recorder.frames_left:

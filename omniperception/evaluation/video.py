@@ -1,59 +1,52 @@
-"""Films one environment: a camera that follows the robot, its LiDAR points, command and velocity."""
+"""Films environments: a camera that follows each robot, its LiDAR points, command and velocity, what it perceives."""
 
 from __future__ import annotations
 
 import math
-import struct
-import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import imageio_ffmpeg
+import numpy as np
 import torch
+from PIL import Image
+from torch import nn
 
 from omniperception.common.rotations import rotate_inverse, rotate_yaw
 from omniperception.env.env import OmniEnv
-from omniperception.evaluation.render import COMMAND, VELOCITY, Arrow, Renderer, View
+from omniperception.evaluation.camera import FollowCamera
+from omniperception.evaluation.overlay import PERCEIVED, TRUE, legend, sector_plot
+from omniperception.evaluation.perceived import perceived, true_sectors
+from omniperception.evaluation.render import COMMAND, DISTAL, PROXIMAL, VELOCITY, Arrow, Renderer, View, shown
+from omniperception.evaluation.video_options import VideoOptions
 from omniperception.perception import PdSampler
 from omniperception.scene.rays import HitClass, ray_shapes
 
 FPS = 25
-BEHIND_M, ABOVE_M, AHEAD_M = 2.4, 1.45, 1.0
-"""Place of the camera with respect to the robot, and how far ahead of the robot it looks."""
-OVER_GROUND_M = 0.4
-"""Least height of the camera above the ground below it, where the ground is not flat."""
-FOLLOW_S, TURN_S = 0.25, 0.9
-"""Time constants with which the camera follows the robot's position and heading."""
 MIN_ARROW = 0.1
 """Speeds (m/s) below this have no arrow."""
+INSET, MARGIN = 0.27, 0.02
+"""Side of the inset and distance of what is drawn over a picture from its edges, by the picture's height."""
+LEAST_INSET = 40
+"""Pixels below which there is no inset."""
 
 
-class FollowCamera:
-    """Stays behind and above the robot, smoothly."""
+@dataclass(frozen=True)
+class Moment:
+    """What a panel shows.
 
-    def __init__(self, dt: float) -> None:
-        """`dt` (s) is the time between two calls of `follow`."""
-        self._keep_pos, self._keep_heading = math.exp(-dt / FOLLOW_S), math.exp(-dt / TURN_S)
-        self._pos: torch.Tensor | None = None
+    Attributes:
+        view: the scene.
+        perceived, true: (S, 3) obstacles by sector, `Perceived.sectors`; None where the policy perceives none.
+    """
 
-    def cut(self) -> None:
-        """Starts again at the robot's next pose."""
-        self._pos = None
-
-    def follow(self, foot_w: torch.Tensor, yaw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Eye and target (3,) (m) for a robot with heading `yaw` () (rad) over a point `foot_w` (3,) of the ground."""
-        heading = torch.stack((yaw.cos(), yaw.sin()))
-        if self._pos is None:
-            self._pos, self._heading = foot_w, heading
-        self._pos = self._keep_pos * self._pos + (1 - self._keep_pos) * foot_w
-        self._heading = self._keep_heading * self._heading + (1 - self._keep_heading) * heading
-        ahead = self._heading / self._heading.norm().clamp(min=1e-6)
-        eye = self._pos + torch.cat((-BEHIND_M * ahead, ahead.new_tensor([ABOVE_M])))
-        target = self._pos + torch.cat((AHEAD_M * ahead, ahead.new_tensor([0.2])))
-        return eye, target
+    view: View
+    perceived: np.ndarray | None = None
+    true: np.ndarray | None = None
 
 
 class Recorder:
-    """Writes a video of one environment, to be called after every control step, and a still of a good moment.
+    """Writes a video of environments, to be called after every control step, and a still of a good moment.
 
     Attributes:
         frames_left: pictures still to be taken; none after `duration_s`.
@@ -64,21 +57,23 @@ class Recorder:
         env: OmniEnv,
         path: Path,
         duration_s: float,
-        width: int = 640,
-        height: int = 360,
-        env_id: int = 0,
+        options: VideoOptions | None = None,
+        policy: object = None,
     ) -> None:
         """
         Args:
             env: what is filmed.
             path: the mp4 file to write.
             duration_s: length of the video.
-            width, height: its size, even numbers of pixels.
-            env_id: the environment that is shown.
+            options: size, environments, camera; None: as they are by default.
+            policy: who acts; a network that tells obstacles by sector has an inset of them.
+
+        Raises:
+            ConfigError: an environment does not exist.
         """
-        if width % 2 or height % 2:
-            raise ValueError(f"a video of {width} x {height} pixels cannot be coded; use even numbers")
-        self._env, self._id, self._size = env, env_id, (width, height)
+        self._env, self._options = env, options or VideoOptions()
+        self._options.check_fits(env.num_envs)
+        self._actor = policy if isinstance(policy, nn.Module) else None
         self._every = max(1, round(1 / (FPS * env.control_dt)))
         dt = self._every * env.control_dt
         self.frames_left = max(1, round(duration_s / dt))
@@ -87,103 +82,123 @@ class Recorder:
         field = env.obstacles
         names = [] if field is None else [field.parts[k].name for k in field.varying]
         self._sized = self._shapes.indices(names)
-        self._renderer = self._build_renderer(1, samples=1)
-        self._camera = FollowCamera(dt)
+        self._renderer = self._build_renderer(samples=1)
+        ids = self._options.env_ids
+        self._cameras = {k: FollowCamera(dt, self._options.camera) for k in ids}
+        self._blind_until = dict.fromkeys(ids, 0)
         self._split = _split_elevation(env)
-        self._blind_until = 0
-        self._best: tuple[float, View] | None = None
+        self._best: tuple[float, list[Moment]] | None = None
+        width, height = self._options.size
         self._writer = imageio_ffmpeg.write_frames(
             str(path), (width, height), fps=1 / dt, codec="libx264", quality=6, macro_block_size=2
         )
         self._writer.send(None)
 
     def __call__(self) -> None:
-        if self._env.done[self._id]:
-            self._camera.cut()
-            self._blind_until = self._env.sensing.tick + 1 if self._env.sensing is not None else 0
+        sensing = self._env.sensing
+        for k, camera in self._cameras.items():
+            if self._env.done[k]:
+                camera.cut()
+                self._blind_until[k] = sensing.tick + 1 if sensing is not None else 0
         self._steps += 1
         if self.frames_left == 0 or self._steps % self._every:
             return
         self.frames_left -= 1
-        view = self._view()
-        interest = self._interest()
+        moments = [self._moment(k) for k in self._cameras]
+        interest = sum(self._interest(k) for k in self._cameras)
         if self._best is None or interest > self._best[0]:
-            self._best = interest, view
-        self._writer.send(self._renderer.render(view).numpy().tobytes())
+            self._best = interest, moments
+        self._writer.send(self._picture(self._renderer, moments).tobytes())
 
     def close(self) -> None:
         """Completes the video file."""
         self._writer.close()
 
-    def write_still(self, path: Path, scale: int = 2) -> None:
-        """Writes the most telling moment so far as a PNG, `scale` times the video's size."""
-        if self._best is None:
-            return
-        write_png(path, self._build_renderer(scale, samples=2).render(self._best[1]))
+    def write_still(self, path: Path) -> None:
+        """Writes the most telling moment so far as a PNG of the video's size."""
+        if self._best is not None:
+            self._picture(self._build_renderer(samples=2), self._best[1]).save(path)
 
-    def _build_renderer(self, scale: int, samples: int) -> Renderer:
-        width, height = (scale * pixels for pixels in self._size)
+    def _build_renderer(self, samples: int) -> Renderer:
         threads = self._env.config.sim.num_threads or None
         device, sized = self._env.device, self._sized
-        return Renderer(self._shapes, width, height, samples, device=device, num_threads=threads, sized=sized)
+        return Renderer(self._shapes, *self._options.panel, samples, device=device, num_threads=threads, sized=sized)
 
-    def _view(self) -> View:
+    def _picture(self, renderer: Renderer, moments: list[Moment]) -> Image.Image:
+        """The panels side by side, with what is drawn over them."""
+        (columns, _), (width, height) = self._options.grid, self._options.panel
+        picture = Image.new("RGB", (self._options.size[0], self._options.size[1]))
+        for k, moment in enumerate(moments):
+            panel = Image.fromarray(renderer.render(moment.view).numpy())
+            if moment.perceived is not None and INSET * height >= LEAST_INSET:
+                plot, margin = sector_plot(moment.perceived, moment.true, round(INSET * height)), round(MARGIN * height)
+                panel.paste(plot, (width - plot.width - margin, margin), plot)
+            picture.paste(panel, (k % columns * width, k // columns * height))
+        colours = {"command": shown(COMMAND), "velocity": shown(VELOCITY)}
+        if self._env.sensing is not None:
+            colours = {"proximal points": shown(PROXIMAL), "distal points": shown(DISTAL), **colours}
+        if any(moment.perceived is not None for moment in moments):
+            colours |= {"obstacles as perceived": PERCEIVED, "as they are": TRUE}
+        key, margin = legend(colours, picture.height), round(MARGIN * picture.height)
+        if key.width + 2 * margin <= picture.width:
+            picture.paste(key, (margin, picture.height - key.height - margin), key)
+        return picture
+
+    def _moment(self, env_id: int) -> Moment:
+        env = self._env
+        view = self._view(env_id)
+        seen = None
+        if self._actor is not None:
+            seen = perceived(self._actor, env.get_observations(), env.state.reference, env_id)
+        if seen is None or seen.sectors is None:
+            return Moment(view)
+        return Moment(view, seen.sectors, true_sectors(env, env_id))
+
+    def _view(self, env_id: int) -> View:
         env, state = self._env, self._env.state.kinematics
-        pos, quat = env.sim.body_poses(self._shapes.bodies)
-        base, yaw = state.base_pos_w[self._id], state.yaw[self._id]
-        below = torch.stack((base[0], base[1], base[2] - env.state.base_height[self._id]))
-        eye, target = self._camera.follow(below, yaw)
-        if env.ground is not None:
-            ground = env.ground.height(eye[None, :2], torch.tensor([self._id], device=env.device))[0]
-            eye[2] = torch.maximum(eye[2], ground + OVER_GROUND_M)
-        points, proximal = self._points()
+        pos, quat = (poses[env_id].clone() for poses in env.sim.body_poses(self._shapes.bodies))
+        field = env.obstacles
+        sizes = None if field is None else field.size[env_id, list(field.varying)]
+        self._renderer.place(pos, quat, sizes)
+        base, yaw = state.base_pos_w[env_id], state.yaw[env_id]
+        below = torch.stack((base[0], base[1], base[2] - env.state.base_height[env_id]))
+        eye, target = self._cameras[env_id].follow(below, yaw, self._renderer.free_share)
+        points, proximal = self._points(env_id)
         arrows = []
-        shown = (env.command.value[:, :2], 0.16, COMMAND), (state.base_lin_vel_yaw, 0.07, VELOCITY)
-        for velocity, width, colour in shown:
-            vector = rotate_yaw(yaw[None], velocity[self._id, None])[0]
+        painted = (env.command.value[:, :2], 0.16, COMMAND), (state.base_lin_vel_yaw, 0.07, VELOCITY)
+        for velocity, width, colour in painted:
+            vector = rotate_yaw(yaw[None], velocity[env_id, None])[0]
             if float(vector.norm()) >= MIN_ARROW:
                 arrows.append(Arrow(base[:2].clone(), vector, width, colour))
-        pose, field = (pos[self._id].clone(), quat[self._id].clone()), env.obstacles
-        sizes = None if field is None else field.size[self._id, list(field.varying)]
-        return View(eye, target, *pose, points, proximal, tuple(arrows), sizes)
+        return View(eye, target, pos, quat, points, proximal, tuple(arrows), sizes)
 
-    def _points(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _points(self, env_id: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Points (P, 3) (m, environment frame) of the episode's newest frame, and which are proximal."""
         sensing, device = self._env.sensing, self._env.device
-        if sensing is None or sensing.frame is None or sensing.tick < self._blind_until:
+        if sensing is None or sensing.frame is None or sensing.tick < self._blind_until[env_id]:
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         frame, config = sensing.frame, sensing.config
         if frame.ranges is None or frame.directions_s is None or frame.elevation is None:  # no network looks at points
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
-        hit = frame.ranges[self._id].isfinite()
-        points_s = frame.directions_s[self._id, hit] * frame.ranges[self._id, hit, None]
+        hit = frame.ranges[env_id].isfinite()
+        points_s = frame.directions_s[env_id, hit] * frame.ranges[env_id, hit, None]
         points_c = _rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
         at, turned = (
-            sensing.scene.body_pos[self._id, sensing.carrier],
-            sensing.scene.body_quat[self._id, sensing.carrier],
+            sensing.scene.body_pos[env_id, sensing.carrier],
+            sensing.scene.body_quat[env_id, sensing.carrier],
         )
-        return _rotate(turned, points_c) + at, frame.elevation[self._id, hit] > self._split
+        return _rotate(turned, points_c) + at, frame.elevation[env_id, hit] > self._split
 
-    def _interest(self) -> float:
+    def _interest(self, env_id: int) -> float:
         """Score of a picture: the robot walks ahead, and its LiDAR sees obstacles."""
         env = self._env
-        speed = float(env.state.kinematics.base_lin_vel_yaw[self._id, 0])
-        value = min(max(speed, 0.0), 0.8) + float(env.episode_length_buf[self._id] * env.control_dt > 2.0)
+        speed = float(env.state.kinematics.base_lin_vel_yaw[env_id, 0])
+        value = min(max(speed, 0.0), 0.8) + float(env.episode_length_buf[env_id] * env.control_dt > 2.0)
         frame = env.sensing.frame if env.sensing is not None else None
         if frame is not None and frame.class_id is not None:
-            seen = float((frame.class_id[self._id] == HitClass.OBSTACLE).float().mean())
+            seen = float((frame.class_id[env_id] == HitClass.OBSTACLE).float().mean())
             value += min(10.0 * seen, 1.0)
         return value
-
-
-def write_png(path: Path, image: torch.Tensor) -> None:
-    """Writes an image (height, width, 3) uint8 as a PNG."""
-    height, width, _ = image.shape
-    lines = torch.cat((torch.zeros(height, 1, dtype=torch.uint8), image.flatten(1)), 1)  # 0: an unfiltered line
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = (b"IHDR", header), (b"IDAT", zlib.compress(lines.numpy().tobytes(), 9)), (b"IEND", b"")
-    chunks = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
 
 
 def _split_elevation(env: OmniEnv) -> float:

@@ -9,10 +9,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from PIL import Image
 
 from omniperception.env.sensing import SensorConfig
 from omniperception.evaluation.render import Renderer, View
-from omniperception.evaluation.video import write_png
 from omniperception.lidar import Lidar, RayScene
 from omniperception.scene import World
 from omniperception.scene.rays import HitClass, RayShapes, ray_shapes
@@ -80,7 +80,7 @@ def draw(
     points, on_robot = nothing if sight is None else (sight.points_w.float(), sight.on_robot)
     picture = Renderer(shapes, width, height, samples=2).render(View(eye, target, pos, quat, points, on_robot))
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, picture)
+    Image.fromarray(picture.numpy()).save(path)
 
 
 def _poses(shapes: RayShapes, data: mujoco.MjData) -> tuple[torch.Tensor, torch.Tensor]:

@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
+from PIL import Image
 
 from omniperception.scene.height_field import EDGE, add_height_field
 from omniperception.scene.terrain import check_contact
@@ -267,13 +268,8 @@ def read_image(file: str) -> np.ndarray:
     """(rows, cols) float64 brightness, 0 black to 1 white, of a picture; the first row is its lowest.
 
     Raises:
-        ImportError: pillow is not installed.
         ValueError: it is no picture.
     """
-    try:
-        from PIL import Image
-    except ImportError:
-        raise ImportError(f"reading {file} needs pillow: pip install 'omniperception[maps]'") from None
     try:
         with Image.open(file) as image:
             deep = image.mode.startswith("I")  # 16 bit

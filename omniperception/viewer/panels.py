@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from omniperception.config import CONFIG_FILE, OUTPUTS
 from omniperception.evaluation.baselines import BASELINES
+from omniperception.evaluation.perceived import Perceived
 from omniperception.viewer import charts
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, PROXIMAL
 from omniperception.viewer.drive import MAX_SPEED, MAX_YAW_RATE, Velocity
-from omniperception.viewer.perceived import Perceived
 from omniperception.viewer.session import MOST_POINTS, Session, spare_kinds
 from omniperception.viewer.stage import POINT_COLOURS
 

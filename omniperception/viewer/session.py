@@ -16,13 +16,13 @@ from omniperception.env.env import OmniEnv
 from omniperception.env.state import AVOIDANCE, MEASURED_CLOUD
 from omniperception.evaluation.baselines import BASELINES, Limits, baseline
 from omniperception.evaluation.episodes import Policy
+from omniperception.evaluation.perceived import Perceived, perceived
 from omniperception.learning import Runner, latest_checkpoint
 from omniperception.lidar import Lidar, LidarFrame
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
 from omniperception.scene.rays import RayShapes, ray_shapes
 from omniperception.viewer.drive import Velocity, driven
 from omniperception.viewer.options import Shown
-from omniperception.viewer.perceived import Perceived, perceived
 from omniperception.viewer.spares import PREFIX as SPARE
 from omniperception.viewer.spares import with_spares
 

@@ -12,10 +12,10 @@ import torch
 
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.env.heights import height_grid
+from omniperception.evaluation.perceived import Perceived
 from omniperception.scene.rays import HitClass
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, HEIGHTS, OBSTACLE, PROXIMAL, SECTORS, TERRAIN, scale
 from omniperception.viewer.meshes import grid_surface, robot_looks, triangles
-from omniperception.viewer.perceived import Perceived
 from omniperception.viewer.session import Session
 
 if TYPE_CHECKING:

@@ -14,6 +14,7 @@ import torch
 
 from omniperception import config
 from omniperception.config import ConfigError
+from omniperception.evaluation.perceived import true
 from omniperception.learning import CheckpointError, latest_checkpoint
 from omniperception.learning.checkpoint import list_checkpoints
 from omniperception.viewer.clock import Clock
@@ -21,7 +22,6 @@ from omniperception.viewer.drive import Stick, Velocity
 from omniperception.viewer.options import PageOptions, Shown
 from omniperception.viewer.page import open_page
 from omniperception.viewer.panels import Panels
-from omniperception.viewer.perceived import true
 from omniperception.viewer.session import Session
 from omniperception.viewer.stage import STICK_REACH, Stage, turned
 

@@ -1,15 +1,20 @@
-"""Pictures: what is where geometry says, and a file that plays."""
+"""Videos: what is where geometry says, a camera that sees the robot, and files that play."""
 
 import math
-import struct
-import zlib
 
 import imageio_ffmpeg
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from omniperception.avoidance.sector_motion import NEARNESS_RANGE
+from omniperception.common.errors import ConfigError
+from omniperception.evaluation.camera import CAMERAS, FollowCamera
+from omniperception.evaluation.overlay import legend, sector_plot
 from omniperception.evaluation.render import Arrow, Renderer, View
-from omniperception.evaluation.video import FollowCamera, Recorder, write_png
+from omniperception.evaluation.video import Recorder
+from omniperception.evaluation.video_options import VideoOptions
 from omniperception.lidar import Shape, ShapeKind
 from omniperception.scene.rays import HitClass, RayShapes
 
@@ -59,12 +64,27 @@ def test_left_in_the_world_is_left_in_the_picture(renderer):
     assert is_dark(image[18, 24]) and not is_dark(image[18, 40])
 
 
-def test_points_hide_behind_things_and_have_two_colours(renderer):
-    points = torch.tensor([[-1.0, 0.0, 1.0], [2.0, 0.0, 1.0], [0.0, 1.5, 1.0]])
-    proximal = torch.tensor([True, False, False])
-    image = renderer.render(view(points=(points, proximal))).int()
-    assert blueness(image[18, 32]) < -100  # the near, proximal point before the ball; the one behind it is hidden
-    assert blueness(image[18, 20]) > 100
+@pytest.fixture(scope="module")
+def fine_renderer():
+    """Ten times as many pixels each way: a focal length of 312."""
+    return Renderer(BALL_ON_GROUND, 10 * WIDTH, 10 * HEIGHT, fov_deg=60.0)
+
+
+def test_points_hide_behind_things_and_have_two_colours(fine_renderer):
+    points = torch.tensor([[-1.0, 0.0, 1.0], [2.0, 0.5, 1.0], [-1.0, 1.5, 1.0]])
+    with_points = fine_renderer.render(view(points=(points, torch.tensor([True, True, False])))).int()
+    change = with_points - fine_renderer.render(view()).int()
+    assert blueness(change[180, 320]) < -50  # the proximal point 3 m ahead, before the ball
+    assert blueness(change[180, 320 - 156]) > 30  # 312 * 1.5 / 3 to the left, a distal one
+    assert not change[170:190, 285:305].any()  # 312 * 0.5 / 6 to the left, behind the ball
+
+
+def test_nearer_points_are_larger_and_less_faint(fine_renderer):
+    points = torch.tensor([[-3.0, 0.5, 1.2], [4.0, -2.0, 2.0]]), torch.tensor([True, True])
+    pictures = [fine_renderer.render(view((0.0, 0.0, -50.0), p)).int() for p in (points, NO_POINTS)]
+    change = (pictures[0] - pictures[1]).abs().sum(2)
+    near, far = change[:, :320], change[:, 320:]
+    assert (near > 0).sum() > 2 * (far > 0).sum() > 0 and near.max() > 1.3 * far.max()
 
 
 def test_an_arrow_lies_on_the_ground_where_it_points(renderer):
@@ -90,34 +110,123 @@ def test_more_samples_change_edges_only(renderer):
     assert ((fine - coarse).abs().amax(2) < 12).float().mean() > 0.85
 
 
-def test_the_camera_stays_behind_the_robot():
-    camera = FollowCamera(0.04)
-    for step in range(200):
-        yaw = torch.tensor(math.pi / 2)
-        eye, target = camera.follow(torch.tensor([0.0, 0.02 * step, 0.3]), yaw)
-    assert abs(float(eye[0])) < 1e-3 and eye[1] < 0.02 * 199 - 2.0 and target[1] > eye[1] + 3.0
+def way_is_free(eye, robot, boxes):
+    """Whether a segment meets no box, by slabs; boxes are (centre, half sizes)."""
+    for centre, half in boxes:
+        with np.errstate(divide="ignore"):
+            slabs = (np.stack((np.subtract(centre, half), np.add(centre, half))) - eye) / (robot - eye)
+        if max(slabs.min(0).max(), 0.0) < min(slabs.max(0).min(), 1.0):
+            return False
+    return True
 
 
-def test_a_video_of_the_real_environment_plays(make_env, tmp_path):
-    env = make_env("obstacles=static", "num_envs=2")
-    recorder = Recorder(env, tmp_path / "a.mp4", duration_s=0.12, width=WIDTH, height=HEIGHT, env_id=1)
+def angle_deg(a, b):
+    return math.degrees(math.acos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0)))
+
+
+CORRIDOR = (
+    ((3.0, 0.8, 1.0), (7.0, 0.1, 1.0)),
+    ((3.0, -0.8, 1.0), (7.0, 0.1, 1.0)),
+    ((-4.0, 0.0, 1.0), (0.1, 0.9, 1.0)),
+)
+"""A corridor of 1.4 m along +x, closed behind; centres and half sizes (m) of its walls."""
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_in_a_corridor_the_robot_is_in_the_picture_and_nothing_before_it(kind):
+    walls = [Shape(ShapeKind.BOX, half, pos=pos, class_id=HitClass.OBSTACLE) for pos, half in CORRIDOR]
+    names = ("ground", *"abc", "ball")
+    shapes = RayShapes((GROUND, *walls, BALL), names, (1,), base=0)
+    renderer = Renderer(shapes, WIDTH, HEIGHT)
+    camera = FollowCamera(0.04, kind)
+    for step in range(220):
+        x, yaw = min(0.04 * step, 6.0) - 3.0, max(step - 150, 0) * 0.1  # walks 6 m, then turns twice around
+        foot = torch.tensor([x, 0.3 * math.sin(x), 0.0])
+        renderer.place(foot + torch.tensor([[0.0, 0.0, 0.3]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), None)
+        eye, target = camera.follow(foot, torch.tensor(yaw), renderer.free_share)
+        eye, ahead = eye.double().numpy(), (target - eye).double().numpy()
+        robot = foot.double().numpy() + np.array([0, 0, 0.3])
+        assert eye[2] > 0 and way_is_free(eye, robot, CORRIDOR)
+        assert angle_deg(ahead, robot - eye) < 46.0 / 2 and np.linalg.norm(robot - eye) > 0.5
+
+
+@pytest.mark.parametrize(("kind", "yaw", "way"), [("chase", 90, (0, -1)), ("side", 90, (1, 0)), ("top", 90, (-1, 0))])
+def test_in_the_open_each_camera_is_where_it_belongs(kind, yaw, way):
+    camera, place = FollowCamera(0.04, kind), CAMERAS[kind]
+    foot = torch.tensor([5.0, -2.0, 0.1])
+    eye, _ = camera.follow(foot, torch.tensor(math.radians(yaw)), lambda start, ends: torch.ones(len(ends)))
+    offset = (eye - foot).double().numpy() - np.array([0, 0, 0.3])
+    assert np.linalg.norm(offset) == pytest.approx(place.distance, abs=1e-5)
+    assert math.degrees(math.asin(offset[2] / place.distance)) == pytest.approx(place.elevation_deg, abs=1e-3)
+    assert offset[:2] / np.linalg.norm(offset[:2]) == pytest.approx(way, abs=1e-4)
+
+
+def test_the_inset_has_obstacles_where_they_are():
+    # from behind counter-clockwise: behind right, ahead right, ahead left, behind left
+    perceived, true = np.full((2, 4, 3), np.inf)
+    perceived[2], true[1] = (2.0, 0.0, 0.0), (1.0, 0.0, 0.0)
+    changed = np.asarray(sector_plot(perceived, true, 200)) != np.asarray(sector_plot(None, None, 200))
+    up, right = 100 - np.argwhere(changed.any(2)).T[0], np.argwhere(changed.any(2)).T[1] - 100
+    metres = np.hypot(up, right) * NEARNESS_RANGE / 98  # the rim is at 98 pixels
+    assert up.min() >= -1
+    ahead_left, ahead_right = metres[right < -1], metres[right > 1]
+    assert ahead_left.min() == pytest.approx(2.0, abs=0.1) and ahead_left.max() > 0.95 * NEARNESS_RANGE
+    assert ahead_right.mean() == pytest.approx(1.0, abs=0.05) and np.ptp(ahead_right) < 0.3
+
+
+def test_the_legend_grows_with_its_names():
+    short, long = legend({"a": (255, 0, 0)}, 720), legend({"a": (255, 0, 0), "another": (0, 0, 255)}, 720)
+    assert long.width > short.width and long.height == short.height
+    colours = {colour for _, colour in long.getcolors(100000)}
+    assert {(255, 0, 0, 255), (0, 0, 255, 255)} <= colours
+
+
+def test_a_grid_of_environments_plays(make_env, tmp_path):
+    env = make_env("obstacles=static", "num_envs=4")
+    options = VideoOptions((2 * WIDTH, 2 * HEIGHT), (3, 0, 2))
+    recorder = Recorder(env, tmp_path / "a.mp4", 0.12, options)
     for _ in range(10):
-        env.step(torch.zeros(2, 12))
+        env.step(torch.zeros(4, 12))
         recorder()
     recorder.close()
     assert recorder.frames_left == 0
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4"))
     assert frames == 3 and seconds == pytest.approx(0.12, abs=0.01)
-    recorder.write_still(tmp_path / "a.png", scale=1)
-    assert (tmp_path / "a.png").stat().st_size > 500
+    recorder.write_still(tmp_path / "a.png")
+    pixels = np.asarray(Image.open(tmp_path / "a.png")).astype(int)
+    assert pixels.shape == (2 * HEIGHT, 2 * WIDTH, 3)
+    panels = [pixels[r : r + HEIGHT, c : c + WIDTH] for r in (0, HEIGHT) for c in (0, WIDTH)]
+    assert all(np.ptp(panel) > 50 for panel in panels[:3]) and panels[3].max() == 0  # three, and none
+    assert not np.array_equal(panels[0], panels[1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"size": (63, 36)}, "video_size=63,36 must be width,height, two even numbers such as 1280,720"),
+        ({"size": (64,)}, "video_size=64 must be width,height"),
+        ({"env_ids": (1, 1)}, "video_envs=1,1 must be different numbers"),
+        ({"size": (64, 36), "env_ids": tuple(range(16))}, "leaves 16 x 9 pixels for each"),
+        ({"camera": "front"}, "camera=front must be one of chase, top, side"),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+    with pytest.raises(ConfigError, match=message):
+        VideoOptions(**options)
+
+
+def test_environments_that_do_not_exist_are_refused():
+    VideoOptions(env_ids=(0, 3)).check_fits(4)
+    with pytest.raises(ConfigError, match="video_envs=0,4: there are 4 environments, from 0 on; num_envs=5 would do"):
+        VideoOptions(env_ids=(0, 4)).check_fits(4)
 
 
 def test_lidar_points_lie_on_what_was_hit(make_env, tmp_path):
     env = make_env("obstacles=static", "num_envs=2", "perception=proximity_gru")
-    recorder = Recorder(env, tmp_path / "a.mp4", duration_s=1.0, width=WIDTH, height=HEIGHT, env_id=1)
+    recorder = Recorder(env, tmp_path / "a.mp4", 1.0, VideoOptions((WIDTH, HEIGHT), (1,)))
     for _ in range(5):
         env.step(torch.zeros(2, 12))
-    points = recorder._view().points_w
+    points = recorder._view(1).points_w
     hit = env.sensing.frame.class_id[1][env.sensing.frame.ranges[1].isfinite()]
     recorder.close()
     on_ground = points[hit == HitClass.TERRAIN]
@@ -128,28 +237,11 @@ def test_lidar_points_lie_on_what_was_hit(make_env, tmp_path):
 def test_points_of_an_ended_episode_are_not_shown(make_env, tmp_path):
     short = "terminations.episode_length_s=0.14"  # 7 steps, a frame every 5
     env = make_env("obstacles=static", "num_envs=2", short, "perception=proximity_gru")
-    recorder = Recorder(env, tmp_path / "a.mp4", duration_s=1.0, width=WIDTH, height=HEIGHT)
+    recorder = Recorder(env, tmp_path / "a.mp4", 1.0, VideoOptions((WIDTH, HEIGHT)))
     shown = []
     for _ in range(10):
         env.step(torch.zeros(2, 12))
         recorder()
-        shown.append(len(recorder._points()[0]) > 0)
+        shown.append(len(recorder._points(0)[0]) > 0)
     recorder.close()
     assert shown == [True] * 6 + [False] * 3 + [True]
-
-
-def test_odd_sizes_are_refused(make_env, tmp_path):
-    env = make_env("lidar=none", "obstacles=none", "rewards=walk", "observations=walk", "num_envs=1")
-    with pytest.raises(ValueError, match="even"):
-        Recorder(env, tmp_path / "a.mp4", 1.0, 63, 36)
-
-
-def test_a_png_holds_the_pixels(tmp_path):
-    image = torch.arange(2 * 3 * 3, dtype=torch.uint8).reshape(2, 3, 3)
-    write_png(tmp_path / "a.png", image)
-    data = (tmp_path / "a.png").read_bytes()
-    assert data[:8] == b"\x89PNG\r\n\x1a\n" and struct.unpack(">II", data[16:24]) == (3, 2)
-    start = data.index(b"IDAT")
-    (length,) = struct.unpack(">I", data[start - 4 : start])
-    lines = zlib.decompress(data[start + 4 : start + 4 + length])
-    assert lines == b"\0" + bytes(range(9)) + b"\0" + bytes(range(9, 18))

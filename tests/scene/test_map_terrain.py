@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from mj_rays import assert_rays_are_those_of_mj_ray
+from PIL import Image
 
 from omniperception.common.errors import ConfigError
 from omniperception.scene.map_terrain import (
@@ -16,7 +17,6 @@ from omniperception.scene.map_terrain import (
     free_places,
 )
 
-Image = pytest.importorskip("PIL.Image", reason="extra maps")
 CELL = 0.1
 BORDER = 10
 """Cells by which a map goes on around the file's."""

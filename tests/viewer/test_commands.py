@@ -40,15 +40,15 @@ def test_a_taken_port(capsys, taken, line):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("line", [[], ["viewer=video", "scenario=static"]])
-def test_without_a_display_the_demo_is_a_film(capsys, monkeypatch, tmp_path, line):
+@pytest.mark.parametrize(("line", "stem"), [([], "demo"), (["viewer=video", "scenario=static"], "demo-static")])
+def test_without_a_display_the_demo_is_a_film(capsys, monkeypatch, tmp_path, line, stem):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(demo, "has_display", lambda: False)
-    main(["demo", "video_s=0.2", *line])
+    main(["demo", "video_s=0.2", "video_size=320,180", *line])
     said = capsys.readouterr().out
-    assert "wrote demo.mp4 and demo.png" in said and ("no display" in said) == (not line)
-    frames = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "demo.mp4"))[0]
-    assert frames == 5 and (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
+    assert f"wrote {stem}.mp4 and {stem}.png" in said and ("no display" in said) == (not line)
+    frames = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / f"{stem}.mp4"))[0]
+    assert frames == 5 and (tmp_path / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(("line", "scenario"), [([], "moving"), (["scenario=corridor"], "corridor")])

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from omniperception.config import ConfigError
+from omniperception.evaluation.perceived import true
 from omniperception.learning import CheckpointError
 from omniperception.scene.rays import HitClass
 from omniperception.viewer import Shown
-from omniperception.viewer.perceived import true
 from omniperception.viewer.session import DRAG_SPEED, Session, spare_kinds
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"

@@ -19,7 +19,7 @@ from omniperception.learning.read_out import MotionReadOut
 
 @dataclass(frozen=True)
 class Perceived:
-    """What is perceived or true in environment 0; None where nobody says.
+    """What is perceived or true in one environment; None where nobody says.
 
     Attributes:
         sectors: (S, 3) distance (m, infinite without an obstacle) and velocity (m/s, yaw-aligned frame), by sector.
@@ -35,17 +35,20 @@ class Perceived:
 
 
 @torch.no_grad()
-def perceived(actor: nn.Module, observations: TensorDict, command: torch.Tensor) -> Perceived | None:
+def perceived(actor: nn.Module, observations: TensorDict, command: torch.Tensor, env_id: int = 0) -> Perceived | None:
     """What the network of an actor says of its newest frames; None where it looks at none, or has none yet.
 
     Args:
         actor: of any kind.
-        observations: what it acts on.
-        command: (1, 3) as the actor is commanded.
+        observations: what it acts on, of all environments.
+        command: (num_envs, 3) as the actor is commanded.
+        env_id: the environment that is asked for.
     """
-    if not isinstance(actor, PerceptionActor) or not int(observations.get("frame_count", torch.zeros(1)).max()):
+    if not isinstance(actor, PerceptionActor) or "frame_count" not in observations:
         return None
-    features = actor.embed_newest(observations)
+    if not int(observations["frame_count"][env_id]):
+        return None
+    features = actor.embed_newest(observations)[env_id, None]
     embedding = features[:, : actor.perception.feature_dim]
     parts = actor.perception.supervised
     heights = embedding[0, parts[HEIGHT_TARGET]] if HEIGHT_TARGET in actor.supervision else None
@@ -58,25 +61,32 @@ def perceived(actor: nn.Module, observations: TensorDict, command: torch.Tensor)
         distance = torch.where(nearness > 0.05, NEARNESS_RANGE * (1.0 - nearness), torch.inf)
         sectors = torch.cat((distance[:, None], torch.zeros(len(distance), 2)), 1)
     if actor.read_out is not None:
-        velocity = actor.read_out.velocity(features, command[:, :2])[0]
+        velocity = actor.read_out.velocity(features, command[env_id, None, :2])[0]
     return Perceived(_array(sectors), _array(risk), _array(velocity), _array(heights))
 
 
 @torch.no_grad()
 def true(env: OmniEnv) -> Perceived:
-    """The same as the simulation has it; sectors without motion where V_avoid is the paper's."""
-    avoidance, sectors = env.avoidance, None
-    if avoidance is not None and avoidance.motion is not None:
-        sectors = avoidance.motion[0]
-    elif avoidance is not None and avoidance.sector_distance is not None:
-        distance = avoidance.sector_distance[0, :, None]
-        sectors = torch.cat((distance, torch.zeros_like(distance).expand(-1, 2)), 1)
+    """The same of environment 0 as the simulation has it."""
+    avoidance = env.avoidance
     return Perceived(
-        _array(sectors),
+        true_sectors(env),
         None if avoidance is None or avoidance.risk is None else _array(avoidance.risk[0]),
         None if avoidance is None else _array(avoidance.velocity[0]),
         _array(env.state.heights[0]),
     )
+
+
+@torch.no_grad()
+def true_sectors(env: OmniEnv, env_id: int = 0) -> np.ndarray | None:
+    """(S, 3) `Perceived.sectors` as the simulation has them; without motion where V_avoid is the paper's."""
+    avoidance = env.avoidance
+    if avoidance is not None and avoidance.motion is not None:
+        return _array(avoidance.motion[env_id])
+    if avoidance is None or avoidance.sector_distance is None:
+        return None
+    distance = avoidance.sector_distance[env_id, :, None]
+    return _array(torch.cat((distance, torch.zeros_like(distance).expand(-1, 2)), 1))
 
 
 def _array(tensor: torch.Tensor | None) -> np.ndarray | None:

@@ -1,0 +1,62 @@
+"""What the commands that film have in common: their arguments and the names of their files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omniperception.cli import argument
+from omniperception.env.env import OmniEnv
+from omniperception.evaluation.camera import CAMERAS
+from omniperception.evaluation.episodes import Policy
+from omniperception.evaluation.video_options import VideoOptions
+
+if TYPE_CHECKING:
+    from omniperception.evaluation.video import Recorder
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmArguments:
+    """Arguments that say what a film shows."""
+
+    video_s: float = argument(20.0, "length of the video (s)", positive=True)
+    camera: str = argument("chase", "where the video is taken from", choices=tuple(CAMERAS))
+    video_size: tuple[int, ...] = argument((1280, 720), "width and height of the video (pixels)", least=2)
+    video_envs: tuple[int, ...] = argument((0,), "environments in the video; several make a grid", least=0)
+
+    @property
+    def video(self) -> VideoOptions:
+        """The same, checked."""
+        return VideoOptions(self.video_size, self.video_envs, self.camera)
+
+
+@contextmanager
+def film(arguments: FilmArguments, env: OmniEnv, policy: Policy, path: Path) -> Iterator[Recorder]:
+    """Writes a film, of what is done before the context ends, and beside it a still of it.
+
+    Args:
+        arguments: what it shows.
+        env: freshly built.
+        policy: who acts.
+        path: the mp4 file; the still has the suffix png.
+
+    Yields:
+        What is to be called after every control step.
+    """
+    from omniperception.evaluation.video import Recorder
+
+    recorder = Recorder(env, path, arguments.video_s, arguments.video, policy)
+    try:
+        yield recorder
+    finally:
+        recorder.close()
+    recorder.write_still(path.with_suffix(".png"))
+
+
+def file_stem(name: str, overrides: Sequence[str]) -> str:
+    """`name`, or name-scenario where overrides give one, so that one scenario's file does not replace another's."""
+    given = [override.partition("=")[2] for override in overrides if override.startswith("scenario=")]
+    return "-".join([name, *given]).replace("/", "-")
