@@ -46,7 +46,7 @@ class RunConfig:
         perception: the actor's view of the LiDAR, or None.
         ppo: the learning settings.
         logger: where scalars of the training go, or None.
-        init: the runs whose weights this one starts from; where two have the same, the later one's.
+        init: the runs whose weights this one starts from: see `Runner.start_from`.
         distillation: of a teacher at the beginning, or None.
         condition: under which the robot walks, where its randomization is one of conf/condition as it stands.
         composed: the resolved configuration as plain dicts and lists, as saved in the run directory.

@@ -115,8 +115,7 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
     else:
         if run.init:
             _check_motion(OmegaConf.create(run.composed), run.init[-1])
-        for name in run.init:
-            runner.start_from(config.find_run(name, "init"))
+            runner.start_from(*(config.find_run(name, "init") for name in run.init))
         report(f"run directory: {run_dir}")
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
         name = run.distillation.teacher

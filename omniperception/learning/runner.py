@@ -29,7 +29,7 @@ from omniperception.learning.config import LearningConfig
 from omniperception.learning.divergence import TrainingDiverged
 from omniperception.learning.logger import Logger
 from omniperception.learning.ppo import PerceptivePpo
-from omniperception.learning.warm_start import start_from
+from omniperception.learning.warm_start import perceive_as, start_from
 
 
 class Runner:
@@ -160,13 +160,23 @@ class Runner:
         """Load the actor's weights alone, to replay it."""
         self._load(path, {"actor": True})
 
-    def start_from(self, run_dir: str | Path) -> None:
-        """Begin with the newest weights of another run: the actor's, and the critic's where it observes the same."""
-        state = load_checkpoint(latest_checkpoint(run_dir), self.device)
+    def start_from(self, *run_dirs: str | Path) -> None:
+        """Begin with the newest weights of other runs.
+
+        The last one gives the actor's, and the critic's where it observes the same; those before give what they
+        perceive with.
+        """
+        *seeing, run_dir = run_dirs
+        for other in seeing:
+            perceive_as(self.alg.actor, self._weights(other)["actor_state_dict"], str(other))
+        state = self._weights(run_dir)
         start_from(self.alg.actor, state["actor_state_dict"], str(run_dir))
         self.alg.actor.reset()
         with contextlib.suppress(CheckpointError):
             start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
+
+    def _weights(self, run_dir: str | Path) -> dict:
+        return load_checkpoint(latest_checkpoint(run_dir), self.device)
 
     def _iterate(self, obs: TensorDict, last: int) -> TensorDict:
         """One iteration: rollout, returns, update, log; returns the observations to go on from."""

@@ -14,6 +14,32 @@ _FIRST_LAYER = "mlp.0.weight"
 _OPTIONAL = ("perception.", "read_out.")
 
 
+def perceive_as(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> None:
+    """Copies the perception network of another run, and what reads it out, into a model, whatever the rest observes.
+
+    Args:
+        model: whose weights are replaced in place.
+        weights: the state of the other.
+        source: names the other run in an error.
+
+    Raises:
+        CheckpointError: the other run perceives nothing, or otherwise.
+    """
+    state = model.state_dict()
+    perceived = [name for name in state if name.startswith(_OPTIONAL)]
+    for name in perceived:
+        if name not in weights or weights[name].shape != state[name].shape:
+            given = "nothing" if name not in weights else f"shape {tuple(weights[name].shape)}"
+            raise CheckpointError(
+                f"init={source} does not give its perception: this run's {name} has shape {tuple(state[name].shape)},"
+                f" that run's {given}; give both the same perception"
+            )
+    if not perceived:
+        raise CheckpointError(f"init={source} is to give its perception, but this run has none; give one run alone")
+    for name in perceived:
+        state[name].copy_(weights[name])
+
+
 def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> None:
     """Copies the actor's weights of another run into a model with the same one-dimensional observations.
 

@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from omniperception import config
 from omniperception.build import build_runner
 from omniperception.env.config import HEIGHT_TARGET
 from omniperception.learning import CheckpointError
 from omniperception.learning.checkpoint import checkpoint_path
 
 SMALL = ("num_envs=8", "ppo.hidden_dims=[32,16]", "ppo.num_mini_batches=2", "ppo.num_steps_per_env=10")
-BLIND = ("experiment=walk", *SMALL)
+BLIND = ("experiment=gait", *SMALL)
 SEEING = ("experiment=avoid", *SMALL, "lidar.num_rays=200", "perception.supervised_epochs=1")
+OTHERWISE = ("init=unread", "observations.groups.proprioception.history=2")
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +28,9 @@ def walk(make_config, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def seeing(make_config, tmp_path_factory):
-    """Run directory and runner of a policy that perceives."""
+    """Run directory and runner of a policy that perceives, with another history than the others."""
     folder = tmp_path_factory.mktemp("seeing")
-    runner = build_runner(make_config(*SEEING, "init=unread", "seed=9"), None)
+    runner = build_runner(make_config(*SEEING, *OTHERWISE, "seed=9"), None)
     runner.save(checkpoint_path(folder, 1))
     return folder, runner
 
@@ -48,7 +48,7 @@ def test_walks_alike_before_it_has_seen_anything(make_config, walk):
 
 def test_perception_comes_along_where_it_fits(make_config, seeing):
     run_dir, first = seeing
-    second = build_runner(make_config(*SEEING, "init=unread", "seed=10"), None)
+    second = build_runner(make_config(*SEEING, *OTHERWISE, "seed=10"), None)
     before = [p.clone() for p in second.alg.actor.perception_parameters()]
     second.start_from(run_dir)
     mine, theirs = second.alg.actor.state_dict(), first.alg.actor.state_dict()
@@ -60,8 +60,7 @@ def test_a_gait_and_perception_are_joined(make_config, walk, seeing):
     (run_dir, blind), (seeing_dir, seeing) = walk, seeing
     run = make_config(*SEEING, f"init=[{seeing_dir},{run_dir}]", "seed=10")
     joined = build_runner(run, None)
-    for name in run.init:
-        joined.start_from(config.find_run(name, "init"))
+    joined.start_from(*run.init)
     assert torch.equal(joined.alg.actor.mlp[2].weight, blind.alg.actor.mlp[2].weight)
     assert torch.equal(joined.alg.actor.obs_normalizer._mean, blind.alg.actor.obs_normalizer._mean)
     mine, theirs = joined.alg.actor.state_dict(), seeing.alg.actor.state_dict()
@@ -69,9 +68,19 @@ def test_a_gait_and_perception_are_joined(make_config, walk, seeing):
     assert perceived and all(torch.equal(mine[name], theirs[name]) for name in perceived)
 
 
+def test_what_does_not_perceive_alike_is_not_joined(make_config, walk, seeing):
+    (run_dir, blind), (seeing_dir, _) = walk, seeing
+    for perception in ("perception=proximity_gru", "perception.history=4"):
+        runner = build_runner(make_config(*SEEING, "init=unread", perception), None)
+        with pytest.raises(CheckpointError, match=r"does not give its perception: .* both the same perception"):
+            runner.start_from(run_dir if "history" in perception else seeing_dir, run_dir)
+    with pytest.raises(CheckpointError, match="this run has none; give one run alone"):
+        blind.start_from(seeing_dir, run_dir)
+
+
 def test_other_observations_are_refused(make_config, walk):
     run_dir, _ = walk
-    runner = build_runner(make_config(*SEEING, "init=unread", "observations.groups.proprioception.history=2"), None)
+    runner = build_runner(make_config(*SEEING, *OTHERWISE), None)
     with pytest.raises(CheckpointError, match=r"init=.* does not fit: this run's .* give both the same observations"):
         runner.start_from(run_dir)
 
@@ -79,7 +88,7 @@ def test_other_observations_are_refused(make_config, walk):
 @pytest.mark.slow
 def test_perception_learns_and_the_policy_stays_as_it_is(make_config, walk):
     run_dir, _ = walk
-    terrain = ("terrain=mixed", "perception.height_weight=1.0")
+    terrain = ("terrain=mixed", "perception.height_weight=1.0", "randomization=lidar")
     often = ("perception.learning_rate=1e-3", "perception.supervised_epochs=4")
     runner = build_runner(make_config(*SEEING, *terrain, f"init={run_dir}", *often), None)
     runner.start_from(run_dir)
