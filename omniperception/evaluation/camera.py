@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -33,19 +33,21 @@ class Place:
 
 CAMERAS = {
     "chase": Place(2.7, 26.0, 180.0, 0.8),
-    "top": Place(6.5, 82.0, 180.0, 0.8, turns=False),
+    "top": Place(5.0, 82.0, 180.0, 0.8, turns=False),
     "side": Place(2.6, 14.0, -90.0, 0.2),
 }
-PIVOT_M = 0.3
-"""Height above the ground of the point that the camera keeps in view."""
+PIVOT_M, LOW_M = 0.3, 0.1
+"""Heights above the ground of the point that the camera never loses, and of what it sees of the legs where it can."""
 STEEPEST_DEG, STEPS = 85.0, 7
 """It looks from as high up as needed, up to this, in so many steps."""
 ENOUGH, LEAST_SHARE = 0.9, 0.05
 """Share of the way to its place with which it is content, and the least that it goes."""
-BESIDE_M, BEFORE_M = 0.25, 0.1
-"""Room that the camera has beside it, and before what it would be behind."""
-FOLLOW_S, TURN_S, RISE_S, RETREAT_S = 0.25, 0.9, 0.35, 0.8
-"""Time constants with which it follows position and heading, changes its elevation, and goes back to its distance."""
+BESIDE_M, NEARER_M, HIGHER_M = 0.1, 0.4, 0.6
+"""Room that the camera always has beside it; room with less than which it begins to come nearer, and to rise."""
+BEFORE_M = 0.1
+"""Room that it has before what it would be behind."""
+FOLLOW_S, TURN_S, RISE_S, APPROACH_S, RETREAT_S = 0.25, 0.9, 0.35, 0.15, 0.8
+"""Time constants with which it follows position and heading, changes its elevation, comes nearer and goes back."""
 
 
 class FollowCamera:
@@ -58,12 +60,14 @@ class FollowCamera:
             kind: one of `CAMERAS`.
         """
         self._place = CAMERAS[kind]
-        constants = FOLLOW_S, TURN_S, RISE_S, RETREAT_S
-        self._keep_pos, self._keep_heading, self._keep_elevation, self._keep_share = (
+        constants = FOLLOW_S, TURN_S, RISE_S, APPROACH_S, RETREAT_S
+        self._keep_pos, self._keep_heading, self._keep_elevation, self._keep_far, self._keep_near = (
             math.exp(-dt / constant) for constant in constants
         )
         self._pos: torch.Tensor | None = None
-        self._elevation, self._share = self._place.elevation_deg, 1.0
+        lowest = self._place.elevation_deg
+        self._elevations = [lowest + k * (STEEPEST_DEG - lowest) / (STEPS - 1) for k in range(STEPS)]
+        self._elevation, self._share = lowest, 1.0
 
     def cut(self) -> None:
         """Starts again at the robot's next pose."""
@@ -80,47 +84,38 @@ class FollowCamera:
         self._pos = self._keep_pos * self._pos + (1 - self._keep_pos) * foot_w
         self._heading = self._keep_heading * self._heading + (1 - self._keep_heading) * heading
         ahead = self._heading / self._heading.norm().clamp(min=1e-6)
-        up = foot_w.new_tensor([0.0, 0.0, PIVOT_M])
-        seen, middle = foot_w + up, self._pos + up  # the robot, and what the camera turns around
+        up = foot_w.new_tensor([0.0, 0.0, 1.0])
+        seen, legs, middle = foot_w + PIVOT_M * up, foot_w + LOW_M * up, self._pos + PIVOT_M * up
 
-        wanted = self._free_elevation(seen, middle, ahead, free_share)
+        def shares(start: torch.Tensor, elevations: Sequence[float], beside: float) -> list[float]:
+            """Free shares of the ways from `start` to the camera's place and points beside it, by elevation (deg)."""
+            ends = torch.cat([middle + self._around(ahead, elevation, beside) for elevation in elevations])
+            found = free_share(start, ends).unflatten(0, (len(elevations), -1)).amin(1)
+            before = torch.where(found < 1.0, BEFORE_M / self._place.distance, 0.0)
+            return (found - before).clamp(min=LEAST_SHARE).tolist()
+
+        wanted = self._wanted_elevation(shares(seen, self._elevations, HIGHER_M), shares(legs, self._elevations, 0.0))
         self._elevation = wanted if begins else wanted + self._keep_elevation * (self._elevation - wanted)
-        (free,) = self._shares(seen, middle, ahead, [self._elevation], free_share)
-        self._share = free if begins else min(free, 1.0 + self._keep_share * (self._share - 1.0))
+        (wide,), (free,) = (shares(seen, [self._elevation], beside) for beside in (NEARER_M, BESIDE_M))
+        keep = self._keep_far if wide < self._share else self._keep_near
+        self._share = min(free, wide if begins else wide + keep * (self._share - wide))
         end = middle + self._place.distance * self._direction(ahead, self._elevation)
-        target = self._pos + torch.cat((self._share * self._place.look_ahead * ahead, ahead.new_tensor([0.2])))
+        target = self._pos + self._share * self._place.look_ahead * torch.cat((ahead, ahead.new_zeros(1))) + 0.2 * up
         return seen + self._share * (end - seen), target
 
-    def _free_elevation(
-        self, seen: torch.Tensor, middle: torch.Tensor, ahead: torch.Tensor, free_share: FreeShare
-    ) -> float:
+    def _wanted_elevation(self, of_base: list[float], of_legs: list[float]) -> float:
         """The lowest elevation (deg) at which hardly anything is in the way, or else where most of the way is free."""
-        lowest = self._place.elevation_deg
-        elevations = [lowest + k * (STEEPEST_DEG - lowest) / (STEPS - 1) for k in range(STEPS)]
-        shares = self._shares(seen, middle, ahead, elevations, free_share)
+        shares = [min(both) for both in zip(of_base, of_legs, strict=True)]
         best = min(ENOUGH, max(shares))
-        return next(e for e, share in zip(elevations, shares, strict=True) if share >= best)
+        return next(e for e, share in zip(self._elevations, shares, strict=True) if share >= best)
 
-    def _shares(
-        self,
-        seen: torch.Tensor,
-        middle: torch.Tensor,
-        ahead: torch.Tensor,
-        elevations: list[float],
-        free_share: FreeShare,
-    ) -> list[float]:
-        """Shares of the ways from the robot to the camera's place that it can take, by elevation (deg)."""
-        ends = []
-        for elevation in elevations:
-            way = self._direction(ahead, elevation)
-            right = torch.linalg.cross(way, way.new_tensor([0.0, 0.0, 1.0]))
-            right = right / right.norm()
-            up = torch.linalg.cross(right, way)
-            sides = torch.stack((0.0 * right, right, -right, up, -up))
-            ends.append(middle + self._place.distance * way + BESIDE_M * sides)
-        shares = free_share(seen, torch.cat(ends)).unflatten(0, (len(elevations), -1)).amin(1)
-        before = BEFORE_M / self._place.distance
-        return [1.0 if share >= 1.0 else max(share - before, LEAST_SHARE) for share in shares.tolist()]
+    def _around(self, ahead: torch.Tensor, elevation_deg: float, beside: float) -> torch.Tensor:
+        """(5, 3) the camera's place and points beside it (m), from the pivot."""
+        way = self._direction(ahead, elevation_deg)
+        right = torch.linalg.cross(way, way.new_tensor([0.0, 0.0, 1.0]))
+        right = right / right.norm()
+        up = torch.linalg.cross(right, way)
+        return self._place.distance * way + beside * torch.stack((0.0 * right, right, -right, up, -up))
 
     def _direction(self, ahead: torch.Tensor, elevation_deg: float) -> torch.Tensor:
         """(3,) unit vector from the pivot to the camera."""

@@ -14,6 +14,8 @@ GLASS, RIM, TEXT = (16, 20, 28, 150), (255, 255, 255, 90), (240, 243, 247, 255)
 """Behind what is drawn, of its lines, of its letters; RGBA."""
 PERCEIVED, TRUE = (226, 60, 200), (240, 243, 247)
 """Obstacles by sector."""
+DEPTH_M = 0.4
+"""Depth of the band that is filled from a perceived obstacle outwards."""
 SMOOTH = 3
 """The inset is drawn so many times as large, then reduced."""
 
@@ -38,7 +40,7 @@ def legend(entries: Mapping[str, Rgb], height: int) -> Image.Image:
 def sector_plot(perceived: np.ndarray | None, true: np.ndarray | None, size: int) -> Image.Image:
     """Where the nearest obstacle of each azimuth sector is, ahead up and left to the left.
 
-    Filled: what is perceived, from the obstacle outwards. Lines: what is true.
+    Bands, from the obstacle outwards: what is perceived. Lines: what is true.
 
     Args:
         perceived, true: (S, 3) `Perceived.sectors`; None: nothing is drawn.
@@ -58,8 +60,9 @@ def sector_plot(perceived: np.ndarray | None, true: np.ndarray | None, size: int
     for inner, low, high in _wedges(perceived, outer):
         angles = np.radians(np.linspace(low, high, 5))
         rim = np.stack((np.cos(angles), np.sin(angles)), 1)
-        corners = middle + np.concatenate((inner * rim, outer * rim[::-1]))
-        draw.polygon([tuple(corner) for corner in corners], fill=(*PERCEIVED, 200))
+        far = min(inner + outer * DEPTH_M / NEARNESS_RANGE, outer)
+        corners = middle + np.concatenate((inner * rim, far * rim[::-1]))
+        draw.polygon([tuple(corner) for corner in corners], fill=PERCEIVED)
     for inner, low, high in _wedges(true, outer):
         draw.arc(box(inner + 0.012 * full), low, high, fill=TRUE, width=round(0.024 * full))
     tip = 0.055 * full

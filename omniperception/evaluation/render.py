@@ -29,12 +29,12 @@ CAMERA_LIGHT = 0.36
 TO_SUN = (-0.42, 0.46, 0.78)
 FOG_M = 28.0
 """Distance (m) at which the ground has faded to 1/e into the horizon."""
-POINT_M = 0.011
+POINT_M = 0.009
 """Radius of a LiDAR point as if it were a thing in the world."""
 POINT_PX = 0.7, 2.6
 """Least and most of it in a picture of 720 lines."""
-FAINT_M, LEAST_OPACITY = 7.0, 0.35
-"""Distance (m) at which a point's opacity has faded to 1/e, and what it never falls below."""
+OPACITY, FAINT_M, LEAST_OPACITY = 0.8, 5.0, 0.3
+"""Of points as near as what the camera looks at; distance (m) beyond that at which it has faded to 1/e; the least."""
 
 
 @dataclass(frozen=True)
@@ -147,18 +147,19 @@ class Renderer:
         self.place(view.body_pos, view.body_quat, view.sizes)
         axes = _camera_axes(view.eye_w, view.target_w)
         rays = self._rays_c @ axes
-        ranges, classes, colour = self._shade(view, rays)
+        ranges, classes, arrows, colour = self._shade(view, rays)
         colour = torch.where((classes >= 0)[:, None], colour, _sky(rays))
         shape = self._rows, self._columns
         colour = colour.clamp(0.0, 1.0).pow(1 / 2.2).unflatten(0, shape)
         slack = torch.where(classes == HitClass.ROBOT, 0.02, 0.06 + 0.02 * ranges)
-        self._draw_points(colour, (ranges + slack).unflatten(0, shape), view, axes)
+        seen_to = torch.where(arrows, 0.0, ranges + slack)  # points would cover the arrows
+        self._draw_points(colour, seen_to.unflatten(0, shape), view, axes)
         if self._samples > 1:
             colour = torch.nn.functional.avg_pool2d(colour.permute(2, 0, 1), self._samples).permute(1, 2, 0)
         return (colour * 255.0 + 0.5).to(torch.uint8).cpu()
 
-    def _shade(self, view: View, rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Distance (m), class and linear colour of what each ray has hit."""
+    def _shade(self, view: View, rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Distance (m) and class of what each ray has hit, whether it is an arrow, and its linear colour."""
         strips = (self._scene.num_envs, -1)
         origins = view.eye_w.expand_as(rays)
         hits = self._scene.cast(origins.unflatten(0, strips), rays.unflatten(0, strips), normals=True)
@@ -170,7 +171,14 @@ class Renderer:
         ground = (classes == HitClass.TERRAIN).nonzero().flatten()
         footprint = ranges[ground] / self._focal
         stretched = footprint / rays[ground, 2].abs().clamp(min=1e-3)
-        albedo[ground] = self._paint_ground(albedo[ground], points[ground, :2], footprint, stretched, view.arrows)
+        albedo[ground] *= DARK_SQUARES + (1 - DARK_SQUARES) * _checkers(
+            points[ground, :2] / SQUARE_M, stretched / SQUARE_M
+        )
+        painted = torch.zeros_like(ranges, dtype=torch.bool)
+        for arrow in view.arrows:
+            cover = (0.5 - _arrow_distance(points[ground, :2], arrow) / footprint).clamp(0.0, 1.0)[:, None]
+            albedo[ground] += cover * (_vector(arrow.colour, rays.device) - albedo[ground])
+            painted[ground] |= cover[:, 0] > 0
         facing = normals @ self._to_sun
         light = facing.clamp(min=0.0) * ~self._shadowed(points, normals, (classes >= 0) & (facing > 0))
         up = (0.5 + 0.5 * normals[:, 2:]).clamp(0.0, 1.0)
@@ -178,22 +186,7 @@ class Renderer:
         sun, sky, earth, horizon = (_vector(c, rays.device) for c in (SUN, SKY_LIGHT, GROUND_LIGHT, HORIZON))
         colour = albedo * (light[:, None] * sun + earth + up * (sky - earth) + fill)
         clear = torch.where(classes >= 0, torch.exp(-((ranges / FOG_M) ** 2)), 0.0)[:, None]
-        return ranges, classes, colour * clear + horizon * (1 - clear)
-
-    def _paint_ground(
-        self,
-        albedo: torch.Tensor,
-        xy_w: torch.Tensor,
-        footprint: torch.Tensor,
-        stretched: torch.Tensor,
-        arrows: tuple[Arrow, ...],
-    ) -> torch.Tensor:
-        board = _checkers(xy_w / SQUARE_M, stretched / SQUARE_M)[:, None]
-        albedo = albedo * (DARK_SQUARES + (1 - DARK_SQUARES) * board)
-        for arrow in arrows:
-            cover = (0.5 - _arrow_distance(xy_w, arrow) / footprint).clamp(0.0, 1.0)[:, None]
-            albedo = albedo + cover * (_vector(arrow.colour, albedo.device) - albedo)
-        return albedo
+        return ranges, classes, painted, colour * clear + horizon * (1 - clear)
 
     def _shadowed(self, points: torch.Tensor, normals: torch.Tensor, lit: torch.Tensor) -> torch.Tensor:
         """Tell whether each of the points that face the sun lies in a shadow."""
@@ -232,7 +225,8 @@ class Renderer:
         row, column, proximal = row[inside], column[inside], proximal[inside]
         distance = offset[inside].norm(dim=1)
         radius = (self._focal * POINT_M / distance).clamp(max(least, 0.5), max(most, 1.0))
-        opacity = torch.exp(-distance / FAINT_M).clamp(min=LEAST_OPACITY)
+        beyond = (distance - (view.target_w - view.eye_w).norm()).clamp(min=0.0)
+        opacity = (OPACITY * torch.exp(-beyond / FAINT_M)).clamp(min=LEAST_OPACITY)
         device = colour.device
         dots = torch.where(proximal[:, None], _vector(PROXIMAL, device), _vector(DISTAL, device)).pow(1 / 2.2)
         for down_px in range(-reach, reach + 1):
@@ -261,14 +255,14 @@ def _sky(rays: torch.Tensor) -> torch.Tensor:
 
 
 def _checkers(xy: torch.Tensor, width: torch.Tensor) -> torch.Tensor:
-    """A board of unit squares of 0 and 1 averaged over boxes of a width, so that it fades out far away.
+    """A board of unit squares of 0 and 1 averaged over boxes of a width (n,), so that it fades out far away; (n, 1).
 
     The closed form is Inigo Quilez's 'Filtering the checkerboard pattern'.
     """
     width = width.clamp(min=1e-4)[:, None]
     low, high = (xy - 0.5 * width) / 2, (xy + 0.5 * width) / 2
     mean = 2.0 * (((low - low.floor()) - 0.5).abs() - ((high - high.floor()) - 0.5).abs()) / width
-    return 0.5 - 0.5 * mean.prod(1)
+    return 0.5 - 0.5 * mean.prod(1, keepdim=True)
 
 
 def _arrow_distance(xy_w: torch.Tensor, arrow: Arrow) -> torch.Tensor:

@@ -27,6 +27,8 @@ MIN_ARROW = 0.1
 """Speeds (m/s) below this have no arrow."""
 INSET, MARGIN = 0.27, 0.02
 """Side of the inset and distance of what is drawn over a picture from its edges, by the picture's height."""
+GAP_PX = 2
+"""Between the pictures of a grid."""
 LEAST_INSET = 40
 """Pixels below which there is no inset."""
 
@@ -127,13 +129,14 @@ class Recorder:
     def _picture(self, renderer: Renderer, moments: list[Moment]) -> Image.Image:
         """The panels side by side, with what is drawn over them."""
         (columns, _), (width, height) = self._options.grid, self._options.panel
+        gap = GAP_PX if len(moments) > 1 else 0
         picture = Image.new("RGB", (self._options.size[0], self._options.size[1]))
         for k, moment in enumerate(moments):
             panel = Image.fromarray(renderer.render(moment.view).numpy())
             if moment.perceived is not None and INSET * height >= LEAST_INSET:
                 plot, margin = sector_plot(moment.perceived, moment.true, round(INSET * height)), round(MARGIN * height)
                 panel.paste(plot, (width - plot.width - margin, margin), plot)
-            picture.paste(panel, (k % columns * width, k // columns * height))
+            picture.paste(panel.crop((0, 0, width - gap, height - gap)), (k % columns * width, k // columns * height))
         colours = {"command": shown(COMMAND), "velocity": shown(VELOCITY)}
         if self._env.sensing is not None:
             colours = {"proximal points": shown(PROXIMAL), "distal points": shown(DISTAL), **colours}
