@@ -128,6 +128,7 @@ class PPOConfig:
         critic_warmup: iterations at the beginning in which only the critic learns, for a policy that starts from
             another run's weights (init=): advantages by a critic that knows nothing destroy it.
         final_entropy_coef: entropy_coef at the last iteration, to which it changes evenly; None: it stays as it is.
+        final_desired_kl: desired_kl at the last iteration, likewise: smaller steps at the end.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
         The others are rsl_rl's PPO arguments.
     """
@@ -155,6 +156,7 @@ class PPOConfig:
     obs_normalization: bool
     mixed_precision: bool | None = False
     final_entropy_coef: float | None = None
+    final_desired_kl: float | None = None
     critic_warmup: int = 0
     symmetry: bool = False
 
@@ -174,6 +176,10 @@ class PPOConfig:
         for name in ("clip_param", "learning_rate", "max_grad_norm", "init_std", "desired_kl"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive")
+        if self.final_desired_kl is not None and self.final_desired_kl <= 0:
+            raise ValueError(f"ppo.final_desired_kl={self.final_desired_kl} must be positive or null")
+        if self.final_desired_kl is not None and self.schedule != "adaptive":
+            raise ValueError("ppo.final_desired_kl is for ppo.schedule=adaptive; give one of them")
         for name in ("gamma", "lam"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must lie in [0, 1]")

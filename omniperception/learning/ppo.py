@@ -67,7 +67,7 @@ class PerceptivePpo(PPO):
         if kwargs.get("symmetry_cfg") is not None:
             self.symmetry: Symmetry | None = MirrorImages(**kwargs["symmetry_cfg"])
         self.num_updates = 0
-        self._entropy = (self.entropy_coef, self.entropy_coef, 1)
+        self._annealed: dict[str, tuple[float, float, int]] = {}
         self.critic_warmup, self.distillation = 0, None
         self.learns_policy = self.num_learning_epochs > 0
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
@@ -146,8 +146,9 @@ class PerceptivePpo(PPO):
             multi_gpu_cfg=multi_gpu,
             **ppo.algorithm(device),
         )
-        if ppo.final_entropy_coef is not None:
-            algorithm.anneal_entropy(ppo.final_entropy_coef, ppo.max_iterations)
+        for name, final in (("entropy_coef", ppo.final_entropy_coef), ("desired_kl", ppo.final_desired_kl)):
+            if final is not None:
+                algorithm.anneal(name, final, ppo.max_iterations)
         algorithm.critic_warmup, algorithm.distillation = ppo.critic_warmup, config.distillation
         if config.estimator is not None and algorithm.learns_policy:
             algorithm.fit_estimator(config.estimator)
@@ -185,8 +186,8 @@ class PerceptivePpo(PPO):
     def update(self) -> dict[str, float]:
         """Learn from a full rollout; mean losses, among them those of the supervised targets."""
         self.guard.start(self.num_updates)
-        first, last, num_updates = self._entropy
-        self.entropy_coef = first + (last - first) * min(self.num_updates / num_updates, 1.0)
+        for name, (first, last, num_updates) in self._annealed.items():
+            setattr(self, name, first + (last - first) * min(self.num_updates / num_updates, 1.0))
         if self.perception_optimizer is not None:
             acted_on = self._embed_rollout() if self.learns_policy else None
             self.train_perception()
@@ -285,9 +286,9 @@ class PerceptivePpo(PPO):
                 self.guard.check_gradients("perception network", self._perception_parameters)
                 optimizer.step()
 
-    def anneal_entropy(self, final: float, num_updates: int) -> None:
-        """Let the entropy coefficient change evenly to `final` within `num_updates` updates."""
-        self._entropy = (self.entropy_coef, final, num_updates)
+    def anneal(self, name: str, final: float, num_updates: int) -> None:
+        """Let one of rsl_rl's settings change evenly to `final` within `num_updates` updates."""
+        self._annealed[name] = (getattr(self, name), final, num_updates)
 
     def fit_estimator(self, config: EstimatorConfig) -> None:
         """Let the truth train the actor's estimator."""

@@ -119,6 +119,20 @@ def test_the_entropy_coefficient_falls():
     assert algorithm(env, frames=False, entropy_coef=0.01).entropy_coef == 0.01
 
 
+def test_steps_get_smaller():
+    env = ToyEnv(4, frames=False)
+    alg, seen = algorithm(env, frames=False, desired_kl=0.02, final_desired_kl=0.002, max_iterations=2), []
+    for _ in range(4):
+        collect(alg, env, 8)
+        alg.update()
+        seen.append(alg.desired_kl)
+    assert seen == pytest.approx([0.02, 0.011, 0.002, 0.002])
+    with pytest.raises(ValueError, match="final_desired_kl=0.0 must be positive"):
+        algorithm(env, frames=False, final_desired_kl=0.0)
+    with pytest.raises(ValueError, match="is for ppo.schedule=adaptive"):
+        algorithm(env, frames=False, final_desired_kl=0.002, schedule="fixed")
+
+
 def test_the_critic_warms_up_alone():
     env = ToyEnv(4)
     alg = algorithm(env, critic_warmup=2)
