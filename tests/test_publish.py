@@ -9,13 +9,13 @@ from omniperception import build, config
 from omniperception.build import build_runner, load_policy
 from omniperception.common import provenance
 from omniperception.deploy import publish
-from omniperception.learning.checkpoint import checkpoint_path, latest_checkpoint
+from omniperception.learning.checkpoint import checkpoint_path, latest_checkpoint, load_checkpoint, save_checkpoint
 
 
 @pytest.fixture
 def run(make_config, tmp_path):
     """A run directory with a checkpoint of everything."""
-    run = make_config("experiment=avoid", "init=unread", "terrain=flat", "num_envs=2", "lidar.num_rays=200")
+    run = make_config("experiment=avoid", "init=[seen,walked]", "terrain=flat", "num_envs=2", "lidar.num_rays=200")
     config.save(run.composed, tmp_path / "run")
     build_runner(run, None).save(str(checkpoint_path(tmp_path / "run", 0)))
     return tmp_path / "run"
@@ -35,6 +35,15 @@ def test_it_comes_from_where_the_run_does(run, tmp_path):
     provenance.write(run, {"commit": "0123abc", "date": "2026-01-31"})
     record = publish.publish(run, tmp_path / "published")
     assert record["commit"] == "0123abc" and record["run"] == str(run) and record["iterations"] == 0
+    assert record["init"] == ["seen", "walked"]
+
+
+def test_steps_are_those_of_all_processes(run, tmp_path, monkeypatch):
+    newest = latest_checkpoint(run)
+    state = load_checkpoint(newest, "cpu")
+    state["logger"]["total_steps"] = 96
+    save_checkpoint(newest, state)
+    assert publish.publish(run, tmp_path / "published")["control_steps"] == 96
 
 
 def test_another_run_starts_from_it(run, tmp_path, make_config):

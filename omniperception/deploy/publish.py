@@ -53,14 +53,13 @@ def publish(run_dir: Path, folder: Path) -> dict:
     assert isinstance(plain, dict)
     config.save(plain, folder)
     save_checkpoint(checkpoint_path(folder, state["iteration"]), {**weights, "iteration": state["iteration"]})
-    steps = state["iteration"] * composed.num_envs * composed.ppo.num_steps_per_env
     record = {
         **(provenance.read(run_dir) or provenance.provenance("cpu")),
         "run": str(run_dir),
-        "init": composed.get("init"),
+        "init": plain.get("init"),
         "seed": composed.seed,
         "iterations": state["iteration"],
-        "control_steps": steps,
+        "control_steps": state["logger"]["total_steps"],
         "training_hours": round(state["total_time"] / 3600, 3),
     }
     provenance.write(folder, record)
