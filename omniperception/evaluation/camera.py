@@ -42,11 +42,11 @@ STEEPEST_DEG, STEPS = 85.0, 7
 """It looks from as high up as needed, up to this, in so many steps."""
 ENOUGH, LEAST_SHARE = 0.9, 0.05
 """Share of the way to its place with which it is content, and the least that it goes."""
-BESIDE_M, NEARER_M, HIGHER_M = 0.1, 0.4, 0.6
+BESIDE_M, NEARER_M, HIGHER_M = 0.1, 0.5, 0.75
 """Room that the camera always has beside it; room with less than which it begins to come nearer, and to rise."""
 BEFORE_M = 0.1
 """Room that it has before what it would be behind."""
-FOLLOW_S, TURN_S, RISE_S, APPROACH_S, RETREAT_S = 0.25, 0.9, 0.35, 0.15, 0.8
+FOLLOW_S, TURN_S, RISE_S, APPROACH_S, RETREAT_S = 0.25, 1.2, 0.5, 0.2, 0.8
 """Time constants with which it follows position and heading, changes its elevation, comes nearer and goes back."""
 
 
