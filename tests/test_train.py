@@ -66,7 +66,7 @@ def test_the_composed_configuration_is_printed(capsys):
 
 def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    quick = ("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1", "ppo.hidden_dims=[32,16]")
+    quick = ("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1", "ppo.mixed_precision=false", SMALL[-1])
     main(["train", "experiment=gait", *quick, "ppo.max_iterations=1", "hydra.run.dir=gait"])
     main(["train", "experiment=walk", *quick, "ppo.max_iterations=1", "hydra.run.dir=walk"])
     student = ("experiment=end_to_end", "init=gait", *quick, "lidar.num_rays=200", "terrain=flat")

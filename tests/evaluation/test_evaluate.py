@@ -172,7 +172,7 @@ def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
     run, walker = ROOT / "pretrained/avoider", ROOT / "pretrained/gait"
     for walks in (None, walker):
         Task(evaluation(run, "static", walker=walks), run, "oracle", World("static"))._contender()
-    assert given == [None, ((-1.0, 1.5), (-1.0, 1.0))]
+    assert given == [None, ((-1.0, 2.0), (-1.5, 1.5))]
 
 
 def test_what_does_not_fit_the_run_is_refused(walker):
