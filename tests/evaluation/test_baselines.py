@@ -121,7 +121,13 @@ class TestFromClouds:
             f"{{wall: {{kind: box, count: 1, size: [[0.1, 0.1], [2.0, 2.0], [0.5, 0.5]], poses: [[{x}, 0.0, 0.0]]}}}}"
         )
         ahead = ("lin_vel_x=[0.8,0.8]", "lin_vel_y=[0,0]", "ang_vel_z=[0,0]", "standing=0", "spawn.yaw_deg=[0,0]")
-        given = ("obstacles=none", f"obstacles.groups={wall}", *(f"commands.{value}" for value in ahead))
+        given = (
+            "terrain=flat",
+            "condition=ideal",
+            "obstacles=none",
+            f"obstacles.groups={wall}",
+            *(f"commands.{value}" for value in ahead),
+        )
         avoider, heard = trained(name, *given, "num_envs=2"), []
         env = avoider.env
 
