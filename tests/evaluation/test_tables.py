@@ -120,6 +120,8 @@ def test_every_result_on_the_test_split_is_noted():
     names = ("run", "weights", "policy", "world", "terrain", "condition", "condition_version", "seed", "commit")
     lab = ROOT / "docs" / "lab"
     lines = [json.loads(line) for line in (lab / "evaluations.jsonl").read_text().splitlines()]
+    for line in lines:
+        line["commit"] += "+changes" if line.get("changes") else ""
     noted = {tuple(line[name] for name in names) for line in lines}
     for path in (lab / "data").iterdir():
         for record in read(path):
