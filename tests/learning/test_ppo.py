@@ -108,25 +108,26 @@ def test_symmetry_and_frames_are_refused():
         PerceptivePpo.build(ToyEnv(4), replace(config(), actor_groups=()), "cpu")
 
 
-def test_the_entropy_coefficient_falls():
-    env = ToyEnv(4, frames=False)
-    alg, seen = algorithm(env, frames=False, entropy_coef=0.01, final_entropy_coef=0.002, max_iterations=4), []
+@pytest.mark.parametrize(
+    ("name", "first", "final", "expected"),
+    [
+        ("entropy_coef", 0.01, 0.002, [0.01, 0.008, 0.006, 0.004, 0.002, 0.002]),
+        ("desired_kl", 0.02, 0.012, [0.02, 0.018, 0.016, 0.014, 0.012, 0.012]),
+    ],
+)
+def test_a_setting_changes_evenly_to_its_final_value(name, first, final, expected):
+    env, seen = ToyEnv(4, frames=False), []
+    alg = algorithm(env, frames=False, max_iterations=4, **{name: first, f"final_{name}": final})
     for _ in range(6):
         collect(alg, env, 8)
         alg.update()
-        seen.append(alg.entropy_coef)
-    assert seen == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002, 0.002])
-    assert algorithm(env, frames=False, entropy_coef=0.01).entropy_coef == 0.01
+        seen.append(getattr(alg, name))
+    assert seen == pytest.approx(expected)
+    assert getattr(algorithm(env, frames=False, **{name: first}), name) == first
 
 
-def test_steps_get_smaller():
+def test_final_desired_kl_is_checked():
     env = ToyEnv(4, frames=False)
-    alg, seen = algorithm(env, frames=False, desired_kl=0.02, final_desired_kl=0.002, max_iterations=2), []
-    for _ in range(4):
-        collect(alg, env, 8)
-        alg.update()
-        seen.append(alg.desired_kl)
-    assert seen == pytest.approx([0.02, 0.011, 0.002, 0.002])
     with pytest.raises(ValueError, match="final_desired_kl=0.0 must be positive"):
         algorithm(env, frames=False, final_desired_kl=0.0)
     with pytest.raises(ValueError, match="is for ppo.schedule=adaptive"):
