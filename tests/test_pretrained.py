@@ -1,6 +1,7 @@
 """The weights in the repository replay, are small, and say where they come from."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from omniperception import build, config
 from omniperception.build import build_runner, load_policy
 from omniperception.common import provenance
 from omniperception.deploy import publish
-from omniperception.evaluation.baselines import blind
+from omniperception.evaluation.baselines import prepared
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.learning import latest_checkpoint
 
@@ -39,9 +40,10 @@ def test_what_it_sees_keeps_the_published_policy_from_touching():
     """Of 12 trials among standing obstacles it touches in at least 6 fewer than when it is blind."""
     run_dir, touched = RUNS[-1].with_name("avoider"), []
     overrides = ["scenario=static", "num_envs=12", "terminations.episode_length_s=10.0"]
-    for look in (lambda env, policy: policy, blind):
-        trained = load_policy(build.assemble(config.load(run_dir, overrides)), run_dir)
-        episodes = run_episodes(trained.env, look(trained.env, trained.policy), 12)
+    run = build.assemble(config.load(run_dir, overrides))
+    for name in ("run", "blind"):
+        trained = load_policy(replace(run, env=prepared(name, run.env, run.env.lidar)), run_dir)
+        episodes = run_episodes(trained.env, trained.policy, 12)
         touched.append(int((episodes.contacts > 0).sum()))
     seeing, unseeing = touched
     assert seeing <= unseeing - 6
