@@ -28,12 +28,9 @@ def perceive_as(model: MLPModel, weights: Mapping[str, torch.Tensor], source: st
     state = model.state_dict()
     perceived = [name for name in state if name.startswith(_OPTIONAL)]
     for name in perceived:
-        if name not in weights or weights[name].shape != state[name].shape:
-            given = "nothing" if name not in weights else f"shape {tuple(weights[name].shape)}"
-            raise CheckpointError(
-                f"init={source} does not give its perception: this run's {name} has shape {tuple(state[name].shape)},"
-                f" that run's {given}; give both the same perception"
-            )
+        own, other = state[name], weights.get(name)
+        if other is None or other.shape != own.shape:
+            raise _misfit(f"init={source} does not give its perception", name, own, other, "perception")
     if not perceived:
         raise CheckpointError(f"init={source} is to give its perception, but this run has none; give one run alone")
     for name in perceived:
@@ -66,9 +63,14 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
                 own[:, :shared] = other[:, :shared]
                 continue
         if other is None or other.shape != own.shape:
-            given = "nothing" if other is None else f"shape {tuple(other.shape)}"
-            raise CheckpointError(
-                f"init={source} does not fit: this run's {name} has shape {tuple(own.shape)}, that run's {given}; give"
-                " both the same observations (groups and history) and ppo.hidden_dims"
-            )
+            alike = "observations (groups and history) and ppo.hidden_dims"
+            raise _misfit(f"init={source} does not fit", name, own, other, alike)
         own.copy_(other)
+
+
+def _misfit(what: str, name: str, own: torch.Tensor, other: torch.Tensor | None, alike: str) -> CheckpointError:
+    """Of a weight that the other run lacks or has in another shape."""
+    given = "nothing" if other is None else f"shape {tuple(other.shape)}"
+    return CheckpointError(
+        f"{what}: this run's {name} has shape {tuple(own.shape)}, that run's {given}; give both the same {alike}"
+    )

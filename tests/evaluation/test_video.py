@@ -122,7 +122,7 @@ def test_more_samples_change_edges_only(renderer):
 
 
 def way_is_free(eye, robot, boxes):
-    """Whether a segment meets no box, by slabs; boxes are (centre, half sizes)."""
+    """Whether a segment meets no box, by the slab method; boxes are (centre, half sizes)."""
     for centre, half in boxes:
         with np.errstate(divide="ignore"):
             slabs = (np.stack((np.subtract(centre, half), np.add(centre, half))) - eye) / (robot - eye)
