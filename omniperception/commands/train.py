@@ -117,7 +117,9 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
     else:
         if run.init:
             _check_motion(OmegaConf.create(run.composed), run.init[-1])
-            runner.start_from(*(config.find_run(name, "init") for name in run.init))
+            given = [config.find_run(name, "init") for name in run.init]
+            estimates = run.env.observations.estimated is not None
+            runner.start_from(*given, observations=build.load_run(given[-1]).env.observations if estimates else None)
         report(f"run directory: {run_dir}")
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
         name = run.distillation.teacher

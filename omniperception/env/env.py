@@ -25,6 +25,7 @@ from omniperception.env.mdp.commands import GoalCommand, VelocityCommand
 from omniperception.env.mdp.curriculum import Curriculum
 from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
+from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 from omniperception.env.metrics import EpisodeMetrics
 from omniperception.env.state import CONTACT_SENSORS, EnvState
 from omniperception.scene import ObstacleField, build_world
@@ -385,6 +386,20 @@ class OmniEnv(VecEnv):
     def observation_widths(self, group: str) -> dict[str, int]:
         """Numbers of each term of an observation group, in order, per control step."""
         return {term: part.stop - part.start for term, part in self._groups[group].slices.items()}
+
+    def actor_inputs(self, observations: ObservationsConfig) -> list[ActorInput]:
+        """What the one-dimensional inputs of an actor with such observations are here, in order.
+
+        Args:
+            observations: of this environment or of another one.
+        """
+        inputs: list[ActorInput] = []
+        for name in observations.actor:
+            group = observations.groups[name]
+            slices = ObservationManager(name, group, self.state).slices.items()
+            for age in reversed(range(group.history)):
+                inputs += [ActorInput(name, term, age, i) for term, at in slices for i in range(at.stop - at.start)]
+        return inputs
 
     def terms_not_finite(self, name: str, env_id: int) -> list[str]:
         """Terms of "rewards", or of an observation group, that are not finite for an environment."""

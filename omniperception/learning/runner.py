@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,6 +15,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
 from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.terms import ObservationsConfig
 from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
     CheckpointError,
@@ -29,7 +31,7 @@ from omniperception.learning.config import LearningConfig
 from omniperception.learning.divergence import TrainingDiverged
 from omniperception.learning.logger import Logger
 from omniperception.learning.ppo import PerceptivePpo
-from omniperception.learning.warm_start import perceive_as, start_from
+from omniperception.learning.warm_start import estimating, perceive_as, start_from
 
 
 class Runner:
@@ -160,17 +162,27 @@ class Runner:
         """Load the actor's weights alone, to replay it."""
         self._load(path, {"actor": True})
 
-    def start_from(self, *run_dirs: str | Path) -> None:
+    def start_from(self, *run_dirs: str | Path, observations: ObservationsConfig | None = None) -> None:
         """Begin with the newest weights of other runs.
 
         The last one gives the actor's, and the critic's where it observes the same; those before give what they
         perceive with.
+
+        Args:
+            run_dirs: of these runs.
+            observations: of the last one, which may observe what this one estimates; None: the same as here.
         """
         *seeing, run_dir = run_dirs
         for other in seeing:
             perceive_as(self.alg.actor, self._weights(other)["actor_state_dict"], str(other))
         state = self._weights(run_dir)
-        start_from(self.alg.actor, state["actor_state_dict"], str(run_dir))
+        weights = state["actor_state_dict"]
+        if observations is not None and self.config.estimator is not None and observations.estimated is None:
+            own = self.env.config.observations
+            truth = self.env.actor_inputs(replace(own, actor=[self.config.estimator.group]))
+            given = self.env.actor_inputs(observations)
+            weights = estimating(self.alg.actor, weights, self.env.actor_inputs(own), given, truth)
+        start_from(self.alg.actor, weights, str(run_dir))
         self.alg.actor.reset()
         with contextlib.suppress(CheckpointError):
             start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from rsl_rl.models import MLPModel
+from rsl_rl.modules import EmpiricalNormalization
 
+from omniperception.env.mdp.terms import ActorInput
 from omniperception.learning.checkpoint import CheckpointError
 from omniperception.learning.estimator import EstimatingModel
 
-_FIRST_LAYER = "mlp.0.weight"
+_FIRST_LAYER, _FIRST_BIAS = "mlp.0.weight", "mlp.0.bias"
+_TRUE = "true_"  # how the observation begins that an estimator of another one is fitted to
 _OPTIONAL = ("perception.", "read_out.")
 
 
@@ -66,6 +69,53 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
             alike = "observations (groups and history) and ppo.hidden_dims"
             raise _misfit(f"init={source} does not fit", name, own, other, alike)
         own.copy_(other)
+
+
+def estimating(
+    model: EstimatingModel,
+    weights: Mapping[str, torch.Tensor],
+    own: Sequence[ActorInput],
+    given: Sequence[ActorInput],
+    truth: Sequence[ActorInput],
+) -> Mapping[str, torch.Tensor]:
+    """The weights of an actor that observes what a model estimates, rearranged for this model.
+
+    The estimate takes over what the measured values of all control steps weighed together: at a steady value, and
+    estimated without error, both actors act alike. Actors that differ in anything else are left as they are.
+
+    Args:
+        model: that estimates.
+        weights: the state of the other actor, which estimates nothing.
+        own: inputs of the model.
+        given: inputs of the other.
+        truth: what is estimated; of `true_<term>` for a term.
+    """
+    left_out = [column for column, one in enumerate(given) if one not in own]
+    column_of = {(one.term.removeprefix(_TRUE), one.component): column for column, one in enumerate(truth)}
+    observed = {(one.term, one.component) for one in own}
+    if not set(own) < set(given) or observed & column_of.keys():
+        return weights
+    if any((given[column].term, given[column].component) not in column_of for column in left_out):
+        return weights
+    kept = [given.index(one) for one in own]
+    layer, bias = weights[_FIRST_LAYER], weights[_FIRST_BIAS].clone()
+    mean, scale = torch.zeros(len(given)), torch.ones(len(given))
+    if isinstance(model.obs_normalizer, EmpiricalNormalization):
+        mean = weights["obs_normalizer._mean"][0]
+        scale = weights["obs_normalizer._std"][0] + model.obs_normalizer.eps
+    of_estimates = layer.new_zeros(len(layer), len(truth))
+    for column in left_out:
+        weight = layer[:, column] / scale[column]
+        of_estimates[:, column_of[given[column].term, given[column].component]] += weight
+        bias -= weight * mean[column]
+    rearranged = dict(weights)
+    rearranged[_FIRST_LAYER] = torch.cat((layer[:, kept], of_estimates, layer[:, len(given) :]), 1)
+    rearranged[_FIRST_BIAS] = bias
+    for name in ("obs_normalizer._mean", "obs_normalizer._var", "obs_normalizer._std"):
+        if name in weights:
+            rearranged[name] = weights[name][:, kept]
+    untrained = {name: value for name, value in model.state_dict().items() if name.startswith("estimator.")}
+    return rearranged | untrained
 
 
 def _misfit(what: str, name: str, own: torch.Tensor, other: torch.Tensor | None, alike: str) -> CheckpointError:

@@ -78,6 +78,46 @@ def test_what_does_not_perceive_alike_is_not_joined(make_config, walk, seeing):
         blind.start_from(seeing_dir, run_dir)
 
 
+def test_an_estimate_takes_over_what_was_measured(make_config, walk):
+    """With the true velocity, the same in all control steps, as its estimate."""
+    run_dir, measuring = walk
+    run = make_config(*BLIND, "observations=gait_without_velocity", f"init={run_dir}", "seed=5")
+    runner = build_runner(run, None)
+    runner.start_from(run_dir, observations=measuring.env.config.observations)
+    actor, group = runner.alg.actor, measuring.env.config.observations.groups["proprioception"]
+    assert actor.obs_dim == measuring.alg.actor.obs_dim - 3 * group.history and group.history > 1
+    observed, velocity = measuring.env.get_observations(), torch.tensor([0.7, -0.3, 0.1])
+    steps = observed["proprioception"].unflatten(1, (group.history, -1)).clone()
+    at = [
+        i
+        for i, one in enumerate(measuring.env.actor_inputs(measuring.env.config.observations))
+        if one[1] == "base_lin_vel"
+    ]
+    assert at[:3] == [24, 25, 26]
+    steps[..., 24:27] = velocity
+    without = torch.cat((steps[..., :24], steps[..., 27:]), -1)
+    obs = observed.clone()
+    obs["proprioception"] = without.flatten(1)
+    observed["proprioception"] = steps.flatten(1)
+    with torch.no_grad():
+        for parameter in actor.estimator.parameters():
+            parameter.zero_()
+        list(actor.estimator.parameters())[-1].copy_(velocity)
+        assert torch.allclose(actor(obs), measuring.alg.actor(observed), atol=1e-4)
+        list(actor.estimator.parameters())[-1].zero_()
+        assert not torch.allclose(actor(obs), measuring.alg.actor(observed), atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "other", ["observations.groups.proprioception.history=2", "observations.groups.proprioception.terms.joint_vel=null"]
+)
+def test_what_is_not_estimated_may_not_be_missing(make_config, walk, other):
+    run_dir, measuring = walk
+    runner = build_runner(make_config(*BLIND, "observations=gait_without_velocity", other), None)
+    with pytest.raises(CheckpointError, match="give both the same observations"):
+        runner.start_from(run_dir, observations=measuring.env.config.observations)
+
+
 def test_other_observations_are_refused(make_config, walk):
     run_dir, _ = walk
     runner = build_runner(make_config(*SEEING, *OTHERWISE), None)

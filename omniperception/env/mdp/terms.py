@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 
@@ -122,6 +122,22 @@ class ObservationGroup:
     def __post_init__(self) -> None:
         if self.history < 1:
             raise ValueError(f"observations: history={self.history} must be at least 1")
+
+
+class ActorInput(NamedTuple):
+    """What an input of an actor is.
+
+    Attributes:
+        group: of observations.
+        term: of the group.
+        age: control steps ago.
+        component: which of the term's numbers.
+    """
+
+    group: str
+    term: str
+    age: int
+    component: int
 
 
 @dataclass(frozen=True)
