@@ -75,7 +75,8 @@ NAMES: dict[str, Kind] = {
     ),
     "lidar.pattern": Kind(_members("lidar", **{name: name for name in _PATTERNS.split()}), built=False),
     "perception.sampler": Kind(
-        _members("perception", raw="RawSampler", fps="FpsSampler", pd="PdSampler", proximity="ProximitySampler"),
+        _members("perception", raw="RawSampler", fps="FpsSampler", pd="PdSampler", proximity="ProximitySampler")
+        | _members("perception", standing="StandingSampler"),
         built=False,
     ),
     "perception.network": Kind(

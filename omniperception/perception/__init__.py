@@ -15,6 +15,7 @@ from omniperception.perception.samplers.base import Attitude, Sampler
 if TYPE_CHECKING:
     from omniperception.perception.networks.rings import RingPath
     from omniperception.perception.samplers.sampling import FpsSampler, PdSampler, ProximitySampler, RawSampler
+    from omniperception.perception.samplers.standing import StandingSampler
 
 _SAMPLERS = "samplers.sampling"
 _NEEDS_WARP = {
@@ -23,6 +24,7 @@ _NEEDS_WARP = {
     "ProximitySampler": _SAMPLERS,
     "RawSampler": _SAMPLERS,
     "RingPath": "networks.rings",
+    "StandingSampler": "samplers.standing",
 }
 
 __all__ = [
@@ -41,6 +43,7 @@ __all__ = [
     "RawSampler",
     "RingPath",
     "Sampler",
+    "StandingSampler",
 ]
 
 

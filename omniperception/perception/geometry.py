@@ -96,14 +96,30 @@ def nearest_obstacles(
         attitude: of the base as measured, and the mount of the sensor.
         config: what is ground, noise and body.
     """
+    points, height = standing(ranges, directions_s, attitude, config)
+    stands = height < config.headroom
+    return by_sector(points[..., :2], stands, config)
+
+
+def standing(
+    ranges: torch.Tensor, directions_s: torch.Tensor, attitude: Attitude, config: GeometryConfig
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What stands on the ground or hangs over it.
+
+    Args: as of :func:`nearest_obstacles`.
+
+    Returns:
+        (n, R, 3) m, the points in the yaw-aligned frame at the base's origin; and (n, R) m, their height above the
+        ground below them, infinite for ground, noise, the robot itself and misses.
+    """
     in_base, points = _points(ranges, directions_s, attitude)
     counts = ranges.isfinite() & ~own_body(in_base, config)
     is_near = ranges < config.near
     height = height_above_ground(points, counts & ~is_near, config)
     least = config.min_height + config.rise * points[..., :2].norm(dim=-1) + config.lift * _steepness(points, attitude)
-    stands = counts & (height > least) & (height < config.headroom)
-    stands &= ~near_noise(points, stands & is_near, counts, attitude, config)
-    return by_sector(points[..., :2], stands, config)
+    stands = counts & (height > least)
+    stands &= ~near_noise(points, stands & is_near & (height < config.headroom), counts, attitude, config)
+    return points, torch.where(stands, height, math.inf)
 
 
 def _points(ranges: torch.Tensor, directions_s: torch.Tensor, attitude: Attitude) -> tuple[torch.Tensor, torch.Tensor]:

@@ -186,11 +186,7 @@ class ProximitySampler(PdSampler):
             ring_deg: height of a theta ring for sorting the proximal half, degrees.
             num_threads: CPU threads; all cores by default.
         """
-        edges = [float(edge) for edge in band_edges]
-        if len(edges) < 2 or any(low >= high for low, high in itertools.pairwise(edges)):
-            raise ValueError(f"band_edges={edges} must be at least two increasing heights")
-        if num_sectors < 1 or not decay > 0.0:
-            raise ValueError(f"num_sectors={num_sectors} must be at least 1 and decay={decay} positive")
+        edges = checked_edges(band_edges, num_sectors, decay)
         if not 0.0 <= blind < max_range:
             raise ValueError(f"blind={blind} must lie in [0, max_range={max_range})")
         if len(body) != 2 or min(body) < 0.0:
@@ -228,6 +224,16 @@ class ProximitySampler(PdSampler):
         launch = _launcher(ranges, self.num_threads)
         launch(kernels.find_nearest, lanes, *cloud, *mount, *counts, *cells, lanes, nearest)
         launch(kernels.write_nearest, lanes, *cloud, *mount, nearest, self.num_proximal, lanes, view(out, wp.vec3))
+
+
+def checked_edges(band_edges: Sequence[float], num_sectors: int, decay: float) -> list[float]:
+    """The edges of bands; a ValueError where they are none, or the other settings of cells cannot be."""
+    edges = [float(edge) for edge in band_edges]
+    if len(edges) < 2 or any(low >= high for low, high in itertools.pairwise(edges)):
+        raise ValueError(f"band_edges={edges} must be at least two increasing heights")
+    if num_sectors < 1 or not decay > 0.0:
+        raise ValueError(f"num_sectors={num_sectors} must be at least 1 and decay={decay} positive")
+    return edges
 
 
 class FpsSampler(PdSampler):
