@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -43,7 +43,7 @@ from omniperception.learning.checkpoint import load_checkpoint
 from omniperception.learning.config import PerceptionConfig
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.read_out import MotionReadOut
-from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler
+from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler, StandingSampler
 from omniperception.scene import RobotConfig
 from omniperception.scene.stepping import stepping_offsets
 
@@ -266,17 +266,16 @@ def sampler_parameters(sampler: Sampler) -> dict:
         "split": sampler.split if sampler.split != -float("inf") else None,
         "ring": sampler.ring,
     }
-    if not isinstance(sampler, ProximitySampler):
+    if not isinstance(sampler, ProximitySampler | StandingSampler):
         return {"kind": "pd", **halves, "num_distal": sampler.num_distal}
-    return {
-        "kind": "proximity",
-        **halves,
+    cells = {
         "num_sectors": sampler.num_sectors,
         "band_edges": [float(f"{edge:.7g}") for edge in sampler.edges.tolist()],
         "decay": sampler.decay,
-        "blind": sampler.blind,
-        "body": list(sampler.body),
     }
+    if isinstance(sampler, StandingSampler):
+        return {"kind": "standing", **halves, **cells, "geometry": asdict(sampler.geometry)}
+    return {"kind": "proximity", **halves, **cells, "blind": sampler.blind, "body": list(sampler.body)}
 
 
 Outputs = torch.Tensor | tuple[torch.Tensor, ...]

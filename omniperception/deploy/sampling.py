@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from omniperception.deploy.description import DeployError
+from omniperception.deploy.geometry import sector_of, standing
 
 _PHI_BITS = 16
 _MAX_RING = (1 << (31 - _PHI_BITS)) - 1
@@ -107,7 +108,7 @@ class PdSampler(CloudSampler):
         near = self._is_proximal(points)
         sampled = np.zeros((self.num_points, 3), np.float32)
         self._write_proximal(sampled, points[near])
-        self._write_distal(sampled[self.num_proximal :], points[~near], attitude)
+        self._write_distal(sampled[self.num_proximal :], points, near, attitude)
         return sampled
 
     def _is_proximal(self, points: np.ndarray) -> np.ndarray:
@@ -129,7 +130,9 @@ class PdSampler(CloudSampler):
         picked = farthest_points(scaled, self.num_proximal)
         out[: len(picked)] = scaled[picked[self._ring_order(points[picked])]]
 
-    def _write_distal(self, out: np.ndarray, points: np.ndarray, attitude: Attitude) -> None:
+    def _write_distal(self, out: np.ndarray, points: np.ndarray, near: np.ndarray, attitude: Attitude) -> None:
+        """Writes the other half of a frame from hits (n, 3), of which `near` (n,) are proximal."""
+        points = points[~near]
         bins = min(len(points), self.num_distal)
         if not bins:
             return
@@ -178,32 +181,83 @@ class ProximitySampler(PdSampler):
         self.num_sectors, self.decay, self.blind = num_sectors, decay, blind
         self.edges, self.body = np.asarray(band_edges, np.float32), tuple(body)
 
-    def _write_distal(self, out: np.ndarray, points: np.ndarray, attitude: Attitude) -> None:
+    def _write_distal(self, out: np.ndarray, points: np.ndarray, near: np.ndarray, attitude: Attitude) -> None:
+        points = points[~near]
         level = _levelled(rotation_matrix(attitude.base_quat))
         turn = (level @ rotation_matrix(attitude.mount_quat)).astype(np.float32)
         offset = (level @ np.asarray(attitude.mount_pos, np.float64)).astype(np.float32)
         at = points[np.linalg.norm(points, axis=1) >= np.float32(self.blind)] @ turn.T + offset
         on_body = (abs(at[:, 0]) < self.body[0]) & (abs(at[:, 1]) < self.body[1])
-        x, y, z = at[~on_body & (at[:, 2] >= self.edges[0]) & (at[:, 2] < self.edges[-1])].T
-        band = np.searchsorted(self.edges, z, side="right") - 1
-        turned = (np.arctan2(y, x) + _PI) / (2 * _PI)
-        sector = np.clip((turned * np.float32(self.num_sectors)).astype(np.int64), 0, self.num_sectors - 1)
-        cell = band * self.num_sectors + sector
-        horizontal = np.sqrt(x * x + y * y)
-        least = np.full(self.num_distal, np.inf, np.float32)
-        np.minimum.at(least, cell, horizontal)
-        nearest = np.flatnonzero(horizontal == least[cell])[::-1]  # of equally near ones the first measured is kept
-        x, y, horizontal = x[nearest], y[nearest], horizontal[nearest]
-        proximity = np.exp(-horizontal / np.float32(self.decay))
-        bearing = proximity / np.maximum(horizontal, np.float32(1e-6))
-        out[cell[nearest]] = np.stack((bearing * x, bearing * y, proximity), 1)
+        at = at[~on_body & (at[:, 2] >= self.edges[0]) & (at[:, 2] < self.edges[-1])]
+        band = np.searchsorted(self.edges, at[:, 2], side="right") - 1
+        write_nearest(out, at[:, :2], band, self.num_sectors, self.decay)
 
 
-_KINDS = {"raw": RawSampler, "pd": PdSampler, "proximity": ProximitySampler}
+class StandingSampler(PdSampler):
+    """Proximal points as above; the distal half as proximities of what stands on the ground, as in training."""
+
+    def __init__(
+        self,
+        num_proximal: int,
+        num_sectors: int,
+        max_range: float,
+        split: float,
+        ring: float,
+        band_edges: Sequence[float],
+        decay: float,
+        geometry: Mapping,
+    ) -> None:
+        """Configure both halves.
+
+        Args:
+            num_proximal: slots of the proximal half, written first.
+            num_sectors: azimuth sectors.
+            max_range: m.
+            split: elevation in the sensor frame above which a point is proximal, rad.
+            ring: height of an elevation ring for sorting the proximal half, rad.
+            band_edges: heights that separate the bands, m above the ground.
+            decay: distance over which the proximity falls by e, m.
+            geometry: settings of training's `GeometryConfig`, by name.
+        """
+        super().__init__(num_proximal, num_sectors * (len(band_edges) - 1), max_range, split, ring)
+        self.num_sectors, self.decay, self.geometry = num_sectors, decay, dict(geometry)
+        self.edges = np.asarray(band_edges, np.float32)
+
+    def _write_distal(self, out: np.ndarray, points: np.ndarray, near: np.ndarray, attitude: Attitude) -> None:
+        mount, level = rotation_matrix(attitude.mount_quat), _levelled(rotation_matrix(attitude.base_quat))
+        sensor = np.asarray(attitude.mount_pos, np.float64)
+        in_base = points @ mount.T.astype(np.float32) + sensor.astype(np.float32)
+        places, height = standing(in_base, np.linalg.norm(points, axis=1), level, sensor, self.geometry)
+        counts = (height >= self.edges[0]) & (height < self.edges[-1])
+        band = np.searchsorted(self.edges, height[counts], side="right") - 1
+        write_nearest(out, places[counts, :2], band, self.num_sectors, self.decay)
+
+
+def write_nearest(out: np.ndarray, places: np.ndarray, band: np.ndarray, num_sectors: int, decay: float) -> None:
+    """Writes the nearest place of each cell: its bearing times its proximity, and the proximity.
+
+    Args:
+        out: (bands * S, 3), zeros.
+        places: (n, 2) m, around the base.
+        band: (n,) of each place.
+        num_sectors: S.
+        decay: distance over which the proximity falls by e, m.
+    """
+    cell = band * num_sectors + sector_of(places, num_sectors)
+    horizontal = np.sqrt(np.square(places).sum(1))
+    least = np.full(len(out), np.inf, np.float32)
+    np.minimum.at(least, cell, horizontal)
+    nearest = np.flatnonzero(horizontal == least[cell])[::-1]  # of equally near ones the first measured is kept
+    proximity = np.exp(-horizontal[nearest] / np.float32(decay))
+    bearing = places[nearest] * (proximity / np.maximum(horizontal[nearest], np.float32(1e-6)))[:, None]
+    out[cell[nearest]] = np.concatenate((bearing, proximity[:, None]), 1)
+
+
+_KINDS = {"raw": RawSampler, "pd": PdSampler, "proximity": ProximitySampler, "standing": StandingSampler}
 
 
 def make_sampler(parameters: Mapping) -> CloudSampler:
-    """The sampler that a description names: its `kind`, one of "raw", "pd" and "proximity", and its arguments."""
+    """The sampler that a description names: its `kind`, one of `_KINDS`, and its arguments."""
     arguments = dict(parameters)
     kind = arguments.pop("kind", None)
     if kind not in _KINDS:
