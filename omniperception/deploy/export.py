@@ -270,7 +270,7 @@ def sampler_parameters(sampler: Sampler) -> dict:
         return {"kind": "pd", **halves, "num_distal": sampler.num_distal}
     cells = {
         "num_sectors": sampler.num_sectors,
-        "band_edges": [float(f"{edge:.7g}") for edge in sampler.edges.tolist()],
+        "band_edges": [float(f"{float(edge):.7g}") for edge in sampler.edges],
         "decay": sampler.decay,
     }
     if isinstance(sampler, StandingSampler):

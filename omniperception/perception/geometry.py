@@ -10,13 +10,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+import warp as wp
 
-from omniperception.common.rotations import matrix_of, yaw_of
+from omniperception.common.launch import constant, launch_over_envs, view
 from omniperception.common.sectors import sector_of, sums_by
 from omniperception.perception.samplers.base import Attitude
+from omniperception.perception.standing_kernels import Settings, find_standing
 
-_RIDGE = 1e-3
-"""Weight of the level plane at standing height in each fit, beside returns whose weights sum to 1."""
+_SETTINGS = (
+    *("reach", "near", "near_share", "standing", "fit_reach", "ring", "lowest", "slope", "min_height", "rise", "lift"),
+    "headroom",
+)
 
 
 @dataclass(frozen=True)
@@ -96,133 +100,77 @@ def nearest_obstacles(
         attitude: of the base as measured, and the mount of the sensor.
         config: what is ground, noise and body.
     """
-    points, height = standing(ranges, directions_s, attitude, config)
+    points, height = Standing(config)(ranges, directions_s, attitude)
     stands = height < config.headroom
     return by_sector(points[..., :2], stands, config)
 
 
-def standing(
-    ranges: torch.Tensor, directions_s: torch.Tensor, attitude: Attitude, config: GeometryConfig
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """What stands on the ground or hangs over it.
-
-    Args: as of :func:`nearest_obstacles`.
-
-    Returns:
-        (n, R, 3) m, the points in the yaw-aligned frame at the base's origin; and (n, R) m, their height above the
-        ground below them, infinite for ground, noise, the robot itself and misses.
-    """
-    in_base, points = _points(ranges, directions_s, attitude)
-    counts = ranges.isfinite() & ~own_body(in_base, config)
-    is_near = ranges < config.near
-    height = height_above_ground(points, counts & ~is_near, config)
-    least = config.min_height + config.rise * points[..., :2].norm(dim=-1) + config.lift * _steepness(points, attitude)
-    stands = counts & (height > least)
-    stands &= ~near_noise(points, stands & is_near & (height < config.headroom), counts, attitude, config)
-    return points, torch.where(stands, height, math.inf)
-
-
-def _points(ranges: torch.Tensor, directions_s: torch.Tensor, attitude: Attitude) -> tuple[torch.Tensor, torch.Tensor]:
-    """(n, R, 3) points in the base frame, and in the levelled, yaw-aligned one at the base's origin; misses at the
-    sensor."""
-    quat = attitude.base_quat
-    mount = matrix_of(quat.new_tensor([attitude.mount_quat]))[0]
-    rays = torch.where(ranges.isfinite(), ranges, 0.0)[..., None] * directions_s
-    in_base = rays @ mount.T + quat.new_tensor(attitude.mount_pos)
-    return in_base, in_base @ levelling(quat).transpose(1, 2)
-
-
-def levelling(base_quat: torch.Tensor) -> torch.Tensor:
-    """(n, 3, 3) rotations from the base frame to the yaw-aligned one, by the orientations (n, 4) of the bases."""
-    yaw = yaw_of(base_quat)
-    cos, sin, zero = yaw.cos(), yaw.sin(), torch.zeros_like(yaw)
-    unturn = torch.stack((cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1.0), -1).unflatten(-1, (3, 3))
-    return unturn @ matrix_of(base_quat)
-
-
-def own_body(points_b: torch.Tensor, config: GeometryConfig) -> torch.Tensor:
-    """(n, R) bool: which points (n, R, 3) in the base frame may be the robot's own, above and below it too."""
-    back, front, side = config.body
-    x, y = points_b[..., 0], points_b[..., 1]
-    return (x > -back) & (x < front) & (y.abs() < side)
-
-
-def _steepness(points: torch.Tensor, attitude: Attitude) -> torch.Tensor:
-    """(n, R) sine of the angle at which points (n, R, 3) are seen from above; 0 from below."""
-    sensor = levelling(attitude.base_quat) @ points.new_tensor(attitude.mount_pos)
-    ray = points - sensor[:, None]
-    return (-ray[..., 2] / ray.norm(dim=-1).clamp(min=1e-6)).clamp(min=0.0)
-
-
-def near_noise(
-    points: torch.Tensor, near: torch.Tensor, counts: torch.Tensor, attitude: Attitude, config: GeometryConfig
-) -> torch.Tensor:
-    """(n, R) bool: which returns next to the sensor stand alone among farther ones of their direction: noise.
-
-    Args:
-        points: (n, R, 3) m, yaw-aligned frame.
-        near: (n, R) bool: the returns in question.
-        counts: (n, R) bool: all returns.
-        attitude: with the mount of the sensor.
-        config: `near_share`.
-    """
-    sensor = levelling(attitude.base_quat) @ points.new_tensor(attitude.mount_pos)
-    sector = sector_of(points[..., :2] - sensor[:, None, :2], config.cell_sectors)
-    share = sums_by(sector, near.float(), config.cell_sectors)
-    share = share / sums_by(sector, counts.float(), config.cell_sectors).clamp(min=1.0)
-    return near & (share.gather(1, sector) < config.near_share)
-
-
-def height_above_ground(points: torch.Tensor, counts: torch.Tensor, config: GeometryConfig) -> torch.Tensor:
-    """(n, R) m: how high points stand above the ground below them, which is found from the lowest ones.
+class Standing:
+    """Tells what stands on the ground, or hangs over it, from ground, noise, and the robot's own body.
 
     A plane is fitted to what lies near the ground, then cells of azimuth and distance give what is left, from the
     inside out: a cell's ground rises above the one before by no more than `slope`, so that the face of an obstacle
-    which hides its foot is none.
+    which hides its foot is none. Returns next to the sensor that stand alone among farther ones of their direction are
+    noise.
 
-    Args:
-        points: (n, R, 3) m, yaw-aligned frame.
-        counts: (n, R) bool: which tell of the ground; those next to the sensor may be noise.
-        config: how the ground is found.
+    Attributes:
+        config: what is ground, noise and body.
     """
-    distance = points[..., :2].norm(dim=-1)
-    above = points[..., 2] - _plane(points, counts & (distance < config.fit_reach), config)
-    rings = math.ceil(config.reach / config.ring)
-    ring = (distance / config.ring).long().clamp(max=rings - 1)
-    cell = ring * config.cell_sectors + sector_of(points[..., :2], config.cell_sectors)
-    counts = counts & (distance < config.reach)
-    num = rings * config.cell_sectors
-    low = above.new_full((len(above), num), math.inf)
-    low.scatter_reduce_(1, cell, torch.where(counts, above, math.inf), "amin")
-    is_low = counts & (above <= low.gather(1, cell) + config.lowest)
-    returns = sums_by(cell, is_low.float(), num)
-    ground = sums_by(cell, torch.where(is_low, above, 0.0), num) / returns.clamp(min=1.0)
-    ground = _outwards(ground.unflatten(1, (rings, -1)), (returns > 0).unflatten(1, (rings, -1)), config)
-    return above - ground.flatten(1).gather(1, cell)
 
+    def __init__(self, config: GeometryConfig, num_threads: int | None = None) -> None:
+        """Args: num_threads: CPU threads; all the process may use by default."""
+        self.config, self._num_threads = config, num_threads
+        self._settings = Settings()
+        self._settings.back, self._settings.front, self._settings.side = config.body
+        self._settings.rings = math.ceil(config.reach / config.ring)
+        self._settings.sectors = config.cell_sectors
+        for name in _SETTINGS:
+            setattr(self._settings, name, getattr(config, name))
+        self._memory: tuple[torch.Tensor, ...] = ()
 
-def _plane(points: torch.Tensor, counts: torch.Tensor, config: GeometryConfig) -> torch.Tensor:
-    """(n, R) m: height of the ground's plane at points (n, R, 3)."""
-    at = torch.cat((points[..., :2], torch.ones_like(points[..., :1])), -1)
-    standing = points.new_tensor([0.0, 0.0, -config.standing])
-    plane = standing.expand(len(points), 3)
-    for band in config.bands:
-        off = points[..., 2] - (at @ plane[..., None])[..., 0]
-        weight = (counts & (off.abs() < band)).float()
-        weighted = (weight / weight.sum(1, keepdim=True).clamp(min=1.0))[..., None] * at
-        normal = weighted.transpose(1, 2) @ at + _RIDGE * torch.eye(3, device=points.device)
-        right = (weighted * points[..., 2:]).sum(1) + _RIDGE * standing
-        plane = torch.linalg.solve(normal, right)
-    return (at @ plane[..., None])[..., 0]
+    def __call__(
+        self, ranges: torch.Tensor, directions_s: torch.Tensor, attitude: Attitude
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Args: as of :func:`nearest_obstacles`.
 
+        Returns:
+            (n, R, 3) m, the points in the yaw-aligned frame at the base's origin; and (n, R) m, their height above the
+            ground below them, infinite for ground, noise, the robot itself and misses. Memory of the next call.
+        """
+        n, device = len(ranges), ranges.device
+        cells, low, ground, returns, around, points, heights = self._memory_for(n, ranges.shape[1], device)
+        inputs = [
+            view(ranges, wp.float32),
+            view(directions_s, wp.vec3),
+            view(attitude.base_quat, wp.vec4),
+            wp.vec3(*attitude.mount_pos),
+            wp.vec4(*attitude.mount_quat),
+            view(constant(self.config.bands, device), wp.float32),
+            self._settings,
+            view(cells, wp.int32),
+            view(low, wp.float32),
+            view(ground, wp.float32),
+            view(returns, wp.int32),
+            view(around, wp.int32),
+            view(points, wp.vec3),
+            view(heights, wp.float32),
+        ]
+        launch_over_envs(find_standing, n, inputs, device, num_threads=self._num_threads)
+        return points, heights
 
-def _outwards(ground: torch.Tensor, known: torch.Tensor, config: GeometryConfig) -> torch.Tensor:
-    """(n, rings, sectors) the cells' ground, limited by the ring before; a cell without returns has the same."""
-    before, found = torch.zeros_like(ground[:, 0]), []
-    for height, is_known in zip(ground.unbind(1), known.unbind(1), strict=True):
-        before = torch.where(is_known, torch.minimum(height, before + config.slope * config.ring), before)
-        found.append(before)
-    return torch.stack(found, 1)
+    def _memory_for(self, n: int, r: int, device: torch.device) -> tuple[torch.Tensor, ...]:
+        """For n environments of r rays; allocated when there are more of them than before."""
+        most = self._memory[-1] if self._memory else None
+        if most is None or len(most) < n or most.shape[1] != r or most.device != device:
+            num_cells, sectors = self._settings.rings * self._settings.sectors, self._settings.sectors
+            shapes = (n, r), (n, num_cells), (n, num_cells), (n, num_cells), (n, 2 * sectors), (n, r, 3), (n, r)
+            whole = {0, 3, 4}
+            with torch.inference_mode(False):
+                self._memory = tuple(
+                    torch.empty(shape, device=device, dtype=torch.int32 if k in whole else torch.float32)
+                    for k, shape in enumerate(shapes)
+                )
+        return tuple(tensor[:n] for tensor in self._memory)
 
 
 def by_sector(places: torch.Tensor, counts: torch.Tensor, config: GeometryConfig) -> Nearest:

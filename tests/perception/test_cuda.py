@@ -9,11 +9,11 @@ from clouds import MAX_RANGE, random_rays, sample
 from omniperception.avoidance.kernels import worst_sectors
 from omniperception.lidar import sector_distances
 from omniperception.lidar.kernels.sectors import sector_minima
-from omniperception.perception import FpsSampler, PdSampler
+from omniperception.perception import FpsSampler, PdSampler, standing_kernels
 from omniperception.perception.networks.kernels import write_rings
 from omniperception.perception.samplers import kernels, sorting_kernels
 
-MODULES = [kernels, sorting_kernels, *(k.module for k in (write_rings, worst_sectors, sector_minima))]
+MODULES = [kernels, sorting_kernels, standing_kernels, *(k.module for k in (write_rings, worst_sectors, sector_minima))]
 
 
 @pytest.mark.parametrize("module", MODULES)

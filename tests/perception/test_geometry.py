@@ -17,8 +17,8 @@ from omniperception.lidar import Lidar
 from omniperception.perception import Attitude
 from omniperception.perception.geometry import (
     GeometryConfig,
+    Standing,
     by_sector,
-    height_above_ground,
     nearest_obstacles,
 )
 from omniperception.scene.rays import HitClass
@@ -51,13 +51,13 @@ class TestGround:
         assert obstacles(plane(), **given).returns.sum() <= 2
 
     def test_heights_are_above_the_ground_below(self):
-        ranges, directions, _ = cloud(plane((0.2, 0.1)), box((1.0, -1.0, 0.0), (1.5, 1.0, 1.0)))
-        points = ranges[..., None] * directions + torch.tensor(MOUNT, dtype=torch.float32)
-        counts = ranges.isfinite() & (points[..., :2].norm(dim=-1) < 3.0)
-        points = torch.where(counts[..., None], points, 0.0)
-        height = height_above_ground(points, counts, CONFIG)
+        rays = cloud(plane((0.2, 0.1)), box((1.0, -1.0, 0.0), (1.5, 1.0, 1.0)))
+        points, height = Standing(CONFIG)(*rays)
+        counts = height.isfinite() & (points[..., :2].norm(dim=-1) < 3.0)
         true = points[..., 2] + HEIGHT - points[..., :2] @ torch.tensor([0.2, 0.1])
         assert (height - true)[counts].abs().max() < 0.05 and (true[counts] > 0.3).any()
+        points_b = rays[0][..., None] * rays[1] + torch.tensor(MOUNT, dtype=torch.float32)
+        torch.testing.assert_close(points[counts], points_b[counts], atol=1e-5, rtol=0.0)
 
     def test_a_bias_of_the_attitude_is_no_obstacle(self):
         ranges, directions, given = cloud(plane(), **PAPER)

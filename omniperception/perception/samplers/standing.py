@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-import torch
+import warp as wp
 
-from omniperception.common.sectors import sector_of
-from omniperception.perception.geometry import GeometryConfig, standing
+from omniperception.common.launch import constant, launch_over_envs, view
+from omniperception.perception.geometry import GeometryConfig, Standing
 from omniperception.perception.samplers.sampling import PdSampler, checked_edges
+from omniperception.perception.standing_kernels import nearest_standing
 
 
 class StandingSampler(PdSampler):
@@ -58,29 +58,19 @@ class StandingSampler(PdSampler):
             ring_deg=ring_deg,
             num_threads=num_threads,
         )
-        self.num_sectors, self.decay, self.edges = num_sectors, decay, torch.tensor(edges)
+        self.num_sectors, self.decay, self.edges = num_sectors, decay, tuple(edges)
         self.geometry = geometry or GeometryConfig()
+        self._standing = Standing(self.geometry, num_threads)
 
     @property
     def kernels(self) -> tuple[str, ...]:
-        return ("sort_each_environment", "pick_farthest", "write_picked") if self.num_proximal else ()
+        proximal = ("sort_each_environment", "pick_farthest", "write_picked") if self.num_proximal else ()
+        return (*proximal, "find_standing", "nearest_standing")
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         if self.num_proximal:
             self._write_halves(ranges, directions_s, elevation, azimuth, out, num_bins=0)
-        points, height = standing(ranges, directions_s, attitude, self.geometry)
-        self.edges = self.edges.to(ranges.device)
-        band = torch.bucketize(height, self.edges, right=True) - 1
-        counts = (band >= 0) & (band < len(self.edges) - 1)
-        cell = torch.where(counts, band, 0) * self.num_sectors + sector_of(points[..., :2], self.num_sectors)
-        distance = torch.where(counts, points[..., :2].norm(dim=-1), math.inf)
-        shape = len(ranges), self.num_distal
-        least = distance.new_full(shape, math.inf).scatter_reduce_(1, cell, distance, "amin")
-        last = ranges.shape[1] - 1
-        rays = torch.arange(last + 1, device=ranges.device).expand_as(cell)
-        rays = torch.where(counts & (distance <= least.gather(1, cell)), rays, last)
-        first = torch.full(shape, last, device=ranges.device).scatter_reduce_(1, cell, rays, "amin")
-        proximity = (-least / self.decay).exp()
-        place = points[..., :2].gather(1, first[..., None].expand(-1, -1, 2))
-        bearing = place * (proximity / least.clamp(min=1e-6))[..., None]  # 0 where there is no hit
-        out[:, self.num_proximal :] = torch.cat((bearing, proximity[..., None]), -1)
+        points, heights = self._standing(ranges, directions_s, attitude)
+        cells = view(constant(self.edges, ranges.device), wp.float32), self.num_sectors, self.decay, self.num_proximal
+        inputs = [view(points, wp.vec3), view(heights, wp.float32), *cells, view(out, wp.vec3)]
+        launch_over_envs(nearest_standing, len(ranges), inputs, ranges.device, num_threads=self.num_threads)
