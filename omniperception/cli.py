@@ -21,7 +21,8 @@
 `Arguments(trials=200, variants=("fps_mlp", "pd_risknet"), out=Path("here"))` if `num_envs` is not an argument of the
 command, and the overrides `["num_envs=64"]`. A command without `overrides` refuses them, and its `main` takes the
 arguments alone. `--help` prints the documentation and every argument with its default. Wrong input ends with one line
-on standard error and exit code 2; so does a ConfigError, and each of `errors`, that `main` raises.
+on standard error and exit code 2; so does a ConfigError, and each of `errors`, that `main` raises. Ctrl-C ends with one
+line, too, and exit code 130.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ from pathlib import Path
 from typing import Any
 
 from omniperception.common.errors import ConfigError, UnknownKey, one_line
+
+INTERRUPTED = 130  # as of a shell: 128 + SIGINT
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false"}
 
@@ -105,6 +108,9 @@ class Command:
             fail(UnknownKey(error.given, (*error.known, *own), error.name))
         except for_the_user as error:
             fail(error)
+        except KeyboardInterrupt as error:  # Ctrl-C
+            print(str(error) or "interrupted", file=sys.stderr, flush=True)
+            sys.exit(INTERRUPTED)
 
     def parse(self, argv: Sequence[str]) -> tuple[Any, list[str]]:
         """Arguments and overrides of a command line."""

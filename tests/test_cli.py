@@ -94,3 +94,13 @@ def test_errors_of_a_command(capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
     with pytest.raises(KeyError):
         Command(fails, Arguments, "")(["what=step"])
+
+
+@pytest.mark.parametrize("said", ["", "interrupted after 3 iterations, checkpoint saved"])
+def test_ctrl_c_is_one_line(said, capsys):
+    def interrupted(arguments):
+        raise KeyboardInterrupt(*filter(None, [said]))
+
+    with pytest.raises(SystemExit) as stopped:
+        Command(interrupted, Arguments, "")(["what=step"])
+    assert stopped.value.code == 130 and capsys.readouterr().err == f"{said or 'interrupted'}\n"
