@@ -48,7 +48,7 @@ def standing(
     least = settings["min_height"] + settings["rise"] * away + settings["lift"] * steepness
     stands = ~on_body & (height > least)
     near = stands & is_near & (height < settings["headroom"])
-    stands &= ~_near_noise(points - sensor, near, ~on_body, settings)
+    stands &= ~_near_noise(ray, near, ~on_body, settings)
     return points, np.where(stands, height, np.float32(np.inf))
 
 

@@ -19,7 +19,7 @@ from omniperception.env.sensing import SensorConfig
 from omniperception.env.state import MEASURED_CLOUD
 from omniperception.evaluation.episodes import Policy
 from omniperception.perception import Attitude
-from omniperception.perception.geometry import GeometryConfig, Nearest, nearest_obstacles
+from omniperception.perception.geometry import GeometryConfig, Nearest, Standing, nearest_obstacles
 from omniperception.scene.build import FOOT_FORCE
 
 BASELINES = {
@@ -160,7 +160,7 @@ class _Clouds:
         attitude: of the bases as measured when the newest frame came.
     """
 
-    def __init__(self, env: OmniEnv) -> None:
+    def __init__(self, env: OmniEnv, config: GeometryConfig) -> None:
         if env.sensing is None:
             raise ValueError("this policy needs a LiDAR, but the run has none; use lidar=mid360")
         if env.sensing.carrier != env.sensing.base:
@@ -168,6 +168,7 @@ class _Clouds:
                 f"this policy needs the LiDAR on the base, but lidar.mount has it on {env.sensing.config.mount_body}"
             )
         self._env, self._sensing, self._tick = env, env.sensing, -1
+        self._standing = Standing(config)
 
     @property
     def is_new(self) -> bool:
@@ -189,19 +190,19 @@ class _Clouds:
         """(num_envs,) bool: whose newest cloud came with the newest tick and shows this episode."""
         return self._sensing.fresh & ~self.begun
 
-    def nearest(self, config: GeometryConfig) -> Nearest:
+    def nearest(self) -> Nearest:
         """Nearest obstacle by sector in the newest clouds."""
         self._tick, frame, sensor = self._sensing.tick, self._sensing.frame, self._sensing.config
         assert frame is not None and frame.ranges is not None and frame.directions_s is not None  # it has been cast
         attitude = Attitude(self._env.state.measured.base_quat_w, sensor.mount_pos, sensor.quat)
-        return nearest_obstacles(frame.ranges, frame.directions_s, attitude, config)
+        return nearest_obstacles(frame.ranges, frame.directions_s, attitude, self._standing)
 
 
 class _Histogram:
     """Distance and velocity of the nearest obstacle by sector, (num_envs, S, 3), at each control step."""
 
     def __init__(self, env: OmniEnv, config: HistogramConfig) -> None:
-        self._env, self._config, self._clouds, self._step = env, config, _Clouds(env), -1
+        self._env, self._clouds, self._step = env, _Clouds(env, config.geometry), -1
         self._odometry = Odometry(env.num_envs, env.control_dt, env.device)
         self._odometry.start(torch.arange(env.num_envs, device=env.device), env.state.measured)
         self._tracks = SectorTracks(
@@ -222,7 +223,7 @@ class _Histogram:
         self._tracks.reset(begun)
         self._tracks.advance(self._odometry.since_last_frame(), self._env.control_dt)
         if clouds.is_new:
-            nearest = clouds.nearest(self._config.geometry)
+            nearest = clouds.nearest()
             self._tracks.update(nearest.distance, nearest.place, clouds.fresh)
 
 
@@ -230,7 +231,7 @@ class _Stop:
     """The commanded velocity, slower while something stands in its way."""
 
     def __init__(self, env: OmniEnv, config: StopConfig) -> None:
-        self._env, self._config, self._clouds = env, config, _Clouds(env)
+        self._env, self._config, self._clouds = env, config, _Clouds(env, config.geometry)
         self._place = torch.zeros(env.num_envs, config.geometry.num_sectors, 2, device=env.device)
         self._distance = self._place.new_full(self._place.shape[:2], torch.inf)
 
@@ -238,7 +239,7 @@ class _Stop:
         """(num_envs, 2) m/s."""
         clouds, config = self._clouds, self._config
         if clouds.is_new:
-            fresh, nearest = clouds.fresh, clouds.nearest(config.geometry)
+            fresh, nearest = clouds.fresh, clouds.nearest()
             self._place = torch.where(fresh[:, None, None], nearest.place, self._place)
             self._distance = torch.where(fresh[:, None], nearest.distance, self._distance)
         self._distance = torch.where(clouds.begun[:, None], torch.inf, self._distance)

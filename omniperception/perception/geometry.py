@@ -90,7 +90,7 @@ class Nearest(NamedTuple):
 
 
 def nearest_obstacles(
-    ranges: torch.Tensor, directions_s: torch.Tensor, attitude: Attitude, config: GeometryConfig
+    ranges: torch.Tensor, directions_s: torch.Tensor, attitude: Attitude, standing: Standing
 ) -> Nearest:
     """Nearest obstacle by sector from a raw cloud.
 
@@ -98,11 +98,10 @@ def nearest_obstacles(
         ranges: (n, R) m as measured; infinite is a miss.
         directions_s: (n, R, 3) unit vectors in the sensor frame.
         attitude: of the base as measured, and the mount of the sensor.
-        config: what is ground, noise and body.
+        standing: tells what is ground, noise and body; its memory is used again.
     """
-    points, height = Standing(config)(ranges, directions_s, attitude)
-    stands = height < config.headroom
-    return by_sector(points[..., :2], stands, config)
+    points, height = standing(ranges, directions_s, attitude)
+    return by_sector(points[..., :2], height < standing.config.headroom, standing.config)
 
 
 class Standing:

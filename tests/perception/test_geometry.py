@@ -28,7 +28,7 @@ CONFIG = GeometryConfig()
 
 
 def obstacles(*surfaces, **given):
-    return nearest_obstacles(*cloud(*surfaces, **given), CONFIG)
+    return nearest_obstacles(*cloud(*surfaces, **given), Standing(CONFIG))
 
 
 def toward(x, y):
@@ -47,7 +47,7 @@ class TestGround:
         """By 2 cm along the ray, so that some of 4000 returns stand 5 cm above the ground."""
         given = {"sigma": 0.02, **PAPER}
         flat = replace(CONFIG, lift=0.0)
-        assert nearest_obstacles(*cloud(plane(), **given), flat).returns.sum() > 8
+        assert nearest_obstacles(*cloud(plane(), **given), Standing(flat)).returns.sum() > 8
         assert obstacles(plane(), **given).returns.sum() <= 2
 
     def test_heights_are_above_the_ground_below(self):
@@ -62,7 +62,7 @@ class TestGround:
     def test_a_bias_of_the_attitude_is_no_obstacle(self):
         ranges, directions, given = cloud(plane(), **PAPER)
         tilted = replace(given, base_quat=torch.tensor([quaternion(0.03, -0.03, 0.0)]))
-        assert nearest_obstacles(ranges, directions, tilted, CONFIG).distance.isinf().all()
+        assert nearest_obstacles(ranges, directions, tilted, Standing(CONFIG)).distance.isinf().all()
 
     def test_low_steps_are_ground_and_high_ones_are_not(self):
         low = obstacles(plane(), box((1.0, -3.0, -1.0), (6.0, 3.0, 0.04)))
@@ -171,7 +171,7 @@ def test_simulated_frames_agree_with_their_labels(scenario, recall):
         frame = lidar.cast(torch.full((8,), 0.1 * time, dtype=torch.float64))
         kinematics = env.state.kinematics
         attitude = Attitude(kinematics.base_quat_w, sensor.mount_pos, sensor.quat)
-        told = nearest_obstacles(frame.ranges, frame.directions_s, attitude, CONFIG).distance
+        told = nearest_obstacles(frame.ranges, frame.directions_s, attitude, Standing(CONFIG)).distance
         hit = (frame.class_id == HitClass.OBSTACLE) & frame.true_ranges.isfinite()
         true = labelled(torch.where(hit, frame.true_ranges, math.inf), frame.directions_s, attitude, HEIGHT)
         counts = true < 3.0
