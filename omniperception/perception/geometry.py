@@ -162,13 +162,17 @@ class Standing:
         most = self._memory[-1] if self._memory else None
         if most is None or len(most) < n or most.shape[1] != r or most.device != device:
             num_cells, sectors = self._settings.rings * self._settings.sectors, self._settings.sectors
-            shapes = (n, r), (n, num_cells), (n, num_cells), (n, num_cells), (n, 2 * sectors), (n, r, 3), (n, r)
-            whole = {0, 3, 4}
+            shapes = (
+                ((n, r), torch.int32),  # cells
+                ((n, num_cells), torch.float32),  # low
+                ((n, num_cells), torch.float32),  # ground
+                ((n, num_cells), torch.int32),  # returns
+                ((n, 2 * sectors), torch.int32),  # around
+                ((n, r, 3), torch.float32),  # points
+                ((n, r), torch.float32),  # heights
+            )
             with torch.inference_mode(False):
-                self._memory = tuple(
-                    torch.empty(shape, device=device, dtype=torch.int32 if k in whole else torch.float32)
-                    for k, shape in enumerate(shapes)
-                )
+                self._memory = tuple(torch.empty(shape, dtype=dtype, device=device) for shape, dtype in shapes)
         return tuple(tensor[:n] for tensor in self._memory)
 
 
