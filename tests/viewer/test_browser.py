@@ -115,11 +115,12 @@ def write_still_weights(path: Path) -> None:
 
 def drag(viewer: Viewer, page: Any, client: Any, obstacle: int) -> None:
     """Pulls an obstacle aside with the mouse; again where the browser's picture was too old to take hold of it."""
-    before = np.array(viewer.state()["obstacles"][obstacle])
+    start = viewer.state()
+    before = np.array(start["obstacles"][obstacle])
 
     def follows() -> bool:
         now = viewer.state()
-        assert now["trials"] == 0  # a new one would have put it elsewhere
+        assert now["trials"] == start["trials"]  # a new one would have put it elsewhere
         return bool(np.hypot(*(np.array(now["obstacles"][obstacle]) - before)[:2]) > 0.1)
 
     def pulled() -> bool:
