@@ -31,6 +31,14 @@ def test_the_published_policy_acts_alike(run, tmp_path):
         assert torch.equal(*(trained.policy(o) for trained, o in zip(replays, obs, strict=True)))
 
 
+def test_it_uses_all_cores_of_whatever_machine_it_is_on(make_config, tmp_path):
+    run = make_config("experiment=walk", "num_envs=2", "sim.num_threads=1")
+    config.save(run.composed, tmp_path / "run")
+    build_runner(run, None).save(str(checkpoint_path(tmp_path / "run", 0)))
+    publish.publish(tmp_path / "run", tmp_path / "published")
+    assert config.load(tmp_path / "published").env.sim.num_threads == 0
+
+
 def test_it_comes_from_where_the_run_does(run, tmp_path):
     provenance.write(run, {"commit": "0123abc", "date": "2026-01-31"})
     record = publish.publish(run, tmp_path / "published")

@@ -49,6 +49,7 @@ def publish(run_dir: Path, folder: Path) -> dict:
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     composed.pop(config.SEARCH_PATH, None)  # a folder of this machine
+    composed.sim.num_threads = 0  # and how many of its cores
     plain = OmegaConf.to_container(composed)
     assert isinstance(plain, dict)
     config.save(plain, folder)
