@@ -36,7 +36,7 @@ def test_it_uses_all_cores_of_whatever_machine_it_is_on(make_config, tmp_path):
     config.save(run.composed, tmp_path / "run")
     build_runner(run, None).save(str(checkpoint_path(tmp_path / "run", 0)))
     publish.publish(tmp_path / "run", tmp_path / "published")
-    assert config.load(tmp_path / "published").env.sim.num_threads == 0
+    assert config.load(tmp_path / "published").sim.num_threads == 0
 
 
 def test_it_comes_from_where_the_run_does(run, tmp_path):

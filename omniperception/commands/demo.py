@@ -32,7 +32,7 @@ class Arguments(FilmArguments):
     """The command's own arguments. The film is short and small: set-up and film take two minutes on two cores."""
 
     video_s: float = argument(8.0, "length of the video (s)", positive=True)
-    video_size: tuple[int, ...] = argument((854, 480), "width and height of the video (pixels)", least=2)
+    video_size: tuple[int, ...] = argument((640, 360), "width and height of the video (pixels)", least=2)
 
     viewer: str | None = argument(
         None, "how it is shown; null: in the browser where there is a display", choices=("web", "video")

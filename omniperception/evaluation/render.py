@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 
 from omniperception.lidar import RayScene
-from omniperception.lidar.launch import thread_pool
 from omniperception.scene.rays import HitClass, RayShapes
 
 COLOURS = {
@@ -37,8 +35,6 @@ POINT_PX = 0.7, 2.6
 """Least and most of it in a picture of 720 lines."""
 OPACITY, FAINT_M, LEAST_OPACITY = 0.8, 5.0, 0.3
 """Of points as near as what the camera looks at; distance (m) beyond that at which it has faded to 1/e; the least."""
-PIECE = 16384
-"""Pixels that are coloured at a time: their numbers stay in a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -151,68 +147,61 @@ class Renderer:
         self.place(view.body_pos, view.body_quat, view.sizes)
         axes = _camera_axes(view.eye_w, view.target_w)
         rays = self._rays_c @ axes
-        strips, shape = (self._scene.num_envs, -1), (self._rows, self._columns)
-        origins = view.eye_w.expand_as(rays)
-        hits = self._scene.cast(origins.unflatten(0, strips), rays.unflatten(0, strips), normals=True)
-        assert hits.normals_w is not None  # asked for
-        ranges, shapes = hits.ranges.flatten(), hits.shape_id.flatten().long()
-        normals = hits.normals_w.flatten(0, 1)
-        lit = self._lit(view.eye_w, rays, ranges, shapes, normals)
-        pieces = [torch.split(pixels, PIECE) for pixels in (rays, ranges, shapes, normals, lit)]
-        shade = partial(self._shade, view)
-        done = thread_pool(self._scene.num_threads).map(shade, *pieces) if len(pieces[0]) > 1 else map(shade, *pieces)
-        colour, seen_to = (torch.cat(parts).unflatten(0, shape) for parts in zip(*done, strict=True))
-        self._draw_points(colour, seen_to, view, axes)
+        ranges, classes, arrows, colour = self._shade(view, rays)
+        colour = torch.where((classes >= 0)[:, None], colour, _sky(rays))
+        shape = self._rows, self._columns
+        colour = colour.clamp(0.0, 1.0).pow(1 / 2.2).unflatten(0, shape)
+        slack = torch.where(classes == HitClass.ROBOT, 0.02, 0.06 + 0.02 * ranges)
+        seen_to = torch.where(arrows, 0.0, ranges + slack)  # points would cover the arrows
+        self._draw_points(colour, seen_to.unflatten(0, shape), view, axes)
         if self._samples > 1:
             colour = torch.nn.functional.avg_pool2d(colour.permute(2, 0, 1), self._samples).permute(1, 2, 0)
         return (colour * 255.0 + 0.5).to(torch.uint8).cpu()
 
-    def _lit(
-        self, eye_w: torch.Tensor, rays: torch.Tensor, ranges: torch.Tensor, shapes: torch.Tensor, normals: torch.Tensor
-    ) -> torch.Tensor:
-        """(pixels,) bool: the sun reaches what each ray has hit."""
-        ids = ((shapes >= 0) & (normals @ self._to_sun > 0)).nonzero().flatten()
-        lit = torch.zeros_like(shapes, dtype=torch.bool)
-        if len(ids) == 0:
-            return lit
-        strips = self._scene.num_envs
-        ids = torch.cat((ids, ids[:1].expand(-len(ids) % strips)))
-        origins = (eye_w + ranges[ids, None] * rays[ids] + 2e-3 * normals[ids]).unflatten(0, (strips, -1))
-        towards = self._to_sun.expand_as(origins)
-        hits = self._scene.cast(origins, towards, max_range=12.0, exclude_shapes=self._terrain)
-        lit[ids] = hits.shape_id.flatten() < 0
-        return lit
-
-    def _shade(
-        self,
-        view: View,
-        rays: torch.Tensor,
-        ranges: torch.Tensor,
-        shapes: torch.Tensor,
-        normals: torch.Tensor,
-        lit: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Colour (n, 3) of some pixels, as shown, and distance (n,) (m) up to which LiDAR points are before them."""
-        classes = self._class[shapes]
-        albedo = self._albedo[shapes]
+    def _shade(self, view: View, rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Distance (m) and class of what each ray has hit, whether it is an arrow, and its linear colour."""
+        strips = (self._scene.num_envs, -1)
+        origins = view.eye_w.expand_as(rays)
+        hits = self._scene.cast(origins.unflatten(0, strips), rays.unflatten(0, strips), normals=True)
+        assert hits.normals_w is not None  # asked for
+        ranges, shape = hits.ranges.flatten(), hits.shape_id.flatten().long()
+        normals, classes = hits.normals_w.flatten(0, 1), self._class[shape]
+        points = view.eye_w + torch.where(classes >= 0, ranges, 0.0)[:, None] * rays
+        albedo = self._albedo[shape]
         ground = (classes == HitClass.TERRAIN).nonzero().flatten()
-        xy = view.eye_w[:2] + ranges[ground, None] * rays[ground, :2]
         footprint = ranges[ground] / self._focal
         stretched = footprint / rays[ground, 2].abs().clamp(min=1e-3)
-        albedo[ground] *= DARK_SQUARES + (1 - DARK_SQUARES) * _checkers(xy / SQUARE_M, stretched / SQUARE_M)
-        seen_to = ranges + torch.where(classes == HitClass.ROBOT, 0.02, 0.06 + 0.02 * ranges)
+        albedo[ground] *= DARK_SQUARES + (1 - DARK_SQUARES) * _checkers(
+            points[ground, :2] / SQUARE_M, stretched / SQUARE_M
+        )
+        painted = torch.zeros_like(ranges, dtype=torch.bool)
         for arrow in view.arrows:
-            cover = (0.5 - _arrow_distance(xy, arrow) / footprint).clamp(0.0, 1.0)[:, None]
+            cover = (0.5 - _arrow_distance(points[ground, :2], arrow) / footprint).clamp(0.0, 1.0)[:, None]
             albedo[ground] += cover * (_vector(arrow.colour, rays.device) - albedo[ground])
-            seen_to[ground[cover[:, 0] > 0]] = 0.0  # points would cover the arrows
+            painted[ground] |= cover[:, 0] > 0
+        facing = normals @ self._to_sun
+        light = facing.clamp(min=0.0) * ~self._shadowed(points, normals, (classes >= 0) & (facing > 0))
         up = (0.5 + 0.5 * normals[:, 2:]).clamp(0.0, 1.0)
         fill = CAMERA_LIGHT * (normals * rays).sum(1, keepdim=True).neg().clamp(min=0.0) * (1.0 - up)
         sun, sky, earth, horizon = (_vector(c, rays.device) for c in (SUN, SKY_LIGHT, GROUND_LIGHT, HORIZON))
-        sunlight = (normals @ self._to_sun * lit)[:, None] * sun
-        colour = albedo * (sunlight + earth + up * (sky - earth) + fill)
-        clear = torch.exp(-((ranges / FOG_M) ** 2))[:, None]
-        colour = torch.where((classes >= 0)[:, None], colour * clear + horizon * (1 - clear), _sky(rays))
-        return colour.clamp(0.0, 1.0).pow(1 / 2.2), seen_to
+        colour = albedo * (light[:, None] * sun + earth + up * (sky - earth) + fill)
+        clear = torch.where(classes >= 0, torch.exp(-((ranges / FOG_M) ** 2)), 0.0)[:, None]
+        return ranges, classes, painted, colour * clear + horizon * (1 - clear)
+
+    def _shadowed(self, points: torch.Tensor, normals: torch.Tensor, lit: torch.Tensor) -> torch.Tensor:
+        """Tell whether each of the points that face the sun lies in a shadow."""
+        shadowed = torch.zeros_like(lit)
+        ids = lit.nonzero().flatten()
+        strips = self._scene.num_envs
+        padding = -len(ids) % strips
+        if len(ids) == 0:
+            return shadowed
+        ids = torch.cat((ids, ids[:1].expand(padding)))
+        origins = (points[ids] + 2e-3 * normals[ids]).unflatten(0, (strips, -1))
+        towards = self._to_sun.expand_as(origins)
+        hits = self._scene.cast(origins, towards, max_range=12.0, exclude_shapes=self._terrain)
+        shadowed[ids] = hits.shape_id.flatten() >= 0
+        return shadowed
 
     def _draw_points(self, colour: torch.Tensor, seen_to: torch.Tensor, view: View, axes: torch.Tensor) -> None:
         """Draws discs where LiDAR points are, nearer ones over farther ones, the smaller and fainter the farther.
