@@ -1,5 +1,6 @@
 """The template in examples/own_project trains, plays and evaluates from a folder of its own."""
 
+import math
 import os
 import shutil
 import subprocess
@@ -12,9 +13,10 @@ import torch
 from omniperception import build, config
 from omniperception.env.mdp.terms import StatefulTerm
 from omniperception.evaluation.records import read
+from omniperception.sim import MujocoSimulator, SimConfig
 
 ROOT = Path(__file__).resolve().parents[1]
-PRESETS = ("rewards", "obstacles", "terrain", "perception", "scenario", "experiment")
+PRESETS = ("rewards", "obstacles", "terrain", "perception", "sim", "scenario", "experiment")
 SMALL = ("num_envs=2", "ppo.num_steps_per_env=10", "ppo.num_mini_batches=1", "ppo.hidden_dims=[16]")
 
 
@@ -47,7 +49,8 @@ def test_it_trains_plays_and_evaluates(project):
     assert done.returncode == 0, done.stderr
     done = run("evaluate", "run=run", "scenario=mine", "plots=false", "trust=own_project", *short)
     assert done.returncode == 0, done.stderr
-    (record,) = read(folder / "run" / "evaluation" / "dev-ideal-mine-own-run.json")
+    (path,) = (folder / "run" / "evaluation").glob("dev-ideal-mine-own-run-*.json")  # a hash of what was overridden
+    (record,) = read(path)
     assert len(record.episodes) == 2
 
 
@@ -71,3 +74,39 @@ def test_its_presets_compose_and_are_built_of_its_own_parts(project, monkeypatch
     assert torch.allclose(embedded[0, 1], last[0, 0])
     tile = run.env.terrain.tiles["waves"]
     assert type(tile).__name__ == "Waves" and tile.height == (0.02, 0.2)
+
+
+def test_its_motors_follow_late(project, monkeypatch):
+    folder, _ = project
+    monkeypatch.syspath_prepend(str(folder))
+    page = (ROOT / "docs" / "guide" / "new_simulator.md").read_text()
+    shown: dict = {"__name__": "own_project.shown"}
+    exec(compile(page.split("```python")[1].split("```")[0], "new_simulator.md", "exec"), shown)
+    path = f"hydra.searchpath=['file://{folder / 'conf'}']"
+    run = build.assemble(config.compose([path, "experiment=walk", "sim=mine", "num_envs=3"]))
+    world = build.build_runner(run, None).env.world
+    own, on_the_page, exact = (
+        settings.build(world, 3)
+        for settings in (run.env.sim, shown["LateMotorsConfig"](time_constant_s=0.03), SimConfig())
+    )
+    target = exact.robot_state()[0][:, 7:] + 0.3
+    for sim in (own, on_the_page, exact):
+        before = sim.robot_state()[0][:, 7:]
+        sim.step(target, num_steps=2)
+        torch.testing.assert_close(sim._ctrl.float() - before, 0.3 * torch.full_like(before, sim_share(sim)))
+    saved = own.state_dict()
+    for sim in (own, on_the_page):
+        sim.step(target, num_steps=2)
+    assert torch.equal(own.qpos, on_the_page.qpos) and not torch.equal(own.qpos, exact.qpos)
+    on_the_page.load_state_dict(saved)
+    on_the_page.step(target, num_steps=2)
+    assert torch.equal(own.qpos, on_the_page.qpos)
+    own.step(target * float("nan"))
+    assert own.failed.all()
+    with pytest.raises(ValueError, match=r"sim\.time_constant_s=0 must be positive"):
+        type(run.env.sim)(time_constant_s=0)
+
+
+def sim_share(sim):
+    """How much of a step reaches the motors within two physics steps of 5 ms."""
+    return 1.0 if type(sim) is MujocoSimulator else 1.0 - math.exp(-0.01 / 0.03)
