@@ -41,7 +41,7 @@ class Arguments:
     """The command line."""
 
     robot: str = argument("g1", "preset of conf/robot")
-    lidar: str = argument("vlp16", "preset of conf/lidar; where it sits inside a mesh it sees nothing")
+    lidar: str = argument("mid360", "preset of conf/lidar; where it sits inside a mesh it sees nothing")
     obstacles: str = argument("moving", "preset of conf/obstacles")
     groups: tuple[int, ...] = argument((2,), "geom groups of the robot's file that hold the meshes")
     num_envs: tuple[int, ...] = argument((64, 256, 512), "environments", least=1)
