@@ -29,7 +29,7 @@ SHOWN = ("robot", "obstacles", "points", "sectors", "arrows", "heights")
 SMOOTHING = 0.2
 """Share of the newest value in the bars of rewards."""
 KEYS = (
-    "**W S** ahead, back · **A D** left, right · **Q E** turn · **X** stand · **T** the task commands ·"
+    "**I K** ahead, back · **J L** left, right · **U O** turn · **X** stand · **T** the task commands ·"
     " **Space** pause · **N** one step · **R** new trial · **P** push · **B** bring the obstacle"
 )
 
@@ -136,13 +136,13 @@ class Panels:
 
     def _build_keys(self) -> None:
         viewer = self._viewer
-        keys: dict[str, tuple[str, Callable[[], None]]] = {
-            "W": ("faster ahead", lambda: viewer.nudge(ahead=STEP)),
-            "S": ("slower, then back", lambda: viewer.nudge(ahead=-STEP)),
-            "A": ("to the left", lambda: viewer.nudge(aside=STEP)),
-            "D": ("to the right", lambda: viewer.nudge(aside=-STEP)),
-            "Q": ("turn left", lambda: viewer.nudge(turn=TURN)),
-            "E": ("turn right", lambda: viewer.nudge(turn=-TURN)),
+        keys: dict[str, tuple[str, Callable[[], None]]] = {  # W A S D Q E and arrows are viser's: they move the view
+            "I": ("faster ahead", lambda: viewer.nudge(ahead=STEP)),
+            "K": ("slower, then back", lambda: viewer.nudge(ahead=-STEP)),
+            "J": ("to the left", lambda: viewer.nudge(aside=STEP)),
+            "L": ("to the right", lambda: viewer.nudge(aside=-STEP)),
+            "U": ("turn left", lambda: viewer.nudge(turn=TURN)),
+            "O": ("turn right", lambda: viewer.nudge(turn=-TURN)),
             "X": ("stand", lambda: viewer.drive((0.0, 0.0, 0.0))),
             "T": ("the task commands", lambda: viewer.drive(None)),
             "space": ("pause or go on", lambda: viewer.pause(not viewer.paused)),

@@ -29,14 +29,17 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
 
     assert viewer.state()["driven"] is None
     start = np.array(viewer.state()["position"][:2])
+    (client,) = viewer.server.get_clients().values()
+    eye = np.array(client.camera.position)
     for _ in range(3):
-        page.keyboard.press("w")
-    wait_for(lambda: viewer.state()["driven"] == (0.6, 0.0, 0.0), "three presses of W command 0.6 m/s")
+        page.keyboard.press("i")
+    wait_for(lambda: viewer.state()["driven"] == (0.6, 0.0, 0.0), "three presses of I command 0.6 m/s")
     yaw = viewer.state()["yaw"]
     heading = np.array([np.cos(yaw), np.sin(yaw)])
     wait_for(lambda: (np.array(viewer.state()["position"][:2]) - start) @ heading > 0.3, "the robot walks ahead")
     page.keyboard.press("x")
     wait_for(lambda: viewer.state()["driven"] == (0.0, 0.0, 0.0), "X stands")
+    assert np.allclose(client.camera.position, eye, atol=1e-3), "keys that drive leave the view where it is"
 
     bring(viewer, page)
     page.keyboard.press("Space")
@@ -55,7 +58,7 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     wait_for(lambda: viewer.state()["checkpoint"] == str(pictures / "still.pt"), "other weights are loaded")
     page.get_by_role("tab", name="Drive").click()
     for _ in range(3):
-        page.keyboard.press("w")
+        page.keyboard.press("i")
     wait_for(lambda: viewer.state()["driven"] == (0.6, 0.0, 0.0), "the command is that for other weights")
     before = viewer.state()
     viewer.ask(lambda: viewer.pause(False))
