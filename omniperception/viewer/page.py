@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import socket
 import webbrowser
@@ -60,7 +61,8 @@ def _check_free(options: PageOptions) -> None:
             probe.bind((options.host, options.port))
         except OSError as error:
             why = (error.strerror or str(error)).lower()
+            no_address = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
+            other = f"host={LOCALHOST}" if no_address else f"port={options.port + 1}"
             raise ViewerError(
-                f"the viewer cannot listen on {options.host}:{options.port} ({why}); give another, such as"
-                f" port={options.port + 1}"
+                f"the viewer cannot listen on {options.host}:{options.port} ({why}); give another, such as {other}"
             ) from None

@@ -128,3 +128,12 @@ def test_the_page_says_who_can_reach_it_and_refuses_a_taken_port():
     message = str(raised.value)
     assert message.startswith(f"the viewer cannot listen on 127.0.0.1:{port} (address already in use)")
     assert f"port={port + 1}" in message and "\n" not in message
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "999.1.1.1"])  # of no machine, and no address
+def test_an_address_that_is_not_here_is_told_from_a_port(host):
+    pytest.importorskip("viser", reason="needs viser: pip install 'omniperception[viewer]'")
+    from omniperception.viewer.page import open_page
+
+    with pytest.raises(ViewerError, match=r"give another, such as host=127\.0\.0\.1$"):
+        open_page(PageOptions(host, 18299), "none")
