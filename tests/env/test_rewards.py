@@ -105,6 +105,8 @@ class TestTerms:
             ("foot_stumble", {"ratio": 5.0, "unit": 10.0}, [25.0, 0.0]),
             ("link_collision", {"unit": 1.0}, [26.0, 0.0]),
             ("link_collision", {"unit": 2.0}, [6.5, 0.0]),
+            ("link_collision", {"unit": 2.0, "most": 4.0}, [4.0 + 0.25, 0.0]),
+            ("foot_stumble", {"ratio": 5.0, "unit": 10.0, "most": 20.0}, [4.0, 0.0]),
             ("joint_limit_violation", {}, [2.0, 0.0]),
             ("joint_near_stop", {"margin": 0.25}, [0.35 + 0.35, 0.25 + 0.05]),
             ("joint_torque_squared", {}, [25.0, 0.0]),

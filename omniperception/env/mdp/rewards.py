@@ -6,6 +6,7 @@ lists the eleven of `rewards=paper`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -64,8 +65,8 @@ def tilt_squared(state: EnvState) -> torch.Tensor:
 
 
 @requires("foot_force")
-def foot_stumble(state: EnvState, ratio: float, unit: float) -> torch.Tensor:
-    """|F_xy|^2 of feet that stumble, in units of `unit` newtons.
+def foot_stumble(state: EnvState, ratio: float, unit: float, most: float = math.inf) -> torch.Tensor:
+    """|F_xy|^2 of feet that stumble, in units of `unit` newtons, each at most (`most` newtons)^2.
 
     A foot stumbles when its horizontal force exceeds `ratio` times the vertical one, as against a vertical face;
     walking friction stays below the friction cone. `ratio` 0 counts every horizontal force.
@@ -73,13 +74,13 @@ def foot_stumble(state: EnvState, ratio: float, unit: float) -> torch.Tensor:
     force = state.foot_force / unit
     horizontal = force[..., :2].square().sum(-1)
     stumbles = horizontal > (ratio * force[..., 2]).square()
-    return (horizontal * stumbles).sum(1)
+    return (horizontal.clamp(max=(most / unit) ** 2) * stumbles).sum(1)
 
 
 @requires("link_force")
-def link_collision(state: EnvState, unit: float) -> torch.Tensor:
-    """|F_xy|^2 of the penalised links, in units of `unit` newtons."""
-    return (state.link_force[..., :2] / unit).square().sum((1, 2))
+def link_collision(state: EnvState, unit: float, most: float = math.inf) -> torch.Tensor:
+    """|F_xy|^2 of the penalised links, in units of `unit` newtons, each at most (`most` newtons)^2."""
+    return (state.link_force[..., :2] / unit).square().sum(2).clamp(max=(most / unit) ** 2).sum(1)
 
 
 @requires("obstacle_contact")
