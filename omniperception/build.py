@@ -23,6 +23,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import Condition
 from omniperception.env.mirror import Mirror
 from omniperception.learning import CheckpointError, Runner, distributed, latest_checkpoint, load_checkpoint
+from omniperception.learning.checkpoint import difference
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
@@ -267,13 +268,14 @@ def load_teacher(run_dir: Path, env: OmniEnv) -> Teacher:
         distribution_cfg={"class_name": "GaussianDistribution", "init_std": run.ppo.init_std},
         **run.ppo.mlp,
     ).to(env.device)
-    try:
-        actor.load_state_dict(load_checkpoint(latest_checkpoint(run_dir), str(env.device))["actor_state_dict"])
-    except RuntimeError as error:
+    weights = load_checkpoint(latest_checkpoint(run_dir), str(env.device))["actor_state_dict"]
+    reason = difference(actor.state_dict(), weights)
+    if reason is not None:
         raise CheckpointError(
-            f"distillation.teacher={run_dir} does not fit ({one_line(error)[:200]}); give both the same preset of"
-            " observations and history"
-        ) from None
+            f"distillation.teacher={run_dir} does not fit: {reason}; give both the same preset of observations and"
+            " history"
+        )
+    actor.load_state_dict(weights)
     return Teacher(actor, "command")
 
 

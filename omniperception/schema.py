@@ -173,8 +173,10 @@ def look_up(kind: Kind, name: str, key: str, trust: Sequence[str] | None = ()) -
     if name in names or name in names.values():
         return _imported(names.get(name, name), key)
     if "." not in name:
-        given = key if key.endswith(f".{name}") else f"{key}={name}"
-        raise DoesNotFit(f"{given} is unknown; {suggest(name, tuple(names))}, or {kind.tag}: a dotted path to your own")
+        is_key = key.endswith(f".{name}")
+        given, before = (key, key.removesuffix(name)) if is_key else (f"{key}={name}", "")
+        hint = suggest(name, tuple(names), before)
+        raise DoesNotFit(f"{given} is unknown; {hint}, or {kind.tag}: a dotted path to your own")
     if trust is not ANYTHING and not any(name.startswith(f"{prefix}.") for prefix in trust):
         raise ConfigError(
             f"{key}={name} is not built: a run's file names it, and it is outside of this package; if you trust it, add"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omniperception.commands import main
+from omniperception.commands import main, scan
 from omniperception.commands.scan import pictures
 from omniperception.commands.scan.room import ROOM, DemoClass, demo_scene, mesh_scene
 from omniperception.lidar import TriangleMesh, read_points
@@ -107,3 +107,19 @@ def test_a_mesh_that_is_none_is_one_line(command, capsys, tmp_path, monkeypatch,
         command("lidar=vlp16", *arguments)
     error = capsys.readouterr().err
     assert stop.value.code == 2 and message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("overrides", "rays", "reach"),
+    [
+        ([], 20_000, 40.0),  # 0.1 s of 200,000 points a second, 40 m at 10 % reflectivity: the maker's figures
+        (["lidar.num_rays=500", "lidar.max_range=7"], 500, 7.0),
+        (["rays=800"], 800, 40.0),
+    ],
+)
+def test_the_lab_shows_the_device_and_not_what_a_task_keeps_of_it(monkeypatch, overrides, rays, reach):
+    served = {}
+    monkeypatch.setattr(scan, "serve_lab", lambda room, sensors, out, options: served.update(sensors))
+    main(["scan", "lidar=mid360", "viewer=web", *overrides])
+    sensor = served["mid360"]()
+    assert (sensor.num_rays, sensor.max_range) == (rays, reach)

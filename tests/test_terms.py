@@ -89,16 +89,16 @@ class TestNames:
         [
             (
                 "+rewards.terms.tilt_square={weight: 1}",
-                "rewards.terms.tilt_square is unknown; did you mean tilt_squared?",
+                "rewards.terms.tilt_square is unknown; did you mean rewards.terms.tilt_squared?",
             ),
             ("+rewards.terms.x={weight: 1, func: alife}", "rewards.terms.x.func=alife is unknown; did you mean alive?"),
             (
                 "rewards.terms.tilt_squared.wieght=1",
-                "rewards.terms.tilt_squared.wieght is unknown; did you mean weight?",
+                "rewards.terms.tilt_squared.wieght is unknown; did you mean rewards.terms.tilt_squared.weight?",
             ),
             (
                 "rewards.terms.closing_speed.margn=1",
-                "rewards.terms.closing_speed.margn is unknown; did you mean margin?",
+                "rewards.terms.closing_speed.margn is unknown; did you mean rewards.terms.closing_speed.margin?",
             ),
             ("+rewards.terms.foot_stumble={weight: 1, unit: 1.0}", "rewards.terms.foot_stumble lacks ratio: give"),
             ("+rewards.terms.alive={}", "rewards.terms.alive lacks its weight: give rewards.terms.alive.weight=..."),
@@ -109,7 +109,10 @@ class TestNames:
             ("observations.groups.command.terms.command.scal=1", "observations.groups.command.terms.command.scal is"),
             ("perception.network.type=pd_risk", "perception.network.type=pd_risk is unknown; did you mean pd_risknet?"),
             ("perception.sampler.type=fsp", "perception.sampler.type=fsp is unknown; did you mean fps?"),
-            ("perception.sampler.splitdeg=3", "perception.sampler.splitdeg is unknown; did you mean split_deg?"),
+            (
+                "perception.sampler.splitdeg=3",
+                "perception.sampler.splitdeg is unknown; did you mean perception.sampler.split_deg?",
+            ),
             ("commands.type=gaol", "commands.type=gaol is unknown; did you mean goal?"),
             ("~commands.type", "commands lacks its type: give commands.type=..., one of velocity, goal"),
             ("+terrain.tiles={hills: {}}", "terrain.tiles is unknown"),

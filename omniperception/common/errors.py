@@ -24,14 +24,15 @@ class UnknownKey(DoesNotFit):
 
     def __init__(self, given: str, known: Iterable[str], name: str = "") -> None:
         self.given, self.known = given, tuple(known)
-        self.name = name or given.lstrip("+~").partition("=")[0].rpartition(".")[2]
-        super().__init__(f"{given} is unknown; {suggest(self.name, self.known)}")
+        path = given.lstrip("+~").partition("=")[0]
+        self.name = name or path.rpartition(".")[2]
+        super().__init__(f"{given} is unknown; {suggest(self.name, self.known, path[: path.rfind(self.name)])}")
 
 
-def suggest(name: str, known: Sequence[str]) -> str:
-    """The known name that is most similar, or all of them."""
+def suggest(name: str, known: Sequence[str], before: str = "") -> str:
+    """The known name that is most similar, with what stands before it; or all of them."""
     near = difflib.get_close_matches(name, known, 1)
-    return f"did you mean {near[0]}?" if near else f"known: {', '.join(sorted(known))}"
+    return f"did you mean {before}{near[0]}?" if near else f"known: {', '.join(sorted(known))}"
 
 
 def one_line(error: BaseException) -> str:

@@ -71,12 +71,18 @@ def _label(run: Path) -> str:
 
 def read_scalars(run: Path, tags: Sequence[str]) -> dict[str, dict[int, float]]:
     """Values by iteration of each tag that the TensorBoard files of a run have."""
+    events = _events(run)
+    known = set(events.Tags()["scalars"])
+    return {tag: {event.step: event.value for event in events.Scalars(tag)} for tag in tags if tag in known}
+
+
+def _events(run: Path) -> Any:
+    """What the TensorBoard files of a run hold."""
     from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
     events = EventAccumulator(str(run), size_guidance={SCALARS: 0})
     events.Reload()
-    known = set(events.Tags()[SCALARS])
-    return {tag: {event.step: event.value for event in events.Scalars(tag)} for tag in tags if tag in known}
+    return events
 
 
 def curves_of(runs: Sequence[Path], tags: Sequence[str]) -> dict[str, list[Curve]]:
@@ -94,7 +100,8 @@ def curves_of(runs: Sequence[Path], tags: Sequence[str]) -> dict[str, list[Curve
                 found[tag].append(_curve(label, having))
     for tag, curves in found.items():
         if not curves:
-            raise ConfigError(f"tags={tag}: none of the {len(runs)} runs has it; see `tensorboard --logdir {runs[0]}`")
+            there = sorted(set().union(*(_events(run).Tags()["scalars"] for run in runs)))
+            raise ConfigError(f"tags={tag}: no run has it, out of {len(runs)}; known: {', '.join(there) or 'none'}")
     return found
 
 

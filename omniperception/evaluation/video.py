@@ -126,6 +126,10 @@ class Recorder:
         device, sized = self._env.device, self._sized
         return Renderer(self._shapes, *self._options.panel, samples, device=device, num_threads=threads, sized=sized)
 
+    @property
+    def _has_inset(self) -> bool:
+        return INSET * self._options.panel[1] >= LEAST_INSET
+
     def _picture(self, renderer: Renderer, moments: list[Moment]) -> Image.Image:
         """The panels side by side, with what is drawn over them."""
         (columns, _), (width, height) = self._options.grid, self._options.panel
@@ -133,14 +137,14 @@ class Recorder:
         picture = Image.new("RGB", (self._options.size[0], self._options.size[1]))
         for k, moment in enumerate(moments):
             panel = Image.fromarray(renderer.render(moment.view).numpy())
-            if moment.perceived is not None and INSET * height >= LEAST_INSET:
+            if moment.perceived is not None and self._has_inset:
                 plot, margin = sector_plot(moment.perceived, moment.true, round(INSET * height)), round(MARGIN * height)
                 panel.paste(plot, (width - plot.width - margin, margin), plot)
             picture.paste(panel.crop((0, 0, width - gap, height - gap)), (k % columns * width, k // columns * height))
         colours = {"command": shown(COMMAND), "velocity": shown(VELOCITY)}
         if self._env.sensing is not None:
             colours = {"proximal points": shown(PROXIMAL), "distal points": shown(DISTAL), **colours}
-        if any(moment.perceived is not None for moment in moments):
+        if self._has_inset and any(moment.perceived is not None for moment in moments):
             colours |= {"obstacles as perceived": PERCEIVED, "as they are": TRUE}
         key, margin = legend(colours, picture.height), round(MARGIN * picture.height)
         if key.width + 2 * margin <= picture.width:

@@ -16,6 +16,7 @@ FORMAT = "omniperception-checkpoint"
 VERSION = 1
 
 _NAME = re.compile(r"model_(\d+)\.pt")
+_LAYER = re.compile(r"mlp\.(\d+)\.weight")
 
 
 class CheckpointError(RuntimeError):
@@ -73,20 +74,65 @@ def load_checkpoint(path: str | os.PathLike, map_location: str | torch.device | 
     """Read a checkpoint without running any code from it."""
     path = Path(path)
     if not path.is_file():
-        raise CheckpointError(f"no checkpoint at {path}")
+        raise CheckpointError(f"no checkpoint at {path}: give a file such as {checkpoint_path('<run>', 100)}")
     try:
         content = torch.load(path, weights_only=True, map_location=map_location)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
-        reason = str(error).strip().splitlines()
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read ({error.strerror or error})") from error
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
         raise CheckpointError(
-            f"{path} is damaged or no checkpoint of this program"
-            f" ({reason[0][:120] if reason else type(error).__name__}); use an older one"
+            f"{path} ({path.stat().st_size:,} bytes) is damaged or no checkpoint of this program; use an older one"
         ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path} is no checkpoint of this program: it has no format '{FORMAT}'")
     if content["version"] != VERSION:
         raise CheckpointError(f"{path} has checkpoint version {content['version']}, this program reads {VERSION}")
     return content
+
+
+def difference(own: Mapping[str, torch.Tensor], other: Mapping[str, torch.Tensor]) -> str | None:
+    """What keeps the weights of an actor out of another one, in words.
+
+    Args:
+        own: state of the actor that is to take them.
+        other: the weights.
+
+    Returns:
+        None where they fit.
+    """
+    layers, others = _layers(own), _layers(other)
+    if not others:
+        return "they are no actor's"
+    if others[-1][0] != layers[-1][0]:
+        return f"they move {others[-1][0]} joints, this robot has {layers[-1][0]}"
+    for part, with_it, without in (
+        ("perception.", "perceive with LiDAR", "walk blind"),
+        ("estimator.", "estimate the base's velocity", "read the base's velocity"),
+    ):
+        mine, theirs = (any(name.startswith(part) for name in state) for state in (own, other))
+        if mine != theirs:
+            return f"they {with_it if theirs else without}, this run is to {with_it if mine else without}"
+    if others[0][1] != layers[0][1]:
+        return f"they read {others[0][1]} numbers, this run has {layers[0][1]}: other observations or another embedding"
+    if others != layers:
+        return f"their hidden layers have {_widths(others)} units, here {_widths(layers)}"
+    for name, tensor in own.items():
+        if name not in other:
+            return f"they lack {name}"
+        if other[name].shape != tensor.shape:
+            return f"their {name} has shape {tuple(other[name].shape)}, here {tuple(tensor.shape)}"
+    unknown = next((name for name in other if name not in own), None)
+    return None if unknown is None else f"they have {unknown}, which nothing here takes"
+
+
+def _layers(state: Mapping[str, torch.Tensor]) -> list[tuple[int, int]]:
+    """Outputs and inputs of the layers of an actor's MLP, first to last."""
+    found = [(int(match[1]), name) for name in state if (match := _LAYER.fullmatch(name))]
+    return [(state[name].shape[0], state[name].shape[1]) for _, name in sorted(found)]
+
+
+def _widths(layers: list[tuple[int, int]]) -> list[int]:
+    return [outputs for outputs, _ in layers[:-1]]
 
 
 def portable(value, where: str = "state"):

@@ -14,12 +14,14 @@ import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
+from omniperception.common.errors import one_line
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import ObservationsConfig
 from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
     CheckpointError,
     checkpoint_path,
+    difference,
     latest_checkpoint,
     load_checkpoint,
     prune_checkpoints,
@@ -249,14 +251,17 @@ class Runner:
 
     def _load(self, path: str | Path, parts: dict | None = None) -> dict:
         state = load_checkpoint(path, self.device)
+        reason = difference(self.alg.actor.state_dict(), state.get("actor_state_dict", {}))
         try:
-            self.alg.load(state, parts)
+            if reason is None:
+                self.alg.load(state, parts)
         except (RuntimeError, ValueError, KeyError) as error:
-            reason = " ".join(str(error).split())
+            reason = one_line(error)[:200]
+        if reason is not None:
             raise CheckpointError(
-                f"{path} does not fit this configuration ({reason[:200]}); use the configuration"
-                " saved in its run directory"
-            ) from error
+                f"{path} does not fit this configuration: {reason}; give weights of a run like this one, or leave out"
+                " the overrides that make it another"
+            )
         return state
 
     def _save_checkpoint(self) -> None:

@@ -4,9 +4,12 @@ import contextlib
 import ctypes
 import itertools
 import os
-from collections.abc import Sequence
+import sys
+import threading
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -33,9 +36,36 @@ def _init_without_driver() -> None:
 
 _init_without_driver()
 
+SAY_AFTER_S = 2.0
+"""How long (s) a kernel is compiled in silence."""
+_launched: set[wp.Module] = set()
+
 CHUNKS_PER_THREAD = 4
 MIN_CHUNK_WORK = 65536
 """Work that is worth another thread's waking up, in units of about half a nanosecond."""
+
+
+@contextlib.contextmanager
+def compiling_is_said(kernel: wp.Kernel) -> Iterator[None]:
+    """Says what takes so long where a kernel is compiled, which Warp does once and keeps on the disk.
+
+    Args:
+        kernel: that is launched; nothing is said of one that has been launched before.
+    """
+    module = kernel.module
+    if module in _launched or any(Path(wp.config.kernel_cache_dir).glob(f"wp_{module.name}_*")):
+        _launched.add(module)
+        yield
+        return
+    line = f"compiling {kernel.key.rpartition('__')[2]} for {SAY_AFTER_S:g} s and more, once on this machine ..."
+    said = threading.Timer(SAY_AFTER_S, print, (line,), {"file": sys.stderr, "flush": True})
+    said.daemon = True
+    said.start()
+    try:
+        yield
+    finally:
+        said.cancel()
+    _launched.add(module)
 
 
 def default_num_threads() -> int:
@@ -82,17 +112,18 @@ class SplitLaunch:
         self.cuda_device = device if device.type == "cuda" else None
         threads = 1 if self.cuda_device else num_threads
         chunks = split(num_envs, work_per_env, threads) if num_envs else []
-        self.commands = [
-            wp.launch(
-                kernel,
-                dim=(count, *inner),
-                inputs=[first + low, *args],
-                device=wp_device(device),
-                record_cmd=True,
-                block_dim=block_dim,
-            )
-            for low, count in chunks
-        ]
+        with compiling_is_said(kernel):
+            self.commands = [
+                wp.launch(
+                    kernel,
+                    dim=(count, *inner),
+                    inputs=[first + low, *args],
+                    device=wp_device(device),
+                    record_cmd=True,
+                    block_dim=block_dim,
+                )
+                for low, count in chunks
+            ]
         self.pool = thread_pool(threads - 1) if len(chunks) > 1 else None
         self.width = min(threads, len(chunks))
 

@@ -32,7 +32,7 @@ from omniperception.viewer.clock import Clock
 from omniperception.viewer.colours import scale
 from omniperception.viewer.meshes import triangles
 from omniperception.viewer.options import PageOptions, Room
-from omniperception.viewer.page import open_page
+from omniperception.viewer.page import check_free, close_page, open_page
 
 DT = 0.02
 """Time (s) between two poses of everything."""
@@ -248,14 +248,11 @@ class Lab:
         self, room: Room, sensors: Mapping[str, Callable[[], SensorConfig]], out: Path, options: PageOptions
     ) -> None:
         self._room, self._sensors, self._out, self._options = room, sensors, out, options
-        self.server = open_page(options, "Scan lab")
+        check_free(options)
         self.name = next(iter(sensors))
-        try:
-            sensor = sensors[self.name]()
-            self.bench = Bench(room, sensor, Knobs.of(sensor))
-        except BaseException:
-            self.server.stop()
-            raise
+        sensor = sensors[self.name]()
+        self.bench = Bench(room, sensor, Knobs.of(sensor))
+        self.server = open_page(options, "Scan lab")
         self.clock = Clock(DT, PICTURE_HZ)
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
         self._stopped, self._status_due, self.message = False, 0.0, ""
@@ -292,7 +289,7 @@ class Lab:
 
     def close(self) -> None:
         """Takes the page down."""
-        self.server.stop()
+        close_page(self.server)
 
     def ask(self, request: Callable[[], None]) -> None:
         """Has something done between two steps; from any thread."""
@@ -389,7 +386,7 @@ class Lab:
             self._slider("num_rays", "rays a frame", 100, MOST_RAYS, 100)
             self._slider("period_s", "period (s)", DT, 0.5, DT)
             self._slider("min_range", "least range (m)", 0.0, 3.0, 0.05)
-            self._slider("max_range", "most range (m)", 0.5, 100.0, 0.5)
+            self._slider("max_range", "most range (m)", 0.5, 300.0, 0.5)
         with gui.add_folder("Noise"):
             self._slider("gaussian", "Gaussian (m)", 0.0, 0.2, 0.005)
             self._slider("jitter_deg", "jitter (deg)", 0.0, 2.0, 0.05)

@@ -6,6 +6,8 @@ import errno
 import logging
 import socket
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from omniperception.viewer.options import LOCALHOST, PageOptions, ViewerError
@@ -22,17 +24,12 @@ def open_page(options: PageOptions, title: str) -> viser.ViserServer:
     Raises:
         ViewerError: the address or the port cannot be had.
     """
-    import rich
     import viser
 
-    _check_free(options)
+    check_free(options)
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # a stray connection is no traceback's worth
-    console = rich.get_console()
-    quiet, console.quiet = console.quiet, True  # the line below says it, and who can reach the page
-    try:
+    with _quiet():  # the line below says it, and who can reach the page
         server = viser.ViserServer(options.host, options.port, label=title, verbose=False)
-    finally:
-        console.quiet = quiet
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
     server.gui.main_panel.set_width(PANEL_PIXELS)
@@ -40,6 +37,25 @@ def open_page(options: PageOptions, title: str) -> viser.ViserServer:
     if options.open_browser:
         webbrowser.open(f"http://{options.host}:{options.port}")
     return server
+
+
+def close_page(server: viser.ViserServer) -> None:
+    """Takes a page down."""
+    with _quiet():
+        server.stop()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without viser's own lines."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def announcement(options: PageOptions) -> str:
@@ -52,8 +68,8 @@ def announcement(options: PageOptions) -> str:
     )
 
 
-def _check_free(options: PageOptions) -> None:
-    """viser itself would quietly take the next port."""
+def check_free(options: PageOptions) -> None:
+    """Raises a ViewerError where the address or the port cannot be had; viser would quietly take the next port."""
     family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

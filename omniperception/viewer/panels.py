@@ -30,7 +30,8 @@ SMOOTHING = 0.2
 """Share of the newest value in the bars of rewards."""
 KEYS = (
     "**I K** ahead, back · **J L** left, right · **U O** turn · **X** stand · **T** the task commands ·"
-    " **Space** pause · **N** one step · **R** new trial · **P** push · **B** bring the obstacle"
+    " **Space** pause · **N** one step · **R** new trial · **P** push · **B** bring the obstacle ·"
+    " **V** look at the robot"
 )
 
 
@@ -120,6 +121,7 @@ class Panels:
 
     def _build_view(self) -> None:
         gui, stage = self._gui, self._viewer.stage
+        self._on_click(gui.add_button("look at the robot (V)"), self._viewer.look_at_robot)
         follow = gui.add_checkbox("keep the robot in the middle", stage.follows)
         self._on(follow, lambda on: setattr(stage, "follows", on))
         for name in SHOWN:
@@ -149,6 +151,7 @@ class Panels:
             "N": ("one control step", viewer.single_step),
             "R": ("new trial", viewer.new_trial),
             "P": ("push the robot to its left", viewer.push_aside),
+            "V": ("look at the robot", viewer.look_at_robot),
             "B": ("bring the obstacle", lambda: viewer.bring(self._kind.value)),
         }
         for key, (label, act) in keys.items():
@@ -229,6 +232,14 @@ class Panels:
         self._set(self._policy, session.shown.policy)
         self._set(self._run, str(session.shown.run_dir))
         self.show_checkpoint(session.checkpoint)
+
+    def renew_lists(self) -> None:
+        """Runs and checkpoints that have come or gone meanwhile."""
+        for handle, names in ((self._run, _runs(Path(self._run.value))), (self._checkpoint, self._checkpoint_names())):
+            if tuple(handle.options) != tuple(names):
+                chosen = handle.value
+                handle.options = tuple(names)
+                self._set(handle, chosen)
 
     def _set(self, handle: Any, value: object) -> None:
         with contextlib.suppress(ValueError):  # an option that is gone meanwhile

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +28,8 @@ GROUND_M, GROUND_STEP = 12.0, 0.1
 ARC_STEPS = 2
 """Straight pieces of a sector's arc."""
 OVER_GROUND = 0.03
+EYE, TARGET = (-3.2, -1.8, 2.2), (0.6, 0.0, 0.2)
+"""Whence and whither (m) a browser looks at the beginning, from where the robot stands."""
 STICK_REACH = 0.8
 """Distance (m) of the stick's ball from the base's middle at a command of 1 m/s."""
 
@@ -61,12 +63,20 @@ class Stage:
         self._poses: dict[int, tuple] = {}
         self._sizes: dict[int, tuple[float, ...]] = {}
         self.cast_shadows(False)
-        server.initial_camera.position = (-3.2, -1.8, 2.2)
-        server.initial_camera.look_at = (0.6, 0.0, 0.2)
+        server.initial_camera.position, server.initial_camera.look_at = EYE, TARGET
 
     def cast_shadows(self, on: bool) -> None:
         """Shadows are nice, and much to ask of a browser without a graphics card."""
         self.scene.configure_default_lights(cast_shadow=on)
+
+    def look(self, clients: Iterable[Any]) -> None:
+        """Has browsers look at the robot from where they did at the beginning."""
+        assert self._session is not None
+        x, y = self._session.env.state.kinematics.base_pos_w[0, :2].tolist()
+        at = np.array([x - self.origin[0], y - self.origin[1], 0.0])
+        for client in clients:
+            with client.atomic():
+                client.camera.position, client.camera.look_at = at + EYE, at + TARGET
 
     # ---- building ----------------------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from omniperception.learning.checkpoint import list_checkpoints
 from omniperception.viewer.clock import Clock
 from omniperception.viewer.drive import Stick, Velocity
 from omniperception.viewer.options import PageOptions, Shown
-from omniperception.viewer.page import open_page
+from omniperception.viewer.page import check_free, close_page, open_page
 from omniperception.viewer.panels import Panels
 from omniperception.viewer.session import Session
 from omniperception.viewer.stage import STICK_REACH, Stage, turned
@@ -28,6 +28,8 @@ from omniperception.viewer.stage import STICK_REACH, Stage, turned
 PICTURE_HZ, CHART_HZ, STATUS_HZ = 25.0, 5.0, 2.0
 LOOK_S = 2.0
 """How often (s) a followed run is asked for a newer checkpoint."""
+LISTS_S = 10.0
+"""How often (s) runs and checkpoints are looked for."""
 PUSH_AHEAD_M = 1.5
 """Where (m) before the robot a spare obstacle is put."""
 SWITCHED = ("scenario", "condition", "terrain", "obstacles", "lidar", "robot")
@@ -51,7 +53,7 @@ class Viewer:
     """
 
     def __init__(self, shown: Shown, options: PageOptions) -> None:
-        """Builds the task, then opens the page.
+        """Builds the task, then opens the page; a port that is taken is told at once.
 
         Raises:
             ViewerError: the page cannot be opened.
@@ -61,18 +63,15 @@ class Viewer:
         chosen, rest = _split(shown.overrides)
         self._choices, self._rest = chosen, rest
         self._options = options
+        check_free(options)
+        self.session = Session(replace(shown, overrides=self._overrides()))
         self.server = open_page(options, "OmniPerception")
-        try:
-            self.session = Session(replace(shown, overrides=self._overrides()))
-        except BaseException:
-            self.server.stop()
-            raise
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
         self.paused, self._single, self._stopped = False, 0, False
         self.stick, self.push_speed, self.follows, self.message = Stick(), 0.8, False, ""
         self._stick_keeps = False
         self.clock = Clock(self.session.env.control_dt, PICTURE_HZ)
-        self._charts_due = self._status_due = self._look_due = 0.0
+        self._charts_due = self._status_due = self._look_due = self._lists_due = 0.0
         self._frames_drawn, self._shown_points, self._frames_window = 0, 0, (time.monotonic(), 0)
         self.points_hz, self._mean_rewards = 0.0, dict[str, float]()
         self._redraw = True
@@ -117,7 +116,7 @@ class Viewer:
 
     def close(self) -> None:
         """Takes the page down."""
-        self.server.stop()
+        close_page(self.server)
 
     def ask(self, request: Callable[[], None]) -> None:
         """Has something done between two control steps; from any thread."""
@@ -159,6 +158,9 @@ class Viewer:
                 self._charts_due = now + 1.0 / CHART_HZ
                 self.panels.draw_charts(perceived, there)
             self._redraw = False
+        if now >= self._lists_due:
+            self._lists_due = now + LISTS_S
+            self.panels.renew_lists()
         if now >= self._status_due:
             self._status_due = now + 1.0 / STATUS_HZ
             started, count = self._frames_window
@@ -217,6 +219,10 @@ class Viewer:
         """Simulated seconds per second."""
         self.clock.speed = speed
         self.clock.start()
+
+    def look_at_robot(self) -> None:
+        """Has everybody look at the robot as at the beginning, wherever it is and the mouse has turned their view."""
+        self.stage.look(self.server.get_clients().values())
 
     def new_trial(self) -> None:
         """Ends the trial; the next one is another scene."""
@@ -287,7 +293,8 @@ class Viewer:
         self.panels.show_choices(choices, session)
         self.clock.start()
         self._draw_again()
-        self.say(f"{session.checkpoint} in {self._where()}")
+        actor = session.checkpoint if shown.policy == "run" else f"policy={shown.policy}"
+        self.say(f"{actor} in {self._where()}")
 
     def _overrides(self) -> tuple[str, ...]:
         chosen = tuple(f"{group}={preset}" for group, preset in self._choices.items() if preset is not None)

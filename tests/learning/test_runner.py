@@ -1,6 +1,7 @@
 """Runner: exact resume in a new process, atomic checkpoints, budgets, interrupts, logs."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from omniperception.learning import (
     load_checkpoint,
     save_checkpoint,
 )
-from omniperception.learning.checkpoint import checkpoint_path, list_checkpoints
+from omniperception.learning.checkpoint import checkpoint_path, difference, list_checkpoints
 
 HERE = Path(__file__).parent
 
@@ -122,9 +123,31 @@ class TestCheckpoints:
 
     def test_another_architecture_is_a_clear_error(self, tmp_path):
         runner_for(tmp_path).learn(1)
-        with pytest.raises(CheckpointError, match="does not fit this configuration") as error:
+        with pytest.raises(CheckpointError, match=r"does not fit this configuration: their hidden layers") as error:
             Runner(ToyEnv(), config(hidden_dims=[4])).load(latest_checkpoint(tmp_path))
         assert "\n" not in str(error.value)
+
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            ({}, None),
+            ({"mlp.2.weight": (3, 8)}, "they move 3 joints, this robot has 2"),
+            ({"mlp.0.weight": (8, 7)}, "they read 7 numbers, this run has 5"),
+            ({"mlp.0.weight": (4, 5), "mlp.2.weight": (2, 4)}, r"their hidden layers have \[4\] units, here \[8\]"),
+            ({"perception.gru.weight": (4, 4)}, "they perceive with LiDAR, this run is to walk blind"),
+            ({"estimator.0.weight": (4, 4)}, "they estimate the base's velocity, this run is to read"),
+            ({"mlp.0.bias": None}, "they lack mlp.0.bias"),
+            ({"mlp.0.bias": (9,)}, r"their mlp.0.bias has shape \(9,\), here \(8,\)"),
+            ({"other": (1,)}, "they have other, which nothing here takes"),
+            ({"mlp.0.weight": None, "mlp.2.weight": None}, "they are no actor's"),
+        ],
+    )
+    def test_what_keeps_weights_out_is_said(self, change, said):
+        shapes = {"mlp.0.weight": (8, 5), "mlp.0.bias": (8,), "mlp.2.weight": (2, 8)}
+        own = {name: torch.zeros(shape) for name, shape in shapes.items()}
+        other = {name: torch.zeros(shape) for name, shape in (shapes | change).items() if shape is not None}
+        found = difference(own, other)
+        assert found is None if said is None else re.search(said, found)
 
     def test_loading_the_actor_alone(self, tmp_path):
         runner_for(tmp_path).learn(1)

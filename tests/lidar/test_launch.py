@@ -1,8 +1,13 @@
 """How launches are divided among CPU threads."""
 
-import pytest
+import time
 
-from omniperception.lidar.launch import CHUNKS_PER_THREAD, MIN_CHUNK_WORK, default_num_threads, split
+import pytest
+import torch
+import warp as wp
+
+from omniperception.lidar import launch
+from omniperception.lidar.launch import CHUNKS_PER_THREAD, MIN_CHUNK_WORK, SplitLaunch, default_num_threads, split
 
 
 @pytest.mark.parametrize(("num_envs", "work", "threads"), [(1, 1, 2), (7, MIN_CHUNK_WORK, 2), (1000, 500, 3)])
@@ -27,3 +32,21 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch, processes, expect
     else:
         monkeypatch.setenv("LOCAL_WORLD_SIZE", processes)
     assert default_num_threads() == expected
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def count_up(env_offset: int, values: wp.array(dtype=int)):  # type: ignore[valid-type]
+    values[env_offset + wp.tid()] = env_offset + wp.tid()
+
+
+def test_compiling_is_said_once(monkeypatch, tmp_path, capfd):
+    """A kernel that no cache has takes longer than a hundredth of a second."""
+    monkeypatch.setattr(launch, "SAY_AFTER_S", 0.01)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    values = wp.zeros(3, dtype=int, device="cpu")
+    assert count_up.module not in launch._launched
+    for _ in range(2):
+        SplitLaunch(count_up, 3, (), (values,), torch.device("cpu"), 1)()
+        time.sleep(0.05)
+    assert values.numpy().tolist() == [0, 1, 2]
+    assert capfd.readouterr().err.count("compiling count_up for 0.01 s and more, once on this machine") == 1

@@ -15,6 +15,7 @@ from browser import chromium, control, open_tab, picture, pixel, wait_for
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint, save_checkpoint
 from omniperception.viewer import PageOptions, Shown
+from omniperception.viewer.stage import TARGET
 from omniperception.viewer.viewer import Viewer
 
 RUN = Path(__file__).parents[2] / "pretrained" / "avoider"
@@ -40,6 +41,14 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     page.keyboard.press("x")
     wait_for(lambda: viewer.state()["driven"] == (0.0, 0.0, 0.0), "X stands")
     assert np.allclose(client.camera.position, eye, atol=1e-3), "keys that drive leave the view where it is"
+    client.camera.position = tuple(eye + 2.0)
+    page.keyboard.press("v")
+
+    def at_robot() -> bool:
+        offset = np.array(viewer.state()["position"][:2]) - viewer.stage.origin
+        return bool(np.allclose(np.array(client.camera.look_at)[:2] - TARGET[:2], offset, atol=0.1))
+
+    wait_for(lambda: np.allclose(client.camera.position, eye, atol=0.1) and at_robot(), "V looks at the robot")
 
     bring(viewer, page)
     page.keyboard.press("Space")

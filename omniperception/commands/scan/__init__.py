@@ -12,7 +12,7 @@ pattern.png, scan.png and the points; the pictures need the extra `plots`, a mes
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, 
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.env.config import EnvConfig
 from omniperception.env.sensing import SensorConfig
-from omniperception.lidar import TriangleMesh
+from omniperception.lidar import DEVICES, TriangleMesh
 from omniperception.scene import RobotConfig
 from omniperception.viewer import PageOptions, ViewerError, serve_lab
 from omniperception.viewer.options import LOCALHOST, PORT, Room
@@ -87,7 +87,7 @@ def _serve(arguments: Arguments, out: Path, overrides: list[str]) -> None:
     """The scan lab."""
     robot = _task(arguments.lidar[0], overrides).robot
     names = [name for name in config.presets("lidar", config.search_path(overrides)) if name != "none"]
-    sensors = {name: partial(_sensor, name, overrides) for name in (*arguments.lidar, *names)}
+    sensors = {name: partial(_device, name, arguments, overrides) for name in (*arguments.lidar, *names)}
     room = lab_room(robot, _surroundings(arguments, robot, walkers=WALKERS))
     serve_lab(room, sensors, out, PageOptions(arguments.host, arguments.port))
 
@@ -108,10 +108,16 @@ def lab_room(robot: RobotConfig, demo: DemoScene) -> Room:
     )
 
 
-def _sensor(name: str, overrides: list[str]) -> SensorConfig:
-    """A sensor's preset."""
+def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConfig:
+    """A sensor as its maker sells it: whole frames as far as it reaches, where nothing else is asked for."""
     sensor = _task(name, overrides).lidar
     assert sensor is not None  # only lidar=none has none
+    given = {override.lstrip("+").partition("=")[0] for override in overrides}
+    if "lidar.num_rays" not in given:
+        whole = sensor.scan_pattern().points_per_frame(sensor.period_s)
+        sensor = replace(sensor, num_rays=min(arguments.rays or whole, whole))
+    if "lidar.max_range" not in given and sensor.device is not None:
+        sensor = replace(sensor, max_range=DEVICES[sensor.device].max_range)
     return sensor
 
 
