@@ -53,7 +53,7 @@ def compiling_is_said(kernel: wp.Kernel) -> Iterator[None]:
         kernel: that is launched; nothing is said of one that has been launched before.
     """
     module = kernel.module
-    if module in _launched or any(Path(wp.config.kernel_cache_dir).glob(f"wp_{module.name}_*")):
+    if module in _launched or any(Path(wp.config.kernel_cache_dir or ".").glob(f"wp_{module.name}_*")):
         _launched.add(module)
         yield
         return

@@ -55,7 +55,7 @@ def test_what_no_run_has_is_named(tmp_path, monkeypatch, capsys):
     make_run(tmp_path / "runs" / "late", 2, [4.0], first=10)
     given = {
         ("runs=nowhere",): "runs=nowhere is no run directory",
-        ("runs=runs/one", "tags=Foo"): "tags=Foo: none of the 1 runs has it",
+        ("runs=runs/one", "tags=Foo"): f"tags=Foo: no run has it, out of 1; known: {TAG}",
         ("runs=runs", f"tags={TAG}"): "have no iteration in common",
     }
     for arguments, message in given.items():
