@@ -64,13 +64,11 @@ def ray_shapes(world: World, exclude_geoms: Collection[str] = (), carrier: str |
         carrier: body that is among `bodies` whether it has a shape or not, beside the base.
 
     Raises:
-        ValueError: `exclude_geoms` names a geom that does not exist.
+        ValueError: `exclude_geoms` names a geom that the robot's file does not have.
     """
     model = world.model
     known = [model.geom(k).name for k in range(model.ngeom)]
-    unknown = sorted(set(exclude_geoms) - set(known))
-    if unknown:
-        raise ValueError(f"robot.mounts: exclude_geoms names {', '.join(unknown)}; known: {', '.join(known)}")
+    exclude_geoms = world.robot.built_geoms(exclude_geoms, known)
     root, seen = world.base_body, set(robot_geoms(model, world.robot))
     unseen = {k for k in range(model.ngeom) if model.body_rootid[model.geom_bodyid[k]] == root} - seen
     kept = [k for k, name in enumerate(known) if name not in exclude_geoms and k not in unseen]

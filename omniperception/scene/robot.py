@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,7 +24,8 @@ class Mount:
     Attributes:
         pos: (x, y, z) of the sensor in the frame of `body` (m).
         rpy: orientation of the sensor in that frame: roll, pitch, yaw about fixed axes (rad).
-        exclude_geoms: geoms of the robot that the rays pass through: the housing around the sensor.
+        exclude_geoms: geoms of the robot that the rays pass through: the housing around the sensor, in each form that
+            the file has of it.
         body: link that carries the sensor; None: the base.
     """
 
@@ -235,6 +236,26 @@ class RobotConfig:
             for geom in touching[0]:
                 for other in touching[1]:
                     spec.add_pair(geomname1=geom, geomname2=other)
+
+    def built_geoms(self, names: Iterable[str], built: Collection[str]) -> tuple[str, ...]:
+        """Those of a mount's `exclude_geoms` that are built: some are of the robot as meshes, others as primitives.
+
+        Args:
+            names: of geoms.
+            built: names of those that are.
+
+        Raises:
+            ValueError: the file does not have one.
+        """
+        given = tuple(names)
+        if not set(given) <= set(built):
+            known = dict.fromkeys((*built, *(geom.name for geom in read_robot(self.path()).geoms)))
+            unknown = sorted(set(given) - known.keys())
+            if unknown:
+                raise ValueError(
+                    f"robot.mounts: exclude_geoms names {', '.join(unknown)}; known: {', '.join(filter(None, known))}"
+                )
+        return tuple(name for name in given if name in built)
 
     def place(self, mount: Mount) -> Place:
         """A mount in the frame of the moving link that carries it."""

@@ -170,9 +170,7 @@ class Bench:
     def build(self) -> None:
         """Makes the sensor as the knobs say; ValueError where they cannot be."""
         room, knobs, sensor = self._room, self.knobs, self.sensor
-        unknown = sorted(set(sensor.exclude_geoms) - set(room.robot_geoms))
-        if unknown:
-            raise ConfigError(f"robot.mounts: exclude_geoms names {unknown}; known: {', '.join(room.robot_geoms)}")
+        excluded = room.robot.built_geoms(sensor.exclude_geoms, room.robot_geoms)
         pattern = sensor.scan_pattern()
         config = replace(
             sensor,
@@ -187,7 +185,7 @@ class Bench:
             pattern,
             room.scene,
             room.bodies[sensor.mount_body or room.robot.base],
-            exclude_shapes=[room.robot_geoms[geom] for geom in sensor.exclude_geoms],
+            exclude_shapes=[room.robot_geoms[geom] for geom in excluded],
             noise=knobs.noise(),
             outputs=OUTPUTS,
             reflectivity=room.reflectivity,

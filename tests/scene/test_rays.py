@@ -1,5 +1,8 @@
 """What rays hit is what bodies touch: the ray scene against mj_ray on the very model that is simulated."""
 
+import importlib.resources
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -62,3 +65,20 @@ def test_every_part_is_a_body_of_its_own(make_config):
 def test_unknown_excluded_geoms_are_named(world):
     with pytest.raises(ValueError, match=r"exclude_geoms names nose; known: .*trunk"):
         ray_shapes(world, ("nose",))
+
+
+def test_excluded_geoms_may_be_of_a_form_that_is_not_built(make_config, tmp_path):
+    """One mount serves the robot as it collides and as it is drawn."""
+    file = tmp_path / "two_forms.xml"
+    text = Path(str(importlib.resources.files("omniperception.scene") / "assets" / "go2.xml")).read_text()
+    drawn = '<geom name="head_drawn" type="sphere" size="0.05" group="2" contype="0" conaffinity="0" mass="0"/>'
+    marker = '<geom name="head_upper"'
+    assert text.count(marker) == 1
+    file.write_text(text.replace(marker, drawn + marker))
+    for groups, left, seen in (("null", "head_upper", "trunk"), ("[2]", "head_drawn", None)):
+        run = make_config(f"robot.file={file}", f"robot.ray_groups={groups}", "obstacles=none")
+        world = build_world(run.env.robot, run.env.terrain, run.env.obstacles)
+        all_names = ray_shapes(world).geom_names
+        names = ray_shapes(world, ("head_upper", "head_drawn")).geom_names
+        assert left in all_names and set(all_names) - set(names) == {left}
+        assert seen is None or seen in names

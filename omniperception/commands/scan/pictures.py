@@ -80,16 +80,14 @@ def take_scan(
     seconds = seconds or sensor.period_s
     pattern = sensor.scan_pattern()
     config = replace(sensor, period_s=seconds, num_rays=num_rays or pattern.points_per_frame(seconds))
-    unknown = sorted(set(sensor.exclude_geoms) - set(demo.robot_geoms))
-    if unknown:
-        raise ValueError(f"robot.mounts: exclude_geoms names {unknown}; known: {', '.join(demo.robot_geoms)}")
-    carrier = demo.bodies[sensor.mount_body or demo.base]
+    excluded = demo.robot.built_geoms(sensor.exclude_geoms, demo.robot_geoms)
+    carrier = demo.bodies[sensor.mount_body or demo.robot.base]
     lidar = Lidar(
         config,
         pattern,
         demo.scene,
         carrier,
-        exclude_shapes=[demo.robot_geoms[geom] for geom in sensor.exclude_geoms],
+        exclude_shapes=[demo.robot_geoms[geom] for geom in excluded],
         seed=seed,
         outputs=OUTPUTS,
         reflectivity={int(kind): value for kind, value in REFLECTIVITY.items()},

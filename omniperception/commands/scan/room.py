@@ -66,7 +66,7 @@ class DemoScene:
     Attributes:
         scene: One environment with the robot's bodies where its default pose has them.
         bodies: Index of each of the robot's links by name.
-        base: The base's name.
+        robot: Its preset.
         robot_geoms: Index of each of the robot's shapes by the name of its geom.
         open_side: Shapes that a picture of the room from outside leaves out: the ceiling and two of the walls.
         extent: Of the room or the mesh along x and y, and its highest point, metres.
@@ -76,7 +76,7 @@ class DemoScene:
 
     scene: RayScene
     bodies: dict[str, int]
-    base: str
+    robot: RobotConfig
     robot_geoms: dict[str, int]
     open_side: tuple[int, ...]
     extent: tuple[tuple[float, float], tuple[float, float], float]
@@ -135,7 +135,7 @@ def _with_robot(
     return DemoScene(
         scene=scene,
         bodies={model.body(k).name: i for i, k in enumerate(bodies)},
-        base=robot.base,
+        robot=robot,
         robot_geoms={model.geom(k).name: first + i for i, k in enumerate(found.geom_ids)},
         open_side=open_side,
         extent=extent,
