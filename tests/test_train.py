@@ -94,6 +94,12 @@ def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
             )
         assert f"distillation.teacher={name}" in capsys.readouterr().err
 
+    seen = ("init=[end,gait]", "ppo.max_iterations=1", *(one for one in student if not one.startswith("init=")))
+    main(["train", *seen, "hydra.run.dir=same"])
+    assert "init=end" not in capsys.readouterr().out
+    main(["train", *seen, "perception.sampler.split_deg=10", "hydra.run.dir=other"])
+    assert "learned from another sampler (split_deg 20.0 -> 10)" in capsys.readouterr().out
+
 
 @pytest.mark.slow
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path):

@@ -120,6 +120,8 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
             given = [config.find_run(name, "init") for name in run.init]
             estimates = run.env.observations.estimated is not None
             runner.start_from(*given, observations=build.load_run(given[-1]).env.observations if estimates else None)
+            for name in run.init:
+                _report_other_inputs(OmegaConf.create(run.composed), name)
         report(f"run directory: {run_dir}")
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
         name = run.distillation.teacher
@@ -153,6 +155,17 @@ def _check_motion(composed: DictConfig, source: str, name: str = "init") -> None
             raise config.ConfigError(
                 f"{name}={source}: its actions meant another motion, that of '{key}={wanted}'; give the same here"
             )
+
+
+def _report_other_inputs(composed: DictConfig, source: str) -> None:
+    """Says where a perception network goes on with inputs that are made otherwise; nothing in its weights shows it."""
+    other = config.read(config.find_run(source, "init"))
+    own, given = (OmegaConf.select(one, "perception.sampler") for one in (composed, other))
+    if own is None or given is None or own == given:
+        return
+    keys = [key for key in dict.fromkeys((*given, *own)) if given.get(key) != own.get(key)]
+    changes = ", ".join(f"{key} {given.get(key)} -> {own.get(key)}" for key in keys)
+    report(f"init={source}: its perception was learned from another sampler ({changes}) and goes on from there")
 
 
 def report(text: str) -> None:
