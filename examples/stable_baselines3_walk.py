@@ -3,8 +3,8 @@
 pip install 'omniperception[train,gym]' stable-baselines3
 python examples/stable_baselines3_walk.py --steps 1500000 --num-envs 256
 
-A test has it learn for a few steps. These 1.5 million take six minutes of one core (Intel Xeon; Stable-Baselines3 2.9.2): episodes
-of 977 of the 1000 steps and a return of 46, where the first 120,000 had 328 and 1.3.
+A test has it learn for a few steps. These 1.5 million take six minutes of one core (Intel Xeon; Stable-Baselines3
+2.9.2): episodes of 977 of the 1000 steps and a return of 46, where the first 120,000 had 328 and 1.3.
 """
 
 from __future__ import annotations
