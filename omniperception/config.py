@@ -248,9 +248,7 @@ def _check_preset(override: Override, known: Sequence[str]) -> None:
         if override.is_delete() or not isinstance(name, str):
             raise ConfigError(f"{override.input_line}: {group} names a preset; known: {', '.join(known)}")
         if name not in known:
-            others = f" There are {', '.join(known)}"
-            hint = suggest(name, known)
-            raise ConfigError(f"{group}={name} is unknown; {hint}{others if hint.startswith('did') else ''}")
+            raise ConfigError(f"{group}={name} is unknown; {suggest(name, known, and_all=True)}")
 
 
 def search_path(overrides: Sequence[Override | str], config: DictConfig | None = None) -> list[Path]:

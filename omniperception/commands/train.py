@@ -119,9 +119,9 @@ def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
             _check_motion(OmegaConf.create(run.composed), run.init[-1])
             given = [config.find_run(name, "init") for name in run.init]
             estimates = run.env.observations.estimated is not None
-            runner.start_from(*given, observations=build.load_run(given[-1]).env.observations if estimates else None)
-            for name in run.init:
-                _report_other_inputs(OmegaConf.create(run.composed), name)
+            observed = build.load_run(given[-1]).env.observations if estimates else None
+            for source in runner.start_from(*given, observations=observed):
+                _report_other_inputs(OmegaConf.create(run.composed), source)
         report(f"run directory: {run_dir}")
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
         name = run.distillation.teacher
@@ -157,11 +157,10 @@ def _check_motion(composed: DictConfig, source: str, name: str = "init") -> None
             )
 
 
-def _report_other_inputs(composed: DictConfig, source: str) -> None:
+def _report_other_inputs(composed: DictConfig, source: Path) -> None:
     """Says where a perception network goes on with inputs that are made otherwise; nothing in its weights shows it."""
-    other = config.read(config.find_run(source, "init"))
-    own, given = (OmegaConf.select(one, "perception.sampler") for one in (composed, other))
-    if own is None or given is None or own == given:
+    own, given = (one.perception.sampler for one in (composed, config.read(source)))
+    if own == given:
         return
     keys = [key for key in dict.fromkeys((*given, *own)) if given.get(key) != own.get(key)]
     changes = ", ".join(f"{key} {given.get(key)} -> {own.get(key)}" for key in keys)

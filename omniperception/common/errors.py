@@ -29,10 +29,13 @@ class UnknownKey(DoesNotFit):
         super().__init__(f"{given} is unknown; {suggest(self.name, self.known, path[: path.rfind(self.name)])}")
 
 
-def suggest(name: str, known: Sequence[str], before: str = "") -> str:
-    """The known name that is most similar, with what stands before it; or all of them."""
+def suggest(name: str, known: Sequence[str], before: str = "", and_all: bool = False) -> str:
+    """The known name that is most similar, with what stands before it; or all of them, or both."""
     near = difflib.get_close_matches(name, known, 1)
-    return f"did you mean {before}{near[0]}?" if near else f"known: {', '.join(sorted(known))}"
+    hints = [f"did you mean {before}{near[0]}?"] if near else []
+    if and_all or not near:
+        hints.append(f"known: {', '.join(sorted(known))}")
+    return " ".join(hints)
 
 
 def one_line(error: BaseException) -> str:

@@ -20,6 +20,8 @@ ROOT = Path(__file__).resolve().parents[2]
 """The checkout, or the folder that the package is installed in."""
 FILE = "provenance.json"
 """Name of the file in a run directory that says where the run comes from."""
+CHANGES = "+changes"
+"""Follows the hash of a commit where files were changed since."""
 LIBRARIES = ("omniperception", "torch", "mujoco-core", "warp-lang", "rsl-rl-lib", "tensordict", "numpy")
 
 
@@ -66,7 +68,7 @@ def made_at(run_dir: Path) -> str:
 
 @cache
 def commit(root: Path = ROOT) -> str | None:
-    """Hash of the commit that the code was run at, with "+changes" if files beside docs/ differed; None outside of a
+    """Hash of the commit that the code was run at, with CHANGES if files beside docs/ differed; None outside of a
     checkout."""
     if not (root / ".git").exists():
         return None
@@ -75,7 +77,7 @@ def commit(root: Path = ROOT) -> str | None:
         changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs")
     except (OSError, subprocess.CalledProcessError):
         return None
-    return f"{found}+changes" if changed else found
+    return f"{found}{CHANGES}" if changed else found
 
 
 def command() -> str:

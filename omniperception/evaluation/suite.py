@@ -17,7 +17,7 @@ import yaml
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
 from omniperception.common.figures import new_figure
-from omniperception.common.provenance import ROOT, provenance
+from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.export import FOLDER as EXPORTED
@@ -209,8 +209,13 @@ class Task:
         return self.run_dir / FOLDER / f"{'-'.join(names)}.json"
 
     def done(self, facts: dict) -> Record | None:
-        """The record of an earlier measurement by the same code with the same settings; None without one."""
+        """The record of an earlier measurement by the same code with the same settings; None without one.
+
+        None is by the same code where files were changed since the commit: nothing says how.
+        """
         evaluation, path = self.evaluation, self.path
+        if (facts["commit"] or "").endswith(CHANGES):
+            return None
         if evaluation.again or not path.is_file() or (evaluation.plots and not path.with_suffix(".npz").is_file()):
             return None
         (record,) = read(path)
@@ -265,8 +270,8 @@ class Task:
 
     @cached_property
     def _own(self) -> EnvConfig:
-        """The run's task, whoever walks: its LiDAR and its avoidance controller."""
-        return build.load_run(self.run_dir, trust=self.evaluation.trust).env
+        """The run's task with the overrides, whoever walks: its LiDAR and its avoidance controller."""
+        return build.load_run(self.run_dir, self.evaluation.overrides, self.evaluation.trust).env
 
     def _limits(self) -> Limits | None:
         """Ranges (m/s) of what the gait has learned to follow; None where it is the run's own, made for V_avoid."""

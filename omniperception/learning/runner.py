@@ -164,7 +164,7 @@ class Runner:
         """Load the actor's weights alone, to replay it."""
         self._load(path, {"actor": True})
 
-    def start_from(self, *run_dirs: str | Path, observations: ObservationsConfig | None = None) -> None:
+    def start_from(self, *run_dirs: Path, observations: ObservationsConfig | None = None) -> list[Path]:
         """Begin with the newest weights of other runs.
 
         The last one gives the actor's, and the critic's where it observes the same; those before give what they
@@ -173,6 +173,9 @@ class Runner:
         Args:
             run_dirs: of these runs.
             observations: of the last one, which may observe what this one estimates; None: the same as here.
+
+        Returns:
+            The runs whose perception goes on here.
         """
         *seeing, run_dir = run_dirs
         for other in seeing:
@@ -184,10 +187,12 @@ class Runner:
             truth = self.env.actor_inputs(replace(own, actor=[self.config.estimator.group]))
             given = self.env.actor_inputs(observations)
             weights = estimating(self.alg.actor, weights, self.env.actor_inputs(own), given, truth)
-        start_from(self.alg.actor, weights, str(run_dir))
+        if start_from(self.alg.actor, weights, str(run_dir)):
+            seeing = [run_dir]
         self.alg.actor.reset()
         with contextlib.suppress(CheckpointError):
             start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
+        return seeing
 
     def _weights(self, run_dir: str | Path) -> dict:
         return load_checkpoint(latest_checkpoint(run_dir), self.device)

@@ -40,7 +40,7 @@ def perceive_as(model: MLPModel, weights: Mapping[str, torch.Tensor], source: st
         state[name].copy_(weights[name])
 
 
-def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> None:
+def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> bool:
     """Copies the actor's weights of another run into a model with the same one-dimensional observations.
 
     The first layer reads these observations before an embedding, so a policy that walked blind starts to walk with
@@ -50,6 +50,9 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
         model: whose weights are replaced in place.
         weights: the state of the other.
         source: names the other run in an error.
+
+    Returns:
+        Whether the perception network was copied, too.
 
     Raises:
         CheckpointError: observations, hidden layers or actions differ.
@@ -69,6 +72,7 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
             alike = "observations (groups and history) and ppo.hidden_dims"
             raise _misfit(f"init={source} does not fit", name, own, other, alike)
         own.copy_(other)
+    return bool(optional) and perceives_alike
 
 
 def estimating(

@@ -29,7 +29,7 @@ ARC_STEPS = 2
 """Straight pieces of a sector's arc."""
 OVER_GROUND = 0.03
 EYE, TARGET = (-3.2, -1.8, 2.2), (0.6, 0.0, 0.2)
-"""Whence and whither (m) a browser looks at the beginning, from where the robot stands."""
+"""Where the camera is at the beginning and what it looks at (m), from where the robot stands."""
 STICK_REACH = 0.8
 """Distance (m) of the stick's ball from the base's middle at a command of 1 m/s."""
 

@@ -10,6 +10,7 @@ import torch
 from omniperception import build, config
 from omniperception.build import build_runner
 from omniperception.common.figures import PlotsUnavailable
+from omniperception.common.provenance import provenance
 from omniperception.common.random import EnvRandom
 from omniperception.config import ConfigError
 from omniperception.evaluation import suite
@@ -42,6 +43,11 @@ def seeing(tmp_path_factory):
 def evaluation(run_dir, *worlds, **given):
     given = {"trials": 4, "num_envs": 2, "jobs": 1, "overrides": (SHORT,)} | given
     return Evaluation([run_dir], [World(name) for name in worlds], **given)
+
+
+def by(monkeypatch, commit):
+    """From now on measured by code at this commit."""
+    monkeypatch.setattr(suite, "provenance", lambda device: {**provenance(device), "commit": commit})
 
 
 def outcomes(records):
@@ -104,6 +110,7 @@ def test_the_same_command_goes_on_where_it_was(walker, monkeypatch, capsys):
         return real(env, *args, **kwargs)
 
     monkeypatch.setattr(suite, "run_episodes", count)
+    by(monkeypatch, "one")
     given = evaluation(walker, "aerial", "small", trials=3)
     with pytest.raises(KeyboardInterrupt):
         evaluate(given)
@@ -117,9 +124,13 @@ def test_the_same_command_goes_on_where_it_was(walker, monkeypatch, capsys):
     evaluate(evaluation(walker, "aerial", trials=2))
     evaluate(evaluation(walker, "aerial", trials=2, plots=True))  # its ways are there
     assert len(measured) == 5
-    monkeypatch.setattr(suite, "provenance", lambda device: {**records[0].facts, "commit": "another"})
+    by(monkeypatch, "another")
     evaluate(evaluation(walker, "aerial", trials=2))  # by other code
     assert len(measured) == 6 and not list((walker / "evaluation").glob("*-aerial-*.npz"))
+    by(monkeypatch, "another+changes")
+    for _ in range(2):
+        evaluate(evaluation(walker, "aerial", trials=2))  # nothing says whether that code was the same
+    assert len(measured) == 8
 
 
 def test_seeds_of_reported_evaluations_follow_from_the_weights(walker):
@@ -162,17 +173,20 @@ def test_every_world_of_the_suite_can_be_evaluated(walker, world):
 
 def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
     """To the range of the walker's commands; a run that computes V_avoid itself is given all of it."""
-    given = []
+    controllers, given = [], []
 
     def spy(name, env, policy, avoidance, limits):
+        controllers.append(avoidance)
         given.append(limits)
         return baseline(name, env, policy, avoidance, limits)
 
     monkeypatch.setattr(suite, "baseline", spy)
     run, walker = ROOT / "pretrained/avoider", ROOT / "pretrained/gait"
     for walks in (None, walker):
-        Task(evaluation(run, "static", walker=walks), run, "oracle", World("static"))._contender()
+        changed = evaluation(run, "static", walker=walks, overrides=("rewards.avoidance.risk.weight=3.0",))
+        Task(changed, run, "oracle", World("static"))._contender()
     assert given == [None, ((-1.0, 2.0), (-1.5, 1.5))]
+    assert [controller.risk.weight for controller in controllers] == [3.0, 3.0]
 
 
 def test_what_does_not_fit_the_run_is_refused(walker):
@@ -190,8 +204,9 @@ def test_missing_matplotlib_is_refused_first(walker, monkeypatch):
         evaluate(evaluation(walker, "static", plots=True))
 
 
-def test_reported_evaluations_have_other_obstacles_and_seeds_and_are_noted_once(walker, tmp_path):
+def test_reported_evaluations_have_other_obstacles_and_seeds_and_are_noted_once(walker, tmp_path, monkeypatch):
     log = tmp_path / "log.jsonl"
+    by(monkeypatch, "one")
     given = evaluation(walker, "static", "rod", split="test", log=log)
     records = evaluate(given)
     assert [record.seed for record in records] == [reported_seed(records[0].weights, w) for w in ("static", "rod")]

@@ -11,6 +11,7 @@ from omniperception.learning.checkpoint import checkpoint_path
 SMALL = ("num_envs=8", "ppo.hidden_dims=[32,16]", "ppo.num_mini_batches=2", "ppo.num_steps_per_env=10")
 BLIND = ("experiment=gait", *SMALL)
 SEEING = ("experiment=avoid", *SMALL, "lidar.num_rays=200", "perception.supervised_epochs=1")
+MANY = ("num_envs=48",)  # frames enough that what was learned holds for others
 OTHERWISE = ("init=unread", "observations.groups.proprioception.history=2")
 
 
@@ -130,7 +131,7 @@ def test_perception_learns_and_the_policy_stays_as_it_is(make_config, walk):
     run_dir, _ = walk
     terrain = ("terrain=mixed", "perception.height_weight=1.0", "randomization=lidar")
     often = ("perception.learning_rate=1e-3", "perception.supervised_epochs=4")
-    runner = build_runner(make_config(*SEEING, *terrain, f"init={run_dir}", *often), None)
+    runner = build_runner(make_config(*SEEING, *MANY, *terrain, f"init={run_dir}", *often), None)
     runner.start_from(run_dir)
     actor, critic = runner.alg.actor, runner.alg.critic
     kept = {name: value.clone() for name, value in actor.state_dict().items() if not name.startswith("perception.")}

@@ -35,7 +35,7 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch, processes, expect
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def count_up(env_offset: int, values: wp.array(dtype=int)):  # type: ignore[valid-type]
+def count_up(env_offset: int, values: wp.array(dtype=int)):
     values[env_offset + wp.tid()] = env_offset + wp.tid()
 
 

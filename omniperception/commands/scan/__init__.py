@@ -112,7 +112,7 @@ def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConf
     """A sensor as its maker sells it: whole frames as far as it reaches, where nothing else is asked for."""
     sensor = _task(name, overrides).lidar
     assert sensor is not None  # only lidar=none has none
-    given = {override.lstrip("+").partition("=")[0] for override in overrides}
+    given = {override.key_or_group for override in config.parse(overrides)}
     if "lidar.num_rays" not in given:
         whole = sensor.scan_pattern().points_per_frame(sensor.period_s)
         sensor = replace(sensor, num_rays=min(arguments.rays or whole, whole))
