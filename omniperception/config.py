@@ -122,7 +122,7 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
             continue
         for key in {"scenario": FIXED_BY_SCENARIO, "condition": FIXED_BY_CONDITION}.get(group, (group,)):
             config[key] = fresh[key]
-    if any(_group_of(override) == "randomization" for override in parsed):
+    if any(group_of(override) == "randomization" for override in parsed):
         config.pop("condition", None)
     OmegaConf.set_struct(config, True)
     apply(config, values)
@@ -224,12 +224,12 @@ def _check_condition(condition: Override | None, overrides: Sequence[Override]) 
     for override in overrides:
         if override.key_or_group.startswith("condition."):
             raise ConfigError(f"{override.input_line}: a condition is chosen as a whole, such as condition=robot")
-        if fixed_by and _group_of(override) == "randomization":
+        if fixed_by and group_of(override) == "randomization":
             given = override.input_line
             raise ConfigError(f"condition={fixed_by} fixes the randomization; use condition=null or leave {given} out")
 
 
-def _group_of(override: Override) -> str:
+def group_of(override: Override) -> str:
     """The key at the top of the configuration that an override changes."""
     return override.key_or_group.partition(".")[0]
 

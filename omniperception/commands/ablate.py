@@ -18,6 +18,7 @@ from pathlib import Path
 from omniperception import config
 from omniperception.cli import Command, argument, trust
 from omniperception.evaluation.ablation import Ablation, evaluate_all, train, write_tables
+from omniperception.evaluation.suite import held_out_scenarios
 from omniperception.learning import CheckpointError
 
 STAGES = ("train", "evaluate", "table", "all")
@@ -48,7 +49,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         experiment=arguments.experiment,
         variants=arguments.variants,
         seeds=arguments.seeds,
-        scenarios=known if arguments.scenarios == ("all",) else arguments.scenarios,
+        scenarios=held_out_scenarios() if arguments.scenarios == ("all",) else arguments.scenarios,
         trials=arguments.trials,
         overrides=tuple(overrides),
         trust=arguments.trust,

@@ -37,7 +37,15 @@ from omniperception import config
 from omniperception.cli import Command, argument, trust
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
-from omniperception.evaluation.suite import POLICIES, SPLITS, Evaluation, World, evaluate, suite_worlds
+from omniperception.evaluation.suite import (
+    POLICIES,
+    SPLITS,
+    Evaluation,
+    World,
+    evaluate,
+    held_out_scenarios,
+    suite_worlds,
+)
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PORT
@@ -118,7 +126,7 @@ def _worlds(arguments: Arguments, folders: list[Path], terrain_given: bool) -> l
     if arguments.suite is None:
         names = arguments.scenario or ("corridor",)
         if names == ("all",):
-            names = tuple(dict.fromkeys(world.name for world in suite_worlds("held_out")))
+            names = held_out_scenarios()
         return [World(name) for name in names]
     if arguments.scenario:
         raise ConfigError(f"suite={arguments.suite} has its own worlds; leave scenario= out, or suite=")

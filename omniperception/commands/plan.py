@@ -24,7 +24,7 @@ NUM_ENVS = 13
 class Arguments:
     """The command's own arguments."""
 
-    beside: str = argument("paper", "experiment that it is compared with; empty for none")
+    beside: str | None = argument("paper", "experiment that it is compared with; null: none")
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:

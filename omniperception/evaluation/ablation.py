@@ -13,9 +13,9 @@ from omniperception import config
 from omniperception.common.provenance import provenance
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import Record, of_run
+from omniperception.evaluation.records import FOLDER, Record, read
 from omniperception.evaluation.statistics import pooled
-from omniperception.evaluation.suite import Evaluation, World, evaluate
+from omniperception.evaluation.suite import Evaluation, World, evaluate, weights_hash
 
 _NO_PROXIMAL = ("perception.height_weight=0", "perception.sampler.num_proximal=0", "perception.network.proximal_dim=0")
 _NO_DISTAL = ("perception.sampler.num_distal=0", "perception.network.distal_dim=0")
@@ -76,13 +76,15 @@ class Ablation:
     trust: Sequence[str] = ()
 
     def __post_init__(self) -> None:
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ConfigError(f"seeds={','.join(map(str, self.seeds))} names one twice; each is one run")
         known = (*VARIANTS, *config.presets("perception", config.search_path(self.overrides)))
         for variant in self.variants:
             if variant not in known:
                 raise ConfigError(f"variants={variant} is unknown; {config.suggest(variant, known)}")
-        for override in self.overrides:
-            if override.split("=", 1)[0] in ("experiment", "perception", "seed"):
-                raise ConfigError(f"{override}: give experiment=, variants= and seeds= instead")
+        for override in config.parse(self.overrides):
+            if override.key_or_group in ("experiment", "perception", "seed"):
+                raise ConfigError(f"{override.input_line}: give experiment=, variants= and seeds= instead")
 
     def run_dir(self, variant: str, seed: int) -> Path:
         return self.out / variant / f"seed{seed}"
@@ -144,7 +146,7 @@ def _row(study: Ablation, variant: str) -> dict:
     """Rates of one variant by scenario, over all seeds."""
     row = {}
     for scenario in study.scenarios:
-        happened = [_record(study.run_dir(variant, seed), scenario).episodes.happened() for seed in study.seeds]
+        happened = [_record(study, study.run_dir(variant, seed), scenario).episodes.happened() for seed in study.seeds]
         row[scenario] = {name: pooled([by_name[name] for by_name in happened]) for name in RATES if name in happened[0]}
     return row
 
@@ -170,9 +172,14 @@ def _cell(rate: dict | None) -> str:
     return f"{100 * rate['rate']:.1f} [{low:.1f}, {high:.1f}] ({least:.1f} to {most:.1f})"
 
 
-def _record(run_dir: Path, scenario: str) -> Record:
-    """The newest result of a run in a scenario."""
-    found = [record for record in of_run(run_dir) if record.world == scenario and record.policy == "run"]
-    if not found:
-        raise ConfigError(f"{run_dir} has not been evaluated in {scenario}; use stage=evaluate or stage=all")
-    return max(found, key=lambda record: record.facts["date"])
+def _record(study: Ablation, run_dir: Path, scenario: str) -> Record:
+    """What `evaluate_all` has measured of a run in a scenario."""
+    path = run_dir / FOLDER / f"dev-ideal-{scenario}-own-run.json"
+    weights = weights_hash(run_dir)
+    for record in read(path) if path.is_file() else []:
+        if len(record.episodes) == study.trials and record.weights == weights:
+            return record
+    raise ConfigError(
+        f"{run_dir} has not been evaluated in {scenario} with trials={study.trials} and its newest checkpoint; use"
+        " stage=evaluate or stage=all"
+    )

@@ -51,7 +51,13 @@ class Record:
     @property
     def key(self) -> tuple[str, ...]:
         """What tells it from the others of a file."""
-        return (*(getattr(self, name) for name in _KEY), *self.facts.get("overrides", ()))
+        return (*(getattr(self, name) for name in _KEY), *self.changes)
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """What was not the run's own: the gait, and overrides."""
+        walker = self.facts.get("walker", self.run)
+        return (*(() if walker == self.run else (f"walker={walker}",)), *self.facts.get("overrides", ()))
 
     @property
     def place(self) -> str:
@@ -109,8 +115,3 @@ def merge(path: Path, records: Sequence[Record]) -> None:
     """Adds records to a file; those that measured the same are replaced."""
     kept = {record.key: record for record in (read(path) if path.exists() else [])}
     write(path, (kept | {record.key: record for record in records}).values())
-
-
-def of_run(run_dir: Path) -> list[Record]:
-    """All results in a run's evaluation folder."""
-    return [record for path in sorted((run_dir / FOLDER).glob("*.json")) for record in read(path)]

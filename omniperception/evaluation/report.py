@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 
 from omniperception.common.tables import markdown
+from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.statistics import paired_difference, pooled, quantiles
@@ -35,12 +36,31 @@ def grouped(records: Iterable[Record], *names: str) -> dict[tuple, list[Record]]
     return groups
 
 
+def check_apart(records: Iterable[Record]) -> None:
+    """Refuses to show two results of one run as if they were of two trainings.
+
+    Raises:
+        ConfigError: two are of the same run, policy and world.
+    """
+    for _, same in grouped(records, "run", "policy", "condition", "world", "terrain").items():
+        if len(same) > 1:
+            kinds = [" ".join([f"split={record.split}", *record.changes]) for record in same[:2]]
+            raise ConfigError(
+                f"{same[0].run}, {same[0].policy}, {same[0].place} is there twice, with {kinds[0]} and with {kinds[1]};"
+                " a table shows one of them, so keep them in files of their own"
+            )
+
+
 def table(records: Sequence[Record]) -> str:
     """All figures: a row for each world and policy, runs of several training seeds together.
 
     With REFERENCE among the policies, each other one has a row with the difference in the first column, trial by trial;
     the last rows are means over the worlds.
+
+    Raises:
+        ConfigError: see `check_apart`.
     """
+    check_apart(records)
     conditions, several = {record.condition for record in records}, len({record.terrain for record in records}) > 1
     rows = []
     for (world, terrain, condition), here in grouped(records, "world", "terrain", "condition").items():
@@ -97,11 +117,9 @@ def mean_figures(records: Sequence[Record]) -> list[str]:
     by_world = list(grouped(records, "world", "terrain").values())
 
     def mean(name: str) -> str:
-        rates = [
-            _mean([float(r.episodes.happened()[name].double().mean()) for r in here if name in r.episodes.happened()])
-            for here in by_world
-        ]
-        return f"{100 * _mean(rates):.1f}"
+        happened = [[h[name] for r in here if name in (h := r.episodes.happened())] for here in by_world]
+        rates = [_mean([float(one.double().mean()) for one in there]) for there in happened if there]
+        return f"{100 * _mean(rates):.1f}" if rates else "–"
 
     touches = _mean([_mean([record.episodes.touches_per_100_m for record in here]) for here in by_world])
     rest = [mean(name) for name in ("fall", "time_out", "diverged")]

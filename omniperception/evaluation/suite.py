@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 import yaml
+from omegaconf import OmegaConf
 
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
@@ -20,6 +21,7 @@ from omniperception.common.figures import new_figure
 from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
+from omniperception.deploy.description import FILE as DESCRIPTION
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.config import EnvConfig
 from omniperception.evaluation.baselines import BASELINES, DRIVEN, Limits, baseline, prepared
@@ -43,6 +45,8 @@ POLICIES = {
 SPLITS = ("dev", "test")
 LOG = Path("docs") / "lab" / "evaluations.jsonl"
 """Where evaluations on the test split are noted, below a checkout."""
+_SCENE = (*config.FIXED_BY_SCENARIO, *config.FIXED_BY_CONDITION)
+"""Groups of a configuration that say where a policy is tried, not what it is."""
 _TEST_SEEDS = 2**31, 2**42
 """First of the seeds on the test split, and how many there are: far from what anybody types."""
 
@@ -103,11 +107,12 @@ class Evaluation:
         _check("scenario", [world.name for world in self.worlds], folders)
         _check("terrain", [world.terrain for world in self.worlds if world.terrain is not None], folders)
         _check("condition", [self.condition] if self.condition is not None else [], folders)
-        for override in self.overrides:
-            if override.split("=", 1)[0] in ("scenario", "num_envs", "condition", "obstacles.split"):
-                raise ConfigError(f"{override} is not an override here; it is an argument of its own")
-            if self.split == "test" and override.split("=", 1)[0] == "seed":
-                raise ConfigError(f"{override}: the seed of split=test follows from the weights; use split=dev")
+        for override in config.parse(self.overrides):
+            given, name = override.input_line, override.key_or_group
+            if name in ("scenario", "num_envs", "condition", "obstacles.split"):
+                raise ConfigError(f"{given} is not an override here; it is an argument of its own")
+            if self.split == "test" and name == "seed":
+                raise ConfigError(f"{given}: the seed of split=test follows from the weights; use split=dev")
 
     def tasks(self) -> list[Task]:
         """What has to be measured, in the order of the table."""
@@ -138,6 +143,11 @@ def suite_worlds(name: str, folders: Sequence[Path] = ()) -> list[World]:
     return [World(scenario, terrain) for scenario, terrains in worlds.items() for terrain in terrains]
 
 
+def held_out_scenarios() -> tuple[str, ...]:
+    """What `all` means where scenarios are named: those of the held-out suite."""
+    return tuple(dict.fromkeys(world.name for world in suite_worlds("held_out")))
+
+
 # ---- one task --------------------------------------------------------------------------------------------------------
 
 
@@ -165,10 +175,10 @@ class Task:
     def composed(self):
         """The configuration: the run's, or the walker's, in the world."""
         evaluation, overrides = self.evaluation, list(self.evaluation.overrides)
-        if self.walker != self.run_dir:  # takes the overrides that change the scene, and finds the presets
+        if self.walker != self.run_dir:  # takes the overrides of robot and scene, and finds the presets
             overrides += config.as_override(config.search_path((), config.read(self.run_dir)))
-            scene = (*config.FIXED_BY_SCENARIO, "randomization", "sim", "hydra")
-            overrides = [o for o in overrides if o.lstrip("+~").split("=", 1)[0].split(".", 1)[0] in scene]
+            reach = (*_SCENE, "robot", "sim", "hydra")
+            overrides = [str(o.input_line) for o in config.parse(overrides) if config.group_of(o) in reach]
         if not any(override.startswith("sim.num_threads=") for override in overrides):
             overrides.append("sim.num_threads=1")
         if self.world.terrain is not None:
@@ -197,15 +207,25 @@ class Task:
             "trials": self.evaluation.trials,
             "num_envs": self.evaluation.num_envs,
             "overrides": list(self.evaluation.overrides),
+            "configuration": self._fingerprint(),
         }
+
+    def _fingerprint(self) -> str:
+        """SHA-256 of everything that is configured: presets and files may change under their names."""
+        configs = (self.composed, config.load(self.run_dir, self._own_overrides()))
+        parts = [config.as_yaml(OmegaConf.to_container(one, resolve=True)) for one in configs]
+        if self.policy == "exported" and (described := self.run_dir / EXPORTED / DESCRIPTION).is_file():
+            parts.append(described.read_text())
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
     @property
     def path(self) -> Path:
         """The file of the outcomes; that of the ways has another suffix."""
         evaluation, world = self.evaluation, self.world
         names = [evaluation.split, evaluation.condition or "own", world.name, world.terrain or "own", self.policy]
-        if evaluation.overrides:
-            names.append(hashlib.sha256(" ".join(evaluation.overrides).encode()).hexdigest()[:8])
+        others = [*evaluation.overrides, *([] if self.walker == self.run_dir else [f"walker={shown(self.walker)}"])]
+        if others:
+            names.append(hashlib.sha256(" ".join(others).encode()).hexdigest()[:8])
         return self.run_dir / FOLDER / f"{'-'.join(names)}.json"
 
     def done(self, facts: dict) -> Record | None:
@@ -262,8 +282,9 @@ class Task:
             if self.policy in BASELINES:
                 policy = baseline(self.policy, env, policy, self._own.rewards.avoidance, self._limits())
             if self.policy == "exported":
-                checkpoint = self.run_dir / EXPORTED
-                policy = ExportedPolicies(env, ExportedPolicy.load(checkpoint))
+                exported = ExportedPolicy.load(self.run_dir / EXPORTED)
+                _check_exported(exported, checkpoint)
+                checkpoint, policy = self.run_dir / EXPORTED, ExportedPolicies(env, exported)
         except ValueError as error:
             raise ConfigError(f"policy={self.policy}: {error}") from None
         return TrainedPolicy(env, policy, checkpoint)
@@ -271,7 +292,12 @@ class Task:
     @cached_property
     def _own(self) -> EnvConfig:
         """The run's task with the overrides, whoever walks: its LiDAR and its avoidance controller."""
-        return build.load_run(self.run_dir, self.evaluation.overrides, self.evaluation.trust).env
+        return build.load_run(self.run_dir, self._own_overrides(), self.evaluation.trust).env
+
+    def _own_overrides(self) -> list[str]:
+        """Those of the run, whatever world it is in."""
+        parsed = config.parse(self.evaluation.overrides)
+        return [str(override.input_line) for override in parsed if config.group_of(override) not in _SCENE]
 
     def _limits(self) -> Limits | None:
         """Ranges (m/s) of what the gait has learned to follow; None where it is the run's own, made for V_avoid."""
@@ -280,6 +306,13 @@ class Task:
         if own or "lin_vel_x" not in commands:
             return None
         return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)
+
+
+def _check_exported(policy: ExportedPolicy, newest: Path) -> None:
+    """Refuses a policy that was exported from other weights than the record would name."""
+    of = policy.description.provenance.get("checkpoint")
+    if of != newest.name:
+        raise ValueError(f"it was exported from {of}, and the run's newest checkpoint is {newest.name}; export again")
 
 
 def weights_hash(run_dir: Path) -> str:

@@ -19,7 +19,7 @@ import torch
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.records import Record, read
-from omniperception.evaluation.report import grouped, headline, rate_cell, table
+from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, table
 from omniperception.evaluation.walking_report import walking_table
 
 _BLOCK = re.compile(r"^<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
@@ -134,6 +134,7 @@ def _untouched(records: Sequence[Record]) -> str:
 
 def _titled(records: Sequence[Record], what: str, keys: list[str], columns: list[str], rows: list[list[str]]) -> str:
     """A table without the columns of keys that are the same everywhere."""
+    check_apart(records)
     kept = [k for k in range(len(keys)) if k == 0 or len({row[k] for row in rows}) > 1]
     rows = [[row[k] for k in kept] + row[len(keys) :] for row in rows]
     return f"{what}; {headline(records)}\n\n{markdown([keys[k] for k in kept] + columns, rows)}"

@@ -9,7 +9,7 @@ import torch
 from omniperception.common.tables import markdown
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import grouped, headline, rate_cell
+from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell
 
 EASY_LEVELS = 5
 """Levels of uneven ground that a robot is expected to pass; tables show the others apart."""
@@ -21,7 +21,12 @@ HEADINGS = (
 
 
 def walking_table(records: Sequence[Record]) -> str:
-    """All figures: a row for each world and ground, runs of several training seeds together."""
+    """All figures: a row for each world and ground, runs of several training seeds together.
+
+    Raises:
+        ConfigError: see `check_apart`.
+    """
+    check_apart(records)
     rows = []
     for (world, terrain, condition, policy), seeds in grouped(
         records, "world", "terrain", "condition", "policy"

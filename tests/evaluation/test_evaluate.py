@@ -1,7 +1,10 @@
 """scripts/evaluate.py: results, determinism, files, resuming, the log, baselines and mistakes."""
 
 import json
+import re
+import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -187,6 +190,37 @@ def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
         Task(changed, run, "oracle", World("static"))._contender()
     assert given == [None, ((-1.0, 2.0), (-1.5, 1.5))]
     assert [controller.risk.weight for controller in controllers] == [3.0, 3.0]
+
+
+def test_overrides_reach_run_scene_and_gait():
+    """Those of the robot and the scene reach the gait's task as well; those of a goal's world are not the run's."""
+    run, walker = ROOT / "pretrained/avoider", ROOT / "pretrained/gait"
+    given = ("robot.kp=40.0", "commands.speed=0.5", "lidar.num_rays=123")
+    changed = evaluation(run, "moving", walker=walker, policies=("run", "oracle"), overrides=given)
+    for policy in ("run", "oracle"):
+        task = Task(changed, run, policy, World("moving"))
+        env = task.assembled().env
+        assert (env.robot.kp, env.commands.speed, task._own.lidar.num_rays) == (40.0, 0.5, 123)
+
+
+def test_results_with_another_gait_or_another_file_of_presets_stand_apart(walker, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(walker, other)
+    alone, driven = (
+        Task(evaluation(walker, "static", walker=w), walker, "oracle", World("static")) for w in (None, other)
+    )
+    assert alone.path != driven.path
+    record = evaluate(evaluation(walker, "static", policies=("oracle",)))[0]
+    assert replace(record, facts=record.facts | {"walker": "b"}).key != record.key
+    folder = tmp_path / "conf" / "scenario"
+    folder.mkdir(parents=True)
+    hashes = []
+    for speed in (0.5, 0.6):
+        text = (ROOT / "conf/scenario/moving.yaml").read_text()
+        (folder / "mine.yaml").write_text(re.sub(r"speed: .*", f"speed: {speed}", text, count=1))
+        mine = evaluation(walker, "mine", overrides=(SHORT, f"hydra.searchpath=[file://{tmp_path / 'conf'}]"))
+        hashes.append(Task(mine, walker, "run", World("mine")).settings()["configuration"])
+    assert hashes[0] != hashes[1]
 
 
 def test_what_does_not_fit_the_run_is_refused(walker):
