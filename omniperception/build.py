@@ -69,6 +69,12 @@ class RunConfig:
                 "ppo.num_learning_epochs=0 keeps the policy as it is, and nothing else learns; set it to at least 1, or"
                 " perception.supervised_epochs"
             )
+        if self.ppo.num_learning_epochs == 0 and (self.distillation is not None or self.ppo.critic_warmup > 0):
+            given = "distillation" if self.distillation is not None else "ppo.critic_warmup"
+            raise ValueError(
+                f"{given} is a beginning of a policy's learning, and ppo.num_learning_epochs=0 keeps it as it is; leave"
+                " one of them out"
+            )
 
 
 _TASK = (
@@ -215,6 +221,19 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
         raise ConfigError(str(error)) from error
 
 
+def check_split(run: RunConfig, what: str) -> None:
+    """Refuses to show or train on obstacles of the test split, by which nothing may be chosen.
+
+    Raises:
+        ConfigError: it has them.
+    """
+    if run.env.obstacles.split != "dev":
+        raise ConfigError(
+            f"obstacles.split={run.env.obstacles.split} is for reports, by evaluate split=test, and no {what} may see"
+            " it; use obstacles.split=dev"
+        )
+
+
 @dataclass(frozen=True)
 class TrainedPolicy:
     """A run's newest policy and the environment to try it in.
@@ -242,13 +261,13 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
     return TrainedPolicy(runner.env, runner.policy, checkpoint)
 
 
-def load_teacher(run_dir: Path, env: OmniEnv) -> Teacher:
-    """The blind policy of a run, to teach in an environment with the same observations.
+def load_teacher(run_dir: Path, env: OmniEnv, trust: Sequence[str] = ()) -> Teacher:
+    """The blind policy of a run, to teach in an environment with the same observations; `trust` as `load_run` has it.
 
     Raises:
         ConfigError, CheckpointError: it perceives, or does not fit.
     """
-    run, observations = load_run(run_dir), env.get_observations()
+    run, observations = load_run(run_dir, trust=trust), env.get_observations()
     if run.perception is not None:
         raise ConfigError(f"distillation.teacher={run_dir} perceives; give a run of experiment=gait or walk")
     groups = run.env.observations.actor

@@ -308,12 +308,17 @@ def save_recipe(overrides: Sequence[str], run_dir: Path) -> None:
     (run_dir / RECIPE_FILE).write_text(yaml.safe_dump(list(overrides)))
 
 
-def recipe(run_dir: Path) -> str | None:
-    """The overrides that a run was begun with, but for where it is; None: it was begun before they were kept."""
+def read_recipe(run_dir: Path) -> list[str]:
+    """The overrides that a run was begun and went on with; none where it was begun before they were kept."""
     path = run_dir / RECIPE_FILE
-    if not path.is_file():
+    return yaml.safe_load(path.read_text()) if path.is_file() else []
+
+
+def recipe(run_dir: Path) -> str | None:
+    """Those overrides in one line, but for where it is; None: it was begun before they were kept."""
+    if not (run_dir / RECIPE_FILE).is_file():
         return None
-    return " ".join(text for text in yaml.safe_load(path.read_text()) if not text.startswith("hydra."))
+    return " ".join(text for text in read_recipe(run_dir) if not text.startswith("hydra."))
 
 
 def as_yaml(composed: dict) -> str:

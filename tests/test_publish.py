@@ -9,7 +9,13 @@ from omniperception import build, config
 from omniperception.build import build_runner, load_policy
 from omniperception.common import provenance
 from omniperception.deploy import publish
-from omniperception.learning.checkpoint import checkpoint_path, latest_checkpoint, load_checkpoint, save_checkpoint
+from omniperception.learning.checkpoint import (
+    CheckpointError,
+    checkpoint_path,
+    latest_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 
 
 @pytest.fixture
@@ -58,6 +64,8 @@ def test_another_run_starts_from_it(run, tmp_path, make_config):
     publish.publish(run, tmp_path / "published")
     runner = build_runner(build.assemble(config.load(run, ["seed=8"])), None)
     runner.start_from(tmp_path / "published")
+    with pytest.raises(CheckpointError, match="holds weights alone, as published runs do"):
+        runner.load(latest_checkpoint(tmp_path / "published"))
     weights = torch.load(latest_checkpoint(run), weights_only=True)["actor_state_dict"]
     assert all(torch.equal(value, weights[name]) for name, value in runner.alg.actor.state_dict().items())
 

@@ -12,7 +12,7 @@ import yaml
 from omniperception import build, config
 from omniperception.commands import main
 from omniperception.common import provenance
-from omniperception.learning import load_checkpoint
+from omniperception.learning import distributed, load_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = (
@@ -99,6 +99,51 @@ def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
     assert "init=end" not in capsys.readouterr().out
     main(["train", *seen, "perception.sampler.split_deg=10", "hydra.run.dir=other"])
     assert "learned from another sampler (split_deg 20.0 -> 10)" in capsys.readouterr().out
+
+
+def test_what_a_run_goes_on_with_is_written_down(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    quick = ("experiment=walk", "num_envs=2", "ppo.num_steps_per_env=4", *SMALL[3:])
+    main(["train", *quick, "ppo.max_iterations=1", "hydra.run.dir=here"])
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", "run=here", "seed=9"])
+    assert "seed=9: here has begun already" in capsys.readouterr().err
+    changed = [
+        "ppo.max_iterations=2",
+        "rewards.terms.velocity_tracking.weight=3.0",
+        "ppo.schedule=fixed",
+        "ppo.learning_rate=1e-5",
+    ]
+    main(["train", "run=here", *changed])
+    saved = config.load(tmp_path / "here")
+    assert saved.rewards.terms.velocity_tracking.weight == 3.0 and saved.ppo.max_iterations == 2
+    assert config.read_recipe(tmp_path / "here")[-4:] == changed
+    assert checkpoint(tmp_path, "here", 2)["learning_rate"] == 1e-5
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", "run=here", "ppo.hidden_dims=[8]"])
+    assert config.load(tmp_path / "here") == saved
+
+
+def test_processes_that_go_on_draw_from_streams_of_their_own(tmp_path, monkeypatch):
+    given = ["experiment=quickstart", "obstacles.curriculum=null", *SMALL, *SMALL_CLOUD, "num_envs=2"]
+    run = build.assemble(config.compose([*given, "lidar.num_rays=200", "randomization=paper"]))
+    first = build.build_runner(run, None)
+    first.save(tmp_path / "model_0.pt")
+    monkeypatch.setattr(distributed, "rank", lambda: 1)
+    second, alone = (build.build_runner(run, None) for _ in range(2))
+    second.load(tmp_path / "model_0.pt")
+    for runner in (first, second, alone):
+        runner.env.random.start_episode(torch.arange(2))
+    drawn = [runner.env.random.uniform(torch.arange(2)) for runner in (first, second, alone)]
+    noise = [runner.env.sensing.lidar.state_dict()["seeded"] for runner in (first, second, alone)]
+    for one, other, same in (drawn, noise):
+        assert torch.equal(other, same) and not torch.equal(other, one)
+
+
+@pytest.mark.parametrize("beginning", ["distillation={teacher: any, iterations: 1}", "ppo.critic_warmup=3"])
+def test_a_beginning_of_learning_needs_a_policy_that_learns(beginning):
+    with pytest.raises(config.ConfigError, match="ppo.num_learning_epochs=0 keeps it as it is"):
+        build.assemble(config.compose(["experiment=avoid", "init=any", beginning]))
 
 
 @pytest.mark.slow

@@ -17,8 +17,8 @@ from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.exported import record
 from omniperception.evaluation.outcomes import Episodes
+from omniperception.evaluation.records import FOLDER, read
 from omniperception.evaluation.records import FOLDER as EVALUATION
-from omniperception.evaluation.records import of_run
 from omniperception.evaluation.statistics import rate
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
@@ -58,9 +58,9 @@ class TrainedRun:
     name: str
 
     def scenarios(self) -> dict[str, Episodes]:
-        """What scripts/evaluate.py measured last of the run's own policy, by world."""
-        records = sorted(of_run(self.path), key=lambda record: record.facts["date"])
-        found = {record.place: record.episodes for record in records if record.policy == "run"}
+        """What scripts/evaluate.py measured of the run's own policy as it stands, on split=dev, by world."""
+        files = sorted((self.path / FOLDER).glob("dev-ideal-*-run.json"))
+        found = {record.place: record.episodes for path in files for record in read(path)}
         if not found:
             raise config.ConfigError(
                 f"runs: {self.path} has not been evaluated; python scripts/evaluate.py run={self.path} scenario=all"

@@ -48,6 +48,10 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Measures, prints a table and draws a picture."""
+    fixed = {"kicks": ("num_envs", "terminations.episode_length_s"), "feet": ("num_envs",)}.get(arguments.what, ())
+    for override in config.parse(overrides):
+        if override.key_or_group in fixed:
+            raise config.ConfigError(f"{override.input_line}: what={arguments.what} sets it itself; leave it out")
     run_dir = config.find_run(arguments.run)
     picture = run_dir / FOLDER / f"gait-{arguments.what}.png"
     picture.parent.mkdir(exist_ok=True)
@@ -90,6 +94,7 @@ def policy_on_free_ground(arguments: Arguments, run_dir: Path, overrides: list[s
     """The run's policy under the condition, without pushes."""
     given = [] if arguments.condition is None else [f"condition={arguments.condition}"]
     run = build.load_run(run_dir, ["scenario=walk", *given, *overrides], arguments.trust)
+    build.check_split(run, "picture")
     calm = replace(run.env.randomization, pushes=None)
     return build.load_policy(
         replace(run, env=replace(run.env, randomization=calm, read_besides=(FOOT_FORCE,))), run_dir

@@ -58,17 +58,27 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     if arguments.run is not None:
         if flags:
             raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
-        run_dir = config.find_run(arguments.run)
-        learn(_trainable(build.load_run(run_dir, values, arguments.trust)), run_dir, resume=True)
+        go_on(config.find_run(arguments.run), values, arguments.trust)
     elif flags & SHOW:
         print(config.as_yaml(assemble(config.compose(values)).composed), end="")
     elif flags:
-        sweep(values)
+        sweep(values, arguments.trust)
     else:
         composed = config.compose(values, with_hydra=True)
         HydraConfig.instance().set_config(composed)  # for ${hydra:...} in hydra.run.dir
         run_dir = Path(os.path.relpath(composed.hydra.run.dir))
-        train(config.without_hydra(composed), run_dir, values)
+        train(config.without_hydra(composed), run_dir, values, arguments.trust)
+
+
+def go_on(run_dir: Path, overrides: Sequence[str], trust: Sequence[str]) -> None:
+    """Goes on with a run; what overrides change is written into its directory, for whoever reads it next."""
+    for override in config.parse(overrides):
+        if override.key_or_group in ("seed", "init"):
+            raise config.ConfigError(
+                f"{override.input_line}: {run_dir} has begun already and goes on from its newest checkpoint; leave it"
+                " out, or train a run of its own"
+            )
+    learn(_trainable(build.load_run(run_dir, overrides, trust)), run_dir, resume=True, changes=overrides, trust=trust)
 
 
 def assemble(composed: DictConfig) -> build.RunConfig:
@@ -83,17 +93,13 @@ def assemble(composed: DictConfig) -> build.RunConfig:
 
 def _trainable(run: build.RunConfig) -> build.RunConfig:
     """Refuses a run that would see obstacles of the test split, or whose logger lacks its library."""
-    if run.env.obstacles.split != "dev":
-        raise config.ConfigError(
-            f"obstacles.split={run.env.obstacles.split} is for reports, and no training may see it; use"
-            " obstacles.split=dev"
-        )
+    build.check_split(run, "training")
     if run.logger is not None:
         run.logger.check()
     return run
 
 
-def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str]) -> None:
+def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
     """Trains the configuration that overrides composed, in its directory."""
     run = assemble(composed)
     distributed.connect(run.env.sim.torch_device)
@@ -104,29 +110,42 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str]) -> None
         if not begun:
             provenance.write(run_dir, provenance.provenance(run.env.sim.torch_device, seed=run.env.seed))
             config.save_recipe(overrides, run_dir)
-    learn(run, run_dir, resume=begun)
+    learn(run, run_dir, resume=begun, trust=trust)
 
 
-def learn(run: build.RunConfig, run_dir: Path, resume: bool) -> None:
-    """Trains a run to its end in `run_dir`; of several processes the first one reports."""
+def learn(
+    run: build.RunConfig, run_dir: Path, resume: bool, changes: Sequence[str] = (), trust: Sequence[str] = ()
+) -> None:
+    """Trains a run to its end in `run_dir`; of several processes the first one reports.
+
+    Args:
+        run: the configuration.
+        run_dir: its directory.
+        resume: whether it goes on from its newest checkpoint.
+        changes: overrides of what it was before.
+        trust: packages of one's own whose names the configurations of `init` and the teacher may build.
+    """
     torch.set_flush_denormal(True)  # gradients of faint activations are, and one convolution took 40 times as long
     runner = build.build_runner(run, run_dir)
     if resume:
         runner.load(str(latest_checkpoint(run_dir)))
+        if changes and distributed.rank() == 0:  # the weights fit
+            config.save(run.composed, run_dir)
+            config.save_recipe([*config.read_recipe(run_dir), *changes], run_dir)
         report(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
     else:
         if run.init:
             _check_motion(OmegaConf.create(run.composed), run.init[-1])
             given = [config.find_run(name, "init") for name in run.init]
             estimates = run.env.observations.estimated is not None
-            observed = build.load_run(given[-1]).env.observations if estimates else None
+            observed = build.load_run(given[-1], trust=trust).env.observations if estimates else None
             for source in runner.start_from(*given, observations=observed):
                 _report_other_inputs(OmegaConf.create(run.composed), source)
         report(f"run directory: {run_dir}")
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
         name = run.distillation.teacher
         _check_motion(OmegaConf.create(run.composed), name, "distillation.teacher")
-        runner.alg.learn_from(build.load_teacher(config.find_run(name, "distillation.teacher"), runner.env))
+        runner.alg.learn_from(build.load_teacher(config.find_run(name, "distillation.teacher"), runner.env, trust))
 
     def save(plan: Plan) -> None:
         plan.save(run_dir)
@@ -173,7 +192,7 @@ def report(text: str) -> None:
         print(text)
 
 
-def sweep(overrides: Sequence[str]) -> None:
+def sweep(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
     """Runs every combination of overrides with several values, by Hydra and the launcher that is chosen."""
     check_jobs(overrides)
 
@@ -182,7 +201,8 @@ def sweep(overrides: Sequence[str]) -> None:
         folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
         try:
             composed = config.compose([*settings.overrides.task, *folders])
-            train(composed, Path(os.path.relpath(settings.runtime.output_dir)), list(settings.overrides.task))
+            run_dir = Path(os.path.relpath(settings.runtime.output_dir))
+            train(composed, run_dir, list(settings.overrides.task), trust)
         except (config.ConfigError, *ERRORS) as error:
             fail(error)
 

@@ -175,9 +175,8 @@ def _cell(rate: dict | None) -> str:
 def _record(study: Ablation, run_dir: Path, scenario: str) -> Record:
     """What `evaluate_all` has measured of a run in a scenario."""
     path = run_dir / FOLDER / f"dev-ideal-{scenario}-own-run.json"
-    weights = weights_hash(run_dir)
     for record in read(path) if path.is_file() else []:
-        if len(record.episodes) == study.trials and record.weights == weights:
+        if len(record.episodes) == study.trials and record.weights == weights_hash(run_dir):
             return record
     raise ConfigError(
         f"{run_dir} has not been evaluated in {scenario} with trials={study.trials} and its newest checkpoint; use"

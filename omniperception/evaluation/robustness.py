@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import torch
 from omegaconf import OmegaConf
 
 from omniperception import config
@@ -18,7 +19,7 @@ from omniperception.evaluation.records import Record
 from omniperception.evaluation.report import rate_cell
 from omniperception.evaluation.statistics import rate
 from omniperception.evaluation.suite import Evaluation, Task, measure_all
-from omniperception.evaluation.walking_report import Part, grounds
+from omniperception.evaluation.walking_report import Part
 
 NEUTRAL = {"ground_friction": 0.8, "motor_strength": 1.0, "velocity_scale": 1.0}
 """Values about which a range is stretched, where it is not 0: those of a robot and a ground without randomization."""
@@ -154,7 +155,7 @@ def draw(measured: Sequence[tuple[Stretch, Record]], path: Path) -> None:
 
 
 def _part(record: Record) -> Part:
-    return Part(record, next(iter(grounds(record).values())))
+    return Part(record, torch.ones(len(record.episodes), dtype=torch.bool))
 
 
 def _error(record: Record) -> float:

@@ -213,7 +213,7 @@ class Task:
     def _fingerprint(self) -> str:
         """SHA-256 of everything that is configured: presets and files may change under their names."""
         configs = (self.composed, config.load(self.run_dir, self._own_overrides()))
-        parts = [config.as_yaml(OmegaConf.to_container(one, resolve=True)) for one in configs]
+        parts = [OmegaConf.to_yaml(one, resolve=True) for one in configs]
         if self.policy == "exported" and (described := self.run_dir / EXPORTED / DESCRIPTION).is_file():
             parts.append(described.read_text())
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()

@@ -327,6 +327,7 @@ class PerceptivePpo(PPO):
 
     def load(self, state: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
         """Load what :meth:`save` returned; all of it, or the actor alone with ``load_cfg={"actor": True}``."""
+        configured = self.learning_rate
         super().load(state, load_cfg, strict)
         self.actor.reset()
         if load_cfg is not None:
@@ -335,7 +336,10 @@ class PerceptivePpo(PPO):
             self.perception_optimizer.load_state_dict(state["perception_optimizer_state_dict"])
         if self.estimator_optimizer is not None:
             self.estimator_optimizer.load_state_dict(state["estimator_optimizer_state_dict"])
-        self.learning_rate, self.num_updates = state["learning_rate"], state["num_updates"]
+        self.num_updates = state["num_updates"]
+        self.learning_rate: float = configured if self.schedule == "fixed" else state["learning_rate"]
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate
         return True
 
     def check_rollout(self) -> None:

@@ -68,6 +68,7 @@ class Runner:
         distributed.connect(device)
         self.env, self.config, self.device = env, config, device
         self.alg = PerceptivePpo.build(env, config, device, distributed.multi_gpu())
+        self.alg.use_mixed_precision = distributed.of_first(self.alg.use_mixed_precision)  # it may be a measurement
         if config.estimator is not None:
             actor = self.alg.actor
             env.state.measure_velocity_by(lambda: actor.estimate)
@@ -105,10 +106,10 @@ class Runner:
             self.logger.open(first)
             with self._interrupts_noted():
                 for _ in range(first, last):
-                    obs = self._iterate(obs, last)
                     if reason := distributed.of_first(self._stop_reason()):
                         self.stop_reason = reason
                         break
+                    obs = self._iterate(obs, last)
                     if self.current_learning_iteration % self.config.ppo.save_interval == 0:
                         self._save_checkpoint()
             self._save_checkpoint()
@@ -144,6 +145,7 @@ class Runner:
         state = self.alg.save() | {
             "iteration": self.current_learning_iteration,
             "total_time": self.total_time,
+            "use_mixed_precision": self.alg.use_mixed_precision,
             "logger": self.logger.state_dict(),
             "rng": rng_state(),
             "env": self.env.state_dict(),
@@ -155,9 +157,13 @@ class Runner:
         state = self._load(path)
         self.current_learning_iteration, self.total_time = state["iteration"], state["total_time"]
         self.logger.load_state_dict(state["logger"])
-        self.env.load_state_dict(state["env"])
-        if distributed.rank() == 0:  # the others keep exploring in ways of their own
+        if self.config.ppo.mixed_precision is None:
+            self.alg.use_mixed_precision = state.get("use_mixed_precision", self.alg.use_mixed_precision)
+        if distributed.rank() == 0:
+            self.env.load_state_dict(state["env"])
             set_rng_state(state["rng"])
+        else:  # the others go on in ways of their own
+            self.env.load_state_dict(_without_streams(state["env"]))
         self._last_saved = Path(path)
 
     def load_policy(self, path: str | Path) -> None:
@@ -256,6 +262,11 @@ class Runner:
 
     def _load(self, path: str | Path, parts: dict | None = None) -> dict:
         state = load_checkpoint(path, self.device)
+        if parts is None and "env" not in state:
+            raise CheckpointError(
+                f"{path} holds weights alone, as published runs do: no training goes on from it; begin one with"
+                f" init={Path(path).parent.parent}"
+            )
         reason = difference(self.alg.actor.state_dict(), state.get("actor_state_dict", {}))
         try:
             if reason is None:
@@ -296,3 +307,13 @@ class Runner:
             yield
         finally:
             signal.signal(signal.SIGINT, previous)
+
+
+def _without_streams(state: dict) -> dict:
+    """An environment's state without what its random numbers and its LiDAR's noise follow from."""
+    streams = ("key", "seeded")
+    return {
+        name: _without_streams(part) if isinstance(part, dict) else part
+        for name, part in state.items()
+        if name not in streams
+    }

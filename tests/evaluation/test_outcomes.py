@@ -12,6 +12,7 @@ from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record, merge, read, write
 from omniperception.evaluation.report import difference, table
 from omniperception.evaluation.statistics import quantiles
+from omniperception.evaluation.tables import VIEWS
 
 # outcome, contacts, first contact (s), length (s)
 TRIALS = [
@@ -162,6 +163,22 @@ def test_seeds_are_pooled_and_their_spread_is_shown():
     text = table([record(), record(run="runs/b", contacts=never)])
     assert cells(text)[2][2] == "31.2 [14.2, 55.6] (25.0 to 37.5)"  # 2 + 3 of 16
     assert "8 trials of each of 2 runs" in text
+
+
+@pytest.mark.parametrize("other", [{"split": "test"}, {"facts": {"overrides": ["a=1"]}}, {"facts": {"walker": "b"}}])
+def test_two_results_of_a_run_are_no_two_trainings(other):
+    """A table of all figures, and one by policy."""
+    first = record()
+    second = replace(first, **other | {"facts": first.facts | other.get("facts", {})})
+    for render in (table, VIEWS["policies"]):
+        with pytest.raises(ConfigError, match="is there twice"):
+            render([first, second])
+
+
+def test_a_mean_over_worlds_is_of_those_that_have_the_figure():
+    walked = replace(record(has_goal=False), world="walk")
+    assert "time_out" not in walked.episodes.happened()
+    assert "nan" not in table([record(), walked]).splitlines()[-1]
 
 
 def test_other_trials_have_no_paired_difference():
