@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from omniperception.common.launch import constant
 from omniperception.common.rotations import multiply
 from omniperception.common.timing import StageTimer
 from omniperception.env.frame_delivery import FrameDelivery, PastPoses
@@ -288,7 +289,7 @@ class LidarSensing:
         if self.carrier == self.base:
             return base_quat
         quat = self.scene.body_quat.float()
-        back = quat[:, self.base] * quat.new_tensor([1.0, -1.0, -1.0, -1.0])
+        back = quat[:, self.base] * constant((1.0, -1.0, -1.0, -1.0), quat.device)
         return multiply(base_quat, multiply(back, quat[:, self.carrier]))
 
     def place_bodies(self) -> None:
@@ -390,7 +391,7 @@ class LidarSensing:
         self.lidar.reset(env_ids, seeds)
         self.frame_count[env_ids] = 0
         if self.frames is not None:
-            self.frames[env_ids] = 0.0
+            self.frames = self.frames.index_fill(0, env_ids, 0.0)  # observations keep the tensor of before
         if self.unseen is not None:
             self.unseen[env_ids] = NEVER
         for max_distance, mean in self._distal_range.items():

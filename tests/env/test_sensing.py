@@ -195,6 +195,20 @@ def test_rays_within_a_frame_follow_the_robot_by_control_steps(make_env):
     assert not torch.allclose(straight.sensing.frame.true_ranges, expected, rtol=1e-3)
 
 
+def test_time_begins_anew_within_a_frame_of_several_segments(make_env):
+    """A seeded reset forgets the moments noted before it; the frames after it are those of a fresh environment."""
+    given = ("obstacles=static", "lidar.motion_segments=5", "perception=none")
+    env, fresh = (make_env(*given, num_envs=2) for _ in range(2))
+    for action in random_actions(env, 3):
+        env.step(action)
+    seeds = torch.tensor([4, 9])
+    for each in (env, fresh):
+        each.reset(seeds=seeds)
+        for action in random_actions(each, 5, scale=0.5):
+            each.step(action)
+    assert torch.equal(env.sensing.frame.true_ranges, fresh.sensing.frame.true_ranges)
+
+
 class TestSlices:
     """Clouds of some environments after those of others give what all at once give."""
 

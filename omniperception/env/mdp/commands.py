@@ -254,7 +254,7 @@ class GoalCommand:
             self.along = self.goal_w.new_zeros(self.route_w.shape[:2])
         self.route_w[env_ids] = route.to(self.route_w.dtype)
         self.along[env_ids] = _along(self.route_w[env_ids])
-        self.progress[env_ids] = 0.0
+        self.progress = self.progress.index_fill(0, env_ids, 0.0)
         self._steer(kinematics)
 
     def way(self, kinematics: Kinematics) -> torch.Tensor:
