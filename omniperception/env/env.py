@@ -436,7 +436,7 @@ class OmniEnv(VecEnv):
             **{name: part.state_dict() for name, part in self._with_state().items()},
             "random": self.random.state_dict(),
             "step_count": self.step_count,
-            "episode_length": self.episode_length_buf,
+            "episode_length": self.episode_length_buf.clone(),
             "frame_heights": self._frame_heights,
             "observations": {name: self.observations[name] for name in self._groups},
         }

@@ -345,11 +345,14 @@ class LidarSensing:
         return capped.sum(1) / distal.sum(1).clamp(min=1)
 
     def state_dict(self) -> dict:
+        clouds = self.lidar.frame
+        read = self.lidar.outputs if self.whole and self._is_cast else ()
         return {
             "tick": self.tick,
             "lidar": self.lidar.state_dict(),
-            "frame_count": self.frame_count,
+            "frame_count": self.frame_count.clone(),
             "frames": self.frames,
+            "clouds": {name: getattr(clouds, name).clone() for name in sorted(read)},
             "distal_range": {str(key): value.clone() for key, value in self._distal_range.items()},
             "unseen": None if self.unseen is None else self.unseen.clone(),
             "odometry": self.odometry.state_dict() if self.odometry is not None else None,
@@ -359,6 +362,10 @@ class LidarSensing:
 
     def load_state_dict(self, state: dict) -> None:
         self.tick = state["tick"]
+        clouds = state.get("clouds", {})  # files from before clouds were saved have none until the next tick
+        self._is_cast = bool(clouds)
+        for name, values in clouds.items():
+            getattr(self.lidar.frame, name).copy_(values)
         self.frame_tick.fill_(self.tick)
         self.lidar.load_state_dict(state["lidar"])
         self.frame_count.copy_(state["frame_count"])

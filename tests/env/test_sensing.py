@@ -7,6 +7,7 @@ import pytest
 import torch
 from stepping import OTHERS, assert_equal, outcome, random_actions, still
 
+from omniperception.env.build import build_sampler
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import RewardTerm
 from omniperception.env.state import requires
@@ -126,6 +127,16 @@ def test_sector_target_is_the_nearness_of_obstacles(make_env):
 def test_wrong_settings_are_refused(make_env, override, message):
     with pytest.raises(ValueError, match=message):
         make_env("obstacles=static", override)
+
+
+@pytest.mark.parametrize(("robot", "base_height"), [("go2", "0.33"), ("go1", "0.325"), ("anymal", "0.55")])
+def test_bands_of_height_that_begin_above_the_ground_are_refused(make_config, robot, base_height):
+    task = make_config(f"robot={robot}", f"robot.base_height={base_height}", "perception=proximity_gru").env
+    if robot != "anymal":
+        assert build_sampler(task) is not None
+        return
+    with pytest.raises(ValueError, match=r"band_edges begins 0\.21 m above the ground.*begin it at -0\.56"):
+        build_sampler(task)
 
 
 def test_no_frames_until_the_curriculum_has_obstacles(make_env):

@@ -94,8 +94,8 @@ class ObservationManager:
         return values
 
     def begin(self, state: EnvState, fresh: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
-        """What `compute` returned last, `observed` (num_envs, history * width), in which environments `fresh` (n,) begin
-        an episode; history and memory of the others stay as they are."""
+        """`observed` (num_envs, history * width), which `compute` returned last, with episodes that begin in some
+        environments `fresh` (n,); history and memory of the others stay as they are."""
         before = copy.deepcopy(self.state_dict())
         values = self.compute(state, fresh)
         self.load_state_dict(_with_rows(before, self.state_dict(), fresh))
