@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode, VectorEnv  # noqa: E402
 
 BLIND = ("experiment=walk", "obstacles=none")
+WITH_LIDAR = ("experiment=quickstart", "obstacles.curriculum=null", "lidar.num_rays=100")
 SEEING = ("lidar.num_rays=200", "randomization=robot", "obstacles=moving")
 STYLE = "symmetric and normalized|probably too|inf|env.spec"
 """What the checker would rather have, and says so."""
@@ -66,6 +67,40 @@ def test_some_environments_are_reset_and_the_others_go_on():
         assert changed.tolist() == mask.tolist()
 
 
+def test_a_reset_of_some_leaves_history_and_frames_of_the_others(vector_with_lidar):
+    env, other = vector_with_lidar(), vector_with_lidar()
+    for each in (env, other):
+        assert (rollout(each, 3, 7)[-1]["frame_count"] == 2).all()
+    before = env.env.get_observations()
+    mask = np.array([False, True, False])
+    env.reset(options={"reset_mask": mask})
+    after = env.env.get_observations()
+    changed = {name: (new != before[name]).flatten(1).any(1).tolist() for name, new in after.items()}
+    assert changed["proprioception"] == changed["frames"] == changed["frame_count"] == mask.tolist()
+    assert not any(row[0] or row[2] for row in changed.values())
+    still = np.zeros((3, 12), np.float32)
+    now, then = env.step(still)[0], other.step(still)[0]
+    for name in now:
+        changed = (now[name] != then[name]).reshape(3, -1).any(1)
+        assert changed.tolist() == mask.tolist(), name
+
+
+def test_seeds_for_some_at_first_cast_no_second_frame_for_the_others(vector_with_lidar):
+    seen = vector_with_lidar().reset(seed=[5, None, None])[0]
+    assert seen["frame_count"].flatten().tolist() == [0, 1, 1]
+
+
+def test_the_end_of_an_episode_is_told_with_its_last_frames(vector_with_lidar):
+    ends, goes_on = vector_with_lidar("terminations.episode_length_s=0.14"), vector_with_lidar()
+    for each in (ends, goes_on):
+        rollout(each, 1, 6)
+    still = np.zeros((3, 12), np.float32)
+    final, expected = ends.step(still)[4]["final_obs"], goes_on.step(still)[0]
+    assert (final["frame_count"] == 2).all() and (final["frames"] != 0).any()
+    for name in expected:
+        assert np.array_equal(final[name], expected[name]), name
+
+
 def test_the_end_of_an_episode_is_told_with_its_last_observation():
     env = omniperception.make(*BLIND, "terminations.episode_length_s=0.1", num_envs=2)
     silent = omniperception.make(*BLIND, "terminations.episode_length_s=1.0", num_envs=2)
@@ -104,6 +139,11 @@ def test_tensors_stay_where_they_are():
 def test_wrong_calls_get_one_line(vector_of_two, call, message):
     with pytest.raises(ConfigError, match=message):
         call(vector_of_two)
+
+
+@pytest.fixture(scope="module")
+def vector_with_lidar():
+    return lambda *overrides: omniperception.make(*WITH_LIDAR, *overrides, num_envs=3)
 
 
 @pytest.fixture(scope="module")

@@ -118,7 +118,8 @@ class Avoidance:
         if self.sector_distance is not None:
             self.sector_distance[env_ids] = self._max_distance
         if self.motion is not None:
-            self.motion[env_ids] = nothing_near(1, self.config.num_sectors, self.motion.device)
+            nothing = nothing_near(len(env_ids), self.config.num_sectors, self.motion.device)
+            self.motion = self.motion.index_copy(0, env_ids, nothing)
         if self.risk is not None:
             self.risk = self.risk.index_fill(0, env_ids, 0.0)
 

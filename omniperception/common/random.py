@@ -113,6 +113,10 @@ class TrialRandom(EnvRandom):
         self.trial = torch.full_like(self.counter, -1)
         self._begun = 0
 
+    def seed(self, env_ids: torch.Tensor, seeds: torch.Tensor) -> None:
+        """Raises ValueError: a trial's draws follow from its number."""
+        raise ValueError("seeds of a reset would be ignored in trials, whose numbers decide what they draw; give none")
+
     def start_episode(self, env_ids: torch.Tensor) -> None:
         """Gives environments `env_ids` (n,) the next n trials."""
         numbers = torch.arange(self._begun, self._begun + len(env_ids), device=env_ids.device)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from omniperception.env.measurement import MeasurementErrors
     from omniperception.env.sensing import LidarSensing
     from omniperception.env.terrain_levels import TerrainLevels
+    from omniperception.perception import Sampler
     from omniperception.scene.ground import Ground
 
 
@@ -99,6 +100,32 @@ def build_delivery(config: EnvConfig, random: EnvRandom) -> FrameDelivery | None
     return FrameDelivery(rows.frames_lost, late_s, config.sim.control_dt, config.num_envs, random.branch("frames"))
 
 
+LOWEST_BAND = 0.05
+"""Height (m) above the ground up to which a sampler's bands may begin: what is lower does not stop a robot."""
+
+
+def build_sampler(config: EnvConfig) -> Sampler | None:
+    """What a network sees of a cloud.
+
+    Raises:
+        ValueError: its bands of height, which count from the base's origin, begin above the ground that carries it.
+    """
+    if config.sampler is None or config.lidar is None:
+        return None
+    from omniperception.perception import ProximitySampler
+
+    sampler, height = config.sampler(), config.robot.base_height
+    if isinstance(sampler, ProximitySampler) and config.lidar.mount_body is None:
+        lowest = float(sampler.edges[0])
+        if lowest + height > LOWEST_BAND:
+            raise ValueError(
+                f"perception.sampler.band_edges begins {lowest + height:.2f} m above the ground, at {lowest:g} m from"
+                f" the base's origin with robot.base_height={height:g}, and what is lower would not be seen; begin it"
+                f" at {-height - 0.01:.2f}, or use perception=polar_rings"
+            )
+    return sampler
+
+
 def build_sensing(
     config: EnvConfig, sim: Simulator, random: EnvRandom, avoidance: Avoidance | None
 ) -> LidarSensing | None:
@@ -115,7 +142,7 @@ def build_sensing(
         config.lidar_noise,
         config.seed,
         config.sim.num_threads or None,
-        config.sampler() if config.sampler is not None else None,
+        build_sampler(config),
         config.frame_history,
         config.base_motion,
         sector_distance=avoidance.sector_distance if avoidance is not None else None,

@@ -26,7 +26,7 @@ from omniperception.env.mdp.curriculum import Curriculum
 from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
-from omniperception.env.metrics import EpisodeMetrics
+from omniperception.env.metrics import OUTCOMES, EpisodeMetrics
 from omniperception.env.state import CONTACT_SENSORS, EnvState
 from omniperception.scene import ObstacleField, build_world
 
@@ -72,7 +72,7 @@ class OmniEnv(VecEnv):
         streams = TrialRandom if config.trials else EnvRandom
         self.random: EnvRandom = streams(config.seed, self.num_envs, self.device)
         self.command = config.commands.build(self.num_envs, self.device, self.random)
-        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        self._episode_length = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self.difficulty = Curriculum(config.randomization.curriculum)
         branch = self.random.branch("randomization")
         self.randomizer = Randomizer(config.randomization, self.sim, branch, self.difficulty)
@@ -91,7 +91,7 @@ class OmniEnv(VecEnv):
             self.avoidance,
             self.sensing,
             build_errors(config, self.random, self.difficulty),
-            self.episode_length_buf,
+            self._episode_length,
             config.observations.command_acceleration,
             self.difficulty,
             config.stepping,
@@ -108,6 +108,8 @@ class OmniEnv(VecEnv):
         if HEIGHT_TARGET in config.targets and not self.heights_each_step:
             self._frame_heights = torch.zeros_like(self.state.heights)
         self._all_envs = torch.arange(self.num_envs, device=self.device)
+        self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.outcomes = dict.fromkeys(OUTCOMES, self.done)
         self._reset(self._all_envs)
         self.healthy = ~self.sim.failed
         self._sense()
@@ -119,6 +121,15 @@ class OmniEnv(VecEnv):
         return self.config
 
     # ---- rsl_rl's contract -------------------------------------------------------------------------------------------
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
+        """(num_envs,) int64 control steps since the episodes began; what is assigned is copied, the state reads it."""
+        return self._episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self._episode_length.copy_(steps)
 
     def get_observations(self) -> TensorDict:
         return self.observations
@@ -172,9 +183,10 @@ class OmniEnv(VecEnv):
                 self.step_count = 0
         self._reset(env_ids, seeds, interrupted=True)
         self.healthy = ~self.sim.failed
-        if self.step_count == 0:
+        everybody = len(env_ids) == self.num_envs
+        if everybody and self.step_count == 0:
             self._sense()
-        self.observations = self._observe(env_ids)
+        self.observations = self._observe(env_ids) if everybody else self._begun(env_ids)
         return self.observations
 
     def final_observations(self) -> TensorDict:
@@ -309,12 +321,12 @@ class OmniEnv(VecEnv):
         self.state.reset(env_ids)
         self.command.reset(env_ids, self.state.kinematics)
         if self.obstacles is not None:
-            commanded = rotate_yaw(pose[:, 2], self.command.value[env_ids, :2])
             goal = None if self.command.goal_w is None else self.command.goal_w[env_ids]
-            self.obstacles.reset(env_ids, pose[:, :2], commanded, goal)
+            self.obstacles.reset(env_ids, pose[:, :2], goal)
             self._resize(self.obstacles, env_ids)
             if isinstance(self.command, GoalCommand) and self.command.config.route_ahead is not None:
                 self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
+            self.obstacles.approach(env_ids, pose[:, :2], rotate_yaw(pose[:, 2], self.command.value[env_ids, :2]))
         self.episode_length_buf[env_ids] = 0
         if self.sensing is not None:
             self.sensing.reset(env_ids, self.state.measured, seeds)
@@ -334,6 +346,13 @@ class OmniEnv(VecEnv):
     def _observe(self, fresh: torch.Tensor) -> TensorDict:
         """Observations, which begin an episode in the environments `fresh` (n,)."""
         return self._collect({name: group.compute(self.state, fresh) for name, group in self._groups.items()})
+
+    def _begun(self, env_ids: torch.Tensor) -> TensorDict:
+        """The newest observations, of which only those of environments (n,) are made anew, between two steps."""
+        groups = self._groups.items()
+        return self._collect(
+            {name: group.begin(self.state, env_ids, self.observations[name]) for name, group in groups}
+        )
 
     def _collect(self, groups: dict[str, torch.Tensor]) -> TensorDict:
         """Adds LiDAR frames and the targets of supervision to the observation groups."""
@@ -417,7 +436,7 @@ class OmniEnv(VecEnv):
             **{name: part.state_dict() for name, part in self._with_state().items()},
             "random": self.random.state_dict(),
             "step_count": self.step_count,
-            "episode_length": self.episode_length_buf,
+            "episode_length": self.episode_length_buf.clone(),
             "frame_heights": self._frame_heights,
             "observations": {name: self.observations[name] for name in self._groups},
         }

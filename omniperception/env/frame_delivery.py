@@ -48,7 +48,8 @@ class FrameDelivery:
         """Draws for the next frame."""
         lost, late = self._random.uniform(self._all_envs, (2,)).unbind(1)
         torch.ge(lost, self._lost, out=self.fresh)
-        self.late_steps.copy_(((self._low + self._span * late) / self._dt).round())
+        steps = ((self._low + self._span * late) / self._dt).round()
+        self.late_steps.copy_(steps.clamp(max=self.max_late_steps))  # float32 rounds half steps anyhow
 
     def state_dict(self) -> dict:
         return {"fresh": self.fresh.clone(), "late_steps": self.late_steps.clone()}

@@ -67,7 +67,8 @@ class EpisodeMetrics:
         return float(self._errors[2] / self._errors[3]) if self._errors[3] > 0 else float("inf")
 
     def state_dict(self) -> dict:
-        return {"sums": list(self._sums()), "steps": self._steps, "collided": self.collided}
+        sums = [total.clone() for total in self._sums()]
+        return {"sums": sums, "steps": self._steps, "collided": self.collided.clone()}
 
     def load_state_dict(self, state: dict) -> None:
         for total, saved in zip(self._sums(), state["sums"], strict=True):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from omniperception.common.launch import constant
 from omniperception.common.rotations import multiply
 from omniperception.common.timing import StageTimer
 from omniperception.env.frame_delivery import FrameDelivery, PastPoses
@@ -288,7 +289,7 @@ class LidarSensing:
         if self.carrier == self.base:
             return base_quat
         quat = self.scene.body_quat.float()
-        back = quat[:, self.base] * quat.new_tensor([1.0, -1.0, -1.0, -1.0])
+        back = quat[:, self.base] * constant((1.0, -1.0, -1.0, -1.0), quat.device)
         return multiply(base_quat, multiply(back, quat[:, self.carrier]))
 
     def place_bodies(self) -> None:
@@ -344,11 +345,14 @@ class LidarSensing:
         return capped.sum(1) / distal.sum(1).clamp(min=1)
 
     def state_dict(self) -> dict:
+        clouds = self.lidar.frame
+        read = self.lidar.outputs if self.whole and self._is_cast else ()
         return {
             "tick": self.tick,
             "lidar": self.lidar.state_dict(),
-            "frame_count": self.frame_count,
+            "frame_count": self.frame_count.clone(),
             "frames": self.frames,
+            "clouds": {name: getattr(clouds, name).clone() for name in sorted(read)},
             "distal_range": {str(key): value.clone() for key, value in self._distal_range.items()},
             "unseen": None if self.unseen is None else self.unseen.clone(),
             "odometry": self.odometry.state_dict() if self.odometry is not None else None,
@@ -358,6 +362,10 @@ class LidarSensing:
 
     def load_state_dict(self, state: dict) -> None:
         self.tick = state["tick"]
+        clouds = state.get("clouds", {})  # files from before clouds were saved have none until the next tick
+        self._is_cast = bool(clouds)
+        for name, values in clouds.items():
+            getattr(self.lidar.frame, name).copy_(values)
         self.frame_tick.fill_(self.tick)
         self.lidar.load_state_dict(state["lidar"])
         self.frame_count.copy_(state["frame_count"])
@@ -390,7 +398,7 @@ class LidarSensing:
         self.lidar.reset(env_ids, seeds)
         self.frame_count[env_ids] = 0
         if self.frames is not None:
-            self.frames[env_ids] = 0.0
+            self.frames = self.frames.index_fill(0, env_ids, 0.0)  # observations keep the tensor of before
         if self.unseen is not None:
             self.unseen[env_ids] = NEVER
         for max_distance, mean in self._distal_range.items():

@@ -224,6 +224,7 @@ class EnvState:
         """State that lasts from step to step."""
         return {
             "actions": list(self.actions),
+            "targets": list(self.targets),
             "stand_s": self.stand_s,
             "reference": self._reference,
             "history": self._history and self._history.state_dict(),
@@ -234,6 +235,8 @@ class EnvState:
     def load_state_dict(self, state: dict) -> None:
         self.invalidate()
         self.actions = tuple(state["actions"])
+        if "targets" in state:  # files from before they were saved begin with the default pose
+            self.targets = (state["targets"][0], state["targets"][1])
         self.stand_s, self._reference = state["stand_s"].clone(), state["reference"].clone()
         if self._history is not None:
             self._history.load_state_dict(state["history"])
@@ -487,7 +490,7 @@ class StateHistory:
         return Kinematics(qpos[self._all_envs, index], qvel[self._all_envs, index])
 
     def state_dict(self) -> dict:
-        return {"past": list(self._past)}
+        return {"past": [past.clone() for past in self._past]}
 
     def load_state_dict(self, state: dict) -> None:
         for past, saved in zip(self._past, state["past"], strict=True):

@@ -69,7 +69,7 @@ class PoseTrack:
 
     def forget(self, env_ids: torch.Tensor | None = None) -> None:
         """Makes the next poses of some environments, or of all, those of all moments."""
-        if env_ids is None:
+        if env_ids is None or len(env_ids) == len(self._forget):
             self._forget.fill_(True)
             self._num_recorded, self._is_complete = 0, False
         else:

@@ -29,7 +29,8 @@ class GeometryConfig:
 
     Attributes:
         num_sectors: azimuth sectors of the result; sector 0 starts at -pi in the yaw-aligned frame.
-        reach: distance (m) up to which returns count.
+        reach: distance (m) up to which returns tell where the ground is; what lies farther away stands on the ground of
+            the outermost ring.
         body: (back, front, side) (m) from the base's origin in the base frame: returns inside are the robot's own.
         near, near_share: returns nearer to the sensor than `near` (m) count where they are at least this share of a
             sector's returns; fewer are noise.

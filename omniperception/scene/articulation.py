@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 
 from omniperception.common.rotations import matrix_of, multiply, rotate, yaw_quat
-from omniperception.scene.part_shapes import quat_about, quat_of_rpy
+from omniperception.lidar import quat_from_rpy
+from omniperception.scene.part_shapes import quat_about
 from omniperception.scene.parts import Part, PartConfig
 
 Rows = torch.Tensor | slice
@@ -41,7 +42,7 @@ class Articulation:
         self.obstacle = torch.tensor([part.obstacle for part in parts], device=device)
         num_obstacles = int(self.obstacle.max()) + 1
         self._joint, self._hang = column([form.pos for form in forms]), column([form.hang for form in forms])
-        self._rest = column([quat_of_rpy(form.rpy_deg) for form in forms])
+        self._rest = column([quat_from_rpy(*map(math.radians, form.rpy_deg)) for form in forms])
         self._axis = column([swing.direction if swing else (1.0, 0.0, 0.0) for swing in swings])
         self._amplitude = torch.deg2rad(column([swing.amplitude_deg if swing else 0.0 for swing in swings]))
         self._frequency = column([swing.frequency if swing else 0.0 for swing in swings])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 from omniperception.scene.obstacle_group import COMPOUND, ApproachConfig, ObstacleGroup
 from omniperception.scene.obstacles import ObstaclesConfig
@@ -24,8 +25,9 @@ def held_out(config: ObstaclesConfig) -> ObstaclesConfig:
     Half of a group (of an odd number the larger half) is of another kind: cylinders become capsules (flat ones
     hexagonal prisms), boxes wedges and hexagonal prisms, spheres rocks; the other half keeps its kind. Either half is
     divided into smaller ones, with sizes in [0.75 low, low] of the group's ranges [low, high], and larger ones, in
-    [high, 1.3 high]. Capsules, meshes and compounds keep their kind, which no training scene has. Groups with fixed
-    poses, which are the bounds of a scene, and layouts stay as they are; a layout's worlds differ by `split`.
+    [high, 1.3 high]. Capsules, meshes and compounds keep their kind, which no training scene has. A range of `present`
+    keeps its ends, and each part draws a number of its own. Groups with fixed poses, which are the bounds of a scene,
+    and layouts stay as they are; a layout's worlds differ by `split`.
     """
     groups: dict[str, ObstacleGroup] = {}
     for index, (name, group) in enumerate(config.groups.items()):
@@ -40,28 +42,42 @@ def _others(name: str, group: ObstacleGroup, larger_first: bool, clearance: floa
         raise ValueError(
             f"obstacles: {name} has files={list(group.files)}, of which there are no held-out ones; use split=dev"
         )
-    found = {}
+    sorts = []
     for count, changes in ((new, True), (group.count - new, False)):
         first, larger_now = (count + 1) // 2, larger_first == changes
-        for number, larger in ((first, larger_now), (count - first, not larger_now)):
-            if number:
-                other = _one(group, number, changes, larger)
-                label = "larger" if larger else "smaller"
-                kind = other.file or other.kind
-                found[f"{name}_{label}_{kind}"] = _kept_off(other, clearance)
+        sorts += [(first, changes, larger_now), (count - first, changes, not larger_now)]
+    found, present = {}, _present([number for number, _, _ in sorts], group.present)
+    for (number, changes, larger), bounds in zip(sorts, present, strict=True):
+        if number:
+            other = _one(replace(group, count=number, present=bounds), changes, larger)
+            kind = other.file or other.kind
+            found[f"{name}_{'larger' if larger else 'smaller'}_{kind}"] = _kept_off(other, clearance)
     return found
 
 
-def _one(group: ObstacleGroup, count: int, changes: bool, larger: bool) -> ObstacleGroup:
-    """`count` obstacles in the place of some of a group's."""
-    present = group.present
-    if present is not None:
-        present = tuple(round(bound * count / group.count) for bound in present)
+def _present(counts: Sequence[int], present: Sequence[int] | None) -> list[tuple[int, int] | None]:
+    """Ranges of how many take part of parts of a group with these counts, whose ends add up to those of the group's."""
+    if present is None:
+        return [None] * len(counts)
+    highs = _apportioned(present[1], counts)
+    return list(zip(_apportioned(present[0], highs), highs, strict=True))
+
+
+def _apportioned(total: int, weights: Sequence[int]) -> list[int]:
+    """Whole numbers nearly in proportion to weights whose sum is at least `total`; none is above its weight."""
+    whole = max(sum(weights), 1)
+    ends = [(2 * total * sum(weights[:k]) + whole) // (2 * whole) for k in range(len(weights) + 1)]
+    return [end - begin for begin, end in pairwise(ends)]
+
+
+def _one(group: ObstacleGroup, changes: bool, larger: bool) -> ObstacleGroup:
+    """Obstacles in the place of a group's."""
+    count, present = group.count, group.present
     if group.kind == COMPOUND:
-        return replace(group, count=count, present=present, scale=_stretched((group.scale,), larger)[0])
+        return replace(group, scale=_stretched((group.scale,), larger)[0])
     size = _stretched(group.sizes_of(0) if group.file and not group.size else group.size, larger)
     if not changes:
-        return replace(group, count=count, present=present, size=size)
+        return replace(group, size=size)
     kind, file, size = _other_kind(group.kind, size)
     if file is not None:
         present = present or (count, count)

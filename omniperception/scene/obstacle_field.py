@@ -143,15 +143,13 @@ class ObstacleField:
         self,
         env_ids: torch.Tensor,
         robot_xy_w: torch.Tensor,
-        command_w: torch.Tensor | None = None,
         goal_w: torch.Tensor | None = None,
     ) -> None:
-        """Places the obstacles of some environments again, in newly drawn sizes.
+        """Places the obstacles of some environments again, in newly drawn sizes; `approach` has to follow.
 
         Args:
             env_ids: (n,) which environments.
             robot_xy_w: (n, 2) where the robot stands, m.
-            command_w: (n, 2) the velocity (m/s) that it is commanded; None for none.
             goal_w: (n, 2) where it is to go, m; only a free path needs it.
         """
         robot = robot_xy_w.to(self._dtype)
@@ -180,11 +178,21 @@ class ObstacleField:
         self.root_pos_w[env_ids] = torch.cat((xy, z[..., None]), -1)
         if self._wander is not None:
             self._wander.reset(env_ids, heading)
-        if self.any_approaches:
-            command = torch.zeros_like(robot) if command_w is None else command_w.to(self._dtype)
-            self._start_approach(env_ids, self._approach.which & active, robot, command)
         if self._ground is not None:
             self._above_ground[env_ids] = above_ground
+        self._stand(env_ids)
+
+    def approach(self, env_ids: torch.Tensor, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
+        """Sends the approaching obstacles of environments (n,) that have been reset past their robots, commanded to go
+        `command_w` (n, 2) in m/s: a command may follow a route through the world that `reset` has drawn."""
+        if self.any_approaches:
+            which = self._approach.which & self.root_active[env_ids]
+            self._start_approach(env_ids, which, robot_xy_w.to(self._dtype), command_w.to(self._dtype))
+            self._stand(env_ids)
+
+    def _stand(self, env_ids: torch.Tensor) -> None:
+        """Puts obstacles (n, O) and their parts onto the ground below them, as they face."""
+        if self._ground is not None:
             self.root_pos_w[env_ids, :, 2] = self._over_ground(env_ids)
         self._face(env_ids)
         self._place_parts(env_ids)
@@ -241,7 +249,8 @@ class ObstacleField:
         return self._part_path, self._quat_path if parts.turns else None
 
     def restart_approaching(self, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
-        """Restarts approaching obstacles that have passed the robot; see `reset` for the arguments."""
+        """Restarts approaching obstacles that have passed the robots at (num_envs, 2) m, commanded to go `command_w`
+        (num_envs, 2) in m/s."""
         robot_xy = robot_xy_w.to(self._dtype)
         gone = self._approach.have_passed(self.root_pos_w[..., :2], robot_xy) & self.root_active
         env_ids = gone.any(1).nonzero().flatten()
@@ -315,10 +324,7 @@ class ObstacleField:
             root_radius = torch.where(self._reach > 0, self._reach * parts.scale[rows], radius[:, self._first_part])
         derived = {"outline": outline, "radius": radius, "half_height": half[..., 2], "root_radius": root_radius}
         for name, value in derived.items():
-            if env_ids is None:
-                setattr(self, name, value)
-            else:
-                getattr(self, name)[env_ids] = value
+            setattr(self, name, value if env_ids is None else getattr(self, name).index_copy(0, env_ids, value))
 
     def _face(self, rows: torch.Tensor | slice = slice(None)) -> None:
         """Turns compounds that move into the way they move."""

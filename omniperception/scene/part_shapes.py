@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from omniperception.common.rotations import matrix_of, multiply, rotate
+from omniperception.lidar import quat_from_rpy
 from omniperception.scene.parts import Part, PartConfig
 
 
@@ -68,7 +69,8 @@ def _reach(form: PartConfig) -> float:
     amplitude = 0.0 if form.swing is None else math.radians(form.swing.amplitude_deg)
     angle = torch.linspace(-amplitude, amplitude, 37, dtype=torch.float64)
     axis = torch.tensor((1.0, 0.0, 0.0) if form.swing is None else form.swing.direction, dtype=torch.float64)
-    turned = multiply(torch.tensor(quat_of_rpy(form.rpy_deg), dtype=torch.float64), quat_about(axis, angle))
+    rest = torch.tensor(quat_from_rpy(*map(math.radians, form.rpy_deg)), dtype=torch.float64)
+    turned = multiply(rest, quat_about(axis, angle))
     pos, hang = (torch.tensor(value, dtype=torch.float64) for value in (form.pos, form.hang))
     size = torch.tensor([[*form.size, 0.0, 0.0][:3]], dtype=torch.float64)
     half = PartShapes([form.kind], size.dtype, size.device).half_extents(size, matrix_of(turned)[:, None])[:, 0, :2]
@@ -79,16 +81,3 @@ def _reach(form: PartConfig) -> float:
 def quat_about(axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     """Quaternions (..., 4) of turns by angles (...) in rad about unit axes (..., 3)."""
     return torch.cat(((angle / 2).cos()[..., None], (angle / 2).sin()[..., None] * axis), -1)
-
-
-def quat_of_rpy(rpy_deg: Sequence[float]) -> tuple[float, float, float, float]:
-    """Quaternion (w, x, y, z) of roll, pitch and yaw (deg), turned in this order about fixed axes."""
-    (cr, cp, cy), (sr, sp, sy) = (
-        [function(math.radians(angle) / 2) for angle in rpy_deg] for function in (math.cos, math.sin)
-    )
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )

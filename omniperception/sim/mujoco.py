@@ -191,7 +191,7 @@ class MujocoSimulator:
         return {name: np.zeros((self.num_envs, num_steps, widths[name])) for name in self._record}
 
     def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
-        self.failure = torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure)
+        self.failure.copy_(torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure))
 
     def detect_failures(self) -> None:
         """Looks at speed, position and the engine's warnings, at which a simulation stops until the call's end."""
@@ -213,7 +213,7 @@ class MujocoSimulator:
         for values in self._records.values():
             values[env_ids.numpy()] = 0.0
         if self._torque is not None:
-            self._torque[env_ids] = 0.0
+            self._torque.numpy()[env_ids.numpy()] = 0.0
 
     def joint_torque(self) -> torch.Tensor:
         if self._torque is None:

@@ -1,12 +1,16 @@
 """The environment's step: seeds, terminations, symmetry, what a run without LiDAR leaves out, observations."""
 
 import math
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 from stepping import FULL, OTHERS, random_actions, still
+
+from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.terms import ObservationGroup, StatefulTerm
 
 
 def test_seeds_differ(make_env):
@@ -162,6 +166,78 @@ def test_observations_have_history_and_forget_at_a_reset(make_env):
     assert (after[1] == after[1, :1]).all()
     assert after[1, 0, :12].abs().max() < 1e-6 and after[1, 0, -3:].tolist() == [0, 0, -1]
     assert torch.equal(observations["action"][OTHERS], actions[2][OTHERS]) and (observations["action"][1] == 0).all()
+
+
+class Total(StatefulTerm):
+    """How often it has been asked since the episode began."""
+
+    def __init__(self):
+        self.count = torch.zeros(4)
+
+    def __call__(self, state):
+        self.count = self.count + 1.0
+        return self.count[:, None]
+
+    def reset(self, env_ids):
+        self.count = self.count.index_fill(0, env_ids, 0.0)
+
+
+def test_a_reset_between_steps_advances_no_term_of_the_others(make_env):
+    task = make_env("obstacles=none", blind=True).config
+    groups = {**task.observations.groups, "action": ObservationGroup({"total": Total}, history=2)}
+    env = OmniEnv(replace(task, observations=replace(task.observations, groups=groups)))
+    for _ in range(3):
+        before = env.step(torch.zeros(4, 12))[0]["action"].tolist()
+    after = env.reset(torch.tensor([1]))["action"].tolist()
+    assert after[1] == [1.0, 1.0] and [after[k] for k in OTHERS] == [before[k] for k in OTHERS]
+    now = env.step(torch.zeros(4, 12))[0]["action"]
+    assert now[1].tolist() == [1.0, 2.0] and now[0].tolist() == [before[0][1], before[0][1] + 1.0]
+
+
+def test_a_reset_right_after_a_loaded_state(make_env):
+    """As a viewer does; the terrain's levels ask how the episodes ended."""
+    given = ("terrain=mixed", "obstacles=none")
+    whole, resumed = (make_env(*given, blind=True) for _ in range(2))
+    whole.step(torch.zeros(4, 12))
+    resumed.load_state_dict(whole.state_dict())
+    for env in (whole, resumed):
+        env.reset()
+    assert torch.equal(whole.sim.qpos, resumed.sim.qpos)
+
+
+def test_an_assigned_clock_is_the_states(make_env):
+    """As rsl_rl's runner does, with init_at_random_ep_len."""
+    env = make_env("obstacles=none", blind=True)
+    env.episode_length_buf = torch.tensor([3, 0, 10, 7])
+    assert env.state.time_s.tolist() == pytest.approx([0.06, 0.0, 0.2, 0.14])
+    env.step(torch.zeros(4, 12))
+    assert env.state.time_s.tolist() == pytest.approx([0.08, 0.02, 0.22, 0.16])
+
+
+@pytest.mark.parametrize(
+    "given", [("obstacles=moving", "randomization=robot"), ("scenario=maze",), ("scenario=people",), ("terrain=mixed",)]
+)
+def test_a_reset_after_steps_in_inference_mode(make_env, given):
+    env = make_env("experiment=avoid", *given, "lidar.num_rays=50", "lidar.selection=every_kth")
+    with torch.inference_mode():
+        for _ in range(6):
+            env.step(torch.full((4, 12), torch.nan))
+    env.reset()
+    env.step(torch.zeros(4, 12))
+
+
+def test_obstacles_approach_along_the_route_of_their_own_episode(make_env, monkeypatch):
+    given = ("scenario=maze", "+obstacles.groups.person={kind:cylinder,count:1,size:[[0.2,0.2],[0.8,0.8]],speed:[1,1]}")
+    env = make_env(*given, "+obstacles.groups.person.approach={within:0.1,distance:[2.0,3.0]}", blind=True)
+    told, approach = [], env.obstacles.approach
+    monkeypatch.setattr(
+        env.obstacles, "approach", lambda ids, at, command: (told.append(command), approach(ids, at, command))
+    )
+    env.reset()
+    ahead = (env.command.along < 3.0).sum(1, keepdim=True)[..., None].expand(-1, 1, 2)
+    way = env.command.route_w.gather(1, ahead)[:, 0] - env.state.kinematics.base_pos_w[:, :2]
+    speed = env.config.commands.speed
+    torch.testing.assert_close(told[0], speed * way / way.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
 
 
 def test_nearest_obstacles_by_hand(make_env):

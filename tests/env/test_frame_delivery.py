@@ -58,6 +58,13 @@ class TestDraws:
         assert delivery.max_late_steps == 5 and delivery.fresh.all()
         assert shares.tolist() == pytest.approx([0.1, 0.2, 0.2, 0.2, 0.2, 0.1], abs=4 * math.sqrt(0.16 / 5000))
 
+    @pytest.mark.parametrize("late_s", [0.03, 0.05, 0.07, 0.09, 0.11])
+    def test_a_fixed_lateness_of_half_a_step_more_is_kept(self, late_s):
+        delivery = FrameDelivery(None, (late_s, late_s), 0.02, 8, EnvRandom(1, 8).branch("frames"))
+        delivery.draw()
+        assert (delivery.late_steps == delivery.max_late_steps).all()
+        assert abs(delivery.max_late_steps * 0.02 - late_s) < 0.0101
+
 
 class TestLost:
     FRESH = (  # by tick, of three environments

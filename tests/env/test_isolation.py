@@ -1,11 +1,16 @@
 """What happens to one environment changes nothing in the others; saved states; both simulators give the same."""
 
+import copy
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from stepping import FULL, OTHERS, SIMS, assert_equal, outcome, random_actions, still
 
+from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.terms import RewardTerm
+from omniperception.env.state import requires
 from omniperception.learning import TrainingDiverged, load_checkpoint, save_checkpoint
 from omniperception.sim import Failure
 
@@ -48,6 +53,62 @@ def test_a_saved_state_goes_on_bit_for_bit(make_env, tmp_path, task):
             assert torch.equal(whole.ground.level, resumed.ground.level)
             assert torch.equal(whole.sim.ground_pos, resumed.sim.ground_pos)
     assert ends >= 4 and (level is None or not torch.equal(whole.ground.level, level))
+
+
+@requires("cloud")
+def mean_range(state):
+    """Of the newest cloud; 0 without one."""
+    return torch.zeros(4) if state.cloud is None else state.cloud.true_ranges.clamp(max=6.0).mean(1)
+
+
+@pytest.mark.parametrize("task", ["mujoco", "robot", "goal"])
+def test_a_saved_state_is_no_live_memory(make_env, task):
+    env = make_env(*{**TASKS, "goal": ("scenario=maze", "lidar.num_rays=100")}[task])
+    actions = random_actions(env, 6, scale=0.5)
+    for action in actions[:3]:
+        env.step(action)
+    saved = env.state_dict()
+    kept = copy.deepcopy(saved)
+    for action in actions[3:]:
+        env.step(action)
+    env.reset()
+    assert_same(saved, kept)
+
+
+def assert_same(a, b, path=""):
+    if isinstance(a, torch.Tensor):
+        assert torch.equal(a, b), path
+    elif isinstance(a, dict | list | tuple):
+        pairs = a.items() if isinstance(a, dict) else enumerate(a)
+        for key, value in pairs:
+            assert_same(value, b[key], f"{path}/{key}")
+    else:
+        assert a == b, path
+
+
+def test_a_saved_state_has_its_clouds_and_targets(make_env):
+    def make():
+        task = make_env("obstacles=static", "lidar.num_rays=100").config
+        terms = task.rewards.terms | {"points": RewardTerm(1.0, mean_range)}
+        return OmniEnv(replace(task, rewards=replace(task.rewards, terms=terms)))
+
+    whole, resumed = make(), make()
+    actions = random_actions(whole, 8, scale=0.5)
+    for action in actions[:7]:
+        whole.step(action)
+    state = copy.deepcopy(whole.state_dict())
+    resumed.load_state_dict(state)
+    assert torch.equal(resumed.state.cloud.true_ranges, whole.state.cloud.true_ranges)
+    for each in (whole, resumed):
+        each.step(actions[7])
+    assert torch.equal(whole.rewards.weighted["points"], resumed.rewards.weighted["points"])
+    assert_same(list(whole.state.targets), list(resumed.state.targets))
+    del state["sensing"]["clouds"], state["state"]["targets"]  # as of an older version
+    resumed.load_state_dict(state)
+    assert resumed.state.cloud is None
+    for _ in range(5):
+        resumed.step(actions[7])
+    assert resumed.state.cloud is not None
 
 
 def qvel(value):

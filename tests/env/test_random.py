@@ -104,6 +104,10 @@ class TestBranches:
             got = branch.uniform(torch.tensor([1]), (6,))
         assert torch.equal(expected.uniform(torch.tensor([2]), (6,)), got)
 
+    def test_seeds_of_trials_are_refused(self):
+        with pytest.raises(ValueError, match="seeds of a reset would be ignored in trials"):
+            TrialRandom(2, 5).seed(everyone(5), everyone(5))
+
     def test_a_saved_state_goes_on(self):
         def make():
             random = EnvRandom(4, 3)

@@ -215,6 +215,16 @@ class TestLatency:
             assert torch.equal(env.state.measured.joint_pos[i], history[-1 - delay][i, 7:])
             assert not torch.equal(env.state.measured.joint_pos[i], env.state.kinematics.joint_pos[i])
 
+    @pytest.mark.parametrize("latency", [0.0025, 0.0075, 0.0125, 0.0175])
+    def test_a_fixed_latency_of_half_a_physics_step_more_is_kept(self, one_row, latency):
+        env = one_row("latency_s", latency, latency, num_envs=2)
+        for _ in range(3):
+            env.step(torch.ones(2, 12))
+        delay = env.randomizer.delay
+        assert (delay <= env.randomizer.max_delay).all() and (delay * 0.005 - latency).abs().max() < 0.0026
+        differ = (env.state.measured.joint_pos != env.state.kinematics.joint_pos).any(1)
+        assert torch.equal(differ, delay > 0)
+
     def test_observations_are_late_privileged_ones_are_not_and_a_reset_has_no_past(self, one_row):
         env = one_row("latency_s", 0.045, 0.045, num_envs=3)
         measured, exact = (lambda: env.state.measured.joint_pos), (lambda: env.state.kinematics.joint_pos)
@@ -358,6 +368,14 @@ class TestCurriculum:
             ),
         }[row]()
         assert_fills(drawn, neutral + 0.5 * (low - neutral), neutral + 0.5 * (high - neutral))
+
+    def test_at_0_the_ground_rebounds_as_the_terrain_says(self, make_env):
+        restitution = ("+randomization.ground_restitution=[0,1]", "terrain.restitution=0.4")
+        share = self.SHARE.replace("randomization", "+randomization", 1)
+        env = make_env(*restitution, share, "obstacles=none", blind=True, num_envs=4)
+        ground = env.world.model.geom("ground").id
+        drawn, nominal = env.sim.model_field("geom_solref")[:, ground], env.world.model.geom_solref[ground]
+        torch.testing.assert_close(drawn, torch.tensor(nominal).expand(4, -1), atol=1e-4, rtol=1e-6)
 
     def test_it_rises_while_robots_walk_well_and_lasts_in_a_checkpoint(self, make_env):
         env = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=2)

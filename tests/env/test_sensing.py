@@ -7,6 +7,7 @@ import pytest
 import torch
 from stepping import OTHERS, assert_equal, outcome, random_actions, still
 
+from omniperception.env.build import build_sampler
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import RewardTerm
 from omniperception.env.state import requires
@@ -128,6 +129,16 @@ def test_wrong_settings_are_refused(make_env, override, message):
         make_env("obstacles=static", override)
 
 
+@pytest.mark.parametrize(("robot", "base_height"), [("go2", "0.33"), ("go1", "0.325"), ("anymal", "0.55")])
+def test_bands_of_height_that_begin_above_the_ground_are_refused(make_config, robot, base_height):
+    task = make_config(f"robot={robot}", f"robot.base_height={base_height}", "perception=proximity_gru").env
+    if robot != "anymal":
+        assert build_sampler(task) is not None
+        return
+    with pytest.raises(ValueError, match=r"band_edges begins 0\.21 m above the ground.*begin it at -0\.56"):
+        build_sampler(task)
+
+
 def test_no_frames_until_the_curriculum_has_obstacles(make_env):
     env = make_env("experiment=quickstart", "perception.sampler.num_proximal=8")
     for _ in range(6):
@@ -193,6 +204,20 @@ def test_rays_within_a_frame_follow_the_robot_by_control_steps(make_env):
     for action in actions:
         straight.step(action)
     assert not torch.allclose(straight.sensing.frame.true_ranges, expected, rtol=1e-3)
+
+
+def test_time_begins_anew_within_a_frame_of_several_segments(make_env):
+    """A seeded reset forgets the moments noted before it; the frames after it are those of a fresh environment."""
+    given = ("obstacles=static", "lidar.motion_segments=5", "perception=none")
+    env, fresh = (make_env(*given, num_envs=2) for _ in range(2))
+    for action in random_actions(env, 3):
+        env.step(action)
+    seeds = torch.tensor([4, 9])
+    for each in (env, fresh):
+        each.reset(seeds=seeds)
+        for action in random_actions(each, 5, scale=0.5):
+            each.step(action)
+    assert torch.equal(env.sensing.frame.true_ranges, fresh.sensing.frame.true_ranges)
 
 
 class TestSlices:

@@ -120,6 +120,11 @@ def test_a_pointcloud2_has_the_layout_of_its_description():
     assert (message["point_step"], message["row_step"], message["width"], message["is_dense"]) == (14, 14, 1, True)
 
 
+def test_a_stamp_just_below_a_second_is_that_second():
+    message = message_from_table(table_of(dict.fromkeys("xyz", np.float32([1.0])), "lidar", 1.9999999999))
+    assert message["header"]["stamp"] == {"sec": 2, "nanosec": 0}
+
+
 def test_a_recording_holds_many_frames(tmp_path):
     pytest.importorskip("mcap_ros2")
     tables = [table_of({a: np.full(3, k, np.float32) for a in "xyz"}, "lidar", 0.1 * k) for k in range(4)]

@@ -106,6 +106,21 @@ def test_sizes_by_hand():
     assert found["grass_larger_capsule"].count == 5 and found["grass_larger_capsule"].present == (3, 5)
 
 
+@pytest.mark.parametrize(
+    ("count", "present"), [(8, (2, 2)), (4, (2, 2)), (8, (1, 3)), (8, (1, 2)), (7, (0, 5)), (5, (5, 5))]
+)
+@pytest.mark.parametrize("kind", ["box", "cylinder", "capsule"])
+def test_as_many_of_a_group_take_part_in_an_episode(kind, count, present):
+    size = [[0.2, 0.3], [0.4, 0.5], [0.4, 0.5]][: 3 if kind == "box" else 2]
+    obstacles = held_out(ObstaclesConfig({"thing": ObstacleGroup(kind, count, size, present=present)}))
+    pos, quat = (torch.zeros(400, len(obstacles.parts()), n, dtype=torch.float64) for n in (3, 4))
+    field = ObstacleField(obstacles, pos, quat, EnvRandom(3, 400))
+    field.reset(torch.arange(400), torch.full((400, 2), 50.0))
+    drawn = field.root_active.sum(1)
+    assert (drawn.min().item(), drawn.max().item()) == present
+    assert drawn.float().mean().item() == pytest.approx(sum(present) / 2, abs=0.15)
+
+
 def test_wedges_are_for_what_is_long():
     groups = {"wall": ObstacleGroup("box", 2, [[0.03, 0.08], [1.0, 2.5], [0.4, 0.6]])}
     groups["crate"] = ObstacleGroup("box", 2, [[0.2, 0.3], [0.2, 0.3], [0.2, 0.3]])

@@ -28,7 +28,9 @@ def built(groups, num_envs=500, seed=0, **settings):
 def reset(field, robot=(0.0, 0.0), command=(0.0, 0.0), goal=None):
     n = field.pos_w.shape[0]
     goal = None if goal is None else torch.tensor(goal).expand(n, 2)
-    field.reset(torch.arange(n), torch.tensor(robot).expand(n, 2), torch.tensor(command).expand(n, 2), goal)
+    env_ids, robot = torch.arange(n), torch.tensor(robot).expand(n, 2)
+    field.reset(env_ids, robot, goal)
+    field.approach(env_ids, robot, torch.tensor(command).expand(n, 2))
 
 
 class TestRanges:
@@ -261,7 +263,7 @@ class TestFeasible:
         uniform = EnvRandom(8, n).uniform(torch.arange(n), (4,))
         start = uniform[:, :2] * 0.2 - 0.1
         goal = uniform[:, 2:] * torch.tensor([1.5, 3.0]) + torch.tensor([6.0, -1.5])
-        field.reset(torch.arange(n), start, torch.zeros(n, 2), goal)
+        field.reset(torch.arange(n), start, goal)
         assert count == 8 and field.active.all() and (field.radius == 0.4).all()
         x, y = field.pos_w[..., 0], field.pos_w[..., 1]
         assert x.min() >= 1.5 and x.max() <= 7 and y.abs().max() <= 2

@@ -25,7 +25,7 @@ def field_of(task, num_envs):
     field = ObstacleField(task.obstacles, *poses, EnvRandom(task.seed, num_envs))
     goal = torch.tensor([task.commands.goal_x[0], 0.0]).expand(num_envs, 2)
     start = torch.zeros(num_envs, 2)
-    field.reset(torch.arange(num_envs), start, torch.tensor([1.0, 0.0]).expand(num_envs, 2), goal)
+    field.reset(torch.arange(num_envs), start, goal)
     return field
 
 

@@ -195,7 +195,8 @@ class VelocityCommand:
         return None
 
     def state_dict(self) -> dict:
-        return {"value": self.value, "time_left": self.time_left, "age": self.age, **self.curriculum.state_dict()}
+        tensors = {name: getattr(self, name).clone() for name in ("value", "time_left", "age")}
+        return tensors | self.curriculum.state_dict()
 
     def load_state_dict(self, state: dict) -> None:
         for name in ("value", "time_left", "age"):
@@ -254,7 +255,7 @@ class GoalCommand:
             self.along = self.goal_w.new_zeros(self.route_w.shape[:2])
         self.route_w[env_ids] = route.to(self.route_w.dtype)
         self.along[env_ids] = _along(self.route_w[env_ids])
-        self.progress[env_ids] = 0.0
+        self.progress = self.progress.index_fill(0, env_ids, 0.0)
         self._steer(kinematics)
 
     def way(self, kinematics: Kinematics) -> torch.Tensor:
@@ -304,8 +305,8 @@ class GoalCommand:
         return (point_w - kinematics.base_pos_w[:, :2]).norm(dim=1)
 
     def state_dict(self) -> dict:
-        state = {"value": self.value, "goal_w": self.goal_w, "elapsed": self.elapsed}
-        return state if self.route_w is None else {**state, "route_w": self.route_w, "progress": self.progress}
+        names = ("value", "goal_w", "elapsed", *(() if self.route_w is None else ("route_w", "progress")))
+        return {name: getattr(self, name).clone() for name in names}
 
     def load_state_dict(self, state: dict) -> None:
         self.value.copy_(state["value"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 
@@ -92,6 +93,14 @@ class ObservationManager:
         self.load_state_dict(before)
         return values
 
+    def begin(self, state: EnvState, fresh: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
+        """`observed` (num_envs, history * width), which `compute` returned last, with episodes that begin in some
+        environments `fresh` (n,); history and memory of the others stay as they are."""
+        before = copy.deepcopy(self.state_dict())
+        values = self.compute(state, fresh)
+        self.load_state_dict(_with_rows(before, self.state_dict(), fresh))
+        return observed.index_copy(0, fresh, values[fresh])
+
     def reset(self, env_ids: torch.Tensor) -> None:
         """Resets the terms with memory for environments (n,) that begin an episode."""
         for term in _stateful(self._terms).values():
@@ -112,6 +121,13 @@ def _check_shape(name: str, value: torch.Tensor, shape: tuple[int, ...], expecte
         raise ValueError(f"{name} is of type {type(value).__name__}, expected a tensor of shape {expected}")
     if tuple(value.shape) != shape:
         raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {expected}")
+
+
+def _with_rows(old: Any, new: Any, env_ids: torch.Tensor) -> Any:
+    """The old state, nested as `state_dict` gives it, with the new rows of environments (n,) in all its tensors."""
+    if isinstance(old, dict):
+        return {name: _with_rows(value, new[name], env_ids) for name, value in old.items()}
+    return old.index_copy(0, env_ids, new[env_ids]) if isinstance(old, torch.Tensor) else old
 
 
 def _stateful(terms: Mapping[str, Callable]) -> dict[str, StatefulTerm]:

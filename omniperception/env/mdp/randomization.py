@@ -292,18 +292,19 @@ class Randomizer:
         if "gravity_offset" in drawn:
             self._write("opt.gravity", env_ids, self._nominal_of("opt.gravity") + drawn["gravity_offset"])
         if self.delay is not None:
-            self.delay[env_ids] = (drawn["latency_s"] / self._model.opt.timestep).round().long()
+            steps = (drawn["latency_s"] / self._model.opt.timestep).round().long()
+            self.delay[env_ids] = steps.clamp(max=self.max_delay)  # drawn in float32, which rounds half steps anyhow
         if self._mass:
             self._set_masses(env_ids, drawn)
 
     def state_dict(self) -> dict:
         """Parameters that live outside the physics model."""
-        return {"drawn": self.drawn, "delay": self.delay}
+        return {"drawn": self.drawn.clone(), "delay": None if self.delay is None else self.delay.clone()}
 
     def load_state_dict(self, state: dict) -> None:
-        for name, mine in self.state_dict().items():
-            if mine is not None:
-                mine.copy_(state[name])
+        self.drawn.copy_(state["drawn"])
+        if self.delay is not None:
+            self.delay.copy_(state["delay"])
 
     def _write(self, field: str, env_ids: torch.Tensor, values: torch.Tensor, *index: int) -> None:
         """Writes float64 values into a model field of some environments, at an index, in the engine's precision."""
@@ -334,7 +335,9 @@ class Randomizer:
     def _neutral_of(self, name: str) -> torch.Tensor:
         """(1,) float64: what a parameter is without randomization."""
         terrain_friction = float(self._model.geom_friction[self._ground, 0])
-        value = {"motor_strength": 1.0, "ground_friction": terrain_friction}.get(name, 0.0)
+        neutral = {"motor_strength": 1.0, "ground_friction": terrain_friction}
+        neutral["ground_restitution"] = 2 * self._sim.world.terrain.restitution  # a contact has half of what is drawn
+        value = neutral.get(name, 0.0)
         return torch.tensor([value], dtype=torch.float64, device=self._sim.device)
 
     def _draw(self, env_ids: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import torch
 
+from omniperception.common.launch import constant
 from omniperception.env.state import EnvState, requires, rests
 
 
@@ -115,7 +116,7 @@ def foot_timing(
     A foot should be down during the first `duty` of its period, which begins `offsets` of a period after the clock's,
     that of the observation `gait_phase` of the same `frequency` (Hz) and `rest_s`.
     """
-    phase = frequency * state.time_s[:, None] - torch.tensor(offsets, device=state.device)
+    phase = frequency * state.time_s[:, None] - constant(tuple(offsets), state.device)
     down = torch.remainder(phase, 1.0) < duty
     down = down | rests(state, rest_s)[:, None]
     return (down == state.foot_contact).float().mean(1)

@@ -30,10 +30,10 @@ class StatefulTerm:
         """Begins an episode in environments (n,)."""
 
     def state_dict(self) -> dict:
-        return {name: value for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+        return {name: value.clone() for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
 
     def load_state_dict(self, state: dict) -> None:
-        vars(self).update(state)
+        vars(self).update({name: value.clone() for name, value in state.items()})
 
 
 def is_class(term: Term) -> bool:

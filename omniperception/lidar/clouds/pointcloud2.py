@@ -78,7 +78,8 @@ def message_from_table(table: PointTable) -> dict:
         for name, offset, kind in zip(table.names, offsets[:-1], types, strict=True)
     ]
     seconds = int(table.time_s // 1.0)
-    stamp = {"sec": seconds, "nanosec": round((table.time_s - seconds) * 1e9)}
+    carried, nanoseconds = divmod(round((table.time_s - seconds) * 1e9), 10**9)
+    stamp = {"sec": seconds + carried, "nanosec": nanoseconds}
     return {
         "header": {"stamp": stamp, "frame_id": table.frame},
         "height": 1,
