@@ -73,7 +73,6 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
         "ppo.num_steps_per_env=4",
         "ppo.num_mini_batches=1",
         "ppo.max_iterations=1",
-        "observations.groups.proprioception.history=1",
         "obstacles.curriculum=null",
         "terminations.episode_length_s=0.3",
     ]
