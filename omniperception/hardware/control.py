@@ -230,6 +230,8 @@ class Control:
             self._mode = self._link.mode
             if self._mode is Mode.POLICY:
                 self.policy.reset()
+                if self.policy.safety is not None:
+                    self.policy.safety.await_frame()  # the sensor may never have spoken
                 self._begin_odometry()
         given = command if self._link.mode is Mode.POLICY else np.zeros(3)
         points = self._points(frames, now)
