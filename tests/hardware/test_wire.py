@@ -3,10 +3,12 @@
 import contextlib
 import importlib.util
 import os
+import pty
 import socket
 import struct
 import subprocess
 import sys
+import termios
 import time
 from dataclasses import replace
 
@@ -360,6 +362,16 @@ class TestDds:
         link.close()
         assert not run_until(lambda: process.poll() is not None, 30.0)["kp"].any()
         assert process.wait(1.0) in (0, 120)  # 120: Python could not flush stderr at its end
+
+    def test_a_start_that_is_refused_leaves_the_terminal_as_it_was(self, exported):
+        terminal, stdin = pty.openpty()
+        before = termios.tcgetattr(stdin)
+        words = ["robot", f"policy={exported}", "points=none", "domain=77", "steer=keyboard"]
+        command = [sys.executable, "-m", "omniperception", *words]
+        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, timeout=120.0)
+        assert done.returncode == 2 and done.stderr == "error: this policy sees: points=none is for a blind one\n"
+        assert before[3] & termios.ECHO and termios.tcgetattr(stdin) == before
+        os.close(terminal), os.close(stdin)
 
     def test_somebody_else_who_writes_lowcmd_is_refused(self, exported):
         network = Network(domain=73)
