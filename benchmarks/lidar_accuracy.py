@@ -22,6 +22,7 @@ from benchmarks.harness.reference import mujoco_ranges
 from benchmarks.harness.rotations import matrices, random_unit
 from benchmarks.harness.table import Table, about, report
 from omniperception.cli import Command, argument
+from omniperception.common.errors import ConfigError
 from omniperception.lidar import (
     HeightField,
     Lidar,
@@ -432,6 +433,9 @@ def main(given: Arguments) -> None:
     """Measures, prints, writes, and exits with 1 if something is wrong."""
     table, good = accuracy(given.rays, given.seed, given.only)
     escaped = leaks(given.rays, given.seed, given.only)
+    if not table.rows and not escaped:
+        names = (case.name for case in cases())
+        raise ConfigError(f"only={given.only} is in no name of a case or room; cases are {', '.join(names)}")
     good &= all(count == 0 for *_, count in escaped)
     rooms = Table("leaks", "rays out of closed rooms", ("room", "rays", "escaped"), escaped)
     report([table, rooms] if escaped else [table], about(1, seed=given.seed), given.out)

@@ -32,7 +32,7 @@ import math
 import sys
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -177,6 +177,21 @@ class Command:
                 "--config-dir DIR adds a folder of presets of your own.",
             ]
         return "\n".join(lines)
+
+
+def refuse_overrides(overrides: Sequence[str], own: Mapping[str, object]) -> None:
+    """Raises a ConfigError where an override changes what the command sets itself; own: these values by key."""
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~")
+        if key in own:
+            raise ConfigError(f"{override}: this command sets {key}={own[key]} itself; leave it out")
+
+
+def refuse_arguments(arguments: Any, names: Iterable[str], why: str) -> None:
+    """Raises a ConfigError where one of these arguments is not its default; why: it would mean nothing."""
+    for field in dataclasses.fields(arguments):
+        if field.name in names and getattr(arguments, field.name) != field.default:
+            raise ConfigError(f"{field.name}= would mean nothing: {why}; leave it out")
 
 
 def fail(error: BaseException) -> typing.NoReturn:

@@ -32,6 +32,8 @@ from omniperception.config import ConfigError
 from omniperception.env.config import EnvConfig
 
 BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
+PARTS = ("floating", "standing", "scenes")
+"""Of subject=physics."""
 AGREEMENT = 0.99
 """Least share of gains where the analytic limit and the simulation must say the same."""
 
@@ -72,15 +74,15 @@ def _learning(given: Arguments, overrides: list[str]) -> Iterator[Table]:
 def _physics(given: Arguments, overrides: list[str]) -> Iterator[Table]:
     env = build.assemble(config.compose([*BLIND, "obstacles=static", *overrides])).env
     paper = build.assemble(config.compose([*BLIND, "randomization=paper"])).env.randomization
-    if given.only in "scenes":
+    if given.only in ("", "scenes"):
         gains = env.robot.kp, env.robot.kv
         rows = [physics.play(scene, given.seconds, gains) for scene in physics.scenes(env, given.num_envs, paper)]
         yield Table.of("scenes", f"robots in trouble for {given.seconds:g} s", rows)
-    if given.only in "floating":
+    if given.only in ("", "floating"):
         maps = list(_maps(physics.INTEGRATORS, physics.stability_map, env, given.size, 200))
         yield from _map_tables("floating", maps)
         plots.draw_maps(maps, "log10 of late over initial energy", (-3.0, 3.0), given.folder / "floating.png")
-    if given.only in "standing":
+    if given.only in ("", "standing"):
         maps = list(_maps((env.sim.integrator,), physics.standing_map, env, given.size, 1.0))
         yield from _map_tables("standing", maps)
         plots.draw_maps(maps, "log10 of late joint speed (rad/s)", (-2.0, 2.0), given.folder / "standing.png")
@@ -125,10 +127,20 @@ def judged(name: str, title: str, rows: Sequence[dict]) -> Table:
 SUBJECTS = {"physics": _physics, "lidar": _lidar, "learning": _learning}
 
 
+def _check_only(given: Arguments) -> None:
+    """Raises a ConfigError for an `only` that would run nothing."""
+    known = {"physics": PARTS, "lidar": (), "learning": tuple(case.name for case in learning.cases())}[given.subject]
+    runs = given.only in ("", *known) or (given.subject == "learning" and any(given.only in name for name in known))
+    if not runs:
+        expected = f"one of {', '.join(known)} was expected" if known else "it is not divided"
+        raise ConfigError(f"only={given.only} runs nothing of subject={given.subject}: {expected}")
+
+
 def main(given: Arguments, overrides: list[str]) -> None:
     """Runs a subject, and exits with 1 if something is not as it should be."""
     if overrides and given.subject != "physics":
         raise ConfigError(f"{overrides[0]} is unknown for subject={given.subject}; overrides are for subject=physics")
+    _check_only(given)
     given.folder.mkdir(parents=True, exist_ok=True)
     with contextlib.chdir(given.folder):  # which takes the engine's log of diverged simulations, MUJOCO_LOG.TXT
         tables = report(SUBJECTS[given.subject](given, overrides), about(1), given.folder)

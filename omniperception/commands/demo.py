@@ -18,8 +18,8 @@ from pathlib import Path
 import torch
 
 from omniperception import build, config
-from omniperception.cli import Command, argument
-from omniperception.commands.filming import FilmArguments, file_stem, film
+from omniperception.cli import Command, argument, refuse_arguments, refuse_overrides
+from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PORT
@@ -46,10 +46,12 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     """Opens the page, or writes the film."""
     run_dir, path = config.SHIPPED_RUNS / RUN, Path(f"{file_stem('demo', overrides)}.mp4")
     num_envs = max(arguments.video.env_ids) + 1
+    refuse_overrides(overrides, {"num_envs": num_envs})
     if not any(override.startswith(("scenario=", "obstacles=")) for override in overrides):
         overrides = [SCENARIO, *overrides]
     viewer = arguments.viewer or ("web" if has_display() and importlib.util.find_spec("viser") else "video")
     if viewer == "web":
+        refuse_arguments(arguments, FILM, "viewer=web films nothing")
         options = PageOptions(arguments.host, arguments.port, arguments.stop_after_s, open_browser=has_display())
         return serve(Shown(run_dir, tuple(overrides)), options)
     trained = build.load_policy(build.load_run(run_dir, [*overrides, f"num_envs={num_envs}"]), run_dir)

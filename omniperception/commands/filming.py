@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,10 @@ class FilmArguments:
     def video(self) -> VideoOptions:
         """The same, checked."""
         return VideoOptions(self.video_size, self.video_envs, self.camera)
+
+
+FILM = tuple(field.name for field in fields(FilmArguments))
+"""Names of these arguments."""
 
 
 @contextmanager

@@ -15,8 +15,8 @@ import json
 from dataclasses import dataclass, replace
 
 from omniperception import build, config
-from omniperception.cli import Command, argument, trust
-from omniperception.commands.filming import FilmArguments, file_stem, film
+from omniperception.cli import Command, argument, refuse_arguments, refuse_overrides, trust
+from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.common.provenance import provenance
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.report import summary_table, times_line
@@ -43,6 +43,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     """Runs the episodes, prints the table and writes the results."""
     run_dir = config.find_run(arguments.run)
     if arguments.viewer == "web":
+        refuse_arguments(arguments, (*FILM, "trials"), "viewer=web counts and films nothing")
+        refuse_overrides(overrides, {"num_envs": 1})
         shown = Shown(run_dir, tuple(overrides), trust=arguments.trust)
         return serve(shown, PageOptions(arguments.host, arguments.port))
     video, stem = arguments.video, file_stem("replay", overrides)

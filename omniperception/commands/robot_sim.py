@@ -14,15 +14,19 @@ wire has its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omniperception import build, config
-from omniperception.cli import Command, argument, trust
+from omniperception.cli import Command, argument, refuse_overrides, trust
 from omniperception.deploy.description import DeployError
 from omniperception.env.env import OmniEnv
 from omniperception.hardware.faults import FAULTS
 from omniperception.hardware.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
+
+WIRE = {"sim.timestep": STEP_S, "sim.decimation": CONTROL_STEPS, "sim.num_threads": 1, "num_envs": 1}
+"""What the wire's timing needs, of one robot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +38,6 @@ class Arguments:
     domain: int = argument(0, "of DDS", least=0)
     crc: bool = argument(True, "whether states carry a checksum and commands without theirs are refused")
     point_to: int = argument(56301, "UDP port of this machine that LiDAR packets go to", least=1)
-    detection_port: int | None = argument(None, "UDP port on which it answers to searches; null: none")
     steer_to: int | None = argument(None, "UDP port that the world's commands are sent to; null: none are")
     hold_last: bool = argument(True, "whether motors go on with the last command when none comes")
     sport_mode: str | None = argument(None, "name of a controller of its own, which runs until it is released")
@@ -47,14 +50,12 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Simulates, and prints what became of the robot."""
-    steps = [f"sim.timestep={STEP_S}", f"sim.decimation={CONTROL_STEPS}", "sim.num_threads=1", "num_envs=1"]
-    env = OmniEnv(build.load_run(config.find_run(arguments.run), [*overrides, *steps], arguments.trust).env)
+    env = world(config.find_run(arguments.run), overrides, arguments.trust)
     wire = SimulatedConfig(
         interface=arguments.interface,
         domain=arguments.domain,
         crc=arguments.crc,
-        detection_port=arguments.detection_port,
-        point_to=None if arguments.detection_port is not None else ("127.0.0.1", arguments.point_to),
+        point_to=("127.0.0.1", arguments.point_to),
         steer_to=arguments.steer_to,
         hold_last=arguments.hold_last,
         sport_mode=arguments.sport_mode or "",
@@ -64,6 +65,17 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         seconds=arguments.seconds,
     )
     print(run(env, wire))
+
+
+def world(run_dir: Path, overrides: list[str], trust: Sequence[str] = ()) -> OmniEnv:
+    """The robot of a run in its world, with all obstacles, as a policy is evaluated.
+
+    Raises:
+        ConfigError: an override is unknown, or changes WIRE.
+    """
+    refuse_overrides(overrides, WIRE)
+    run = build.load_run(run_dir, [*overrides, *(f"{key}={value}" for key, value in WIRE.items())], trust)
+    return OmniEnv(replace(run.env, initial_level=1.0, trials=True))
 
 
 command = Command(main, Arguments, __doc__, overrides="of the run's configuration", errors=(DeployError,))

@@ -1,15 +1,19 @@
 """Trials over the robot's wire in real time: robot-sim, robot and its guard as processes, with and without faults.
 
-    robot-trials run=pretrained/avoider policy=exported scenario=moving,corridor trials=100 out=outputs/wire
-    robot-trials run=pretrained/avoider policy=exported scenario=static faults=all trials=3 out=outputs/faults
+    R="run=pretrained/avoider policy=pretrained/avoider/exported condition=ideal"
+    robot-trials $R scenario=moving,corridor trials=100 out=outputs/wire
+    robot-trials $R scenario=static faults=all trials=3 out=outputs/faults
     robot-trials table=true out=outputs/wire                    # the tables again, from the files
 
-Writes a file for each trial; the same command goes on where it was stopped. Prints two tables: outcomes with 95 %
+Writes a file for each trial; the same command goes on where it was stopped, and a folder with results of another run,
+policy, limit or other overrides is refused. Prints two tables: outcomes with 95 %
 intervals, and timing: p50 and p99 of a control step and of how late it began, steps later than half a period, LiDAR
 frames, lost packets, and by how much the simulation was behind real time. The tables mean something only on a machine
 with a free core for each of the three processes: look at the lag first.
 
-Beside them: evaluate run=... policy=exported scenario=moving,corridor trials=100, in one process and without a wire.
+Beside them, in one process and without a wire, under the same condition (the run's own is what it was trained under):
+evaluate run=pretrained/avoider policy=exported condition=ideal scenario=moving,corridor trials=100, which reads
+exported/ in the run directory, where export writes unless told otherwise.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import config
-from omniperception.cli import Command, argument
+from omniperception.cli import Command, argument, trust
 from omniperception.deploy.description import DeployError
 from omniperception.hardware.trials import KNOWN_FAULTS, NO_FAULT, TrialsConfig, results, run, table
 
@@ -34,6 +38,7 @@ class Arguments:
     trials: int = argument(100, "of each scenario and fault", least=1)
     limit_s: float = argument(30.0, "from standing up, within which the goal has to be reached", positive=True)
     out: Path = argument(Path("outputs/wire"), "folder of the results")
+    trust: tuple[str, ...] = trust()
     table: bool = argument(False, "whether only the tables of the results that are there are printed")
 
 
@@ -52,6 +57,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
                 trials=arguments.trials,
                 limit_s=arguments.limit_s,
                 overrides=overrides,
+                trust=arguments.trust,
             )
         )
     print(table(results(arguments.out)))

@@ -105,6 +105,11 @@ def _caveats(description: Description) -> list[str]:
         lines.append(
             f"velocity_commands follow the command at {list(description.command_acceleration)} m/s^2, rad/s^2."
         )
+    for term in (term for _, term in _terms(description) if term.frequency is not None):
+        lines.append(f"{term.quantity} is 0 once the command has been 0 for {term.rest_s:g} s.")
+    lines.append(f"Actions, and last_action, are clipped to +-{description.joints.action_limit:g} before their scale.")
+    if description.estimated:
+        lines.append(f"The network's second output, 'estimate', is its {', '.join(description.estimated)}.")
     if description.stepping is not None:
         lines.append("NOT TO BE USED AS IT IS: targets lack the stepping motion of policy.json, which this form has no")
         lines.append("place for.")

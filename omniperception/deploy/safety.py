@@ -91,6 +91,12 @@ class Safety:
         self._targets: np.ndarray | None = None
         self._strained = np.zeros(len(self._names), np.int64)
 
+    def await_frame(self) -> None:
+        """Holds a policy that sees at a command of 0 until a good frame comes; training begins without that wait."""
+        if self._sees:
+            self.sight, self._age, self._pace = Sight.STOPPED, math.inf, 0.0
+            log.warning("standing until a good frame comes")
+
     def frame_is_good(self, points: np.ndarray) -> bool:
         """Whether a frame (n, 3), m, holds enough hits; counts and names it otherwise."""
         square = np.einsum("ij,ij->i", points, points)

@@ -53,6 +53,13 @@ class Extrinsic:
     pos: Sequence[float] = (0.0, 0.0, 0.0)
     quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        if not (np.isfinite([*self.pos, *self.quat]).all() and np.any(self.quat)):
+            raise DeployError(
+                f"extrinsic of x,y,z {list(self.pos)} and qw,qx,qy,qz {list(self.quat)}: finite numbers were expected,"
+                " and a quaternion other than 0"
+            )
+
     def undo(self, points: np.ndarray) -> np.ndarray:
         """(n, 3) float32 in the sensor's own frame; a point that is zero was no point, and a moved zero becomes one."""
         miss = ~points.any(axis=1)
@@ -63,12 +70,13 @@ class Extrinsic:
 
 
 def without_noise(points: np.ndarray, tags: np.ndarray) -> np.ndarray:
-    """(n, 3) with points that the sensor itself calls noise with high confidence made misses.
+    """(n, 3) with points that a Mid-360 does not call normal made misses; tags: (n,) uint8.
 
-    A Livox tag holds two bits each for noise by position (edges) and by intensity (rain, fog, dust); 01 is the highest
-    confidence that a point is none.
+    Two bits each say how certain a point is: 0 and 1 where it may stick between adjacent objects, 2 and 3 for rain, fog
+    and dust, 4 and 5 for other reasons; 0 is high (a normal point), 1 medium, 2 low. So says Livox's "Communication
+    Protocol--Mid360", Tag Information (github.com/Livox-SDK/livox_wiki_en). Another sensor's tags mean other things.
     """
-    noise = ((tags & 3) == 1) | ((tags >> 2 & 3) == 1)
+    noise = (tags & 0x3F) != 0
     return np.where(noise[:, None], np.float32(0.0), points)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import sys
@@ -230,6 +231,8 @@ class Control:
             self._mode = self._link.mode
             if self._mode is Mode.POLICY:
                 self.policy.reset()
+                if self.policy.safety is not None:
+                    self.policy.safety.await_frame()  # the sensor may never have spoken
                 self._begin_odometry()
         given = command if self._link.mode is Mode.POLICY else np.zeros(3)
         points = self._points(frames, now)
@@ -309,28 +312,31 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
     policy = ExportedPolicy.load(config.policy)
     description = policy.description
     machine = machine_config(description)
-    operator = make_operator(config.steer, description.command)
-    network = Network(config.interface, config.domain)
-    states = StateReader(network.reader(LOW_STATE_TOPIC, LOW_STATE), config.check_crc)
-    frames = None
-    if description.perception is not None and description.lidar is not None:
-        if config.lidar is None:
-            raise DeployError("this policy sees: points=none is for a blind one")
-        frames = Frames(config.lidar, description.lidar, network)
-    ensure_released(network, config.sport_mode)
-    recorder = None if config.record is None else Recorder(config.record, description)
-    link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
-    control = Control(policy, states, frames, operator, link, recorder)
-    try:
-        begins, times = _loop(control, link, description.control_period_s, config.seconds, should_end)
-    finally:
-        operator.close()
-        if link.mode in (Mode.STANDING, Mode.STANDING_UP, Mode.POLICY):
-            link.ask(Request.LIE)
+    with contextlib.ExitStack() as closing:  # whatever ends it, the terminal is left as it was found
+        operator = make_operator(config.steer, description.command)
+        closing.callback(operator.close)
+        network = Network(config.interface, config.domain)
+        states = StateReader(network.reader(LOW_STATE_TOPIC, LOW_STATE), config.check_crc)
+        frames = None
+        if description.perception is not None and description.lidar is not None:
+            if config.lidar is None:
+                raise DeployError("this policy sees: points=none is for a blind one")
+            frames = Frames(config.lidar, description.lidar, network)
+            closing.callback(frames.close)
+        ensure_released(network, config.sport_mode)
+        recorder = None if config.record is None else Recorder(config.record, description)
         if recorder is not None:
-            recorder.close()
-    if link.is_closed and guard.poll() not in (None, 0):
-        raise DeployError("the guard has ended; its message stands above")
+            closing.callback(recorder.close)
+        link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
+        closing.callback(link.close)
+        control = Control(policy, states, frames, operator, link, recorder)
+        try:
+            begins, times = _loop(control, link, description.control_period_s, config.seconds, should_end)
+        finally:
+            if link.mode in (Mode.STANDING, Mode.STANDING_UP, Mode.POLICY):
+                link.ask(Request.LIE)
+        if link.is_closed and guard.poll() not in (None, 0):
+            raise DeployError("the guard has ended; its message stands above")
     counts = {} if policy.safety is None else dict(policy.safety.counts)
     counts |= {"states refused": states.refused} | ({} if frames is None else frames.counts())
     number = 0 if frames is None else frames.number

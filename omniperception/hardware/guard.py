@@ -8,7 +8,9 @@ end falls silent or closes, the robot lies down, its joints are damped for a whi
 
 from __future__ import annotations
 
+import contextlib
 import json
+import select
 import socket
 import struct
 import subprocess
@@ -205,8 +207,10 @@ class Guard:
             try:
                 self.tick(time.monotonic())
             except Exception as error:  # whatever it is: damped joints are better than joints left alone
-                print(f"guard: e-stop: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
                 self.machine.ask(time.monotonic(), Request.STOP)
+                _say(f"guard: e-stop: {type(error).__name__}: {error}")
+                with contextlib.suppress(Exception):  # the next period tries again
+                    self._drive(time.monotonic())
             due = max(due + PERIOD_S, time.monotonic() - PERIOD_S)  # what was missed is not made up for
             time.sleep(max(0.0, due - time.monotonic()))
 
@@ -217,8 +221,11 @@ class Guard:
             self.machine.sense(sensed(state, now))
             self._follow_remote(state, now)
         self._read_link(now)
-        self._writer.write(LOW_CMD.to_cdr(command(self.machine.drive(now))))
+        self._drive(now)
         self._report()
+
+    def _drive(self, now: float) -> None:
+        self._writer.write(LOW_CMD.to_cdr(command(self.machine.drive(now))))
 
     def _follow_remote(self, state: np.ndarray, now: float) -> None:
         pressed = remote(state["wireless_remote"]).pressed
@@ -247,7 +254,7 @@ class Guard:
         said = bytes([MODES.index(self.machine.mode)]) + self.machine.reason.encode()[:200]
         if said != self._said:
             self._said = said
-            print(f"guard: {self.machine.mode}: {self.machine.reason}", file=sys.stderr, flush=True)
+            _say(f"guard: {self.machine.mode}: {self.machine.reason}")
             try:
                 self._link.send(said)
             except OSError:
@@ -261,6 +268,13 @@ class Guard:
                 self.machine.ask(now, Request.LIE)
             self._gone_since = now
         return now - self._gone_since > self._config.linger_s
+
+
+def _say(text: str) -> None:
+    """A line to the terminal, or nothing where that is gone or stopped: the motors must not wait for it."""
+    with contextlib.suppress(OSError):
+        if select.select([], [sys.stderr], [], 0.0)[1]:
+            print(text, file=sys.stderr, flush=True)
 
 
 def main(argv: list[str], exit_with: Callable[[int], None] = sys.exit) -> None:

@@ -46,7 +46,7 @@ class Packet:
     Attributes:
         points: (n, 3) float32 m, sensor frame; a miss is zero.
         times_ns: (n,) int64 on the sensor's clock.
-        tags: (n,) uint8: noise by position in bits 0 and 1, by intensity in 2 and 3; 0 is a normal point.
+        tags: (n,) uint8, see `clouds.without_noise`; 0 is a normal point.
         number: counts packets, modulo 65536.
     """
 

@@ -59,11 +59,11 @@ class MachineConfig:
         fold_s: from where the joints are to the crouch.
         rise_s: from the crouch to standing.
         settle_s: in which a walking robot comes to stand, before it lies down.
-        fold_down_s: from standing to the crouch.
+        fold_down_s: from standing to the crouch, or from wherever standing up was broken off.
         reach: most that a joint may be from the standing pose when the machine calls it standing, rad.
         max_tilt_deg: most that the base may lean when not damped.
         max_temperature: of a motor, degrees Celsius.
-        max_step: most that a target may differ from the one before, rad.
+        max_step: most that a target may differ from the one before, and the first from where joints are held, rad.
     """
 
     stand_pose: Sequence[float]
@@ -140,6 +140,7 @@ class Machine:
         self._sensed: Sensed | None = None
         self._targets: tuple[float, np.ndarray] | None = None
         self._held = self._stand
+        self._settle_s = config.settle_s
 
     def sense(self, sensed: Sensed) -> None:
         """Takes a valid state in."""
@@ -172,8 +173,10 @@ class Machine:
         elif request is Request.STAND and self.mode is Mode.POLICY:
             self._enter(now, Mode.STANDING, "asked for")
         elif request is Request.WALK and self.mode is Mode.STANDING:
-            if self._is_silent(now):
+            if self._targets is None or self._is_silent(now):
                 self.reason = "not walking: the policy is silent"
+            elif (away := float(abs(self._targets[1] - self._held).max())) > self.config.max_step:
+                self.reason = f"not walking: a target is {away:.1f} rad from where the joints are held"
             else:
                 self._enter(now, Mode.POLICY, "asked for")
         elif request is Request.LIE and self.mode in (Mode.STANDING_UP, Mode.STANDING, Mode.POLICY):
@@ -226,7 +229,7 @@ class Machine:
                 self._enter(now, Mode.STANDING, "stood up")
             elif since >= config.fold_s + config.rise_s + 1.0:
                 self._fault(now, f"standing up failed: a joint is {away:.1f} rad away")
-        elif self.mode is Mode.LYING_DOWN and since >= config.settle_s + config.fold_down_s:
+        elif self.mode is Mode.LYING_DOWN and since >= self._settle_s + config.fold_down_s:
             self._enter(now, Mode.DAMPING, f"lay down ({self.reason})")
 
     def _pose(self, since: float) -> np.ndarray:
@@ -239,6 +242,8 @@ class Machine:
         quarter = config.settle_s / 2
         if self.mode is Mode.STANDING:
             return _along(since, (0.0, quarter), (self._from, self._stand))
+        if not self._settle_s:
+            return _along(since, (0.0, config.fold_down_s), (self._from, self._crouch))
         times = (0.0, quarter, config.settle_s, config.settle_s + config.fold_down_s)
         return _along(since, times, (self._from, self._stand, self._stand, self._crouch))
 
@@ -255,6 +260,7 @@ class Machine:
             return
         led = self.mode not in (Mode.DAMPING, Mode.STOPPED)
         self._from = self._held if led or self._sensed is None else self._sensed.joint_pos
+        self._settle_s = 0.0 if self.mode is Mode.STANDING_UP else self.config.settle_s  # it does not stand yet
         self.mode, self.reason, self._since = mode, reason, now
 
 

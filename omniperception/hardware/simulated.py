@@ -19,16 +19,8 @@ from omniperception.env.env import OmniEnv
 from omniperception.hardware.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
 from omniperception.hardware.faults import Faults
 from omniperception.hardware.livox import (
-    CONFIGURE,
     POINT_PORT,
     POINTS_PER_PACKET,
-    SEARCH,
-    Message,
-    Sensor,
-    discovery_answer,
-    read_configuration,
-    read_message,
-    write_message,
     write_points,
 )
 from omniperception.hardware.machine import Request
@@ -54,8 +46,7 @@ class SimulatedConfig:
         domain: of DDS.
         crc: whether states carry a checksum, and commands without theirs are refused.
         host: where LiDAR packets come from.
-        detection_port: UDP port on which it answers to searches; None: packets go to `point_to` at once.
-        point_to: address and port that packets go to until it is configured otherwise.
+        point_to: address and port that packets go to.
         steer_to: UDP port of this machine that the world's commands are sent to, for `robot steer=udp:PORT`, with
             stand and walk when the robot is ready; None: none are sent.
         hold_last: whether the motors go on with the last command when none comes; otherwise they are limp after 0.1 s.
@@ -72,8 +63,7 @@ class SimulatedConfig:
     domain: int = 0
     crc: bool = True
     host: str = "127.0.0.1"
-    detection_port: int | None = None
-    point_to: tuple[str, int] | None = ("127.0.0.1", 56301)
+    point_to: tuple[str, int] = ("127.0.0.1", 56301)
     steer_to: int | None = None
     hold_last: bool = True
     sport_mode: str = ""
@@ -174,18 +164,10 @@ class Scanner:
         self._left, self._number = np.zeros((0, 3), np.float32), 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((config.host, 0 if config.host == "127.0.0.1" else POINT_PORT))
-        self._to = config.point_to
-        self._control: socket.socket | None = None
-        if config.detection_port is not None:
-            self._control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._control.bind((config.host, config.detection_port))
-            self._control.setblocking(False)
-            self._sensor = Sensor(config.host, config.detection_port, "robot-sim")
+        self._to: tuple[str, int] | None = config.point_to
 
     def scan(self, time_s: float, faults: Faults) -> None:
         """Sends the packets of the points measured since the call before; time_s: now; faults: on their way."""
-        if self._control is not None:
-            self._answer(self._control)
         self._sensing.place_bodies()
         frame = self._lidar.cast(time_s)
         assert frame.ranges is not None and frame.directions_s is not None
@@ -204,32 +186,9 @@ class Scanner:
                 self._socket.sendto(packet, self._to)
         self._left = points[whole * POINTS_PER_PACKET :]
 
-    def _answer(self, control: socket.socket) -> None:
-        """To searches and configurations."""
-        while True:
-            try:
-                data, address = control.recvfrom(2048)
-            except BlockingIOError:
-                return
-            message = read_message(data)
-            if message is None or message.is_answer:
-                continue
-            if message.command == SEARCH:
-                answer = discovery_answer(self._sensor, message.number)
-            elif message.command == CONFIGURE:
-                host = read_configuration(message.data).get(6)
-                if host is not None:
-                    self._to = (socket.inet_ntoa(host[:4]), int.from_bytes(host[4:6], "little"))
-                answer = Message(CONFIGURE, message.number, True, bytes(3))
-            else:
-                continue
-            control.sendto(write_message(answer, from_sensor=True), address)
-
     def close(self) -> None:
         """Ends it."""
         self._socket.close()
-        if self._control is not None:
-            self._control.close()
 
 
 class SimulatedRobot:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omniperception.deploy.description import FILE, DeployError
+from omniperception.deploy.description import FILE, DeployError, checksum
 from omniperception.evaluation.statistics import wilson
 from omniperception.hardware.faults import FAULTS, SENSORS
 
@@ -44,6 +44,7 @@ class TrialsConfig:
         trials: of each scenario and fault.
         limit_s: time from standing up within which the goal has to be reached.
         overrides: of the run's configuration.
+        trust: packages of one's own that the run may name.
         startup_s: longest that the simulation may take to start.
     """
 
@@ -55,6 +56,7 @@ class TrialsConfig:
     trials: int
     limit_s: float
     overrides: Sequence[str] = ()
+    trust: Sequence[str] = ()
     startup_s: float = 600.0
 
     def __post_init__(self) -> None:
@@ -64,10 +66,34 @@ class TrialsConfig:
         if not (self.policy / FILE).is_file():
             raise DeployError(f"policy={self.policy}: a folder that export has written was expected")
 
+    @property
+    def made_with(self) -> dict:
+        """What all results of a folder must share, as JSON gives it back."""
+        return {
+            "run": self.run,
+            "policy": checksum(self.policy / FILE),  # which holds those of its other files
+            "limit_s": self.limit_s,
+            "overrides": list(self.overrides),
+        }
+
 
 def run(config: TrialsConfig) -> None:
-    """Makes every trial whose file is not there yet."""
+    """Makes every trial whose file is not there yet.
+
+    Raises:
+        DeployError: the folder holds results of another run, policy, limit or other overrides.
+    """
     config.out.mkdir(parents=True, exist_ok=True)
+    made_with = config.made_with
+    for path in _files(config.out):
+        theirs = json.loads(path.read_text()).get("made_with", {})
+        differs = [name for name, value in made_with.items() if theirs.get(name) != value]
+        if differs:
+            name = differs[0]
+            raise DeployError(
+                f"out={config.out}: {path.name} is of another {name} ({theirs.get(name, 'unknown')}), not"
+                f" {made_with[name]}; give another folder"
+            )
     number = 0
     for scenario in config.scenarios:
         for fault in config.faults:
@@ -77,7 +103,7 @@ def run(config: TrialsConfig) -> None:
                 if path.exists():
                     continue
                 result = _trial(config, scenario, fault, trial, _FIRST_DOMAIN + number % _DOMAINS)
-                path.write_text(json.dumps(result))
+                path.write_text(json.dumps({"made_with": made_with, **result}))
                 print(f"{path.name}: {_told(result)}", flush=True)
 
 
@@ -89,6 +115,7 @@ def _trial(config: TrialsConfig, scenario: str, fault: str, trial: int, domain: 
     policy = _swapped(config.policy, work / "policy") if fault == "swap" else config.policy
     lidar, steer = _free_port(), _free_port()
     words = [f"run={config.run}", f"scenario={scenario}", f"seed={1_000_000 + trial}", *config.overrides]
+    words += [f"trust={','.join(config.trust)}"] if config.trust else []
     words += [f"domain={domain}", f"point_to={lidar}", f"steer_to={steer}", f"report={work / 'outcome.json'}"]
     words += [f"seconds={config.limit_s + _STANDING_UP_S}", *([f"fault={fault}"] if fault in FAULTS else [])]
     simulation = _start("robot-sim", words, subprocess.PIPE)
@@ -183,10 +210,15 @@ def results(folder: Path) -> list[dict]:
     Raises:
         DeployError: there is none.
     """
-    found = [json.loads(path.read_text()) for path in sorted(folder.glob("*-*-*.json"))]
+    found = [json.loads(path.read_text()) for path in _files(folder)]
     if not found:
         raise DeployError(f"{folder} holds no results of trials")
     return found
+
+
+def _files(folder: Path) -> list[Path]:
+    """Of results, in order."""
+    return sorted(folder.glob("*-*-*.json"))
 
 
 def table(trials: Sequence[dict]) -> str:

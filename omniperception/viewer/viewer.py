@@ -231,7 +231,7 @@ class Viewer:
     # ---- obstacles ---------------------------------------------------------------------------------------------------
 
     def bring(self, kind: str) -> None:
-        """Puts a spare obstacle before the robot, in the direction of its command."""
+        """Puts a spare obstacle before the robot, in the direction that it faces."""
         state = self.session.env.state.kinematics
         yaw = float(state.yaw[0])
         x, y = state.base_pos_w[0, :2].tolist()

@@ -482,7 +482,10 @@ def test_deploy_yaml_names_what_it_has_no_place_for(exported_run):
     assert "# It also reads 'frames' and 'frame_count'" in text
     described = Description.read(exported_run("none") / "exported")
     assert "base_lin_vel is no observation of unitree_rl_lab's controller" in deploy_yaml(described)
-    assert "NOT TO BE USED" in (exported_run("clock") / "exported" / "deploy.yaml").read_text()
+    assert "# The network's second output, 'estimate', is its base_lin_vel.\n" in text
+    assert "# Actions, and last_action, are clipped to +-100 before their scale.\n" in deploy_yaml(described)
+    clocked = (exported_run("clock") / "exported" / "deploy.yaml").read_text()
+    assert "NOT TO BE USED" in clocked and "# gait_phase is 0 once the command has been 0 for 0.1 s.\n" in clocked
     other = replace(described.joints, names=[f"leg_{k}" for k in range(12)])
     assert deploy_yaml(replace(described, joints=other)) is None
 

@@ -116,6 +116,22 @@ def test_a_robot_that_never_sees_anything_stands():
     assert fed_command(robot) == [0.0] * 3
 
 
+def test_a_robot_that_awaits_its_first_frame_stands():
+    """However long none comes, or only an empty one; then its speed grows within 0.3 s, 15 steps."""
+    robot = policy()
+    robot.safety.await_frame()
+    for cloud in [None] * 10 + [CLOUD[:4]] + [None] * 40:
+        robot.step(state(), [1.0, 0.0, 0.0], cloud)
+        assert fed_command(robot) == [0.0] * 3 and robot.safety.sight is Sight.STOPPED
+    for step in range(1, 16):
+        robot.step(state(), [1.0, 0.0, 0.0], CLOUD if step % 5 == 1 else None)
+        assert fed_command(robot)[0] == pytest.approx(step / 15)
+    blind = policy(lidar=None, perception=None)
+    blind.safety.await_frame()
+    blind.step(state(), [1.0, 0.0, 0.0])
+    assert fed_command(blind) == [1.0, 0.0, 0.0]
+
+
 def rolled(degrees):
     half = np.radians(degrees) / 2
     return [float(np.cos(half)), float(np.sin(half)), 0.0, 0.0]

@@ -72,10 +72,16 @@ def test_an_extrinsic_is_undone_and_misses_stay_misses():
     np.testing.assert_allclose(extrinsic.undo(given), [[2, 0, 0], [0, 0, 0], [0, 0, 0]], atol=1e-6)
 
 
-def test_points_that_the_sensor_calls_noise_are_misses():
-    """Bits 0, 1 and 2, 3 of a tag: 01 is high confidence of noise, 10 and 11 lower; higher bits are not about noise."""
-    tags = np.array([0b0000, 0b0001, 0b0100, 0b0010, 0b1100, 0b110000], np.uint8)
-    assert without_noise(np.ones((6, 3), np.float32), tags)[:, 0].tolist() == [1, 0, 0, 1, 1, 1]
+@pytest.mark.parametrize("parts", [{"pos": (0.0, float("nan"), 0.0)}, {"quat": (0.0, 0.0, 0.0, 0.0)}])
+def test_an_extrinsic_that_is_none_is_refused(parts):
+    with pytest.raises(DeployError, match="finite numbers were expected, and a quaternion other than 0"):
+        Extrinsic(**parts)
+
+
+def test_points_that_the_sensor_is_less_than_certain_of_are_misses():
+    """A Mid-360's three fields of two bits: 0 is a normal point, 1 and 2 ever less certain; bits 6 and 7 are free."""
+    tags = np.array([0, 1, 2, 1 << 2, 2 << 2, 1 << 4, 2 << 4, 0b100110, 0b11000000], np.uint8)
+    assert without_noise(np.ones((9, 3), np.float32), tags)[:, 0].tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 1]
 
 
 def text(value):

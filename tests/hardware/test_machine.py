@@ -107,6 +107,40 @@ def test_walking_needs_a_policy_that_speaks():
     assert robot.mode is Mode.STANDING and "the policy is silent" in robot.machine.reason
 
 
+def test_the_first_target_may_not_be_far_from_where_the_robot_stands():
+    """Thighs at 0.8 rad, asked for 2.0: it goes on standing, and walks once the policy is near."""
+    robot = Robot()
+    robot.run(0.1)
+    robot.ask(Request.STAND).run(2.1)
+    robot.targets = STAND + np.array([0.0, 1.2, 0.0] * 4)
+    robot.run(0.1)
+    robot.ask(Request.WALK)
+    np.testing.assert_allclose(robot.run(0.1).joint_pos, STAND)
+    assert robot.mode is Mode.STANDING
+    assert robot.machine.reason == "not walking: a target is 1.2 rad from where the joints are held"
+    robot.targets = STAND + np.array([0.0, 0.9, 0.0] * 4)
+    robot.run(0.1)
+    robot.ask(Request.WALK).run(0.1)
+    assert robot.mode is Mode.POLICY
+
+
+def test_lying_down_while_it_stands_up_folds_the_legs_from_where_they_are():
+    """A fifth of the way into the crouch; 1.5 s later they are folded, by a straight way."""
+    robot = Robot()
+    robot.joints = np.array([0.0, 2.5, -1.0] * 4)
+    begin = robot.joints + 0.2 * (CROUCH - robot.joints)
+    robot.run(0.1)
+    robot.ask(Request.STAND).run(0.2)
+    robot.ask(Request.LIE)
+    for part in (0.25, 0.5, 0.75):
+        np.testing.assert_allclose(robot.run(0.375).joint_pos, begin + part * (CROUCH - begin), atol=0.01)
+    assert robot.mode is Mode.LYING_DOWN
+    assert is_damped(robot.run(0.38)) and "lay down" in robot.machine.reason
+    robot.ask(Request.STAND).run(2.1)
+    robot.ask(Request.LIE).run(2.0)
+    assert robot.mode is Mode.LYING_DOWN  # from standing it settles first, as ever
+
+
 def test_back_to_standing_and_down():
     robot = walking()
     robot.targets = STAND + 0.2

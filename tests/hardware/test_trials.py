@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from lockstep import ROOT
 
+from omniperception.commands.robot_sim import world
+from omniperception.common.errors import ConfigError
 from omniperception.deploy import DeployError
+from omniperception.hardware import trials
 from omniperception.hardware.faults import FAULTS, Faults
 from omniperception.hardware.livox import read_points, write_points
 from omniperception.hardware.messages import LOW_STATE, crc, sealed
-from omniperception.hardware.trials import KNOWN_FAULTS, TrialsConfig, results, table
+from omniperception.hardware.trials import KNOWN_FAULTS, TrialsConfig, results, run, table
 
 PACKETS = [write_points(np.full((2, 3), 1.0), 1000 * k, k, 500_000) for k in range(20)]
 
@@ -94,6 +97,50 @@ def test_what_cannot_be_tried_is_said(tmp_path):
         TrialsConfig(policy=tmp_path, faults=("rain",), **parts)
     with pytest.raises(DeployError, match="a folder that export has written was expected"):
         TrialsConfig(policy=tmp_path, faults=("none",), **parts)
+
+
+def a_config(folder, **changes):
+    (folder / "policy").mkdir(exist_ok=True)
+    (folder / "policy" / "policy.json").write_text("{}")
+    given = {"run": "a", "policy": folder / "policy", "out": folder / "out", "scenarios": ("moving",)}
+    given |= {"faults": ("none",), "trials": 1, "limit_s": 30.0, "overrides": ["condition=ideal"]}
+    return TrialsConfig(**{**given, **changes})
+
+
+def test_results_of_something_else_are_not_taken_for_ones_own(tmp_path):
+    config = a_config(tmp_path)
+    config.out.mkdir()
+    file = config.out / "moving-none-000.json"
+    file.write_text(json.dumps(a_result(0) | {"made_with": config.made_with}))
+    run(config)  # it is there
+    for name, value in {"run": "b", "limit_s": 20.0, "overrides": ["condition=robot"]}.items():
+        with pytest.raises(DeployError, match=f"moving-none-000.json is of another {name} .* give another folder"):
+            run(a_config(tmp_path, **{name: value}))
+    (tmp_path / "policy" / "policy.json").write_text('{"joints": 1}')
+    with pytest.raises(DeployError, match="is of another policy"):
+        run(config)
+    file.write_text(json.dumps(a_result(0)))  # from before results said what they are of
+    with pytest.raises(DeployError, match=r"is of another run \(unknown\), not a; give another folder"):
+        run(a_config(tmp_path, scenarios=("corridor",)))
+
+
+def test_packages_that_the_run_may_name_reach_the_simulation(tmp_path, monkeypatch):
+    started = []
+    monkeypatch.setattr(trials, "_start", lambda command, words, stdout: started.append(words) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run(a_config(tmp_path, trust=("one", "two")))
+    assert "trust=one,two" in started[0] and "condition=ideal" in started[0]
+
+
+def test_the_simulated_world_is_an_evaluations():
+    """A run that was trained with a curriculum shows all obstacles; what the wire's timing needs is not to be had."""
+    curriculum = "obstacles.curriculum={start_velocity_error: 0.12, max_velocity_error: 0.3, rise: 0.02}"
+    env = world(ROOT / "pretrained" / "avoider", ["scenario=moving", curriculum])
+    assert set(env.curriculum_levels) == {1.0} and env.config.trials and env.num_envs == 1
+    with pytest.raises(ConfigError, match=r"num_envs=4: this command sets num_envs=1 itself; leave it out"):
+        world(ROOT / "pretrained" / "avoider", ["num_envs=4"])
+    with pytest.raises(ConfigError, match=r"sim.timestep=0.001: this command sets sim.timestep=0.002"):
+        world(ROOT / "pretrained" / "avoider", ["sim.timestep=0.001"])
 
 
 @pytest.mark.slow

@@ -1,10 +1,14 @@
 """A simulated robot, its guard and the published policy together, step by step; and processes over DDS."""
 
+import contextlib
 import importlib.util
+import os
+import pty
 import socket
 import struct
 import subprocess
 import sys
+import termios
 import time
 from dataclasses import replace
 
@@ -96,6 +100,8 @@ def replayed_is_recorded(record, exported):
     assert (
         not blind.frames() and blind.sight[-1] == "stopped" and np.nanmax(abs(blind.targets() - blind.recorded)) > 0.05
     )
+    seen = {sight for sight, step in zip(blind.sight, blind.steps, strict=True) if step.mode.startswith("policy")}
+    assert seen == {"stopped"}  # a policy that has never had a frame does not begin to walk
 
 
 def unplugged(robot):
@@ -242,18 +248,20 @@ def test_a_guard_that_fails_inside_stops_the_robot(exported):
     network, (ours, theirs) = Memory(), socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     settings = guard.GuardConfig(machine_config(Description.read(exported)), listen_s=1e-9, linger_s=0.1)
     failing, sent = guard.Guard(settings, theirs, network), network.reader(LOW_CMD_TOPIC, LOW_CMD, 100)
-    failures = iter([RuntimeError("broken")])
+    failures, at_once = iter([RuntimeError("broken")]), []
 
     def fails_once():
         for failure in failures:
             raise failure
+        at_once.append(sent.take())
 
     failing._states.newest = fails_once
     ours.close()
     failing.run()
     assert failing.machine.mode is Mode.STOPPED
-    last = LOW_CMD.from_cdr(sent.take()[-1])
-    assert not last["motor_cmd"]["kp"].any() and last["motor_cmd"]["kd"][0] == 3.0
+    for data in (at_once[0][0], sent.take()[-1]):  # the period that failed has written, too
+        command = LOW_CMD.from_cdr(data)
+        assert not command["motor_cmd"]["kp"].any() and command["motor_cmd"]["kd"][0] == 3.0
 
 
 class TestDds:
@@ -309,6 +317,61 @@ class TestDds:
         time.sleep(0.2)
         assert commands.take()  # it damps on
         assert process.wait(60.0) == 0
+
+    @pytest.mark.parametrize("terminal", ["closed", "stopped"])
+    def test_a_guard_without_a_terminal_lays_the_robot_down(self, exported, terminal):
+        """Its stderr is a pipe that nobody reads: its end is closed, or it is full."""
+        machine = machine_config(Description.read(exported))
+        domain = {"closed": 75, "stopped": 76}[terminal]
+        network = Network(domain=domain)
+        states, commands = network.writer(LOW_STATE_TOPIC, LOW_STATE), network.reader(LOW_CMD_TOPIC, LOW_CMD)
+        state = LOW_STATE.zeros()
+        state["imu_state"]["quaternion"] = (1, 0, 0, 0)
+        state["motor_state"]["q"][:12], state["motor_state"]["temperature"] = machine.stand_pose, 30
+        state = LOW_STATE.to_cdr(sealed(state))
+        read, write = os.pipe()
+        kept = os.dup(2)
+        os.dup2(write, 2)
+        try:
+            link, process = guard.start(guard.GuardConfig(machine, domain=domain, listen_s=0.1, linger_s=0.3))
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+        def run_until(happened, seconds=120.0):
+            end, newest = time.monotonic() + seconds, None
+            while time.monotonic() < end and not happened():
+                states.write(state)
+                time.sleep(0.004)
+                link.poll()
+                newest = (commands.take() or [newest])[-1]
+            return LOW_CMD.from_cdr(newest)["motor_cmd"]
+
+        run_until(lambda: link.mode is Mode.STANDING_UP or link.ask(Request.STAND))
+        assert run_until(lambda: False, 0.2)["kp"][0] == 60.0
+        if terminal == "closed":
+            os.close(read)
+        else:
+            os.set_blocking(write, False)
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    os.write(write, bytes(4096))
+            os.set_blocking(write, True)
+        os.close(write)
+        link.poll = lambda: None
+        link.close()
+        assert not run_until(lambda: process.poll() is not None, 30.0)["kp"].any()
+        assert process.wait(1.0) in (0, 120)  # 120: Python could not flush stderr at its end
+
+    def test_a_start_that_is_refused_leaves_the_terminal_as_it_was(self, exported):
+        terminal, stdin = pty.openpty()
+        before = termios.tcgetattr(stdin)
+        words = ["robot", f"policy={exported}", "points=none", "domain=77", "steer=keyboard"]
+        command = [sys.executable, "-m", "omniperception", *words]
+        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, timeout=120.0)
+        assert done.returncode == 2 and done.stderr == "error: this policy sees: points=none is for a blind one\n"
+        assert before[3] & termios.ECHO and termios.tcgetattr(stdin) == before
+        os.close(terminal), os.close(stdin)
 
     def test_somebody_else_who_writes_lowcmd_is_refused(self, exported):
         network = Network(domain=73)

@@ -64,6 +64,21 @@ def test_with_a_display_the_demo_opens_the_browser(monkeypatch, line, scenario):
     assert shown.run_dir.name == "avoider" and shown.overrides == (f"scenario={scenario}",)
 
 
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (("play", RUN, "viewer=web", "trials=5"), "trials= would mean nothing: viewer=web counts and films nothing;"),
+        (("play", RUN, "viewer=web", "camera=side"), "camera= would mean nothing"),
+        (("play", RUN, "viewer=web", "num_envs=4"), "num_envs=4: this command sets num_envs=1 itself"),
+        (("demo", "viewer=web", "video_s=3"), "video_s= would mean nothing: viewer=web films nothing; leave it out"),
+        (("demo", "viewer=video", "num_envs=4"), "num_envs=4: this command sets num_envs=1 itself; leave it out"),
+        (("demo", "viewer=web", "+num_envs=4"), "+num_envs=4: this command sets num_envs=1 itself"),
+    ],
+)
+def test_what_would_be_ignored_is_refused(capsys, line, expected):
+    assert expected in said(capsys, *line)
+
+
 def test_the_test_split_is_not_looked_at(capsys):
     message = said(capsys, "evaluate", RUN, "scenario=static", "split=test", "viewer=web")
     assert "viewer=web shows split=dev" in message
