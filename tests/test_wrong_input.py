@@ -50,7 +50,7 @@ LINES = [
     ("train run=RUN init=other", "has begun already"),
     ("play run=RUN viewer=none obstacles.split=test", "evaluate split=test"),
     ("evaluate run=RUN ++obstacles.split=test", "argument of its own"),
-    ("gait run=RUN what=kicks num_envs=3", "what=kicks sets it itself"),
+    ("gait run=RUN what=kicks num_envs=3", "this command sets num_envs=64 itself"),
     ("gait run=RUN what=feet obstacles.split=test", "evaluate split=test"),
     ("ablate seeds=1,2,1", "names one twice"),
     ("train run=RUN experiment=paper", "experiment=paper"),

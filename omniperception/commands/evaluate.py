@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import config
-from omniperception.cli import Command, argument, trust
+from omniperception.cli import Command, argument, refuse_arguments, trust
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
 from omniperception.evaluation.suite import (
@@ -49,6 +49,9 @@ from omniperception.evaluation.suite import (
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PORT
+
+MEASURED = ("trials", "num_envs", "jobs", "plots", "again", "out", "log")
+"""Arguments about what is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +90,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     folders = config.search_path(overrides, config.read(runs[0]))
     worlds = _worlds(arguments, folders, any(o.split("=", 1)[0] == "terrain" for o in overrides))
     if arguments.viewer == "web":
+        refuse_arguments(arguments, MEASURED, "viewer=web measures nothing")
         return serve(_shown(arguments, runs[0], worlds[0], overrides), PageOptions(arguments.host, arguments.port))
     evaluate(
         Evaluation(

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omniperception import build, config
-from omniperception.cli import Command, argument, trust
+from omniperception.cli import Command, argument, refuse_overrides, trust
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.common.tables import markdown
 from omniperception.evaluation import robustness
@@ -48,10 +48,10 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Measures, prints a table and draws a picture."""
-    fixed = {"kicks": ("num_envs", "terminations.episode_length_s"), "feet": ("num_envs",)}.get(arguments.what, ())
-    for override in config.parse(overrides):
-        if override.key_or_group in fixed:
-            raise config.ConfigError(f"{override.input_line}: what={arguments.what} sets it itself; leave it out")
+    if arguments.what == "kicks":
+        refuse_overrides(overrides, {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S})
+    if arguments.what == "feet":
+        refuse_overrides(overrides, {"num_envs": len(COMMANDS)})
     run_dir = config.find_run(arguments.run)
     picture = run_dir / FOLDER / f"gait-{arguments.what}.png"
     picture.parent.mkdir(exist_ok=True)

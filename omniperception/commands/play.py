@@ -47,6 +47,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         refuse_overrides(overrides, {"num_envs": 1})
         shown = Shown(run_dir, tuple(overrides), trust=arguments.trust)
         return serve(shown, PageOptions(arguments.host, arguments.port))
+    if arguments.viewer == "none":
+        refuse_arguments(arguments, FILM, "viewer=none films nothing")
     video, stem = arguments.video, file_stem("replay", overrides)
     run = build.load_run(run_dir, overrides, arguments.trust)
     build.check_split(run, "replay")

@@ -84,6 +84,11 @@ def test_the_test_split_is_not_looked_at(capsys):
     assert "viewer=web shows split=dev" in message
 
 
+def test_what_nothing_would_read_is_refused(capsys):
+    assert "out= would mean nothing" in said(capsys, "evaluate", RUN, "viewer=web", "out=x.json")
+    assert "video_s= would mean nothing" in said(capsys, "play", RUN, "viewer=none", "video_s=1")
+
+
 def test_a_missing_library_names_the_extra(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     message = said(capsys, "play", RUN, "viewer=web")
