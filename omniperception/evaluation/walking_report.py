@@ -31,8 +31,10 @@ def walking_table(records: Sequence[Record]) -> str:
     for (world, terrain, condition, policy), seeds in grouped(
         records, "world", "terrain", "condition", "policy"
     ).items():
-        for ground, wanted in grounds(seeds[0]).items():
-            parts = [Part(record, wanted) for record in seeds]
+        by_seed = [grounds(record) for record in seeds]  # other seeds, other tiles
+        for ground in dict.fromkeys(name for found in by_seed for name in found):
+            there = zip(seeds, by_seed, strict=True)
+            parts = [Part(record, found[ground]) for record, found in there if ground in found]
             rows.append([world, terrain, ground, condition, policy, *figures(parts)])
     return (
         f"{headline(records)}\n\n{markdown(['world', 'terrain', 'ground', 'condition', 'policy', *HEADINGS], rows)}\n"

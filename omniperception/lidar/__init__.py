@@ -58,9 +58,10 @@ if TYPE_CHECKING:
     from .meshes import TriangleMesh
     from .motion import PoseTrack
     from .mujoco import GeomShapes, MujocoScene, geom_shapes
+    from .rotations import quat_from_rpy
     from .scene import RayHits, RayScene
     from .sectors import SectorDistances, sector_distances
-    from .sensor import Lidar, LidarConfig, env_slices, quat_from_rpy, ray_bytes
+    from .sensor import Lidar, LidarConfig, env_slices, ray_bytes
     from .shapes import Shape, ShapeKind
 
 _LOADED_WHEN_USED = {
@@ -70,9 +71,10 @@ _LOADED_WHEN_USED = {
     "meshes": ("TriangleMesh",),
     "motion": ("PoseTrack",),
     "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
+    "rotations": ("quat_from_rpy",),
     "scene": ("RayHits", "RayScene"),
     "sectors": ("SectorDistances", "sector_distances"),
-    "sensor": ("Lidar", "LidarConfig", "env_slices", "quat_from_rpy", "ray_bytes"),
+    "sensor": ("Lidar", "LidarConfig", "env_slices", "ray_bytes"),
     "shapes": ("Shape", "ShapeKind"),
 }
 

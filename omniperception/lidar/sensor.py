@@ -21,6 +21,7 @@ from .motion import PoseTrack, SweptShapes
 from .noise import Noise, max_deviation, noise_by_name
 from .patterns import ROW_SLACK, ScanPattern, make_selection
 from .patterns.selection import Strategy
+from .rotations import quat_from_rpy
 from .scan_table import ScanTable
 from .scene import PlacedShapes, RayScene, View
 from .shapes import ShapeKind, finite_tuple
@@ -32,17 +33,6 @@ _SEEDS = 0x7FFFFFFF
 
 RAYS_PER_TASK = BLOCK
 """Rays of one environment that a CPU thread casts in one go."""
-
-
-def quat_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """(w, x, y, z) of a turn about x by roll, then about fixed y by pitch, then about fixed z by yaw."""
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a / 2.0), math.sin(a / 2.0)) for a in (roll, pitch, yaw))
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch
 from omniperception.deploy import DeployError
 from omniperception.deploy.export import sampler_parameters
 from omniperception.deploy.sampling import Attitude, farthest_points, make_sampler
-from omniperception.lidar.sensor import quat_from_rpy
+from omniperception.lidar import quat_from_rpy
 from omniperception.perception import Attitude as TorchAttitude
 from omniperception.perception import FpsSampler, PdSampler, ProximitySampler, RawSampler, StandingSampler
 

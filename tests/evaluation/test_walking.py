@@ -2,11 +2,13 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from omniperception.env.mdp.commands import SETTLE_S
+from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record
@@ -138,6 +140,13 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     assert sum(int(there.sum()) for there in of_kinds) == 9
     assert sum(len(Part(record, there).fell) for there in of_kinds) == 9
     assert "stairs_up" in walking_table([record])
+    fell = torch.where(easy, OUTCOMES.index("fall"), OUTCOMES.index("time_out"))
+    first = replace(record, episodes=replace(episodes, outcome=fell))
+    turned = {name: values.flip(0) for name, values in episodes.walking.items()}  # another seed, with other tiles
+    second = replace(first, run="b", episodes=replace(episodes, outcome=fell.flip(0), walking=turned))
+    lines = [line.split("|") for line in walking_table([first, second]).splitlines() if line.startswith("|")]
+    rows = {cells[3].strip(): cells[6].strip() for cells in lines}
+    assert rows["levels 0 to 4"].startswith("100.0") and rows["levels 5 and above"].startswith("0.0")
 
 
 def test_commands_to_a_goal_have_no_figures_of_a_gait(make_env):
