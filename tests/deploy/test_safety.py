@@ -244,7 +244,9 @@ def test_the_published_policy_stands_half_a_second_after_it_slows_down(tmp_path)
 
     run_dir = Path(__file__).resolve().parents[2] / "pretrained" / "avoider"
     export(run_dir, tmp_path, ("onnx",))
-    env = OmniEnv(build.assemble(config.load(run_dir, ["num_envs=1", "scenario=static", "seed=3"])).env)
+    env = OmniEnv(
+        build.assemble(config.load(run_dir, ["num_envs=1", "scenario=static", "condition=ideal", "seed=3"])).env
+    )
     robot, tick, speeds = ExportedPolicy.load(tmp_path), 0, []
     for step in range(250):
         fresh = env.sensing.tick != tick and step < 100
