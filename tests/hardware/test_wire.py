@@ -339,8 +339,10 @@ class TestDds:
             os.close(kept)
 
         def run_until(happened, seconds=120.0):
-            end, newest = time.monotonic() + seconds, None
-            while time.monotonic() < end and not happened():
+            """The newest motor commands by then; on a busy machine the first one may come later."""
+            begin, newest = time.monotonic(), None
+            while (not happened() and time.monotonic() < begin + seconds) or newest is None:
+                assert time.monotonic() < begin + 120.0, "no command has come"
                 states.write(state)
                 time.sleep(0.004)
                 link.poll()
