@@ -17,8 +17,8 @@ from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.exported import record
 from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import FOLDER, read
 from omniperception.evaluation.records import FOLDER as EVALUATION
+from omniperception.evaluation.records import read
 from omniperception.evaluation.statistics import rate
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
@@ -59,7 +59,7 @@ class TrainedRun:
 
     def scenarios(self) -> dict[str, Episodes]:
         """What scripts/evaluate.py measured of the run's own policy as it stands, on split=dev, by world."""
-        files = sorted((self.path / FOLDER).glob("dev-ideal-*-run.json"))
+        files = sorted((self.path / EVALUATION).glob("dev-ideal-*-run.json"))
         found = {record.place: record.episodes for path in files for record in read(path)}
         if not found:
             raise config.ConfigError(

@@ -348,7 +348,7 @@ class OmniEnv(VecEnv):
         return self._collect({name: group.compute(self.state, fresh) for name, group in self._groups.items()})
 
     def _begun(self, env_ids: torch.Tensor) -> TensorDict:
-        """The newest observations, of which only those of environments (n,) are made anew, between two steps."""
+        """The newest observations, between two steps; only those of environments (n,) are computed again."""
         groups = self._groups.items()
         return self._collect(
             {name: group.begin(self.state, env_ids, self.observations[name]) for name, group in groups}
