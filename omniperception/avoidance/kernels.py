@@ -4,6 +4,8 @@ import math
 
 import warp as wp
 
+from omniperception.lidar.kernels.sectors import sector_of
+
 
 @wp.func
 def slab(start: float, direction: float, half: float):
@@ -74,8 +76,7 @@ def nearest_by_sector(
             a = axis[env, o]
             w = velocity[env, o]
             near = nearest_point(p, a, outline[env, o])
-            bearing = wp.atan2(near[1], near[0]) + wp.static(math.pi)
-            own = wp.min(int(bearing / width), num_sectors - 1)
+            own = sector_of(near[0], near[1], num_sectors)
             sectors_out[env, own] = keep_nearer(wp.length(near), w, sectors_out[env, own])
             for s in range(num_sectors):
                 angle = (float(s) + 0.5) * width - wp.static(math.pi)

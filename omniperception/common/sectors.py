@@ -7,10 +7,14 @@ import math
 import torch
 
 
+def bearing_in_sectors(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
+    """(...) azimuth from -pi on of places (..., 2), in widths of a sector."""
+    return (torch.atan2(places[..., 1], places[..., 0]) + math.pi) * (num_sectors / (2.0 * math.pi))
+
+
 def sector_of(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
     """(...) int64 azimuth sector of places (..., 2); sector 0 starts at -pi."""
-    turned = (torch.atan2(places[..., 1], places[..., 0]) + math.pi) * (num_sectors / (2.0 * math.pi))
-    return turned.long().clamp(0, num_sectors - 1)
+    return bearing_in_sectors(places, num_sectors).long().clamp(0, num_sectors - 1)
 
 
 def sums_by(index: torch.Tensor, values: torch.Tensor, num: int) -> torch.Tensor:

@@ -82,7 +82,7 @@ def find_standing(
             p = wp.quat_rotate(level, p)
             if not on_body:
                 ring = wp.min(int(_horizontal(p) / settings.ring), settings.rings - 1)
-                cells[env, ray] = ring * settings.sectors + sector_of(p, settings.sectors)
+                cells[env, ray] = ring * settings.sectors + sector_of(p[0], p[1], settings.sectors)
         points[env, ray] = p
 
     upright = wp.vec3(0.0, 0.0, -settings.standing)
@@ -134,7 +134,7 @@ def find_standing(
             steepness = wp.max(-seen[2] / wp.max(wp.length(seen), 1.0e-6), 0.0)
             least = settings.min_height + settings.rise * _horizontal(p) + settings.lift * steepness
             above = heights[env, ray] - ground[env, cell]
-            sector = sector_of(seen, settings.sectors)
+            sector = sector_of(seen[0], seen[1], settings.sectors)
             around[env, settings.sectors + sector] = around[env, settings.sectors + sector] + 1
             if above > least:
                 height = above
@@ -143,7 +143,7 @@ def find_standing(
         heights[env, ray] = height
     for ray in range(num_rays):
         if ranges[env, ray] < settings.near and heights[env, ray] < settings.headroom:
-            sector = sector_of(points[env, ray] - sensor, settings.sectors)
+            sector = sector_of(points[env, ray][0] - sensor[0], points[env, ray][1] - sensor[1], settings.sectors)
             share = float(around[env, sector]) / float(wp.max(around[env, settings.sectors + sector], 1))
             if share < settings.near_share:
                 heights[env, ray] = _INF
@@ -176,7 +176,7 @@ def nearest_standing(
             while height >= band_edges[band + 1]:
                 band += 1
             p = points[env, ray]
-            slot = first_slot + band * num_sectors + sector_of(p, num_sectors)
+            slot = first_slot + band * num_sectors + sector_of(p[0], p[1], num_sectors)
             away = _horizontal(p)
             proximity = wp.exp(-away / decay)
             if proximity > points_out[env, slot][2]:

@@ -20,11 +20,15 @@ def levelled(base_quat: wp.vec4):
 
 
 @wp.func
-def sector_of(p: wp.vec3, num_sectors: int) -> int:
-    sector = int(wp.floor((wp.atan2(p[1], p[0]) + PI) * float(num_sectors) / (2.0 * PI)))
-    if sector >= num_sectors:
-        sector = 0
-    return wp.max(sector, 0)
+def bearing_in_sectors(x: float, y: float, num_sectors: int) -> float:
+    """Azimuth from -pi on, in widths of a sector."""
+    return (wp.atan2(y, x) + PI) * float(num_sectors) / (2.0 * PI)
+
+
+@wp.func
+def sector_of(x: float, y: float, num_sectors: int) -> int:
+    """Azimuth sector; sector 0 starts at -pi."""
+    return wp.clamp(int(bearing_in_sectors(x, y, num_sectors)), 0, num_sectors - 1)
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -60,4 +64,4 @@ def sector_minima(
     for ray in range(lane, ranges.shape[1], num_lanes):
         if class_id[env, ray] == wanted_class:
             p = offset + ranges[env, ray] * (turn * directions[env, ray])
-            wp.atomic_min(distances, env, sector_of(p, num_sectors), wp.sqrt(p[0] * p[0] + p[1] * p[1]))
+            wp.atomic_min(distances, env, sector_of(p[0], p[1], num_sectors), wp.sqrt(p[0] * p[0] + p[1] * p[1]))

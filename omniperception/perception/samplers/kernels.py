@@ -10,7 +10,7 @@ from pathlib import Path
 import warp as wp
 
 from omniperception.lidar.kernels.rotations import to_quat
-from omniperception.lidar.kernels.sectors import levelled
+from omniperception.lidar.kernels.sectors import levelled, sector_of
 from omniperception.lidar.native import function_body
 
 wp.set_module_options({"enable_backward": False})
@@ -214,8 +214,7 @@ def proximity_cell(p: wp.vec3, body: wp.vec2, band_edges: wp.array(dtype=wp.floa
     band = wp.int32(0)
     while p[2] >= band_edges[band + 1]:
         band += 1
-    turned = (wp.atan2(p[1], p[0]) + _PI) / (2.0 * _PI)
-    return band * num_sectors + wp.clamp(int(turned * float(num_sectors)), 0, num_sectors - 1)
+    return band * num_sectors + sector_of(p[0], p[1], num_sectors)
 
 
 @wp.func
