@@ -36,6 +36,14 @@ def grouped(records: Iterable[Record], *names: str) -> dict[tuple, list[Record]]
     return groups
 
 
+def without_constants(
+    keys: Sequence[str], columns: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[list[str], list[list[str]]]:
+    """Headings and rows, which begin with keys, without the keys that are the same everywhere but the first."""
+    kept = [k for k in range(len(keys)) if k == 0 or len({row[k] for row in rows}) > 1]
+    return [keys[k] for k in kept] + list(columns), [[row[k] for k in kept] + list(row[len(keys) :]) for row in rows]
+
+
 def check_apart(records: Iterable[Record]) -> None:
     """Refuses to show two results of one run as if they were of two trainings.
 

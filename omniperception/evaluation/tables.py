@@ -5,6 +5,7 @@
 <!-- table: before view=worlds policy=run -->                   the same with a column for each condition
 <!-- table: before view=conditions policy=run,blind -->         untouched and falls: a row for each policy
 <!-- table: gait view=walking -->                              figures of a gait: a row for each ground
+<!-- table: gait view=levels -->                               the same, all kinds of ground together
 <!-- end -->
 """
 
@@ -19,8 +20,8 @@ import torch
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.records import Record, read
-from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, table
-from omniperception.evaluation.walking_report import walking_table
+from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, table, without_constants
+from omniperception.evaluation.walking_report import level_table, walking_table
 
 _BLOCK = re.compile(r"^<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
 _BEGIN = re.compile(r"^<!-- table:", re.MULTILINE)
@@ -106,6 +107,7 @@ VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
     "worlds": by_world,
     "conditions": by_condition,
     "walking": walking_table,
+    "levels": level_table,
 }
 
 
@@ -135,6 +137,4 @@ def _untouched(records: Sequence[Record]) -> str:
 def _titled(records: Sequence[Record], what: str, keys: list[str], columns: list[str], rows: list[list[str]]) -> str:
     """A table without the columns of keys that are the same everywhere."""
     check_apart(records)
-    kept = [k for k in range(len(keys)) if k == 0 or len({row[k] for row in rows}) > 1]
-    rows = [[row[k] for k in kept] + row[len(keys) :] for row in rows]
-    return f"{what}; {headline(records)}\n\n{markdown([keys[k] for k in kept] + columns, rows)}"
+    return f"{what}; {headline(records)}\n\n{markdown(*without_constants(keys, columns, rows))}"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 
 from omniperception.common.tables import markdown
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell
+from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, without_constants
 
 EASY_LEVELS = 5
 """Levels of uneven ground that a robot is expected to pass; tables show the others apart."""
@@ -20,25 +20,40 @@ HEADINGS = (
 )
 
 
+KEYS = ("world", "terrain", "ground", "condition", "policy")
+"""What a row is of."""
+
+
 def walking_table(records: Sequence[Record]) -> str:
     """All figures: a row for each world and ground, runs of several training seeds together.
 
     Raises:
         ConfigError: see `check_apart`.
     """
+    return _table(records, grounds)
+
+
+def level_table(records: Sequence[Record]) -> str:
+    """The same with all kinds of ground together: a row for each world, and for easy and hard levels.
+
+    Raises:
+        ConfigError: see `check_apart`.
+    """
+    return _table(records, lambda record: {name: there for name, there in grounds(record).items() if "," not in name})
+
+
+def _table(records: Sequence[Record], parts_of: Callable[[Record], dict[str, torch.Tensor]]) -> str:
     check_apart(records)
     rows = []
     for (world, terrain, condition, policy), seeds in grouped(
         records, "world", "terrain", "condition", "policy"
     ).items():
-        by_seed = [grounds(record) for record in seeds]  # other seeds, other tiles
+        by_seed = [parts_of(record) for record in seeds]  # other seeds, other tiles
         for ground in dict.fromkeys(name for found in by_seed for name in found):
             there = zip(seeds, by_seed, strict=True)
             parts = [Part(record, found[ground]) for record, found in there if ground in found]
             rows.append([world, terrain, ground, condition, policy, *figures(parts)])
-    return (
-        f"{headline(records)}\n\n{markdown(['world', 'terrain', 'ground', 'condition', 'policy', *HEADINGS], rows)}\n"
-    )
+    return f"{headline(records)}\n\n{markdown(*without_constants(KEYS, HEADINGS, rows))}\n"
 
 
 def grounds(record: Record) -> dict[str, torch.Tensor]:

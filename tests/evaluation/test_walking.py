@@ -13,7 +13,7 @@ from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.walking import AT_STOP, COLUMNS
-from omniperception.evaluation.walking_report import Part, grounds, walking_table
+from omniperception.evaluation.walking_report import Part, grounds, level_table, walking_table
 
 BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk", "num_envs=3")
 
@@ -139,13 +139,15 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     of_kinds = [there for name, there in parts.items() if "," in name]
     assert sum(int(there.sum()) for there in of_kinds) == 9
     assert sum(len(Part(record, there).fell) for there in of_kinds) == 9
-    assert "stairs_up" in walking_table([record])
+    assert "stairs_up" in walking_table([record]) and "stairs_up" not in level_table([record])
+    assert level_table([record]).count("| levels ") == 2 and "| condition" not in level_table([record])
     fell = torch.where(easy, OUTCOMES.index("fall"), OUTCOMES.index("time_out"))
     first = replace(record, episodes=replace(episodes, outcome=fell))
     turned = {name: values.flip(0) for name, values in episodes.walking.items()}  # another seed, with other tiles
     second = replace(first, run="b", episodes=replace(episodes, outcome=fell.flip(0), walking=turned))
     lines = [line.split("|") for line in walking_table([first, second]).splitlines() if line.startswith("|")]
-    rows = {cells[3].strip(): cells[6].strip() for cells in lines}
+    at = [cell.strip() for cell in lines[0]].index("falls, %")
+    rows = {cells[2].strip(): cells[at].strip() for cells in lines}
     assert rows["levels 0 to 4"].startswith("100.0") and rows["levels 5 and above"].startswith("0.0")
 
 
