@@ -17,6 +17,7 @@ from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.avoidance.velocity import SECTOR_TARGET
 from omniperception.build import RunConfig, assemble
 from omniperception.common.rotations import yaw_quat
+from omniperception.common.sectors import sector_of
 from omniperception.config import compose
 from omniperception.env.config import HEIGHT_TARGET
 from omniperception.env.env import OmniEnv
@@ -353,8 +354,7 @@ def read_sectors(points: torch.Tensor, used: torch.Tensor, height: torch.Tensor,
     own = (points[..., 0].abs() < BODY[0]) & (points[..., 1].abs() < BODY[1])
     stands = used & ~own & (points[..., 2] > ABOVE_GROUND - height[:, None])
     distance = points[..., :2].norm(dim=-1).masked_fill(~stands, math.inf)
-    turned = (torch.atan2(points[..., 1], points[..., 0]) / (2.0 * math.pi) + 0.5) * num_sectors
-    sector = turned.long().clamp(0, num_sectors - 1)
+    sector = sector_of(points[..., :2], num_sectors)
     nearest = torch.full((len(points), num_sectors), math.inf, dtype=distance.dtype)
     return nearest.scatter_reduce(1, sector, distance, "amin").clamp(max=NEARNESS_RANGE)
 

@@ -12,9 +12,14 @@ def bearing_in_sectors(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
     return (torch.atan2(places[..., 1], places[..., 0]) + math.pi) * (num_sectors / (2.0 * math.pi))
 
 
+def sector_at(bearing: torch.Tensor, num_sectors: int) -> torch.Tensor:
+    """(...) int64 sector of bearings (...) in widths of a sector."""
+    return bearing.long().clamp(0, num_sectors - 1)
+
+
 def sector_of(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
     """(...) int64 azimuth sector of places (..., 2); sector 0 starts at -pi."""
-    return bearing_in_sectors(places, num_sectors).long().clamp(0, num_sectors - 1)
+    return sector_at(bearing_in_sectors(places, num_sectors), num_sectors)
 
 
 def sums_by(index: torch.Tensor, values: torch.Tensor, num: int) -> torch.Tensor:

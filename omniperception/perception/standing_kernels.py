@@ -143,7 +143,8 @@ def find_standing(
         heights[env, ray] = height
     for ray in range(num_rays):
         if ranges[env, ray] < settings.near and heights[env, ray] < settings.headroom:
-            sector = sector_of(points[env, ray][0] - sensor[0], points[env, ray][1] - sensor[1], settings.sectors)
+            seen = points[env, ray] - sensor
+            sector = sector_of(seen[0], seen[1], settings.sectors)
             share = float(around[env, sector]) / float(wp.max(around[env, settings.sectors + sector], 1))
             if share < settings.near_share:
                 heights[env, ray] = _INF

@@ -26,9 +26,15 @@ def bearing_in_sectors(x: float, y: float, num_sectors: int) -> float:
 
 
 @wp.func
+def sector_at(bearing: float, num_sectors: int) -> int:
+    """Sector of a bearing in widths of a sector."""
+    return wp.clamp(int(bearing), 0, num_sectors - 1)
+
+
+@wp.func
 def sector_of(x: float, y: float, num_sectors: int) -> int:
     """Azimuth sector; sector 0 starts at -pi."""
-    return wp.clamp(int(bearing_in_sectors(x, y, num_sectors)), 0, num_sectors - 1)
+    return sector_at(bearing_in_sectors(x, y, num_sectors), num_sectors)
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -4,7 +4,7 @@ import math
 
 import warp as wp
 
-from omniperception.lidar.kernels.sectors import bearing_in_sectors, sector_of
+from omniperception.lidar.kernels.sectors import bearing_in_sectors, sector_at
 
 FAINT = 1e-6
 """Proximity below which a cell counts as empty; with a decay of 0.5 m, a distance of 6.9 m."""
@@ -56,14 +56,14 @@ def write_rings(
                     x = far * (cos * c[0] - sin * c[1]) + shift[0]
                     y = far * (sin * c[0] + cos * c[1]) + shift[1]
                     distance = wp.sqrt(x * x + y * y)
-                    sector = sector_of(x, y, num_sectors)
+                    bearing = bearing_in_sectors(x, y, num_sectors)
+                    sector = sector_at(bearing, num_sectors)
                     band = cell / num_sectors
                     if distance < nearest[env, band, sector]:
                         nearest[env, band, sector] = distance
                         first = (k * bands + band) * per_cell
                         for j in range(decays.shape[0]):
                             rings_out[env, window, first + j, sector] = wp.exp(-distance / decays[j])
-                        beside = bearing_in_sectors(x, y, num_sectors) - float(sector) - 0.5
-                        within = beside * wp.static(2.0 * math.pi) / float(num_sectors)
+                        within = (bearing - float(sector) - 0.5) * wp.static(2.0 * math.pi) / float(num_sectors)
                         last = rings_out[env, window, first + decays.shape[0] - 1, sector]
                         rings_out[env, window, first + decays.shape[0], sector] = wp.static(LATERAL) * within * last

@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn import functional
 
 from omniperception.common.launch import constant, launch_over_envs, view
-from omniperception.common.sectors import bearing_in_sectors, sector_of
+from omniperception.common.sectors import bearing_in_sectors, sector_at
 from omniperception.perception.networks.kernels import EMPTY_DISTANCE, FAINT, LATERAL, write_rings
 from omniperception.perception.networks.motion_match import NOTHING, MotionMatch
 from omniperception.perception.networks.windows import valid_frames, window_count
@@ -84,11 +84,12 @@ def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, 
     here = _turned(-yaw[:, newest, None, None, None], windows - origin[:, newest, None, None, None])
     hit = _windows(hit, shape.history) & valid_frames(count, shape.history)[..., None, None]
     distance = torch.where(hit, here.square().sum(-1).sqrt(), EMPTY_DISTANCE)
-    sector = sector_of(here, shape.num_sectors)
+    turned = bearing_in_sectors(here, shape.num_sectors)
+    sector = sector_at(turned, shape.num_sectors)
     empty = 0.0 * distance  # not zeros_like, whose shape an exporter takes for a constant
     nearest = (empty + EMPTY_DISTANCE).scatter_reduce(-1, sector, distance, "amin")
     is_nearest = (distance <= nearest.gather(-1, sector)) & hit
-    within = (bearing_in_sectors(here, shape.num_sectors) - sector - 0.5) * (2 * math.pi / shape.num_sectors)
+    within = (turned - sector - 0.5) * (2 * math.pi / shape.num_sectors)
     lateral = empty.scatter_reduce(-1, sector, torch.where(is_nearest, within, 0.0), "sum")
     proximities = [torch.exp(-nearest / decay) for decay in shape.decays]
     return torch.stack((*proximities, LATERAL * lateral * proximities[-1]), -2).flatten(2, 4)
