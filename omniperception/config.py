@@ -41,8 +41,8 @@ DEFINED_BY_SCENARIO = ("obstacles", "commands")
 """Groups that a scenario writes out in full, so that another preset would be mixed with it."""
 OPTIONAL_GROUPS = ("experiment", "scenario", "condition")
 """Groups of which none may be chosen."""
-SUITES = "suite"
-"""Folder of lists of scenarios, which evaluate reads; no group of a configuration."""
+SUITES, STUDIES = "suite", "study"
+"""Folders of what evaluate and ablate read; no groups of a configuration."""
 _EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
 
 
@@ -133,7 +133,7 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
 
 def _keys() -> set[str]:
     """Keys at the top of a command line."""
-    groups = {path.name for path in CONFIG_DIR.iterdir() if path.is_dir()} - {SUITES}
+    groups = {path.name for path in CONFIG_DIR.iterdir() if path.is_dir()} - {SUITES, STUDIES}
     return {"seed", "num_envs", "distillation", "init", "stepping", *groups}
 
 
@@ -202,7 +202,7 @@ def _split(overrides: Sequence[Override], folders: Sequence[Path]) -> tuple[list
     values: list[Override] = []
     for override in overrides:
         group = override.key_or_group
-        if group != SUITES and presets(group, folders):
+        if group not in (SUITES, STUDIES) and presets(group, folders):
             _check_preset(override, presets(group, folders))
             chosen.append(override)
         elif group != "hydra.searchpath":
@@ -295,6 +295,19 @@ def presets(group: str, folders: Sequence[Path] = ()) -> tuple[str, ...]:
     """Names of a group's presets, those in the user's folders included; none where there is no such group."""
     found = {path.stem for folder in (CONFIG_DIR, *folders) for path in (folder / group).glob("[!_]*.yaml")}
     return tuple(sorted(found))
+
+
+def listed(folder: str, name: str, folders: Sequence[Path] = ()) -> Path:
+    """The file of a suite or study, which one of the user's folders may replace.
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    known = presets(folder, folders)
+    if name not in known:
+        raise ConfigError(f"{folder}={name} is unknown; {suggest(name, known)}")
+    paths = (parent / folder / f"{name}.yaml" for parent in (*folders, CONFIG_DIR))
+    return next(path for path in paths if path.is_file())
 
 
 def save(composed: dict, run_dir: Path) -> None:

@@ -1,27 +1,31 @@
-"""The ablation study: one command trains, goes on, evaluates and writes the table."""
+"""Studies: one command trains, goes on, evaluates and writes the tables."""
 
 import hashlib
-import json
 import re
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 import torch
+import yaml
 
+from omniperception import build, config
 from omniperception.commands import main
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.ablation import Ablation, write_tables
+from omniperception.evaluation.ablation import Ablation, Arm, Study, load_study, overrides_of, write_tables
 from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record, write
+from omniperception.evaluation.records import Record, read, write
+from omniperception.evaluation.study_report import study_table
 
-GIVEN = {"out": Path("x"), "experiment": "avoid", "variants": ["fps_gru"], "seeds": [1], "scenarios": ["corridor"]}
+STUDY = Study(experiment="avoid", variants=["fps_gru"], seeds=[1], scenarios=["corridor"], trials=2)
 
 
-def evaluated(study, trials=2, **given):
-    """Writes a result of the study's only run, one that reached the goal and one that fell, and its checkpoint."""
-    checkpoint = study.run_dir("fps_gru", 1) / "checkpoints" / "model_1.pt"
-    checkpoint.parent.mkdir(parents=True, exist_ok=True)
+def evaluated(ablation, trials=2, arm="own", **given):
+    """Writes a result of an arm's only run, one that reached the goal and one that fell, and its checkpoint."""
+    run_dir = ablation.run_dir(arm, "fps_gru", 1)
+    config.save(build.assemble(config.compose(["perception=fps_gru"])).composed, run_dir)
+    checkpoint = run_dir / "checkpoints" / "model_1.pt"
+    checkpoint.parent.mkdir(exist_ok=True)
     checkpoint.write_bytes(b"weights")
     outcome = torch.tensor([OUTCOMES.index("goal"), OUTCOMES.index("fall")])[:trials]
     zeros = torch.zeros(trials, dtype=torch.float64)
@@ -31,60 +35,88 @@ def evaluated(study, trials=2, **given):
     weights = hashlib.sha256(b"weights").hexdigest()
     named = {"policy": "run", "world": "corridor", "terrain": "own", "condition": "ideal", "split": "dev"}
     named |= {"weights": weights} | given
-    record = Record(**named, condition_version=1, run="a", seed=1, facts={}, episodes=trials)
+    record = Record(**named, condition_version=1, run=str(run_dir), seed=1, facts={}, episodes=trials)
     path = "{split}-{condition}-{world}-{terrain}-{policy}.json".format(**named)
-    write(study.run_dir("fps_gru", 1) / "evaluation" / path, [record])
+    write(run_dir / "evaluation" / path, [record])
 
 
-def test_every_line_of_a_table_has_as_many_cells(tmp_path):
-    """Or it is not shown as one."""
-    study = Ablation(**GIVEN | {"out": tmp_path, "trials": 2})
-    evaluated(study)
-    lines = [line for line in write_tables(study).splitlines() if line.startswith("|")]
-    assert len(lines) == 3 and {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {8}
+def test_a_row_for_each_arm_and_every_line_has_as_many_cells(tmp_path):
+    """Or it is not shown as a table."""
+    ablation = Ablation(replace(STUDY, arms={"alone": Arm(), "taught": Arm()}), tmp_path)
+    evaluated(ablation, arm="alone")
+    evaluated(ablation, arm="taught")
+    lines = [line for line in write_tables(ablation).splitlines() if line.startswith("|")]
+    assert len(lines) == 4 and {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {10}
+    assert [line.split("|")[1].strip() for line in lines[2:]] == ["alone", "taught"]
+    records = read(tmp_path / "results.json.gz")
+    assert study_table(records) == (tmp_path / "ablation.md").read_text()
 
 
 @pytest.mark.parametrize(
     "given", [{"trials": 1}, {"condition": "robot"}, {"split": "test"}, {"weights": "0f"}], ids=str
 )
 def test_results_of_other_evaluations_are_not_in_the_table(tmp_path, given):
-    study = Ablation(**GIVEN | {"out": tmp_path, "trials": 2})
-    evaluated(study, **given)
-    with pytest.raises(ConfigError, match="has not been evaluated in corridor with trials=2 and its newest checkpoint"):
-        write_tables(study)
-    evaluated(study)
-    assert "50.0 [" in write_tables(study)
+    ablation = Ablation(STUDY, tmp_path)
+    evaluated(ablation, **given)
+    with pytest.raises(ConfigError, match="in corridor with condition=ideal policy=run trials=2"):
+        write_tables(ablation)
+    evaluated(ablation)
+    assert "50.0 [" in write_tables(ablation)
 
 
-def test_a_seed_is_one_run():
-    with pytest.raises(ConfigError, match="seeds=1,2,1 names one twice"):
-        Ablation(**GIVEN | {"seeds": [1, 2, 1]})
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"seeds": [1, 2, 1]}, "seeds=1,2,1 names one twice"),
+        ({"arms": {"taught": Arm(after="lesson"), "lesson": Arm()}}, "after=lesson must be an arm before it"),
+        ({"split": "tests"}, "split=tests is unknown; did you mean test"),
+        ({"policies": ["blinded"]}, "policies=blinded is unknown; did you mean blind"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_study_that_cannot_be(given, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(STUDY, **given)
+
+
+def test_a_file_that_is_no_study_is_named(tmp_path):
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "mine.yaml").write_text("experiment: avoid\nvariant: [fps_gru]\n")
+    with pytest.raises(ConfigError, match=r"mine.yaml is no study: .*unexpected keyword argument 'variant'"):
+        load_study("mine", [tmp_path])
+
+
+@pytest.mark.parametrize("name", config.presets(config.STUDIES))
+def test_studies_that_are_shipped_compose(name):
+    study = load_study(name)
+    for arm in study.arms.values():
+        overrides = [f"experiment={study.experiment}", *overrides_of(study.variants[0]), *arm.overrides]
+        build.assemble(config.compose(overrides))
 
 
 @pytest.mark.slow
 def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
+    """Two arms, of which the second goes on with the first."""
+    study = {"experiment": "avoid", "variants": ["fps_mlp_small"], "seeds": [1, 2], "scenarios": ["corridor"]}
+    study |= {"trials": 2, "arms": {"short": {}, "long": {"after": "short", "overrides": ["ppo.max_iterations=2"]}}}
+    (tmp_path / "conf" / "study").mkdir(parents=True)
+    (tmp_path / "conf" / "study" / "mine.yaml").write_text(yaml.safe_dump(study, sort_keys=False))
+    out = tmp_path / "out"
     arguments = [
-        f"out={tmp_path}",
-        "variants=fps_mlp_small",
-        "seeds=1,2",
-        "scenarios=corridor",
-        "trials=2",
-        "num_envs=2",
-        "ppo.num_steps_per_env=4",
-        "ppo.num_mini_batches=1",
-        "ppo.max_iterations=1",
-        "obstacles.curriculum=null",
-        "terminations.episode_length_s=0.3",
+        *("--config-dir", str(tmp_path / "conf"), "study=mine", f"out={out}"),
+        *("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1", "ppo.max_iterations=1"),
+        *("obstacles.curriculum=null", "terminations.episode_length_s=0.3"),
     ]
     main(["ablate", "stage=train", *arguments])
-    checkpoints = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/seed*/checkpoints/model_1.pt")}
-    assert len(checkpoints) == 2
+    checkpoints = {path: path.stat().st_mtime_ns for path in out.glob("*/*/seed*/checkpoints/model_*.pt")}
+    names = sorted(str(path.relative_to(out)).replace("/checkpoints/", " ") for path in checkpoints)
+    runs = [f"{arm}/fps_mlp_small/seed{seed}" for arm in ("long", "short") for seed in (1, 2)]
+    assert {name.split()[0] for name in names} == set(runs)
+    assert {f"{run} model_{2 if run.startswith('long') else 1}.pt" for run in runs} <= set(names)
     main(["ablate", *arguments])
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
-    table = (tmp_path / "ablation.md").read_text()
-    assert re.search(r"\| fps_mlp_small +\| \d", table)
-    rows = json.loads((tmp_path / "ablation.json").read_text())["rows"]
-    assert rows["fps_mlp_small"]["corridor"]["collision"]["seeds"] == 2
+    table = (out / "ablation.md").read_text()
+    assert re.search(r"\| long +\| fps_mlp_small +\| run +\| \d", table) and "each of 4 runs" in table
     with pytest.raises(SystemExit, match="2"):
         main(["ablate", *arguments, "ppo.gamma=0.9"])
     assert "holds a run of another configuration" in capfd.readouterr().err

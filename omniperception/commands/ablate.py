@@ -1,24 +1,26 @@
-"""Trains perception variants over seeds, evaluates them in scenarios, and writes tables with intervals.
+"""Trains networks, ways of training and seeds against each other, evaluates them, and writes tables with intervals.
 
-    ablate variants=fps_mlp_small,fps_gru_small,polar_rings seeds=1,2,3
+    ablate study=end_to_end                                  # the paper's ablation, end to end: PPO alone, and taught
+    ablate variants=fps_mlp_small,polar_rings seeds=1,2      # of study=perception
     ablate stage=train hydra/launcher=submitit_slurm hydra.launcher.partition=cpu
 
-Runs lie in <out>/<variant>/seed<seed>. The same command goes on where it was stopped: finished runs and evaluations are
-left alone. A variant is a preset of `perception`, or a name from `VARIANTS` in omniperception/evaluation/ablation.py
-(such as polar_rings_no_match), which lists its overrides. On a cluster, with pip install
-'omniperception[train,cluster]', give stage=train and Hydra's launcher; nothing else differs. Writes
-<out>/ablation.md and ablation.json.
+A study is a file of conf/study; the arguments below replace what it says. Runs lie in <out>/<arm>/<variant>/seed<seed>.
+The same command goes on where it was stopped: finished runs and evaluations are left alone. A variant is a preset of
+`perception`, or a name from `VARIANTS` in omniperception/evaluation/ablation.py (such as polar_rings_no_match), which
+lists its overrides. On a cluster, with pip install 'omniperception[train,cluster]', give stage=train and Hydra's
+launcher; nothing else differs. Writes <out>/ablation.md, and every trial into <out>/results.json.gz,
+which tables reads.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omniperception import config
 from omniperception.cli import Command, argument, trust
-from omniperception.evaluation.ablation import Ablation, evaluate_all, train, write_tables
-from omniperception.evaluation.suite import held_out_scenarios
+from omniperception.evaluation.ablation import Ablation, Study, evaluate_all, load_study, train, write_tables
+from omniperception.evaluation.suite import POLICIES, SPLITS
 from omniperception.learning import CheckpointError
 
 STAGES = ("train", "evaluate", "table", "all")
@@ -29,37 +31,45 @@ class Arguments:
     """The command's own arguments."""
 
     stage: str = argument("all", "what is done", choices=STAGES)
-    out: Path = argument(Path("outputs/ablation"), "folder of the study")
-    experiment: str = argument("avoid", "recipe that all variants share")
-    variants: tuple[str, ...] = argument(("fps_mlp_small", "fps_gru_small", "polar_rings"), "perception variants")
-    seeds: tuple[int, ...] = argument((1, 2, 3), "seeds; each variant is trained with each", least=0)
-    scenarios: tuple[str, ...] = argument(("all",), "where they are evaluated")
-    trials: int = argument(250, "trials of each run in each scenario", least=1)
+    study: str = argument("perception", "file of conf/study")
+    out: Path | None = argument(None, "folder of the study; null: outputs/<study>")
+    experiment: str | None = argument(None, "recipe that all trainings share; null, here and below: the study's")
+    arms: tuple[str, ...] | None = argument(None, "those of its ways of training that are meant")
+    variants: tuple[str, ...] | None = argument(None, "perception variants")
+    seeds: tuple[int, ...] | None = argument(None, "seeds; each variant is trained with each", least=0)
+    scenarios: tuple[str, ...] | None = argument(None, "where they are evaluated; all: those of the held-out suite")
+    conditions: tuple[str, ...] | None = argument(None, "presets of conf/condition")
+    policies: tuple[str, ...] | None = argument(None, "policies, as of evaluate", choices=tuple(POLICIES))
+    split: str | None = argument(None, "obstacles and seeds for choosing, or for reporting", choices=SPLITS)
+    trials: int | None = argument(None, "trials of each run in each scenario", least=1)
     trust: tuple[str, ...] = trust()
+
+
+_OF_THE_STUDY = ("experiment", "variants", "seeds", "scenarios", "conditions", "policies", "split", "trials")
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Runs the stages of the study."""
-    known = config.presets("scenario", config.search_path(overrides))
-    for name in arguments.scenarios:
-        if name not in (*known, "all"):
-            raise config.ConfigError(f"scenarios={name} is unknown; {config.suggest(name, known)}")
-    study = Ablation(
-        out=arguments.out,
-        experiment=arguments.experiment,
-        variants=arguments.variants,
-        seeds=arguments.seeds,
-        scenarios=held_out_scenarios() if arguments.scenarios == ("all",) else arguments.scenarios,
-        trials=arguments.trials,
-        overrides=tuple(overrides),
-        trust=arguments.trust,
-    )
+    given = {name: value for name in _OF_THE_STUDY if (value := getattr(arguments, name)) is not None}
+    study = replace(load_study(arguments.study, config.search_path(overrides)), **given)
+    if arguments.arms is not None:
+        study = _with_arms(study, arguments.arms)
+    out = arguments.out or config.OUTPUTS / arguments.study
+    ablation = Ablation(study, out, tuple(overrides), arguments.trust)
     if arguments.stage in ("train", "all"):
-        train(study)
+        train(ablation)
     if arguments.stage in ("evaluate", "all"):
-        evaluate_all(study)
+        evaluate_all(ablation)
     if arguments.stage in ("table", "all"):
-        print(write_tables(study))
+        print(write_tables(ablation))
 
 
-command = Command(main, Arguments, __doc__, "of the training", (CheckpointError,))
+def _with_arms(study: Study, names: tuple[str, ...]) -> Study:
+    """The study with some of its arms, in its order."""
+    for name in names:
+        if name not in study.arms:
+            raise config.ConfigError(f"arms={name} is unknown; {config.suggest(name, tuple(study.arms))}")
+    return replace(study, arms={name: arm for name, arm in study.arms.items() if name in names})
+
+
+command = Command(main, Arguments, __doc__, "of the trainings", (CheckpointError,))

@@ -1,21 +1,21 @@
-"""The ablation study: trains variants over seeds, evaluates them, and writes tables."""
+"""Studies: the same training with several networks, ways of training and seeds, evaluated, and tables of it."""
 
 from __future__ import annotations
 
-import json
+import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from omniperception import config
-from omniperception.common.provenance import provenance
-from omniperception.common.tables import markdown
+import yaml
+
+from omniperception import build, config
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import FOLDER, Record, read
-from omniperception.evaluation.statistics import pooled
-from omniperception.evaluation.suite import Evaluation, World, evaluate, weights_hash
+from omniperception.evaluation.records import FOLDER, Record, read, write
+from omniperception.evaluation.study_report import study_table
+from omniperception.evaluation.suite import POLICIES, SPLITS, Evaluation, Task, World, held_out_scenarios, measure_all
 
 _NO_PROXIMAL = ("perception.height_weight=0", "perception.sampler.num_proximal=0", "perception.network.proximal_dim=0")
 _NO_DISTAL = ("perception.sampler.num_distal=0", "perception.network.distal_dim=0")
@@ -29,89 +29,173 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 }
 """Overrides of the variants that are no presets of `perception`; what the perception is supervised with is the
 experiment's."""
-
-RATES = {
-    "untouched": "reached, untouched",
-    "success": "reached",
-    "collision": "touched",
-    "fall": "falls",
-    "time_out": "time-outs",
-}
-"""Rates in a row, and what the table calls them; the first decides."""
-PAPER = {
-    "direct_mlp": "out of memory (24 GB)",
-    "fps_mlp": "33.3 | 93.3",
-    "fps_gru": "30.0 | 70.0",
-    "pd_risknet": "76.7 | 56.7",
-}
-"""Success and collision rates (%) of the paper's Table 'PD-RiskNet Ablation Results', by the preset of that network.
-
-30 trials each in Isaac Gym, in a corridor that its text describes in part, of policies trained end to end: shown beside
-ours, in our corridor and with our training, and not to be compared with it.
-"""
+RESULTS = "results.json.gz"
 
 
 @dataclass(frozen=True)
-class Ablation:
-    """Settings of an ablation study.
+class Arm:
+    """A way of training.
 
     Attributes:
-        out: the study's directory.
-        experiment: the recipe that all variants share.
-        variants: perception presets, or names from VARIANTS.
-        seeds: one run of each variant for each.
-        scenarios: names from conf/scenario.
-        trials: of each run in each scenario.
-        overrides: of the training, Hydra's own (such as hydra/launcher=submitit_slurm) included.
-        trust: packages of one's own whose names the configuration may build.
+        overrides: of the study's experiment, or of the training that this one goes on with.
+        after: the arm whose finished training, with the same network and seed, this one goes on with; None: none.
     """
 
-    out: Path
+    overrides: Sequence[str] = ()
+    after: str | None = None
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is trained and evaluated; a file of conf/study has these names.
+
+    Attributes:
+        experiment: the recipe that all trainings share.
+        variants: perception presets, or names from VARIANTS.
+        seeds: one run of each variant and arm for each.
+        scenarios: names from conf/scenario, on their own terrain.
+        trials: of each run in each scenario.
+        arms: ways of training by name; one that goes on with another stands behind it.
+        conditions: presets of `condition`.
+        policies: names from `suite.POLICIES`.
+        split: dev or test.
+    """
+
     experiment: str
     variants: Sequence[str]
     seeds: Sequence[int]
     scenarios: Sequence[str]
-    trials: int = 1000
-    overrides: Sequence[str] = ()
-    trust: Sequence[str] = ()
+    trials: int
+    arms: Mapping[str, Arm] = field(default_factory=lambda: {"own": Arm()})
+    conditions: Sequence[str] = ("ideal",)
+    policies: Sequence[str] = ("run",)
+    split: str = "dev"
 
     def __post_init__(self) -> None:
         if len(set(self.seeds)) < len(self.seeds):
             raise ConfigError(f"seeds={','.join(map(str, self.seeds))} names one twice; each is one run")
-        known = (*VARIANTS, *config.presets("perception", config.search_path(self.overrides)))
-        for variant in self.variants:
+        before: set[str] = set()
+        for name, arm in self.arms.items():
+            if arm.after is not None and arm.after not in before:
+                raise ConfigError(f"arms.{name}.after={arm.after} must be an arm before it, one of {sorted(before)}")
+            before.add(name)
+        for key, values, known in (("split", [self.split], SPLITS), ("policies", self.policies, POLICIES)):
+            for value in values:
+                if value not in known:
+                    raise ConfigError(f"{key}={value} is unknown; {config.suggest(value, tuple(known))}")
+
+
+def load_study(name: str, folders: Sequence[Path] = ()) -> Study:
+    """The study of a file of conf/study."""
+    path = config.listed(config.STUDIES, name, folders)
+    try:
+        given = dict(yaml.safe_load(path.read_text()))
+        if "arms" in given:
+            given["arms"] = {arm: Arm(**settings) for arm, settings in given["arms"].items()}
+        return Study(**given)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise ConfigError(f"{path}: {error}") from None
+        raise ConfigError(f"{path} is no study: {error}") from None
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """A study in a folder.
+
+    Attributes:
+        study: what is trained and evaluated.
+        out: its folder; runs lie in <out>/<arm>/<variant>/seed<seed>.
+        overrides: of every training, Hydra's own (such as hydra/launcher=submitit_slurm) included.
+        trust: packages of one's own whose names the configuration may build.
+    """
+
+    study: Study
+    out: Path
+    overrides: Sequence[str] = ()
+    trust: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        folders = config.search_path(self.overrides)
+        for variant in self.study.variants:
+            known = (*VARIANTS, *config.presets("perception", folders))
             if variant not in known:
                 raise ConfigError(f"variants={variant} is unknown; {config.suggest(variant, known)}")
+        for scenario in self.study.scenarios:
+            if scenario not in (known := (*config.presets("scenario", folders), "all")):
+                raise ConfigError(f"scenarios={scenario} is unknown; {config.suggest(scenario, known)}")
         for override in config.parse(self.overrides):
             if override.key_or_group in ("experiment", "perception", "seed"):
-                raise ConfigError(f"{override.input_line}: give experiment=, variants= and seeds= instead")
+                raise ConfigError(f"{override.input_line}: give study=, variants= and seeds= instead")
 
-    def run_dir(self, variant: str, seed: int) -> Path:
-        return self.out / variant / f"seed{seed}"
+    def run_dir(self, arm: str, variant: str, seed: int) -> Path:
+        return self.out / arm / variant / f"seed{seed}"
+
+    def run_dirs(self) -> Iterator[Path]:
+        """All of them, seeds of a training one after the other."""
+        for arm in self.study.arms:
+            for variant in self.study.variants:
+                for seed in self.study.seeds:
+                    yield self.run_dir(arm, variant, seed)
+
+    def worlds(self) -> list[World]:
+        names = self.study.scenarios
+        return [World(name) for name in (held_out_scenarios() if list(names) == ["all"] else names)]
 
 
-def train(study: Ablation) -> None:
-    """Trains what is missing, a sweep over the seeds for each variant.
+def train(ablation: Ablation) -> None:
+    """Trains what is missing, arm by arm, a sweep over the seeds for each variant.
 
-    Stopped runs go on, finished ones are left alone. With a launcher of Hydra's (a cluster) the variants are trained at
-    the same time, otherwise one after the other.
+    Stopped runs go on, finished ones are left alone. With a launcher of Hydra's (a cluster) the variants of an arm are
+    trained at the same time, otherwise one after the other.
+
+    Raises:
+        ConfigError: an arm goes on with another on a cluster, or a training failed.
     """
-    together = any(override.startswith("hydra/launcher=") for override in study.overrides)
-    running = []
-    for variant in study.variants:
-        command = [
-            *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),
-            *overrides_of(variant),
-            f"seed={','.join(map(str, study.seeds))}",
-            f"hydra.sweep.dir={study.out}",
-            f"hydra.sweep.subdir={variant}/seed${{seed}}",
-            *study.overrides,
-        ]
-        running.append(subprocess.Popen(command))
-        if not together:
-            _wait(running.pop())
-    for process in running:
-        _wait(process)
+    study = ablation.study
+    together = any(override.startswith("hydra/launcher=") for override in ablation.overrides)
+    for name, arm in study.arms.items():
+        if together and arm.after is not None:
+            raise ConfigError(f"arms={name} goes on with {arm.after}, which hydra/launcher= cannot; leave it out")
+        running = []
+        for variant in study.variants:
+            if arm.after is not None:
+                for seed in study.seeds:
+                    _go_on(ablation, name, variant, seed)
+                continue
+            running.append(subprocess.Popen(_sweep(ablation, name, variant)))
+            if not together:
+                _wait(running.pop())
+        for process in running:
+            _wait(process)
+
+
+def _sweep(ablation: Ablation, arm: str, variant: str) -> list[str]:
+    """Command of a training over the seeds."""
+    study = ablation.study
+    return [
+        *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),
+        *overrides_of(variant),
+        *study.arms[arm].overrides,
+        f"seed={','.join(map(str, study.seeds))}",
+        f"hydra.sweep.dir={ablation.out}",
+        f"hydra.sweep.subdir={arm}/{variant}/seed${{seed}}",
+        *ablation.overrides,
+    ]
+
+
+def _go_on(ablation: Ablation, name: str, variant: str, seed: int) -> None:
+    """Trains a run of an arm that goes on with another: in a copy, of which the settings are changed once."""
+    arm, run_dir = ablation.study.arms[name], ablation.run_dir(name, variant, seed)
+    if not run_dir.exists():
+        before = ablation.run_dir(str(arm.after), variant, seed)
+        temporary = run_dir.with_name(f"{run_dir.name}.part")
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.copytree(before, temporary, ignore=shutil.ignore_patterns(FOLDER))
+        config.save(build.load_run(before, arm.overrides, ablation.trust).composed, temporary)
+        config.save_recipe([*config.read_recipe(before), *arm.overrides], temporary)
+        temporary.rename(run_dir)
+    _wait(subprocess.Popen([sys.executable, "-m", "omniperception", "train", f"run={run_dir}"]))
 
 
 def overrides_of(variant: str) -> tuple[str, ...]:
@@ -124,61 +208,55 @@ def _wait(process: subprocess.Popen) -> None:
         raise ConfigError(f"training ended with exit code {process.returncode}; the same command goes on from there")
 
 
-def evaluate_all(study: Ablation) -> None:
+def _evaluations(ablation: Ablation) -> Iterator[Evaluation]:
+    """Of all runs, a condition after the other.
+
+    Raises:
+        ConfigError: a run has not been trained.
+    """
+    study, worlds, runs = ablation.study, ablation.worlds(), list(ablation.run_dirs())
+    for run_dir in runs:
+        if not run_dir.is_dir():
+            raise ConfigError(f"{run_dir} has not been trained; use stage=train or stage=all")
+    for condition in study.conditions:
+        yield Evaluation(
+            runs=runs,
+            worlds=worlds,
+            policies=study.policies,
+            split=study.split,
+            condition=condition,
+            trials=study.trials,
+            trust=ablation.trust,
+        )
+
+
+def evaluate_all(ablation: Ablation) -> None:
     """Evaluates every run in every scenario, but for what the same code has evaluated at the same checkpoint before."""
-    for variant in study.variants:
-        for seed in study.seeds:
-            worlds = [World(name) for name in study.scenarios]
-            evaluate(Evaluation([study.run_dir(variant, seed)], worlds, trials=study.trials, trust=study.trust))
+    for evaluation in _evaluations(ablation):
+        measure_all(evaluation.tasks())
 
 
-def write_tables(study: Ablation) -> str:
-    """Writes ablation.json and ablation.md into the study's directory; the latter's text."""
-    rows = {variant: _row(study, variant) for variant in study.variants}
-    text = "\n\n".join(_table(scenario, rows, study) for scenario in study.scenarios) + "\n"
-    record = {"experiment": study.experiment, "overrides": list(study.overrides), "rows": rows, **provenance("cpu")}
-    (study.out / "ablation.json").write_text(json.dumps(record, indent=2) + "\n")
-    (study.out / "ablation.md").write_text(text)
+def write_tables(ablation: Ablation) -> str:
+    """Writes the results, trial by trial, and ablation.md into the study's folder; the latter's text.
+
+    Raises:
+        ConfigError: a run has not been evaluated in a scenario with its newest checkpoint.
+    """
+    tasks = [task for evaluation in _evaluations(ablation) for task in evaluation.tasks()]
+    records = [replace(_found(task), run=str(task.run_dir.relative_to(ablation.out))) for task in tasks]
+    text = study_table(records)
+    write(ablation.out / RESULTS, records)
+    (ablation.out / "ablation.md").write_text(text)
     return text
 
 
-def _row(study: Ablation, variant: str) -> dict:
-    """Rates of one variant by scenario, over all seeds."""
-    row = {}
-    for scenario in study.scenarios:
-        happened = [_record(study, study.run_dir(variant, seed), scenario).episodes.happened() for seed in study.seeds]
-        row[scenario] = {name: pooled([by_name[name] for by_name in happened]) for name in RATES if name in happened[0]}
-    return row
-
-
-def _table(scenario: str, rows: dict, study: Ablation) -> str:
-    columns = ["variant", *(f"{label}, %" for label in RATES.values())]
-    cells = [[variant, *(_cell(row[scenario].get(name)) for name in RATES)] for variant, row in rows.items()]
-    if scenario == "corridor":
-        columns.append("paper (30 trials of its own scene and training): success | collision, %")
-        for variant, row in zip(rows, cells, strict=True):
-            row.append(PAPER.get(variant, ""))
-    title = (
-        f"**{scenario}**, {study.trials} trials of each of {len(study.seeds)} seeds: rate [95 % interval]"
-        " (least to most of the seeds)"
-    )
-    return f"{title}\n\n{markdown(columns, cells)}"
-
-
-def _cell(rate: dict | None) -> str:
-    if rate is None:
-        return "–"
-    low, high, least, most = (100 * rate[key] for key in ("low", "high", "least", "most"))
-    return f"{100 * rate['rate']:.1f} [{low:.1f}, {high:.1f}] ({least:.1f} to {most:.1f})"
-
-
-def _record(study: Ablation, run_dir: Path, scenario: str) -> Record:
-    """What `evaluate_all` has measured of a run in a scenario."""
-    path = run_dir / FOLDER / f"dev-ideal-{scenario}-own-run.json"
-    for record in read(path) if path.is_file() else []:
-        if len(record.episodes) == study.trials and record.weights == weights_hash(run_dir):
+def _found(task: Task) -> Record:
+    """What `evaluate_all` has measured."""
+    for record in read(task.path) if task.path.is_file() else []:
+        if len(record.episodes) == task.evaluation.trials and record.weights == task.weights:
             return record
     raise ConfigError(
-        f"{run_dir} has not been evaluated in {scenario} with trials={study.trials} and its newest checkpoint; use"
-        " stage=evaluate or stage=all"
+        f"{task.run_dir} has not been evaluated in {task.world.name} with condition={task.evaluation.condition}"
+        f" policy={task.policy} trials={task.evaluation.trials} and its newest checkpoint; use stage=evaluate or"
+        " stage=all"
     )

@@ -133,10 +133,7 @@ def _check(group: str, names: Sequence[str], folders: Sequence[Path]) -> None:
 
 def suite_worlds(name: str, folders: Sequence[Path] = ()) -> list[World]:
     """The worlds of a suite, a file of conf/suite with the terrains of each scenario."""
-    known = config.presets(config.SUITES, folders)
-    if name not in known:
-        raise ConfigError(f"suite={name} is unknown; {config.suggest(name, known)}")
-    path = next(p for f in (*folders, config.CONFIG_DIR) if (p := f / config.SUITES / f"{name}.yaml").is_file())
+    path = config.listed(config.SUITES, name, folders)
     worlds = yaml.safe_load(path.read_text()).get("worlds")
     if not isinstance(worlds, dict) or not all(isinstance(terrains, list) for terrains in worlds.values()):
         raise ConfigError(f"{path} must have 'worlds: {{scenario: [terrain, ...]}}'")
