@@ -227,14 +227,14 @@ class Control:
         command, asked = self._operator.poll(now, remote(self._state["wireless_remote"]), self._pose)
         for request in asked:
             self._link.ask(request)
-        if self._link.mode is not self._mode:
-            self._mode = self._link.mode
+        entered, self._mode = self._link.mode is not self._mode, self._link.mode
+        if entered or self._mode is not Mode.POLICY:
+            self.policy.reset()  # what it would do from here, not what it would have done since: nobody follows it
             if self._mode is Mode.POLICY:
-                self.policy.reset()
                 if self.policy.safety is not None:
                     self.policy.safety.await_frame()  # the sensor may never have spoken
                 self._begin_odometry()
-        given = command if self._link.mode is Mode.POLICY else np.zeros(3)
+        given = command if self._mode is Mode.POLICY else np.zeros(3)
         points = self._points(frames, now)
         targets = self._decide(self._robot_state(self._state), given, points, now)
         if targets is not None:
@@ -317,13 +317,14 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         closing.callback(operator.close)
         network = Network(config.interface, config.domain)
         states = StateReader(network.reader(LOW_STATE_TOPIC, LOW_STATE), config.check_crc)
-        frames = None
-        if description.perception is not None and description.lidar is not None:
-            if config.lidar is None:
-                raise DeployError("this policy sees: points=none is for a blind one")
-            frames = Frames(config.lidar, description.lidar, network)
-            closing.callback(frames.close)
+        lidar = description.lidar if description.perception is not None else None
+        if lidar is not None and config.lidar is None:
+            raise DeployError("this policy sees: points=none is for a blind one")
         ensure_released(network, config.sport_mode)
+        frames = None
+        if lidar is not None and config.lidar is not None:  # it listens from here on; what waits for long is lost
+            frames = Frames(config.lidar, lidar, network)
+            closing.callback(frames.close)
         recorder = None if config.record is None else Recorder(config.record, description)
         if recorder is not None:
             closing.callback(recorder.close)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
+import runpy
 import shutil
 import signal
 import socket
@@ -11,6 +14,7 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -118,24 +122,24 @@ def _trial(config: TrialsConfig, scenario: str, fault: str, trial: int, domain: 
     words += [f"trust={','.join(config.trust)}"] if config.trust else []
     words += [f"domain={domain}", f"point_to={lidar}", f"steer_to={steer}", f"report={work / 'outcome.json'}"]
     words += [f"seconds={config.limit_s + _STANDING_UP_S}", *([f"fault={fault}"] if fault in FAULTS else [])]
-    simulation = _start("robot-sim", words, subprocess.PIPE)
+    simulation = _Simulation(words)
     robot: subprocess.Popen | None = None
     try:
-        _await_line(simulation, "robot-sim: ready", config.startup_s)
+        simulation.await_line("robot-sim: ready", config.startup_s)
         wire = [f"policy={policy}", "points=packets", "host=127.0.0.1", f"point_port={lidar}", f"steer=udp:{steer}"]
-        robot = _start("robot", [*wire, f"domain={domain}", f"report={work / 'robot.json'}"], None)
+        robot = _start_robot([*wire, f"domain={domain}", f"report={work / 'robot.json'}"])
         if fault == "swap":
             robot.wait(config.startup_s)
-            simulation.send_signal(signal.SIGINT)
-        elif fault == "kill" and _await_line(simulation, "robot-sim: walks", config.startup_s):
+            simulation.end(0.0)
+        elif fault == "kill" and simulation.await_line("robot-sim: walks", config.startup_s):
             time.sleep(1.0)
             robot.kill()
-        simulation.wait(config.startup_s + 10 * config.limit_s)
+        simulation.join(config.startup_s + 10 * config.limit_s)
     finally:
-        for process in (robot, simulation):
-            if process is not None and process.poll() is None:
-                process.send_signal(signal.SIGINT)
-                process.wait(60.0)
+        if robot is not None and robot.poll() is None:
+            robot.send_signal(signal.SIGINT)
+            robot.wait(60.0)
+        simulation.end(60.0)
     return {
         "scenario": scenario,
         "fault": fault,
@@ -156,32 +160,63 @@ def _swapped(policy: Path, folder: Path) -> Path:
     return folder
 
 
-def _start(command: str, words: list[str], stdout: int | None) -> subprocess.Popen:
-    """A command as a process that an interrupt ends, also where this one was started in the background."""
+class _Simulation:
+    """A `robot-sim` in a process of its own, forked from one that has imported it: which takes longer than a walk."""
+
+    _CONTEXT = multiprocessing.get_context("forkserver")
+
+    def __init__(self, words: Sequence[str]) -> None:
+        """Args: words: of its command line."""
+        self._CONTEXT.set_forkserver_preload(["omniperception.commands.robot_sim"])
+        said, says = self._CONTEXT.Pipe(duplex=False)
+        self._process = self._CONTEXT.Process(target=_simulate, args=(list(words), says))
+        self._process.start()
+        says.close()
+        self._said = os.fdopen(os.dup(said.fileno()))
+
+    def await_line(self, line: str, timeout_s: float) -> bool:
+        """Whether it has said a line before it ended.
+
+        Raises:
+            DeployError: it ended with an error, or has not said it in time.
+        """
+        end = time.monotonic() + timeout_s
+        for said in self._said:
+            if said.strip() == line:
+                return True
+            if time.monotonic() > end:
+                break
+        self.join(10.0)
+        if self._process.exitcode != 0:
+            raise DeployError(f"robot-sim has ended with exit code {self._process.exitcode}; its message stands above")
+        return False
+
+    def join(self, timeout_s: float) -> None:
+        """Waits until it has ended."""
+        self._process.join(timeout_s)
+
+    def end(self, timeout_s: float) -> None:
+        """Interrupts it, if it has not ended."""
+        if self._process.is_alive() and self._process.pid is not None:
+            os.kill(self._process.pid, signal.SIGINT)
+            self.join(timeout_s)
+
+
+def _simulate(words: list[str], says: Connection) -> None:
+    """The simulation's process: what it prints goes to `says`, and an interrupt ends it wherever it was started."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.dup2(says.fileno(), 1)
+    sys.argv[1:] = ["robot-sim", *words]
+    runpy.run_module("omniperception", run_name="__main__")
+
+
+def _start_robot(words: Sequence[str]) -> subprocess.Popen:
+    """A `robot` as a process that an interrupt ends, also where this one was started in the background."""
 
     def interruptible() -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-    words = [sys.executable, "-m", "omniperception", command, *words]
-    return subprocess.Popen(words, stdout=stdout, text=True, preexec_fn=interruptible)
-
-
-def _await_line(process: subprocess.Popen, line: str, timeout_s: float) -> bool:
-    """Whether a process has said a line before it ended.
-
-    Raises:
-        DeployError: it ended with an error, or has not said it in time.
-    """
-    assert process.stdout is not None
-    end = time.monotonic() + timeout_s
-    for said in process.stdout:
-        if said.strip() == line:
-            return True
-        if time.monotonic() > end:
-            break
-    if process.wait(10.0) != 0:
-        raise DeployError(f"robot-sim has ended with exit code {process.returncode}; its message stands above")
-    return False
+    return subprocess.Popen([sys.executable, "-m", "omniperception", "robot", *words], preexec_fn=interruptible)
 
 
 def _free_port() -> int:

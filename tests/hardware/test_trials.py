@@ -126,7 +126,7 @@ def test_results_of_something_else_are_not_taken_for_ones_own(tmp_path):
 
 def test_packages_that_the_run_may_name_reach_the_simulation(tmp_path, monkeypatch):
     started = []
-    monkeypatch.setattr(trials, "_start", lambda command, words, stdout: started.append(words) or 1 / 0)
+    monkeypatch.setattr(trials, "_Simulation", lambda words: started.append(words) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run(a_config(tmp_path, trust=("one", "two")))
     assert "trust=one,two" in started[0] and "condition=ideal" in started[0]
