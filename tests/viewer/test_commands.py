@@ -82,6 +82,8 @@ def test_what_would_be_ignored_is_refused(capsys, line, expected):
 def test_the_test_split_is_not_looked_at(capsys):
     message = said(capsys, "evaluate", RUN, "scenario=static", "split=test", "viewer=web")
     assert "viewer=web shows split=dev" in message
+    message = said(capsys, "play", RUN, "viewer=web", "obstacles.split=test")
+    assert "obstacles.split=test is for reports" in message and "no page may see it" in message
 
 
 def test_what_nothing_would_read_is_refused(capsys):
