@@ -19,7 +19,7 @@ from own_robots import skip_if_not_fetched
 PRESETS = sorted(
     str(path.relative_to(config.CONFIG_DIR).with_suffix(""))
     for path in config.CONFIG_DIR.glob("**/*.yaml")
-    if path.parent != config.CONFIG_DIR and path.parent.name != "suite" and not path.name.startswith("_")
+    if path.parent != config.CONFIG_DIR and path.parent.name not in (config.SUITES, config.STUDIES) and not path.name.startswith("_")
 )
 BLIND = ["perception=none", "rewards=walk", "observations=walk"]
 COMPANIONS = {
@@ -36,7 +36,7 @@ LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
 def test_no_preset_is_missed():
     assert len(PRESETS) == 124
     groups = {preset.split("/")[0] for preset in PRESETS}
-    assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()} - {"suite"}
+    assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()} - {config.SUITES, config.STUDIES}
     assert set(COMPANIONS) <= set(PRESETS)
 
 

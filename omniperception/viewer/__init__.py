@@ -6,6 +6,7 @@ knows of the viewer: it reads tasks by what they offer to everybody.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,8 +68,9 @@ def serve_lab(
 
 @contextmanager
 def libraries() -> Iterator[None]:
-    """Turns a missing library of the extra `viewer` into one line."""
+    """Turns a missing library of the extra `viewer` into one line, before a task is built."""
     try:
+        importlib.import_module("viser")
         yield
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("viser", "trimesh", "rich"):

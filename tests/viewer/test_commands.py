@@ -10,6 +10,7 @@ import imageio_ffmpeg
 import pytest
 
 from omniperception.commands import demo, main
+from omniperception.viewer import viewer
 
 RUN = f"run={Path(__file__).parents[2] / 'pretrained' / 'avoider'}"
 
@@ -93,5 +94,6 @@ def test_what_nothing_would_read_is_refused(capsys):
 
 def test_a_missing_library_names_the_extra(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setattr(viewer, "Session", lambda shown: pytest.fail("the task was built before the library was missed"))
     message = said(capsys, "play", RUN, "viewer=web")
     assert "pip install 'omniperception[viewer]'" in message
