@@ -94,6 +94,6 @@ def test_what_nothing_would_read_is_refused(capsys):
 
 def test_a_missing_library_names_the_extra(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.setattr(viewer, "Session", lambda shown: pytest.fail("the task was built before the library was missed"))
+    monkeypatch.setattr(viewer, "Session", lambda shown: pytest.fail("the task was built first"))
     message = said(capsys, "play", RUN, "viewer=web")
     assert "pip install 'omniperception[viewer]'" in message
