@@ -117,7 +117,8 @@ def test_the_tables_of_the_docs_are_those_of_the_files():
 
 
 def test_every_result_on_the_test_split_is_noted():
-    names = ("run", "weights", "policy", "world", "terrain", "condition", "condition_version", "seed", "commit")
+    """By its weights: a study names its runs from its own folder."""
+    names = ("weights", "policy", "world", "terrain", "condition", "condition_version", "seed", "commit")
     lab = ROOT / "docs" / "lab"
     lines = [json.loads(line) for line in (lab / "evaluations.jsonl").read_text().splitlines()]
     for line in lines:
