@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from torch import nn
 
 from benchmarks.harness.table import Table, about, report
 from omniperception import build, config
@@ -28,6 +27,7 @@ from omniperception.config import ConfigError
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.baselines import baseline, prepared
 from omniperception.evaluation.episodes import run_episodes
+from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.report import rate_cell
 from omniperception.learning import CheckpointError
 from omniperception.learning.models import PerceptionActor
@@ -42,7 +42,7 @@ PARTS = {
 """Rows of the table, and what is true in each."""
 ALL = "all obstacles, at every step"
 NEAR_M, MOVES_M_S, NOTICED_M = 2.5, 0.3, 0.5
-"""Obstacles that count for the errors: so near, so fast; one is noticed where its distance is known so well."""
+"""Sectors that count for the errors: their obstacle so near, so fast; noticed where its distance is known so well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,37 +58,33 @@ class Arguments:
     folder: Path = argument(Path("outputs/perceived_parts"), "where the table goes")
 
 
-class PartlyTrue(nn.Module):
+class PartlyTrue(MotionReadOut):
     """A read-out of which parts of the motion by sector are the simulator's.
 
     Attributes:
-        moving, noticed: obstacles that move near a robot, and how many of them are noticed.
+        moving, noticed: sectors in which something moves near a robot, and how many of them are noticed.
         velocity_error: sum over those noticed (m/s).
     """
 
     def __init__(self, own: MotionReadOut, env: OmniEnv, parts: Sequence[str]) -> None:
         """Args: own: the policy's; env: knows the truth; parts: of "distance" and "velocity", those that are true."""
-        super().__init__()
-        self.own, self._env, self._parts = own, env, parts
+        assert env.avoidance is not None and env.avoidance.motion is not None  # the network is supervised with it
+        super().__init__(own.feature_dim, env.avoidance.motion[0].numel(), own.part, own.velocity_risk)
+        self.layers, self.candidates = own.layers, own.candidates
+        self._avoidance, self._num_envs, self._parts = env.avoidance, env.num_envs, parts
         self.moving = self.noticed = 0
         self.velocity_error = 0.0
 
-    def extend(self, embedding: torch.Tensor) -> torch.Tensor:
-        """As :meth:`MotionReadOut.extend`; an embedding that is not of all environments is that of no frames."""
-        motion = self.own.motion(embedding)
-        if len(motion) == self._env.num_envs:
-            assert self._env.avoidance is not None and self._env.avoidance.motion is not None
-            true = encode(self._env.avoidance.motion)
-            self._count(decode(motion), self._env.avoidance.motion)
-            distance = true if "distance" in self._parts else motion
-            velocity = true if "velocity" in self._parts else motion
-            motion = torch.cat((distance[..., :1], velocity[..., 1:]), -1)
-        risk = self.own.velocity_risk.risk(decode(motion), self.own.candidates)
-        return torch.cat((embedding, risk), -1)
-
-    def velocity(self, features: torch.Tensor, command: torch.Tensor) -> torch.Tensor:
-        """As :meth:`MotionReadOut.velocity`, of extended embeddings."""
-        return self.own.velocity(features, command)
+    def motion(self, embedding: torch.Tensor) -> torch.Tensor:
+        """As of :class:`MotionReadOut`; an embedding that is not of all environments is that of no frames."""
+        said, true = super().motion(embedding), self._avoidance.motion
+        if len(said) != self._num_envs or true is None:
+            return said
+        self._count(decode(said), true)
+        told = encode(true)
+        distance = told if "distance" in self._parts else said
+        velocity = told if "velocity" in self._parts else said
+        return torch.cat((distance[..., :1], velocity[..., 1:]), -1)
 
     def _count(self, said: torch.Tensor, true: torch.Tensor) -> None:
         moves = (true[..., 0] < NEAR_M) & (true[..., 1:].norm(dim=-1) >= MOVES_M_S)
@@ -98,17 +94,14 @@ class PartlyTrue(nn.Module):
         self.velocity_error += float((said[..., 1:] - true[..., 1:]).norm(dim=-1)[noticed].sum())
 
 
-def run_with(run: RunConfig, run_dir: Path, parts: Sequence[str], trials: int) -> tuple[torch.Tensor, dict[str, float]]:
-    """Trials of a run with parts of what it perceives replaced by the truth.
+def run_with(run: RunConfig, run_dir: Path, parts: Sequence[str], trials: int) -> tuple[Episodes, PartlyTrue]:
+    """Trials of a run with parts of what it perceives replaced by the truth, and the read-out that did it.
 
     Args:
         run: its configuration, in the world.
         run_dir: its folder.
         parts: see `PartlyTrue`.
         trials: how many.
-
-    Returns:
-        (trials,) bool, which reached the goal untouched and without a fall, and figures by heading of the table.
 
     Raises:
         ConfigError: its avoidance velocity does not follow from motion by sector.
@@ -118,21 +111,15 @@ def run_with(run: RunConfig, run_dir: Path, parts: Sequence[str], trials: int) -
     trained = build.load_policy(_prepared(run, "run"), run_dir)
     actor = trained.policy
     assert isinstance(actor, PerceptionActor) and isinstance(actor.read_out, MotionReadOut)  # as the weight asks for
-    partly = actor.read_out = PartlyTrue(actor.read_out, trained.env, parts)  # type: ignore[assignment]
-    episodes = run_episodes(trained.env, actor, trials)
-    errors = {
-        "noticed, %": 100 * partly.noticed / max(partly.moving, 1),
-        "velocity error, m/s": partly.velocity_error / max(partly.noticed, 1),
-    }
-    return episodes.clean, {"falls, %": 100 * float(episodes.happened()["fall"].float().mean())} | errors
+    partly = actor.read_out = PartlyTrue(actor.read_out, trained.env, parts)
+    return run_episodes(trained.env, actor, trials), partly
 
 
-def run_with_all(run: RunConfig, run_dir: Path, trials: int) -> tuple[torch.Tensor, dict[str, float]]:
-    """The same of the gait that is told everything."""
+def run_with_all(run: RunConfig, run_dir: Path, trials: int) -> Episodes:
+    """Trials of the gait that is told everything."""
     trained = build.load_policy(_prepared(run, "oracle"), run_dir)
     policy = baseline("oracle", trained.env, trained.policy, run.env.rewards.avoidance, None)
-    episodes = run_episodes(trained.env, policy, trials)
-    return episodes.clean, {"falls, %": 100 * float(episodes.happened()["fall"].float().mean())}
+    return run_episodes(trained.env, policy, trials)
 
 
 def _prepared(run: RunConfig, policy: str) -> RunConfig:
@@ -152,14 +139,16 @@ def main(given: Arguments, overrides: list[str]) -> None:
         run = build.load_run(run_dir, place)
         build.check_split(run, "study")
         for name in (*PARTS, ALL):
-            parts = PARTS.get(name)
-            if parts is None:
-                clean, figures = run_with_all(run, run_dir, given.trials)
+            errors = ["", ""]
+            if name == ALL:
+                episodes = run_with_all(run, run_dir, given.trials)
             else:
-                clean, figures = run_with(run, run_dir, parts, given.trials)
-            numbers = [f"{figures[column]:.2f}" if column in figures else "" for column in columns[3:]]
-            table.rows.append((scenario, name, rate_cell([clean]), *numbers))
-            print(f"{scenario}, {name}: {rate_cell([clean])}", flush=True)
+                episodes, partly = run_with(run, run_dir, PARTS[name], given.trials)
+                noticed, error = partly.noticed / max(partly.moving, 1), partly.velocity_error / max(partly.noticed, 1)
+                errors = [f"{100 * noticed:.2f}", f"{error:.2f}"]
+            falls = 100 * float(episodes.happened()["fall"].float().mean())
+            table.rows.append((scenario, name, rate_cell([episodes.clean]), f"{falls:.2f}", *errors))
+            print(f"{scenario}, {name}: {rate_cell([episodes.clean])}", flush=True)
     report([table], about(1, run=str(run_dir), overrides=overrides), given.folder)
 
 
