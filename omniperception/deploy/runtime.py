@@ -123,7 +123,7 @@ class ExportedPolicy:
             raise DeployError(f"{path} cannot be loaded ({str(error).splitlines()[0][:160]}); export again") from None
         policy = cls(description, session, safety)
         belongs = session.get_modelmeta().custom_metadata_map.get(FINGERPRINT)
-        if belongs != description.fingerprint or checksum(path) != description.checksums["onnx"]:
+        if belongs != description.fingerprint or checksum(path) != description.checksums.get("onnx"):
             raise DeployError(f"{path} and {FILE} are not from the same export, or were changed; export again")
         return policy
 
@@ -271,9 +271,17 @@ class ExportedPolicy:
 
     def _check(self, state: RobotState, command: np.ndarray, safety: Safety) -> None:
         """Raises SafetyStop where the state is no state to walk in, or a number is not finite."""
-        for name in ("joint_pos", "joint_vel", "base_quat", "base_ang_vel"):
-            if not np.isfinite(np.asarray(getattr(state, name), np.float64)).all():
-                raise SafetyStop(f"{name}: finite numbers were expected, {getattr(state, name)} given")
+        given: dict[str, ArrayLike] = {
+            name: getattr(state, name) for name in ("joint_pos", "joint_vel", "base_quat", "base_ang_vel")
+        }
+        given |= {} if state.base_lin_vel is None else {"base_lin_vel": state.base_lin_vel}
+        for name, value in (given | dict(state.other or {})).items():
+            if not np.isfinite(np.asarray(value, np.float64)).all():
+                raise SafetyStop(f"{name}: finite numbers were expected, {np.asarray(value).tolist()} given")
+        if np.shape(state.base_quat) == (4,) and not abs(np.linalg.norm(state.base_quat) - 1.0) < _UNIT:
+            raise SafetyStop(
+                f"base_quat: a unit quaternion (w, x, y, z) was expected, {np.asarray(state.base_quat).tolist()} given"
+            )
         joint_pos, joint_vel = (np.asarray(value, np.float32) for value in (state.joint_pos, state.joint_vel))
         if joint_pos.shape == joint_vel.shape == self._default_pos.shape:  # otherwise the observation names it
             safety.check_state(-float(_projected_gravity(self, state, command)[2]), joint_pos, joint_vel)
@@ -420,11 +428,15 @@ def _projected_gravity(policy: ExportedPolicy, state: RobotState, command: Array
     return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], np.float32)
 
 
+_UNIT = 1e-2
+"""By how much the length of a unit quaternion may be off."""
+
+
 def _quaternion(given: ArrayLike) -> np.ndarray:
     """(4,) float64 of unit length."""
     quat = np.asarray(given, np.float64)
     length = float(np.linalg.norm(quat)) if quat.shape == (4,) else float("nan")
-    if not abs(length - 1.0) < 1e-2:
+    if not abs(length - 1.0) < _UNIT:
         raise DeployError(f"base_quat: a unit quaternion (w, x, y, z) was expected, {quat.tolist()} given")
     return quat / length
 

@@ -14,6 +14,7 @@ import numpy as np
 from omniperception.deploy.description import DeployError
 from omniperception.deploy.go2 import MOTORS
 from omniperception.hardware.clouds import Points, read_custom_msg, read_point_cloud2
+from omniperception.hardware.machine import Mode
 from omniperception.hardware.messages import LOW_STATE
 
 _CLOUDS: dict[str, Callable[[bytes], Points]] = {
@@ -22,6 +23,7 @@ _CLOUDS: dict[str, Callable[[bytes], Points]] = {
 }
 _LOW_STATE, _JOINTS, _IMU = "unitree_go/msg/LowState", "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
 _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
+_MODE, _MODES = "std_msgs/msg/String", tuple(Mode)
 OUTPUTS = "/policy/"
 """Topics that begin so are what a policy has said."""
 
@@ -158,6 +160,10 @@ def events(path: Path, wanted: Topics) -> Iterator[Event]:
         raise DeployError(f"{path}: the base's orientation was expected, a topic of type {_IMU}; none is there")
     points = _chosen(path, inputs, tuple(_CLOUDS), wanted.points, "points")
     command = _chosen(path, inputs, _TWISTS, wanted.command, "commands")
+    read = {"joints": low or joints, "orientation": low or imu, "points": points, "commands": command}
+    print(
+        f"{path}: " + ", ".join(f"{what} from {topic or 'no topic'}" for what, topic in read.items()), file=sys.stderr
+    )
     assembled, begin, has_imu = LOW_STATE.zeros(), None, False
     for message in messages(path):
         begin = message.time_ns if begin is None else begin
@@ -175,8 +181,8 @@ def events(path: Path, wanted: Topics) -> Iterator[Event]:
             yield Event(now, points=_CLOUDS[message.kind](message.data))
         elif topic == command:
             yield Event(now, command=_command(message.decode()))
-        elif topic == "/mode":
-            yield Event(now, mode=message.decode().data)
+        elif topic == "/mode" and message.kind == _MODE and (mode := message.decode().data).partition(":")[0] in _MODES:
+            yield Event(now, mode=mode)
         elif topic == f"{OUTPUTS}joint_targets":
             yield Event(now, targets=_in_motors_order(path, message.decode(), "position"))
 
@@ -216,6 +222,8 @@ def _in_motors_order(path: Path, message: Any, field: str) -> np.ndarray:
         )
     if not len(values):
         return np.zeros(len(MOTORS))
+    if len(values) != len(names):
+        raise DeployError(f"{path}: {len(names)} joints are named, and {field} has {len(values)} numbers")
     return values[[names.index(name) for name in MOTORS]]
 
 

@@ -178,7 +178,9 @@ def read_point_cloud2(data: bytes) -> Points:
     """
     try:
         return _point_cloud2(data)
-    except (struct.error, ValueError) as error:
+    except DeployError:
+        raise
+    except (struct.error, TypeError, ValueError) as error:
         raise DeployError(f"PointCloud2: {error}") from None
 
 
@@ -190,8 +192,8 @@ def _point_cloud2(data: bytes) -> Points:
     fields = {}
     for _ in range(cdr.read("I")):
         name, offset, kind, _ = cdr.text(), cdr.read("I"), cdr.read("B"), cdr.read("I")
-        fields[name] = ("<" + point_fields.TYPES.get(kind, "V"), offset)
-    big_endian, step, _ = cdr.read("B"), cdr.read("I"), cdr.read("I")
+        fields[name] = ("<" + point_fields.TYPES[kind] if kind in point_fields.TYPES else "V1", offset)
+    big_endian, step, row_step = cdr.read("B"), cdr.read("I"), cdr.read("I")
     time_field = next((name for name in _TIME_FIELDS if name in fields), None)
     if big_endian or not {"x", "y", "z"} <= set(fields) or time_field is None:
         raise DeployError(
@@ -207,10 +209,19 @@ def _point_cloud2(data: bytes) -> Points:
             "itemsize": step,
         }
     )
-    rows = np.frombuffer(cdr.bytes(), dtype, width * height)
-    points = np.nan_to_num(np.stack([rows[axis].astype(np.float32) for axis in "xyz"], 1), posinf=0.0, neginf=0.0)
+    if any(dtype[name].kind == "V" for name in names):
+        raise DeployError(f"PointCloud2: numbers were expected in {', '.join(names)}")
+    padded = height > 1 and row_step > width * step
+    strides = (row_step if padded else width * step, step)
+    rows = np.ndarray((height, width), dtype, cdr.bytes(), strides=strides).reshape(-1)
+    points = np.stack([rows[axis].astype(np.float32) for axis in "xyz"], 1)
+    points[~np.isfinite(points).all(axis=1)] = 0.0
     times = rows[time_field]
     if time_field == "timestamp":
+        if times.dtype.kind == "f" and (times != np.floor(times)).any():
+            raise DeployError(
+                f"PointCloud2: timestamp in nanoseconds, as of livox_ros_driver2, was expected, {times[0]!r} given"
+            )
         times_ns = times.astype(np.int64)
     elif times.dtype.kind == "f":
         times_ns = stamp + np.rint(times.astype(np.float64) * 1e9).astype(np.int64)

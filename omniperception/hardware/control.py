@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -16,14 +17,14 @@ import numpy as np
 
 from omniperception.deploy import DeployError, ExportedPolicy, RobotState, SafetyStop
 from omniperception.deploy.description import FILE, Description
-from omniperception.deploy.go2 import MOTORS
+from omniperception.deploy.go2 import MOTORS, RANGES
 from omniperception.deploy.odometry import Odometry
 from omniperception.hardware.clouds import Frame, Points
 from omniperception.hardware.dds import LOW_STATE_TOPIC, Network
 from omniperception.hardware.guard import GuardConfig, Link, StateReader, start
 from omniperception.hardware.legs import base_velocity
 from omniperception.hardware.lidar import Frames, LidarSource
-from omniperception.hardware.machine import MachineConfig, Mode, Request
+from omniperception.hardware.machine import DRIVEN, MachineConfig, Mode, Request
 from omniperception.hardware.messages import LOW_STATE, remote
 from omniperception.hardware.operator import Goal, Operator, make_operator
 from omniperception.hardware.recording import Recorder, Step
@@ -97,6 +98,10 @@ class Report:
         return f"{len(self.step_ms)} steps, {self.late} late; p50 {p50:.2f} ms, p99 {p99:.2f} ms; {counts}"
 
 
+_ROUNDING = 1e-3
+"""Difference (rad) up to which two angles of a robot's description are the same."""
+
+
 def motor_order(description: Description) -> np.ndarray:
     """(12,) motor of each joint of the policy.
 
@@ -107,6 +112,13 @@ def motor_order(description: Description) -> np.ndarray:
     if set(names) != set(MOTORS) or len(names) != len(MOTORS):
         other = sorted(set(names) ^ set(MOTORS))
         raise DeployError(f"the policy moves another robot than a Go2: {', '.join(other[:4])} ...")
+    for name, lower, upper in zip(names, description.joints.lower, description.joints.upper, strict=True):
+        lowest, highest = RANGES[name]
+        if (lower is not None and lower < lowest - _ROUNDING) or (upper is not None and upper > highest + _ROUNDING):
+            raise DeployError(
+                f"the policy moves another robot than a Go2: its {name} goes from {lower} to {upper} rad, a Go2's from"
+                f" {lowest} to {highest}"
+            )
     return np.array([MOTORS.index(name) for name in names])
 
 
@@ -183,6 +195,7 @@ class Control:
 
     Attributes:
         policy: with its memory.
+        missed: frames that were due and did not come.
     """
 
     def __init__(
@@ -204,6 +217,8 @@ class Control:
         self._is_led = isinstance(operator, Goal)
         self._needs_velocity = not described.estimated and (moves or "base_lin_vel" in observed)
         self._state: np.ndarray | None = None
+        self._heard, self._stopped = -math.inf, ""
+        self.missed = 0
         self._mode, self._last_frame = Mode.DAMPING, math.inf
         self._velocity = np.zeros(3)
         self._begin_odometry()
@@ -214,11 +229,14 @@ class Control:
     def step(self, now: float) -> bool:
         """One control step; False without a state of the robot so far."""
         newest = self._states.newest()
-        self._state = newest if newest is not None else self._state
+        if newest is not None:
+            self._state, self._heard = newest, now
         frames = [] if self._frames is None else self._frames.new()
         if self._listener is not None and self._frames is not None:
-            for received in self._frames.received:
-                self._listener.points(now, received)
+            received = self._frames.received
+            if received:  # in one message: a thread beside the loop encodes it
+                points_of, times_of = ([getattr(part, name) for part in received] for name in ("points", "times_ns"))
+                self._listener.points(now, Points(np.concatenate(points_of), np.concatenate(times_of)))
         self._link.poll()
         if self._state is None:
             return False
@@ -227,8 +245,9 @@ class Control:
         command, asked = self._operator.poll(now, remote(self._state["wireless_remote"]), self._pose)
         for request in asked:
             self._link.ask(request)
-        entered, self._mode = self._link.mode is not self._mode, self._link.mode
-        if entered or self._mode is not Mode.POLICY:
+        before, self._mode = self._mode, self._link.mode
+        drives_on = before in DRIVEN and self._mode in DRIVEN
+        if not drives_on:
             self.policy.reset()  # what it would do from here, not what it would have done since: nobody follows it
             if self._mode is Mode.POLICY:
                 if self.policy.safety is not None:
@@ -237,7 +256,8 @@ class Control:
         given = command if self._mode is Mode.POLICY else np.zeros(3)
         points = self._points(frames, now)
         targets = self._decide(self._robot_state(self._state), given, points, now)
-        if targets is not None:
+        is_heard = now - self._heard <= MachineConfig.state_age_s  # from an older state nothing follows
+        if targets is not None and is_heard:
             self._link.send_targets(targets)
         if self._listener is not None:
             mode = f"{self._mode}: {self._link.reason}"
@@ -253,8 +273,10 @@ class Control:
         try:
             targets = self.policy.step(state, command, points)
         except SafetyStop as stop:
-            if self._mode is Mode.POLICY:
+            if self._mode in DRIVEN or str(stop) != self._stopped:
                 print(f"stop: {stop}", file=sys.stderr, flush=True)
+            self._stopped = str(stop)
+            if self._mode in DRIVEN:
                 self._link.ask(Request.DAMP)
                 if self._listener is not None:
                     self._listener.stop(now, str(stop))
@@ -272,6 +294,7 @@ class Control:
             if now - self._last_frame > 1.5 * period:
                 self._last_frame += period
                 self.policy.miss()
+                self.missed += self._mode in DRIVEN
             return None
         self._last_frame = now
         return self.policy.thin(frames[-1].points, frames[-1].offsets_s)
@@ -332,26 +355,34 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         closing.callback(link.close)
         control = Control(policy, states, frames, operator, link, recorder)
         try:
-            begins, times = _loop(control, link, description.control_period_s, config.seconds, should_end)
+            begins, times, skipped = _loop(control, link, description.control_period_s, config.seconds, should_end)
         finally:
-            if link.mode in (Mode.STANDING, Mode.STANDING_UP, Mode.POLICY):
+            if link.mode in (Mode.STANDING, Mode.STANDING_UP, *DRIVEN):
                 link.ask(Request.LIE)
-        if link.is_closed and guard.poll() not in (None, 0):
-            raise DeployError("the guard has ended; its message stands above")
-    counts = {} if policy.safety is None else dict(policy.safety.counts)
-    counts |= {"states refused": states.refused} | ({} if frames is None else frames.counts())
-    number = 0 if frames is None else frames.number
-    report = Report(np.array(begins), np.array(times), 1e3 * description.control_period_s, number, counts)
-    if config.report is not None:
-        report.write(config.report)
+            if link.mode in DRIVEN:  # it slows the robot down before the guard lays it down
+                _loop(control, link, description.control_period_s, 2.0, lambda: link.mode not in DRIVEN)
+        if link.is_closed:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                guard.wait(1.0)
+            if guard.returncode != 0:
+                raise DeployError("the guard has ended; its message stands above")
+        counts = {} if policy.safety is None else dict(policy.safety.counts)
+        counts |= {"steps skipped": skipped, "states refused": states.refused, "states repeated": states.repeated}
+        if frames is not None:
+            counts |= {"frames missed": control.missed} | frames.counts()
+        number = 0 if frames is None else frames.number
+        report = Report(np.array(begins), np.array(times), 1e3 * description.control_period_s, number, counts)
+        if config.report is not None:
+            report.write(config.report)
     return report
 
 
 def _loop(
     control: Control, link: Link, period_s: float, seconds: float | None, should_end: Callable[[], bool]
-) -> tuple[list[float], list[float]]:
-    """How long after their time the steps began, and how long they took, ms."""
+) -> tuple[list[float], list[float], int]:
+    """How long after their time the steps began, how long they took, ms, and how many a stall has cost."""
     begin = due = time.monotonic()
+    skipped = 0
     begins: list[float] = []
     times: list[float] = []
     try:
@@ -360,8 +391,10 @@ def _loop(
             if control.step(now):
                 begins.append(1e3 * (now - due))
                 times.append(1e3 * (time.monotonic() - now))
-            due = max(due + period_s, time.monotonic() - period_s)
+            due += period_s
+            missed = max(0, math.ceil((time.monotonic() - due) / period_s) - 1)  # a stall's steps are not made up for
+            due, skipped = due + missed * period_s, skipped + missed
             time.sleep(max(0.0, due - time.monotonic()))
     except KeyboardInterrupt:
         print("ended: the guard lays the robot down", file=sys.stderr)
-    return begins, times
+    return begins, times, skipped

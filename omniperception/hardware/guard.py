@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import select
+import signal
 import socket
 import struct
 import subprocess
@@ -27,6 +28,10 @@ from omniperception.hardware.machine import Drive, Machine, MachineConfig, Mode,
 from omniperception.hardware.messages import LOW_CMD, LOW_STATE, crc, low_cmd, remote, sealed
 
 PERIOD_S = 0.002
+_RESTART_MS = 1000
+"""A state's clock that is as much behind the one before has begun again."""
+_DISCOVERY = 10
+"""Times `listen_s` that a guard waits for the first state, before it listens for others."""
 MODES, REQUESTS = tuple(Mode), tuple(Request)
 _TARGETS = struct.Struct("<B12f")
 _TARGETS_KIND = 255
@@ -76,12 +81,15 @@ class StateReader:
 
     Attributes:
         refused: states whose length or checksum was wrong.
+        repeated: states that were not newer than the one before, by their own clock.
     """
 
     def __init__(self, reader: Reader, check_crc: bool) -> None:
-        """Args: reader: of rt/lowstate; check_crc: whether checksums matter."""
+        """Args: reader: of rt/lowstate; check_crc: whether checksums and the states' own clock matter: simulators that
+        fill neither need false."""
         self._reader, self._check_crc = reader, check_crc
-        self.refused = 0
+        self.refused = self.repeated = 0
+        self._tick: int | None = None
 
     def newest(self) -> np.ndarray | None:
         """() LOW_STATE that has come since the call before; None without a valid one."""
@@ -94,9 +102,19 @@ class StateReader:
                 continue
             if self._check_crc and crc(state) != state["crc"]:
                 self.refused += 1
+            elif self._check_crc and not self._is_newer(int(state["tick"])):
+                self.repeated += 1
             else:
                 newest = state
         return newest
+
+    def _is_newer(self, tick: int) -> bool:
+        """Whether a state's clock (ms) has gone on, or began again."""
+        before = self._tick
+        if before is None or not -_RESTART_MS < (tick - before + 2**31) % 2**32 - 2**31 <= 0:
+            self._tick = tick
+            return True
+        return False
 
 
 def sensed(state: np.ndarray, now: float) -> Sensed:
@@ -124,17 +142,22 @@ class Link:
         self._end = end
         end.setblocking(False)
         self.mode, self.reason, self.is_closed = Mode.DAMPING, "start", False
+        self._unsent: list[bytes] = []
 
     def send_targets(self, targets: np.ndarray) -> None:
         """Joint targets (12,), rad, in the motors' order."""
         self._send(_TARGETS.pack(_TARGETS_KIND, *targets))
 
     def ask(self, request: Request) -> None:
-        """A request."""
-        self._send(bytes([REQUESTS.index(request)]))
+        """A request; it is sent again by `poll` where the guard is behind."""
+        data = bytes([REQUESTS.index(request)])
+        if not self._send(data):
+            self._unsent.append(data)
 
     def poll(self) -> None:
         """Reads what the guard has said of itself."""
+        while self._unsent and self._send(self._unsent[0]):
+            self._unsent.pop(0)
         while True:
             try:
                 said = self._end.recv(512)
@@ -152,13 +175,15 @@ class Link:
         self._end.close()
         self.is_closed = True
 
-    def _send(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> bool:
+        """Whether it need not be sent again; targets that the guard has no room for are not: newer ones follow."""
         try:
             self._end.send(data)
         except BlockingIOError:
-            return  # the guard is behind; it will read the newest soon enough
+            return False
         except OSError:
             self.is_closed = True
+        return True
 
 
 def start(config: GuardConfig) -> tuple[Link, subprocess.Popen]:
@@ -187,18 +212,26 @@ class Guard:
         self._writer = network.writer(LOW_CMD_TOPIC, LOW_CMD)
         self._held: set[Request] = set()
         self._gone_since: float | None = None
+        self._is_asked_to_leave = False
         self._said = b""
 
     def _refuse_others(self, network: Network) -> None:
+        """Listens from the first state on: before it, nobody may have been found on the network yet."""
         others = network.reader(LOW_CMD_TOPIC, LOW_CMD)
-        end = time.monotonic() + self._config.listen_s
+        heard, end = False, time.monotonic() + _DISCOVERY * self._config.listen_s
         while time.monotonic() < end:
+            if not heard and self._states.newest() is not None:
+                heard, end = True, time.monotonic() + self._config.listen_s
             if others.take():
                 raise DeployError(
                     "somebody else writes rt/lowcmd: end that program, and release the on-board sport mode in Unitree's"
                     " app or with MotionSwitcherClient.ReleaseMode()"
                 )
             time.sleep(0.01)
+
+    def leave(self, *_: object) -> None:
+        """As when the policy's process has gone: a handler of signals."""
+        self._is_asked_to_leave = True
 
     def run(self) -> None:
         """Until the policy's process has gone and the joints have been damped for a while."""
@@ -235,6 +268,8 @@ class Guard:
         self._held = asked
 
     def _read_link(self, now: float) -> None:
+        if self._is_asked_to_leave and self._gone_since is None:
+            self._gone_since = now
         while self._gone_since is None:
             try:
                 data = self._link.recv(256)
@@ -285,6 +320,7 @@ def main(argv: list[str], exit_with: Callable[[int], None] = sys.exit) -> None:
     except DeployError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         return exit_with(2)
+    signal.signal(signal.SIGTERM, guard.leave)
     guard.run()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -129,12 +130,21 @@ class _Topic:
         custom = source.kind == "CustomMsg"
         self._reader: Reader = network.reader(source.topic, CUSTOM_MSG if custom else POINT_CLOUD2, 16)
         self._decode = read_custom_msg if custom else read_point_cloud2
+        self._refused = 0
 
     def read(self) -> list[Points]:
-        return [self._decode(data) for data in self._reader.take()]
+        read = []
+        for data in self._reader.take():
+            try:
+                read.append(self._decode(data))
+            except DeployError as error:
+                self._refused += 1
+                if self._refused == 1:  # the robot stands without frames; this is why
+                    print(f"refused: {error}", file=sys.stderr, flush=True)
+        return read
 
     def counts(self) -> dict[str, int]:
-        return {}
+        return {"messages refused": self._refused}
 
     def close(self) -> None:
         """The network ends it."""

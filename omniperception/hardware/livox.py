@@ -9,11 +9,13 @@ from __future__ import annotations
 import binascii
 import contextlib
 import ipaddress
+import select
 import socket
 import struct
 import time
 import zlib
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,7 +155,10 @@ def read_discovery(message: Message) -> Sensor | None:
 
 def configuration(host: str, point_port: int = HOST_POINT_PORT) -> bytes:
     """Data of CONFIGURE: Cartesian points in mm, to this host, and sampling."""
-    address = ipaddress.IPv4Address(host).packed
+    try:
+        address = ipaddress.IPv4Address(host).packed
+    except ValueError:
+        raise DeployError(f"host={host}: an address such as 192.168.1.50 was expected") from None
     values = (
         (_POINT_TYPE_KEY, bytes([_CARTESIAN_MM])),
         (_POINT_HOST_KEY, address + struct.pack("<HH", point_port, POINT_PORT)),
@@ -187,7 +192,8 @@ class Mid360:
         self.host = host
         self.sensor: Sensor | None = None
         self.lost = self.doubled = self.other = 0
-        self._recent: list[int] = []
+        self._recent: deque[tuple[int, int]] = deque(maxlen=64)
+        self._newest: tuple[int, int] | None = None
         self._socket = _socket(host, point_port)
         self.point_port = self._socket.getsockname()[1]
 
@@ -197,12 +203,16 @@ class Mid360:
         Raises:
             DeployError: none has answered, or it has refused.
         """
-        with _socket(self.host, HOST_COMMAND_PORT if port == DETECTION_PORT else 0) as own:
+        is_real = port == DETECTION_PORT
+        with contextlib.ExitStack() as open_sockets:
+            own = open_sockets.enter_context(_socket(self.host, DETECTION_PORT if is_real else 0, shared=True))
             own.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            for answer in _ask(own, Message(SEARCH, 1, False, b""), (broadcast, port), timeout_s):
+            # it answers to everybody, which a socket of one address does not hear
+            everybody = open_sockets.enter_context(_socket("0.0.0.0", own.getsockname()[1], shared=True))
+            for answer in _ask((own, everybody), Message(SEARCH, 1, False, b""), (broadcast, port), timeout_s):
                 sensor = read_discovery(answer)
                 if sensor is not None:
-                    self._configure(own, sensor, timeout_s)
+                    self._configure(sensor, HOST_COMMAND_PORT if is_real else 0, timeout_s)
                     self.sensor = sensor
                     return sensor
         raise DeployError(
@@ -210,14 +220,15 @@ class Mid360:
             " address in the sensor's network (usually 192.168.1.x)"
         )
 
-    def _configure(self, own: socket.socket, sensor: Sensor, timeout_s: float) -> None:
+    def _configure(self, sensor: Sensor, port: int, timeout_s: float) -> None:
         request = Message(CONFIGURE, 2, False, configuration(self.host, self.point_port))
-        for answer in _ask(own, request, (sensor.address, sensor.command_port), timeout_s):
-            if answer.command == CONFIGURE and answer.is_answer and len(answer.data) >= 3:
-                failed, key = struct.unpack_from("<BH", answer.data)
-                if failed:
-                    raise DeployError(f"the Mid-360 {sensor.serial} refuses key 0x{key:04x} (code {failed})")
-                return
+        with _socket(self.host, port) as own:
+            for answer in _ask((own,), request, (sensor.address, sensor.command_port), timeout_s):
+                if answer.command == CONFIGURE and answer.is_answer and len(answer.data) >= 3:
+                    failed, key = struct.unpack_from("<BH", answer.data)
+                    if failed:
+                        raise DeployError(f"the Mid-360 {sensor.serial} refuses key 0x{key:04x} (code {failed})")
+                    return
         raise DeployError(f"the Mid-360 {sensor.serial} at {sensor.address} has not answered to its configuration")
 
     def packets(self) -> Iterator[Packet]:
@@ -230,53 +241,55 @@ class Mid360:
             packet = read_points(data)
             if packet is None:
                 self.other += 1
-            elif packet.number in self._recent:
+            elif (which := (packet.number, int(packet.times_ns[0]))) in self._recent:
                 self.doubled += 1
             else:
-                self._note(packet.number)
+                self._recent.append(which)
+                self._note(*which)
                 yield packet
 
-    def _note(self, number: int) -> None:
-        """Counts gaps in the packets' numbers; one that comes late after all is no gap."""
-        if self._recent:
-            ahead = (number - self._recent[-1]) & 0xFFFF
+    def _note(self, number: int, time_ns: int) -> None:
+        """Counts gaps in the packets' numbers. One that comes late after all is no gap; where a later packet has a
+        lower number, counting began again: the sensor was switched on, or counts the packets of a frame."""
+        if self._newest is not None:
+            ahead, later = (number - self._newest[0]) & 0xFFFF, time_ns > self._newest[1]
             if 1 <= ahead < 0x8000:
                 self.lost += ahead - 1
-            else:
+            elif not later:
                 self.lost = max(0, self.lost - 1)
-                self._recent.insert(-1, number)
                 return
-        self._recent = [*self._recent[-31:], number]
+        self._newest = (number, time_ns)
 
     def close(self) -> None:
         """Ends listening."""
         self._socket.close()
 
 
-def _socket(host: str, port: int) -> socket.socket:
+def _socket(host: str, port: int, shared: bool = False) -> socket.socket:
+    """Listens at an address; shared: also where another does."""
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    if shared:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     made.setblocking(False)
     try:
         made.bind((host, port))
-    except OSError as error:
+    except (OSError, OverflowError) as error:
         made.close()
-        raise DeployError(f"host={host}: port {port} cannot be listened to ({error.strerror})") from None
+        raise DeployError(f"host={host}: port {port} cannot be listened to ({error})") from None
     return made
 
 
-def _ask(own: socket.socket, request: Message, to: tuple[str, int], timeout_s: float) -> Iterator[Message]:
-    """Answers that come, while the request is repeated once a second."""
+def _ask(heard: Sequence[socket.socket], request: Message, to: tuple[str, int], timeout_s: float) -> Iterator[Message]:
+    """Answers that come to any of some sockets, while the first of them repeats the request once a second."""
     end, again = time.monotonic() + timeout_s, 0.0
     while time.monotonic() < end:
         if time.monotonic() >= again:
             again = time.monotonic() + 1.0
             with contextlib.suppress(OSError):  # a network that is still down
-                own.sendto(write_message(request), to)
-        try:
-            answer = read_message(own.recv(2048))
-        except BlockingIOError:
-            time.sleep(0.005)
-            continue
-        if answer is not None:
-            yield answer
+                heard[0].sendto(write_message(request), to)
+        ready, _, _ = select.select(heard, [], [], 0.005)
+        for one in ready:
+            answer = read_message(one.recv(2048))
+            if answer is not None:
+                yield answer

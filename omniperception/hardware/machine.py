@@ -1,7 +1,9 @@
 """What stands between a policy and the motors: modes, the ways between them, and watchdogs.
 
-    damping --stand--> standing up --> standing --walk--> policy --stand--> standing --lie--> lying down --> damping
-                                                            '--- the policy is silent --------^
+    damping --stand--> standing up --> standing --walk--> policy --stand--> slowing down --> standing
+                                  standing --lie--> lying down --> damping
+                                                          policy --lie--> slowing down --> lying down --> damping
+                                      policy, slowing down --the policy is silent--> damping
     every mode --fault--> damping       every mode --e-stop--> stopped, for good
 
 Pure functions of time and messages: `guard` runs them on the wire. Arrays are in the order of the motors.
@@ -26,8 +28,13 @@ class Mode(StrEnum):
     STANDING_UP = "standing up"
     STANDING = "standing"
     POLICY = "policy"
+    SLOWING = "slowing down"
     LYING_DOWN = "lying down"
     STOPPED = "stopped"
+
+
+DRIVEN = (Mode.POLICY, Mode.SLOWING)
+"""Modes in which the policy drives."""
 
 
 class Request(StrEnum):
@@ -55,10 +62,13 @@ class MachineConfig:
         stand_kd: the same.
         damping_kd: of damped joints; their kp is 0.
         state_age_s: the joints are damped when the newest valid state is older.
-        silence_s: the robot lies down when the policy's newest targets are older.
+        silence_s: the joints are damped when the policy's newest targets are older while it drives: a walking robot
+            sinks, and falls less often than one whose legs are led anywhere.
         fold_s: from where the joints are to the crouch.
         rise_s: from the crouch to standing.
-        settle_s: in which a walking robot comes to stand, before it lies down.
+        slow_s: for how long the policy, told to stand, still drives when something else is asked for: a robot that
+            walks at 1 m/s and whose legs are led to the standing pose falls over them.
+        settle_s: in which a robot that slowed down comes to the standing pose, before it lies down.
         fold_down_s: from standing to the crouch, or from wherever standing up was broken off.
         reach: most that a joint may be from the standing pose when the machine calls it standing, rad.
         max_tilt_deg: most that the base may lean when not damped.
@@ -79,6 +89,7 @@ class MachineConfig:
     silence_s: float = 0.04
     fold_s: float = 1.0
     rise_s: float = 1.0
+    slow_s: float = 1.0
     settle_s: float = 0.6
     fold_down_s: float = 1.5
     reach: float = 0.3
@@ -140,7 +151,7 @@ class Machine:
         self._sensed: Sensed | None = None
         self._targets: tuple[float, np.ndarray] | None = None
         self._held = self._stand
-        self._settle_s = config.settle_s
+        self._settle_s, self._next = config.settle_s, Mode.STANDING
 
     def sense(self, sensed: Sensed) -> None:
         """Takes a valid state in."""
@@ -150,7 +161,7 @@ class Machine:
         """Takes the policy's joint targets (12,), rad, in; faulty ones end in damping."""
         if not np.isfinite(targets).all():
             return self._fault(now, "the policy's targets are not finite")
-        if self.mode is Mode.POLICY and self._targets is not None:
+        if self.mode in DRIVEN and self._targets is not None:
             step = float(abs(targets - self._targets[1]).max())
             if step > self.config.max_step:
                 return self._fault(now, f"a target is {step:.1f} rad from the one before")
@@ -170,8 +181,10 @@ class Machine:
                 self.reason = f"not standing up: {obstacle}"
             else:
                 self._enter(now, Mode.STANDING_UP, "asked for")
-        elif request is Request.STAND and self.mode is Mode.POLICY:
-            self._enter(now, Mode.STANDING, "asked for")
+        elif request in (Request.STAND, Request.LIE) and self.mode in DRIVEN:
+            self._next = Mode.STANDING if request is Request.STAND else Mode.LYING_DOWN
+            if self.mode is Mode.POLICY:
+                self._enter(now, Mode.SLOWING, "asked for")
         elif request is Request.WALK and self.mode is Mode.STANDING:
             if self._targets is None or self._is_silent(now):
                 self.reason = "not walking: the policy is silent"
@@ -179,14 +192,14 @@ class Machine:
                 self.reason = f"not walking: a target is {away:.1f} rad from where the joints are held"
             else:
                 self._enter(now, Mode.POLICY, "asked for")
-        elif request is Request.LIE and self.mode in (Mode.STANDING_UP, Mode.STANDING, Mode.POLICY):
+        elif request is Request.LIE and self.mode in (Mode.STANDING_UP, Mode.STANDING):
             self._enter(now, Mode.LYING_DOWN, "asked for")
 
     def drive(self, now: float) -> Drive:
         """What the motors are told now; call it at the rate of the motors' commands."""
         self._watch(now)
         self._proceed(now)
-        if self.mode is Mode.POLICY:
+        if self.mode in DRIVEN:
             assert self._targets is not None
             self._held = self._targets[1]
             return Drive(self._held, self.config.kp, self.config.kd)
@@ -203,8 +216,8 @@ class Machine:
         fault = self._fault_now(now)
         if fault:
             self._fault(now, fault)
-        elif self.mode is Mode.POLICY and self._is_silent(now):
-            self._enter(now, Mode.LYING_DOWN, f"the policy is silent for {1e3 * self.config.silence_s:.0f} ms")
+        elif self.mode in DRIVEN and self._is_silent(now):
+            self._fault(now, f"the policy is silent for {1e3 * self.config.silence_s:.0f} ms")
 
     def _fault_now(self, now: float) -> str:
         """Why the joints must be damped; empty: they need not."""
@@ -229,6 +242,8 @@ class Machine:
                 self._enter(now, Mode.STANDING, "stood up")
             elif since >= config.fold_s + config.rise_s + 1.0:
                 self._fault(now, f"standing up failed: a joint is {away:.1f} rad away")
+        elif self.mode is Mode.SLOWING and since >= config.slow_s:
+            self._enter(now, self._next, self.reason)
         elif self.mode is Mode.LYING_DOWN and since >= self._settle_s + config.fold_down_s:
             self._enter(now, Mode.DAMPING, f"lay down ({self.reason})")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import select
 import socket
 import sys
@@ -18,6 +19,8 @@ from omniperception.hardware.messages import Remote
 
 _NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 _STALE_S = 0.5
+_SEQUENCE = re.compile("\x1b[\\[O][0-9;]*[A-Za-z~]")
+"""What a terminal sends for arrows and function keys, which begin as the Escape key does."""
 
 
 class Operator(Protocol):
@@ -48,7 +51,7 @@ def make_operator(text: str, ranges: Mapping[str, Sequence[float]]) -> Operator:
         numbers = [float(part) for part in text.removeprefix("goal:").split(",")]
         if not np.isfinite(numbers).all():
             raise ValueError
-        if text.startswith("goal:") and len(numbers) in (2, 3) and numbers[2:] > [0.0] * (len(numbers) - 2):
+        if text.startswith("goal:") and len(numbers) in (2, 3) and all(speed > 0 for speed in numbers[2:]):
             return Goal(numbers[:2], ranges, *numbers[2:])
         if not text.startswith("goal:") and len(numbers) == 3:
             return Constant(numbers)
@@ -120,9 +123,9 @@ class Datagrams:
         self._socket.setblocking(False)
         try:
             self._socket.bind(("127.0.0.1", port))
-        except OSError as error:
+        except (OSError, OverflowError) as error:
             self._socket.close()
-            raise DeployError(f"steer=udp:{port}: the port cannot be listened to ({error.strerror})") from None
+            raise DeployError(f"steer=udp:{port}: the port cannot be listened to ({error})") from None
         self._command, self._since = np.zeros(3), -1e9
 
     def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
@@ -171,7 +174,10 @@ class Keyboard:
     def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         asked = []
         while select.select([sys.stdin], [], [], 0.0)[0]:
-            for key in os.read(sys.stdin.fileno(), 64).decode("ascii", "replace"):
+            typed = os.read(sys.stdin.fileno(), 64).decode("ascii", "replace")
+            if not typed:  # the terminal is gone
+                break
+            for key in _SEQUENCE.sub("", typed):
                 if key in self._REQUESTS:
                     asked.append(self._REQUESTS[key])
                 elif key in self._STEPS:

@@ -38,6 +38,8 @@ HEIGHTS = (-0.15, 0.5)
 OWN = (0.5, 0.3)
 """m ahead and aside, within which a point is the robot's own and none."""
 _SEPARATOR = "=" * 80 + "\n"
+_CLOCK_JUMP_NS = 10**9
+"""Where a sensor's clock is as far from the time at which its points come, it has jumped."""
 _CHUNK_BYTES = 256 * 1024
 """A killed process loses as much as has not been written yet."""
 _PARTS = {
@@ -170,7 +172,10 @@ class Recorder:
         if path.suffix != ".mcap":
             raise DeployError(f"record={path}: a file ending in .mcap was expected")
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("wb")
+        try:
+            self._file = path.open("xb")
+        except FileExistsError:
+            raise DeployError(f"record={path} exists; give another name") from None
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
         kinds = set(TOPICS.values())
         schemas = {kind: self._writer.register_msgdef(kind, definition(kind)) for kind in sorted(kinds)}
@@ -233,8 +238,9 @@ class Recorder:
     def _write_points(self, time_ns: int, points: Points) -> None:
         if not len(points.times_ns):
             return
-        if self._sensor_start is None:
-            self._sensor_start = time_ns - int(points.times_ns[0])
+        newest = int(points.times_ns.max())
+        if self._sensor_start is None or abs(newest + self._sensor_start - time_ns) > _CLOCK_JUMP_NS:
+            self._sensor_start = time_ns - newest
         times = points.times_ns + self._sensor_start
         rows = np.zeros(len(times), [("xyz", "<f4", 3), ("t", "<u4")])
         rows["xyz"], rows["t"] = points.points, times - times.min()

@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import runpy
+import select
 import shutil
 import signal
 import socket
@@ -31,6 +32,7 @@ NO_FAULT = "none"
 KNOWN_FAULTS = (NO_FAULT, *PROCESS_FAULTS, *FAULTS)
 _STANDING_UP_S = 10.0
 _FIRST_DOMAIN, _DOMAINS = 100, 100
+_NOT_THE_SAME = "are not from the same export"
 _LYING = 0.2
 """m: a base that is lower lies; it stands above 0.25."""
 
@@ -127,7 +129,7 @@ def _trial(config: TrialsConfig, scenario: str, fault: str, trial: int, domain: 
     try:
         simulation.await_line("robot-sim: ready", config.startup_s)
         wire = [f"policy={policy}", "points=packets", "host=127.0.0.1", f"point_port={lidar}", f"steer=udp:{steer}"]
-        robot = _start_robot([*wire, f"domain={domain}", f"report={work / 'robot.json'}"])
+        robot = _start_robot([*wire, f"domain={domain}", f"report={work / 'robot.json'}"], work / "robot.txt")
         if fault == "swap":
             robot.wait(config.startup_s)
             simulation.end(0.0)
@@ -148,6 +150,7 @@ def _trial(config: TrialsConfig, scenario: str, fault: str, trial: int, domain: 
         "outcome": _read(work / "outcome.json"),
         "robot": _read(work / "robot.json"),
         "robot_exit": None if robot is None else robot.returncode,
+        "robot_said": (work / "robot.txt").read_text(errors="replace")[-2000:],
     }
 
 
@@ -172,7 +175,7 @@ class _Simulation:
         self._process = self._CONTEXT.Process(target=_simulate, args=(list(words), says))
         self._process.start()
         says.close()
-        self._said = os.fdopen(os.dup(said.fileno()))
+        self._said = os.fdopen(os.dup(said.fileno()), "rb", buffering=0)  # what select sees has not been read ahead
 
     def await_line(self, line: str, timeout_s: float) -> bool:
         """Whether it has said a line before it ended.
@@ -181,11 +184,14 @@ class _Simulation:
             DeployError: it ended with an error, or has not said it in time.
         """
         end = time.monotonic() + timeout_s
-        for said in self._said:
-            if said.strip() == line:
+        while select.select([self._said], [], [], max(0.0, end - time.monotonic()))[0]:
+            said = self._said.readline()
+            if said.decode("utf-8", "replace").strip() == line:
                 return True
-            if time.monotonic() > end:
+            if not said:
                 break
+        else:
+            raise DeployError(f"robot-sim has not said '{line}' within {timeout_s:g} s")
         self.join(10.0)
         if self._process.exitcode != 0:
             raise DeployError(f"robot-sim has ended with exit code {self._process.exitcode}; its message stands above")
@@ -210,13 +216,16 @@ def _simulate(words: list[str], says: Connection) -> None:
     runpy.run_module("omniperception", run_name="__main__")
 
 
-def _start_robot(words: Sequence[str]) -> subprocess.Popen:
-    """A `robot` as a process that an interrupt ends, also where this one was started in the background."""
+def _start_robot(words: Sequence[str], said: Path) -> subprocess.Popen:
+    """A `robot` as a process that an interrupt ends, also where this one was started in the background; what it and its
+    guard say goes into a file."""
 
     def interruptible() -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-    return subprocess.Popen([sys.executable, "-m", "omniperception", "robot", *words], preexec_fn=interruptible)
+    command = [sys.executable, "-m", "omniperception", "robot", *words]
+    with said.open("wb") as file:
+        return subprocess.Popen(command, preexec_fn=interruptible, stderr=file)
 
 
 def _free_port() -> int:
@@ -233,10 +242,16 @@ def _told(result: dict) -> str:
     """A trial in words."""
     outcome = result["outcome"] or {}
     if not outcome.get("stood"):
-        return "refused before a motor moved" if result["robot_exit"] == 2 else "never stood up"
+        return "refused before a motor moved" if _is_refused(result) else "never stood up"
     did = [name for name in ("reached", "touched", "fell") if outcome[name]]
     did.append("lay at the end" if outcome["height"] < _LYING else f"{outcome['speed']:.1f} m/s at the end")
     return ", ".join(did)
+
+
+def _is_refused(result: dict) -> bool:
+    """Whether `robot` has refused a description that is not the network's, and for no other reason."""
+    stood = (result["outcome"] or {}).get("stood")
+    return not stood and result["robot_exit"] == 2 and _NOT_THE_SAME in result["robot_said"]
 
 
 def results(folder: Path) -> list[dict]:
@@ -261,9 +276,10 @@ def table(trials: Sequence[dict]) -> str:
     head = "| scenario | fault | trials | untouched at the goal | touched | fell | lay at the end | refused |"
     rows = [head, "|---" * 8 + "|"]
     timing = [
-        "| scenario | fault | steps | p50 | p99 | begin late: p50 | p99 | late steps | frames | packets lost | lag |"
+        "| scenario | fault | steps | p50 | p99 | begin late: p50 | p99 | late steps | skipped | frames | missed"
+        " | late points | packets lost | lag |"
     ]
-    timing.append("|---" * 11 + "|")
+    timing.append("|---" * 14 + "|")
     keys = dict.fromkeys((trial["scenario"], trial["fault"]) for trial in trials)
     for scenario, fault in keys:
         group = [trial for trial in trials if (trial["scenario"], trial["fault"]) == (scenario, fault)]
@@ -271,7 +287,8 @@ def table(trials: Sequence[dict]) -> str:
         rows.append(f"| {scenario} | {fault} | {len(group)} | {' | '.join(cells)} |")
         timing.append(f"| {scenario} | {fault} | {' | '.join(_timing(group))} |")
     notes = (
-        "Steps and their beginnings in ms; late: more than half a period; lag: most behind real time, ms (median, max)."
+        "Steps and their beginnings in ms; late: more than half a period; skipped: cost by a stall; missed: frames that"
+        " were due and did not come; lag: most behind real time, ms (median, max)."
     )
     return "\n".join([*rows, "", *timing, "", notes])
 
@@ -282,9 +299,7 @@ def _counts(group: Sequence[dict]) -> list[int]:
     stood = [(trial, o) for trial, o in zip(group, outcomes, strict=True) if o.get("stood")]
     arrived = [o for trial, o in stood if _arrived(o, trial["limit_s"])]
     lying = [o for _, o in stood if o["height"] < _LYING and not o["fell"]]
-    refused = [
-        trial for trial, o in zip(group, outcomes, strict=True) if not o.get("stood") and trial["robot_exit"] == 2
-    ]
+    refused = [trial for trial in group if _is_refused(trial)]
     return [len(arrived), _sum(stood, "touched"), _sum(stood, "fell"), len(lying), len(refused)]
 
 
@@ -309,15 +324,24 @@ def _timing(group: Sequence[dict]) -> list[str]:
     lags = [1e3 * trial["outcome"]["lag_s"] for trial in group if trial["outcome"] is not None]
     lag = f"{np.median(lags):.0f}, {max(lags):.0f}" if lags else "-"
     if not reports:
-        return ["-"] * 8 + [lag]
+        return ["-"] * 11 + [lag]
     steps = np.concatenate([report["step_ms"] for report in reports])
     begins = np.concatenate([report["begin_ms"] for report in reports])
     late = np.concatenate([np.array(report["begin_ms"]) > report["period_ms"] / 2 for report in reports])
-    lost = sum(report["counts"].get("packets lost", 0) for report in reports)
+    names = ("steps skipped", "frames missed", "late points", "packets lost")
+    skipped, missed, old, lost = (_counted([report["counts"] for report in reports], name) for name in names)
     numbers = [*np.percentile(steps, (50, 99)), *np.percentile(begins, (50, 99))]
     frames = sum(report["frames"] for report in reports)
     share = f"{int(late.sum())} ({100 * late.mean():.1f} %)"
-    return [str(len(steps)), *(f"{number:.2f}" for number in numbers), share, str(frames), str(lost), lag]
+    return [
+        *(str(len(steps)), *(f"{number:.2f}" for number in numbers), share),
+        *(skipped, str(frames), missed, old, lost, lag),
+    ]
+
+
+def _counted(counts: Sequence[dict], name: str) -> str:
+    """The sum of a count; "-" where one of the trials has not counted it."""
+    return str(sum(count[name] for count in counts)) if all(name in count for count in counts) else "-"
 
 
 __all__ = ["KNOWN_FAULTS", "NO_FAULT", "PROCESS_FAULTS", "SENSORS", "TrialsConfig", "results", "run", "table"]

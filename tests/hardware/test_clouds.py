@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from messages_by_hand import LIVOX, XYZ, point_cloud2, text
 
 from omniperception.deploy import DeployError
 from omniperception.hardware.clouds import (
@@ -84,24 +85,6 @@ def test_points_that_the_sensor_is_less_than_certain_of_are_misses():
     assert without_noise(np.ones((9, 3), np.float32), tags)[:, 0].tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 1]
 
 
-def text(value):
-    data = value.encode() + b"\0"
-    return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
-
-
-def point_cloud2(fields, rows, width, frame="livox"):
-    """As ROS 2 sends it: header 12.000000007 s, one row."""
-    body = struct.pack("<iI", 12, 7) + text(frame) + struct.pack("<II", 1, width) + struct.pack("<I", len(fields))
-    for name, offset, kind in fields:
-        body += text(name) + struct.pack("<IB3xI", offset, kind, 1)
-    body += struct.pack("<B3xII", 0, len(rows) // width, len(rows)) + struct.pack("<I", len(rows)) + rows + b"\1"
-    return b"\0\1\0\0" + body
-
-
-XYZ = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
-LIVOX = [*XYZ, ("intensity", 12, 7), ("tag", 16, 2), ("line", 17, 2), ("timestamp", 18, 8)]
-
-
 def test_livox_ros_driver2s_point_cloud():
     """Its format 0: 26 bytes per point, times as float64 nanoseconds; nan is a miss."""
     rows = struct.pack("<ffffBBd", 1.0, 2.0, 3.0, 9.0, 0, 1, 5e9) + struct.pack(
@@ -116,6 +99,25 @@ def test_times_after_the_header():
     assert read_point_cloud2(point_cloud2([*XYZ, ("time", 12, 7)], rows, 1)).times_ns.tolist() == [12_250_000_007]
     rows = struct.pack("<fffI", 1.0, 2.0, 3.0, 250)
     assert read_point_cloud2(point_cloud2([*XYZ, ("t", 12, 6)], rows, 1)).times_ns.tolist() == [12_000_000_257]
+
+
+def test_a_point_with_one_number_that_is_none_is_a_miss_and_rows_may_be_padded():
+    """Two rows of one point, each with 8 bytes behind it."""
+    rows = b"".join(struct.pack("<fffd8x", *xyz, 5e9) for xyz in ((1.0, np.inf, 3.0), (4.0, 5.0, 6.0)))
+    whole = point_cloud2([*XYZ, ("timestamp", 12, 8)], rows, 1)
+    sizes = struct.pack("<II", 2, 1).join(whole.split(struct.pack("<II", 1, 1), 1))
+    head, tail = sizes.split(struct.pack("<B3xII", 0, 56, 56), 1)
+    read = read_point_cloud2(head + struct.pack("<B3xII", 0, 20, 28) + tail)
+    assert read.points.tolist() == [[0, 0, 0], [4, 5, 6]] and read.times_ns.tolist() == [5 * 10**9] * 2
+
+
+def test_times_in_seconds_and_points_that_are_no_numbers_are_refused():
+    """Cut by nanoseconds, such a stream would never give a frame."""
+    rows = struct.pack("<fffd", 1.0, 2.0, 3.0, 1.7e9 + 0.25)
+    with pytest.raises(DeployError, match="timestamp in nanoseconds.* was expected, .*1700000000.25"):
+        read_point_cloud2(point_cloud2([*XYZ, ("timestamp", 12, 8)], rows, 1))
+    with pytest.raises(DeployError, match="numbers were expected in x, y, z, t"):
+        read_point_cloud2(point_cloud2([*XYZ, ("t", 12, 99)], struct.pack("<fffI", 1.0, 2.0, 3.0, 4), 1))
 
 
 def test_a_cloud_without_times_or_cut_off_is_refused():

@@ -77,22 +77,41 @@ def test_lost_doubled_and_late_packets_are_counted():
     lidar.close()
 
 
-class Device(threading.Thread):
-    """A Mid-360 on the loopback that answers to SEARCH and CONFIGURE; `refuses` names a key."""
+def test_a_sensor_that_counts_anew_goes_on():
+    """As one does that was switched on again, or counts the packets of a frame: a later packet with a lower number."""
+    lidar = Mid360("127.0.0.1", 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sensor:
+        for frame in range(4):
+            for number in range(40):
+                data = packet([[1.0, 0.0, 0.0]], 10**9 + (40 * frame + number) * 480_000, number)
+                sensor.sendto(data, ("127.0.0.1", lidar.point_port))
+    assert [each.number for each in lidar.packets()] == [*range(40)] * 4
+    assert (lidar.lost, lidar.doubled) == (0, 0) and len(lidar._recent) <= 64
+    lidar.close()
 
-    def __init__(self, refuses=0):
+
+class Device(threading.Thread):
+    """A Mid-360 on the loopback that answers to SEARCH and CONFIGURE; `refuses` names a key, `everybody` the address to
+    which it answers where it is searched, as a real one does."""
+
+    def __init__(self, refuses=0, everybody=None):
         super().__init__(daemon=True)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self.socket.bind(("" if everybody else "127.0.0.1", 0))
         self.socket.settimeout(5.0)
         self.port, self.refuses, self.configured = self.socket.getsockname()[1], refuses, {}
+        self.everybody = everybody
 
     def run(self):
         while not self.configured:
             data, address = self.socket.recvfrom(2048)
             message = livox.read_message(data)
+            if message.is_answer:
+                continue
             if message.command == livox.SEARCH:
                 answer = livox.discovery_answer(Sensor("127.0.0.1", self.port, "loopback"), message.number)
+                address = (self.everybody or address[0], address[1])
             else:
                 self.configured = livox.read_configuration(message.data)
                 failed = struct.pack("<BH", bool(self.refuses), self.refuses)
@@ -100,14 +119,22 @@ class Device(threading.Thread):
             self.socket.sendto(livox.write_message(answer, from_sensor=True), address)
 
 
-def test_a_sensor_is_found_and_pointed_at_this_machine():
-    device, lidar = Device(), Mid360("127.0.0.1", 0)
+@pytest.mark.parametrize("everybody", [None, "127.255.255.255"])
+def test_a_sensor_is_found_and_pointed_at_this_machine(everybody):
+    device, lidar = Device(everybody=everybody), Mid360("127.0.0.1", 0)
     device.start()
-    assert lidar.find("127.0.0.1", device.port).serial == "loopback"
+    assert lidar.find(everybody or "127.0.0.1", device.port).serial == "loopback"
     device.join(5.0)
     assert device.configured[0x0006] == bytes([127, 0, 0, 1]) + struct.pack("<HH", lidar.point_port, 56300)
     assert device.configured[0x0000] == b"\1" and device.configured[0x001A] == b"\1"
     lidar.close()
+
+
+def test_addresses_and_ports_that_are_none_are_named():
+    with pytest.raises(DeployError, match="host=127.0.0.1: port 70000 cannot be listened to"):
+        Mid360("127.0.0.1", 70000)
+    with pytest.raises(DeployError, match="host=localhost: an address such as 192.168.1.50 was expected"):
+        livox.configuration("localhost")
 
 
 def test_a_sensor_that_refuses_or_is_silent_is_named():

@@ -146,7 +146,9 @@ def test_back_to_standing_and_down():
     robot.targets = STAND + 0.2
     robot.run(0.1)
     robot.ask(Request.STAND)
-    np.testing.assert_allclose(robot.run(TICK).joint_pos, STAND + 0.2, atol=0.01)
+    command = robot.run(0.99)
+    assert robot.mode is Mode.SLOWING and (command.kp, command.kd) == (25.0, 0.6)  # the policy drives on
+    np.testing.assert_allclose(robot.run(2 * TICK).joint_pos, STAND + 0.2, atol=0.01)
     np.testing.assert_allclose(robot.run(0.4).joint_pos, STAND, atol=1e-9)
     assert robot.mode is Mode.STANDING
     robot.ask(Request.LIE).run(2.0)
@@ -155,18 +157,15 @@ def test_back_to_standing_and_down():
     np.testing.assert_allclose(robot.joints, CROUCH, atol=0.01)
 
 
-def test_a_silent_policy_lets_the_robot_lie_down():
-    """38 ms of silence are none; then it stands for 0.6 s and folds its legs, whatever the policy says again."""
-    robot = walking()
+@pytest.mark.parametrize("mode", [Mode.POLICY, Mode.SLOWING])
+def test_a_silent_policy_damps(mode):
+    """38 ms of silence are none; then nothing that it says again moves the robot."""
+    robot = in_mode(mode)
     robot.targets = None
     robot.run(0.038)
-    assert robot.mode is Mode.POLICY
-    robot.run(0.006)
-    assert robot.mode is Mode.LYING_DOWN and "silent for 40 ms" in robot.machine.reason
-    np.testing.assert_allclose(robot.run(0.59).joint_pos, STAND)
+    assert robot.mode is mode
+    assert is_damped(robot.run(0.006)) and "silent for 40 ms" in robot.machine.reason
     robot.targets = STAND + 0.5
-    robot.run(1.0)
-    assert robot.mode is Mode.LYING_DOWN
     assert is_damped(robot.run(1.0)) and robot.mode is Mode.DAMPING
 
 
@@ -218,10 +217,45 @@ def test_asking_for_damping_damps_at_once():
     assert robot.mode is Mode.STANDING
 
 
-@pytest.mark.parametrize("before", [lambda: Robot(), walking])
-def test_nothing_outvotes_an_e_stop(before):
-    robot = before()
+def in_mode(mode):
+    """A robot that is in the middle of it."""
+    robot = Robot()
     robot.run(0.1)
+    if mode is not Mode.DAMPING:
+        robot.ask(Request.STAND).run(0.5 if mode is Mode.STANDING_UP else 2.1)
+    if mode in (Mode.POLICY, Mode.SLOWING):
+        robot.ask(Request.WALK).run(0.1)
+    if mode in (Mode.SLOWING, Mode.LYING_DOWN):
+        robot.ask(Request.LIE).run(0.5)
+    assert robot.mode is mode
+    return robot
+
+
+MODES = (Mode.DAMPING, Mode.STANDING_UP, Mode.STANDING, Mode.POLICY, Mode.SLOWING, Mode.LYING_DOWN)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_damping_and_every_watchdog_act_in_every_mode(mode):
+    assert is_damped(in_mode(mode).ask(Request.DAMP).run(TICK))
+    robot = in_mode(mode)
+    robot.senses = False
+    assert is_damped(robot.run(0.05)) and robot.mode is Mode.DAMPING
+    robot = in_mode(mode)
+    robot.cos = 0.0
+    assert is_damped(robot.run(2 * TICK)) and robot.mode is Mode.DAMPING
+
+
+def test_a_walking_robot_may_be_asked_to_lie_down():
+    robot = in_mode(Mode.POLICY).ask(Request.LIE)
+    robot.run(CONFIG.slow_s + CONFIG.settle_s / 2)
+    assert robot.mode is Mode.LYING_DOWN and robot.joints == pytest.approx(STAND, abs=0.01)
+    robot.run(2.0)
+    assert robot.mode is Mode.DAMPING and robot.joints == pytest.approx(CROUCH, abs=0.01)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_nothing_outvotes_an_e_stop(mode):
+    robot = in_mode(mode)
     robot.ask(Request.STOP)
     for request in Request:
         assert is_damped(robot.ask(request).run(0.1)) and robot.mode is Mode.STOPPED

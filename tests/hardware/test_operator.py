@@ -1,5 +1,7 @@
 """Where commands come from."""
 
+import os
+import pty
 import socket
 
 import numpy as np
@@ -40,10 +42,28 @@ def test_datagrams_hold_for_half_a_second():
     operator.close()
 
 
+def test_arrows_are_no_e_stop_and_a_terminal_that_is_gone_ends_nothing(monkeypatch):
+    """An arrow begins as the Escape key does."""
+    terminal, typed = pty.openpty()
+    with open(typed, closefd=False) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        keyboard = make_operator("keyboard", RANGES)
+        for keys, share, asked in ((b"w", 0.2, []), (b"\x1b[A\x1bOBw", 0.4, []), (b"\x1b", 0.4, [Request.STOP])):
+            os.write(terminal, keys)
+            command, got = keyboard.poll(0.0, CENTRED, START)
+            assert command[0] == pytest.approx(share) and got == asked
+        monkeypatch.setattr("os.read", lambda *_: b"")
+        monkeypatch.setattr("select.select", lambda *_: ([0], [], []))
+        assert keyboard.poll(0.0, CENTRED, START)[1] == []
+        keyboard.close()
+    os.close(terminal), os.close(typed)
+
+
 def test_one_command_for_good_and_wrong_words():
     assert make_operator("0.5,0,-0.1", RANGES).poll(0.0, CENTRED, START)[0].tolist() == [0.5, 0.0, -0.1]
     expected = r"remote, keyboard, udp:PORT, goal:X,Y\[,SPEED\] or V_X,V_Y,YAW_RATE"
-    for text in ("joystick", "1,2", "udp:x", "goal:1", "goal:1,x", "goal:1,2,-1", "nan,0,0"):
+    for text in ("joystick", "1,2", "udp:x", "goal:1", "goal:1,x", "goal:1,2,-1", "nan,0,0", "udp:99999"):
+        expected = "the port cannot be listened to" if text == "udp:99999" else expected
         with pytest.raises(DeployError, match=f"steer={text}: {expected}"):
             make_operator(text, RANGES)
 
@@ -55,5 +75,6 @@ def test_a_goal_is_faced_and_stayed_at():
     assert command == pytest.approx([0.0, 0.3, 1.5]) and not asked
     assert goal.poll(0.0, CENTRED, np.array([0.0, 4.5, np.pi / 2]))[0] == pytest.approx([0.15, 0.0, 0.0])
     assert goal.poll(0.0, CENTRED, np.array([0.1, 5.1, 2.0]))[0].tolist() == [0.0, 0.0, 0.0]
+    assert make_operator("goal:5,0", RANGES).poll(0.0, CENTRED, START)[0] == pytest.approx([0.5, 0.0, 0.0])
     behind = make_operator("goal:-5,0,2.0", RANGES).poll(0.0, CENTRED, np.array([0.0, 0.0, 0.0]))[0]
     assert behind[0] == -0.5 and abs(behind[2]) == 1.5

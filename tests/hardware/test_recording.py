@@ -70,6 +70,20 @@ def test_what_was_written_comes_back(tmp_path):
     assert [event.targets[1] for event in found if event.targets is not None] == pytest.approx([0.01, 1.01])
 
 
+def test_nothing_is_overwritten_and_a_clock_that_jumps_is_recorded_on(tmp_path):
+    """From the sensor's own clock to the world's, which together are more seconds than ROS 2 has room for."""
+    a_run(tmp_path / "a.mcap")
+    with pytest.raises(DeployError, match="a.mcap exists; give another name"):
+        Recorder(tmp_path / "a.mcap", Described)
+    recorder = Recorder(tmp_path / "b.mcap", Described)
+    for k, start in enumerate((7 * 10**9, 17 * 10**17)):
+        recorder.points(100.0 + k, Points(np.ones((1, 3), np.float32), np.array([start])))
+    recorder.step(Step(102.0, a_state(0), "policy: asked for", np.zeros(3), None, None, np.zeros(12)))
+    recorder.close()
+    points = [event.points for event in events(tmp_path / "b.mcap", Topics()) if event.points is not None]
+    assert points[1].times_ns[0] - points[0].times_ns[0] == 10**9
+
+
 def test_others_read_it(tmp_path):
     """mcap's own reader, by the definitions in the file."""
     from mcap.reader import make_reader

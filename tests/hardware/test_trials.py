@@ -62,7 +62,7 @@ def a_result(trial, **changes):
     outcome = {"stood": True, "touched": False, "fell": False, "reached": True, "reached_s": 12.0, "height": 0.3}
     outcome |= {"speed": 1.0, "lag_s": 0.001 * trial} | changes
     robot = {"begin_ms": [0.0] * 99 + [11.0], "step_ms": [2.0] * 100, "period_ms": 20.0, "frames": 50}
-    robot["counts"] = {"packets lost": 2}
+    robot["counts"] = {"packets lost": 2, "frames missed": 3, "steps skipped": 1}
     return {
         "scenario": "moving",
         "fault": "none",
@@ -71,6 +71,7 @@ def a_result(trial, **changes):
         "outcome": outcome,
         "robot": robot,
         "robot_exit": 0,
+        "robot_said": "",
     }
 
 
@@ -79,14 +80,15 @@ def test_the_table_counts(tmp_path):
     changes = ({}, {"touched": True}, {"reached_s": 31.0}, {"fell": True, "reached_s": None, "height": 0.1})
     for k, change in enumerate(changes):
         (tmp_path / f"moving-none-{k:03d}.json").write_text(json.dumps(a_result(k, **change)))
-    refused = a_result(0, stood=False) | {"fault": "swap", "robot": None, "robot_exit": 2}
-    (tmp_path / "moving-swap-000.json").write_text(json.dumps(refused))
+    for k, why in enumerate(("p.onnx and policy.json are not from the same export", "motion_switcher is silent")):
+        ended = a_result(k, stood=False) | {"fault": "swap", "robot": None, "robot_exit": 2, "robot_said": why}
+        (tmp_path / f"moving-swap-{k:03d}.json").write_text(json.dumps(ended))
     lines = table(results(tmp_path)).splitlines()
     one = "1 (25 % [5, 70])"
     none = "0 (0 % [0, 49])"
     assert lines[2] == f"| moving | none | 4 | {one} | {one} | {one} | {none} | {none} |"
-    assert lines[3].endswith("| 1 (100 % [21, 100]) |")
-    assert lines[7] == "| moving | none | 400 | 2.00 | 2.00 | 0.00 | 0.11 | 4 (1.0 %) | 200 | 8 | 2, 3 |"
+    assert lines[3].endswith("| 1 (50 % [9, 91]) |")  # the other one was refused for another reason
+    assert lines[7] == "| moving | none | 400 | 2.00 | 2.00 | 0.00 | 0.11 | 4 (1.0 %) | 4 | 200 | 12 | - | 8 | 2, 3 |"
     with pytest.raises(DeployError, match="holds no results of trials"):
         results(tmp_path / "none")
 

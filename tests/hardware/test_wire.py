@@ -19,18 +19,21 @@ pytest.importorskip("onnxruntime", reason="extra deploy")
 pytest.importorskip("onnx", reason="extra export")
 
 from lockstep import ROOT, Lockstep, Memory
+from messages_by_hand import LIVOX, point_cloud2
 
+from omniperception.commands import main
 from omniperception.deploy import DeployError, Description, ExportedPolicy
 from omniperception.deploy.export import export
-from omniperception.hardware import guard
+from omniperception.hardware import guard, lidar
 from omniperception.hardware.bags import Topics, events
-from omniperception.hardware.clouds import read_custom_msg
 from omniperception.hardware.control import machine_config, motor_order
-from omniperception.hardware.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
+from omniperception.hardware.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, Network
 from omniperception.hardware.faults import FAULTS, SENSORS
+from omniperception.hardware.lidar import LidarSource
 from omniperception.hardware.machine import Mode, Request
 from omniperception.hardware.messages import LOW_CMD, LOW_STATE, crc, low_cmd, sealed
 from omniperception.hardware.replay import draw, replay
+from omniperception.hardware.trials import results
 
 
 @pytest.fixture(scope="session")
@@ -78,7 +81,7 @@ def test_it_stands_up_and_walks_and_lies_down_when_the_policy_dies(lockstep, exp
     assert speed(robot) > 0.4 and robot.control.policy.frame_count == 5
     robot.policy_lives = False
     robot.run(0.05)
-    assert robot.machine.mode is Mode.LYING_DOWN and "the policy is silent" in robot.machine.reason
+    assert robot.machine.mode is Mode.DAMPING and "the policy is silent" in robot.machine.reason
     robot.run(2.3)
     assert is_lying(robot) and robot.robot.outcome.largest_tilt_deg < 30 and not robot.robot.outcome.fell
     if record is not None:
@@ -179,8 +182,9 @@ def test_an_e_stop_while_it_walks(lockstep):
     assert robot.machine.mode is Mode.STOPPED and is_lying(robot)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault", [pytest.param(name, marks=() if name in ("unplug", "silence") else pytest.mark.slow) for name in FAULTS]
+)
 def test_a_fault_while_it_walks(lockstep, fault):
     """Those of the LiDAR pass; those of the state end in damping; none ends in a fall."""
     robot = lockstep("scenario=static", fault=fault)
@@ -212,6 +216,82 @@ def test_another_robot_is_refused_before_a_motor_moves(exported):
     object.__setattr__(described.joints, "names", [f"leg_{k}" for k in range(12)])
     with pytest.raises(DeployError, match="the policy moves another robot than a Go2"):
         machine_config(described)
+
+
+def test_a_robot_whose_joints_have_the_names_of_a_go2s_and_go_farther_is_refused(exported):
+    """As a Go1's do: its thighs go from -0.686 to 4.501 rad."""
+    described = Description.read(exported)
+    ends = zip(described.joints.names, described.joints.upper, strict=True)
+    upper = [4.501 if "thigh" in name else end for name, end in ends]
+    object.__setattr__(described, "joints", replace(described.joints, upper=upper))
+    with pytest.raises(DeployError, match="another robot than a Go2: its FL_thigh_joint goes from .* to 4.501 rad"):
+        motor_order(described)
+
+
+def test_a_state_that_is_not_newer_is_none():
+    """By its own clock; one that is far behind has begun again, as after a restart."""
+    network = Memory()
+    reader = guard.StateReader(network.reader(LOW_STATE_TOPIC, LOW_STATE, 4), check_crc=True)
+    writer = network.writer(LOW_STATE_TOPIC, LOW_STATE)
+
+    def newest(*ticks):
+        for tick in ticks:
+            state = LOW_STATE.zeros()
+            state["tick"] = tick
+            writer.write(LOW_STATE.to_cdr(sealed(state)))
+        found = reader.newest()
+        return None if found is None else int(found["tick"])
+
+    assert newest(4000) == 4000 and newest(4000) is None and newest(4002, 4000) == 4002
+    assert newest(3500) is None and newest(10) == 10  # half a second ago, and a restart
+    assert newest(2**32 - 2) is None and reader.repeated == 4
+    reader._tick = 2**32 - 2
+    assert newest(4) == 4  # the clock's end
+
+
+def test_requests_are_sent_again_where_the_guard_is_behind():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    link = guard.Link(ours)
+    for _ in range(5000):
+        link.send_targets(np.zeros(12))
+    link.ask(Request.STOP)
+    theirs.setblocking(False)
+
+    def read():
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                yield theirs.recv(256)
+
+    stop = bytes([guard.REQUESTS.index(Request.STOP)])
+    assert stop not in list(read())
+    link.poll()
+    assert list(read()) == [stop]
+
+
+def test_from_a_state_that_has_stopped_coming_no_targets_follow(lockstep):
+    """The policy's own reader is silent, the guard's is not."""
+    robot = lockstep("scenario=static").run(0.2)
+    sent = []
+    robot.link.send_targets = sent.append
+    robot.run(0.1)
+    assert len(sent) == 5
+    robot.control._states.newest = lambda: None
+    robot.run(0.2)
+    assert len(sent) in (6, 7)  # the last of them by rounding
+
+
+def test_a_bag_of_ros_2_is_replayed_and_drawn(exported, tmp_path, capsys):
+    """Its joints are where no Go2's can be, which is said."""
+    for library in ("rosbags", "mcap_ros2", "matplotlib"):
+        pytest.importorskip(library)
+    from test_recording import a_ros_bag
+
+    a_ros_bag(tmp_path / "bag")
+    main(["replay-bag", str(tmp_path / "bag"), f"policy={exported}"])
+    said = capsys.readouterr()
+    assert "joints from /joint_states, orientation from /imu, points from /cloud, commands from /cmd_vel" in said.err
+    assert "beyond its limit" in said.err + said.out
+    assert (tmp_path / "bag.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_joints_without_limits_are_named(exported):
@@ -288,19 +368,41 @@ class TestDds:
         read = LOW_CMD.from_cdr(asked[-1])
         assert read["motor_cmd"]["q"][3] == 1.5 and crc(read) == read["crc"]
 
-    def test_a_drivers_cloud_goes_over_the_loopback(self):
-        """One point of livox_ros_driver2's CustomMsg; its layout is test_clouds'."""
-        network = Network(domain=74)
-        reader, writer = network.reader("rt/livox/lidar", CUSTOM_MSG, 4), network.writer("rt/livox/lidar", CUSTOM_MSG)
-        body = struct.pack("<iII", 12, 7, 4) + b"imu\0" + struct.pack("<QIB3xI", 5 * 10**9, 1, 0, 1)
-        body += struct.pack("<IfffBBBx", 480, 1.0, 2.0, 3.0, 9, 0, 1)
+    @pytest.mark.parametrize("kind", ["CustomMsg", "PointCloud2"])
+    def test_a_drivers_cloud_goes_over_the_loopback(self, kind, capsys, monkeypatch):
+        """One point of livox_ros_driver2's messages, whose layout is test_clouds'; then two that are cut off."""
+        network = Network(domain={"CustomMsg": 74, "PointCloud2": 79}[kind])
+        if kind == "CustomMsg":
+            message = struct.pack("<iII", 12, 7, 4) + b"imu\0" + struct.pack("<QIB3xI", 5 * 10**9, 1, 0, 1)
+            message = b"\0\1\0\0" + message + struct.pack("<IfffBBBx", 480, 1.0, 2.0, 3.0, 9, 0, 1)
+        else:
+            rows = struct.pack("<ffffBBd", 1.0, 2.0, 3.0, 9.0, 0, 1, 5e9 + 480)
+            message = point_cloud2(LIVOX, rows, 1)
+        source = lidar._Topic(LidarSource(kind=kind), network)
+        writer = network.writer("rt/livox/lidar", {"CustomMsg": CUSTOM_MSG, "PointCloud2": POINT_CLOUD2}[kind])
         end, came = time.monotonic() + 120.0, []
         while not came and time.monotonic() < end:
-            writer.write(b"\0\1\0\0" + body)
+            writer.write(message)
             time.sleep(0.02)
-            came = reader.take()
-        read = read_custom_msg(came[-1])
-        assert read.points.tolist() == [[1.0, 2.0, 3.0]] and read.times_ns.tolist() == [5 * 10**9 + 480]
+            came = source.read()
+        assert came[-1].points.tolist() == [[1.0, 2.0, 3.0]] and came[-1].times_ns.tolist() == [5 * 10**9 + 480]
+        monkeypatch.setattr(source._reader, "take", lambda: [message[:30], message[:30]])
+        assert source.read() == [] and source.counts() == {"messages refused": 2}
+        assert capsys.readouterr().err.count(f"refused: {kind}: ") == 1  # said once
+
+    def test_a_terminated_guard_damps_and_then_ends(self, exported):
+        machine = machine_config(Description.read(exported))
+        link, process = guard.start(guard.GuardConfig(machine, domain=78, listen_s=0.1, linger_s=0.5))
+        commands = Network(domain=78).reader(LOW_CMD_TOPIC, LOW_CMD)
+        end = time.monotonic() + 120.0
+        while not commands.take() and time.monotonic() < end:
+            time.sleep(0.01)
+        process.terminate()
+        time.sleep(0.1)
+        commands.take()
+        time.sleep(0.2)
+        assert commands.take() and process.wait(60.0) == 0
+        link.close()
 
     def test_a_guard_outlives_its_policy_and_then_ends(self, exported):
         machine = machine_config(Description.read(exported))
@@ -328,7 +430,6 @@ class TestDds:
         state = LOW_STATE.zeros()
         state["imu_state"]["quaternion"] = (1, 0, 0, 0)
         state["motor_state"]["q"][:12], state["motor_state"]["temperature"] = machine.stand_pose, 30
-        state = LOW_STATE.to_cdr(sealed(state))
         read, write = os.pipe()
         kept = os.dup(2)
         os.dup2(write, 2)
@@ -343,7 +444,8 @@ class TestDds:
             begin, newest = time.monotonic(), None
             while (not happened() and time.monotonic() < begin + seconds) or newest is None:
                 assert time.monotonic() < begin + 120.0, "no command has come"
-                states.write(state)
+                state["tick"] += 4
+                states.write(LOW_STATE.to_cdr(sealed(state)))
                 time.sleep(0.004)
                 link.poll()
                 newest = (commands.take() or [newest])[-1]
@@ -374,6 +476,17 @@ class TestDds:
         assert done.returncode == 2 and done.stderr == "error: this policy sees: points=none is for a blind one\n"
         assert before[3] & termios.ECHO and termios.tcgetattr(stdin) == before
         os.close(terminal), os.close(stdin)
+
+    def test_three_processes_whose_policy_is_killed(self, exported, tmp_path):
+        """Whatever else the machine does, the robot stands up and lies at the end; how well it walks is for a quiet
+        one."""
+        words = [f"run={ROOT / 'pretrained' / 'avoider'}", f"policy={exported}", "scenario=static", "faults=kill"]
+        command = [sys.executable, "-m", "omniperception", "robot-trials", *words, "trials=1", f"out={tmp_path}"]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300.0)
+        assert done.returncode == 0, done.stderr
+        (result,) = results(tmp_path)
+        assert "guard: standing up: asked for" in result["robot_said"] and result["outcome"]["height"] < 0.2
+        assert result["robot_said"].rstrip().rpartition("\n")[2].startswith("guard: damping")
 
     def test_somebody_else_who_writes_lowcmd_is_refused(self, exported):
         network = Network(domain=73)
