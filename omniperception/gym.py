@@ -219,6 +219,7 @@ def make(*overrides: str, num_envs: int | None = None, arrays: Arrays = "numpy",
     given = (*overrides, *(() if num_envs is None else (f"num_envs={num_envs}",)))
     vector, _ = gymnasium_classes()
     run = build.assemble(config.compose(given))
+    build.check_split(run, "training")
     try:
         return vector(OmniEnv(run.env), arrays, critic)
     except (ValueError, ImportError) as error:

@@ -84,6 +84,9 @@ BIPED_PRESET = {
     "penalized_geoms": ["torso_geom_1", "head_geom_0"],
     "footprint": [0.05, 0.07],
     "footing": 0.2,
+    "outline": [0.2, 0.2, 0.2],
+    "height": 0.8,
+    "radius": 0.2,
     "min_base_height": 0.3,
     "mounts": {
         "back": {"pos": [0.0, 0.0, 0.02], "body": "head", "exclude_geoms": ["head_geom_0"]},

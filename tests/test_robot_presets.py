@@ -18,6 +18,7 @@ from omniperception.commands import main
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.config import ConfigError
 from omniperception.env.mirror import mirrored_joints
+from omniperception.evaluation import baselines
 from omniperception.robots import fetch
 from omniperception.robots.stand import flat_world, stand
 from omniperception.scene.fetched import fetched
@@ -53,6 +54,31 @@ def test_it_stands_on_its_feet(name):
     assert found.steady and all("ground" in pair and feet & set(pair) for pair in found.contacts)
     weight = float(world.model.body_mass[1:].sum()) * 9.81
     assert sum(found.contacts.values()) == pytest.approx(weight, rel=0.05)
+
+
+def test_the_room_it_takes_holds_it_and_reaches_perception_and_avoidance(name):
+    """In the default pose all that can be touched lies within; boxes around geoms by MuJoCo."""
+    robot = robot_of(name)
+    model = robot.compiled()
+    data = mujoco.MjData(model)
+    for joint, angle in robot.default_joint_pos.items():
+        data.joint(joint).qpos = angle
+    data.qpos[:7] = 0, 0, robot.base_height, 1, 0, 0, 0
+    mujoco.mj_kinematics(model, data)
+    touched = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    turns = data.geom_xmat[touched].reshape(-1, 3, 3)
+    boxes = model.geom_aabb[touched].reshape(-1, 2, 3)
+    middles = data.geom_xpos[touched] + (turns @ boxes[:, 0, :, None])[..., 0]
+    halves = (np.abs(turns) @ boxes[:, 1, :, None])[..., 0]
+    low, high = (middles - halves).min(0), (middles + halves).max(0)
+    back, front, side = robot.outline
+    assert -back < low[0] and high[0] < front and max(-low[1], high[1]) < side and high[2] < robot.height
+    given = ["experiment=avoid", f"robot={name}", "init=null"]
+    run = build.assemble(config.compose([*given, "lidar.mount=above"]))
+    geometry = run.perception.sampler().geometry
+    assert (geometry.body, geometry.standing, geometry.headroom) == (robot.outline, robot.base_height, robot.height)
+    assert run.env.rewards.avoidance.risk.robot_radius == robot.radius and run.env.obstacles.headroom == robot.height
+    assert baselines.geometry_of(robot) == replace(geometry, num_sectors=72)
 
 
 def test_base_height_is_that_of_the_default_pose(name):

@@ -230,7 +230,7 @@ def test_a_preset_is_written_and_the_robot_checked_and_trained_with(tmp_path, mo
         (["robot-new", "none.xml"], "file=none.xml is no file"),
         (["robot-new", "biped.xml", "name=a-b"], "name=a-b must be letters"),
         (["robot-new", "biped.xml", "joints=elbow"], "joints=elbow are no hinges or slides of biped.xml; known: tail"),
-        (["robot-new", "biped.xml", "lidar=nose"], "lidar=nose is no moving link of biped.xml; known: torso"),
+        (["robot-new", "biped.xml", "lidar=nose"], "lidar=nose is no link of biped.xml; known: torso"),
         (["robot-new", "ghost.xml"], "no geom collides"),
         (["robot-new", "biped.xml", "frequency=0"], "frequency=0 must be a number above 0"),
         (["robot-check", "wolf"], "robot=wolf is unknown"),

@@ -134,6 +134,7 @@ LINES = [
     ("train robot.mounts.head.exclude_geoms=[nose]", "nose"),
     ("train init=nowhere", "init=nowhere"),
     ("train suite=held_out", "suite=held_out is unknown"),
+    ("train experiment=walk init=RUN robot=anymal", "it moves the robot of go2.xml, this one is that of anymal.xml"),
     ("train init=RUN stepping={lift:1.5,rest_s:1}", "its actions meant another motion, that of 'stepping=null'"),
     ("train init=RUN stepping={lift:1.5}", "stepping"),
     ("train stepping={lift:-1,rest_s:1}", "stepping.lift=-1 must be positive"),

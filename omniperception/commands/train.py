@@ -167,13 +167,21 @@ def learn(
 def _check_motion(composed: DictConfig, source: str, name: str = "init") -> None:
     """Refuses weights whose actions meant another motion in the run that they come from; nothing in them shows it."""
     other = config.read(config.find_run(source, name))
+    robots = [OmegaConf.select(one, "robot.file") for one in (composed, other)]
     for key in ("stepping", "robot.joints", "robot.default_joint_pos", "robot.action_scale"):
         own, given = OmegaConf.select(composed, key), OmegaConf.select(other, key)
         if own != given:
+            if robots[0] != robots[1]:
+                raise config.ConfigError(
+                    f"{name}={source}: it moves the robot of {robots[1]}, this one is that of {robots[0]}, and {key}"
+                    f" differs; give {name}=<a run with this robot>, such as one of experiment=gait"
+                )
             wanted = "null" if given is None else str(given).replace("'", "").replace(": ", ":")
             raise config.ConfigError(
                 f"{name}={source}: its actions meant another motion, that of '{key}={wanted}'; give the same here"
             )
+    if robots[0] != robots[1]:
+        report(f"{name}={source}: it was learned by the robot of {robots[1]}, this one is that of {robots[0]}")
 
 
 def _report_other_inputs(composed: DictConfig, source: Path) -> None:

@@ -114,14 +114,14 @@ def build_sampler(config: EnvConfig) -> Sampler | None:
         return None
     from omniperception.perception import ProximitySampler
 
-    sampler, height = config.sampler(), config.robot.base_height
-    if isinstance(sampler, ProximitySampler) and config.lidar.mount_body is None:
-        lowest = float(sampler.edges[0])
+    sampler, link = config.sampler(), config.lidar.mount_body
+    if isinstance(sampler, ProximitySampler):
+        height, lowest = config.robot.height_of(link), float(sampler.edges[0])
         if lowest + height > LOWEST_BAND:
             raise ValueError(
                 f"perception.sampler.band_edges begins {lowest + height:.2f} m above the ground, at {lowest:g} m from"
-                f" the base's origin with robot.base_height={height:g}, and what is lower would not be seen; begin it"
-                f" at {-height - 0.01:.2f}, or use perception=polar_rings"
+                f" the origin of {link or 'the base'} at {height:g}, and what is lower would not be seen; begin it at"
+                f" {-height - 0.01:.2f}, or use perception=polar_rings"
             )
     return sampler
 

@@ -102,6 +102,14 @@ class EnvConfig:
                 " the device, or use randomization=lidar"
             )
         self._check_measured_noise()
+        if self.base_motion and self.lidar is not None and self.lidar.mount_body is not None:
+            raise ValueError(
+                "perception.base_motion=true says how the base moves, but the LiDAR is carried by"
+                f" {self.lidar.mount_body}, which turns against it; use a lidar.mount on the base, or"
+                " perception.base_motion=false with another network than polar_rings"
+            )
+        if isinstance(self.terrain, MapTerrainConfig):
+            self.terrain.check_footing(self.robot.footing)
         if self.lidar is None:
             if self.sampler is not None:
                 raise ValueError(

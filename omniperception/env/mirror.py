@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.observations import gait_phase
 from omniperception.env.mdp.terms import JOINT_MAGNITUDES, JOINTS, ROTATION, VECTOR
 from omniperception.scene import RobotConfig
 
@@ -25,6 +26,9 @@ class Mirror:
             ValueError: a joint or a term has no mirror image.
         """
         joints = mirrored_joints(env.robot)
+        groups = env.config.observations.groups.values()
+        if any(getattr(term, "func", term) is gait_phase for group in groups for term in group.terms.values()):
+            _check_feet(env.robot)
         self._joints = tuple(torch.as_tensor(part, device=env.device) for part in joints)
         self._groups = {}
         for name, group in env.config.observations.groups.items():
@@ -74,6 +78,28 @@ def mirrored_joints(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
             "ppo.symmetry=true: robot.default_joint_pos is not its own mirror image; set ppo.symmetry=false"
         )
     return index, sign
+
+
+def _check_feet(robot: RobotConfig) -> None:
+    """The mirror image of the clock is half a period off, so the feet of a pair must step in turn.
+
+    Raises:
+        ValueError: they do not.
+    """
+    if robot.gait is None:
+        return
+    model = robot.compiled()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    ids = [model.geom(name).id for name in robot.foot_names]
+    at = (data.geom_xpos[ids] - data.body(robot.base).xpos) @ data.body(robot.base).xmat.reshape(3, 3)
+    twins = np.linalg.norm(at[:, None] - at * VECTOR, axis=2).argmin(1)
+    offsets = np.array(robot.gait.offsets)
+    if not np.allclose((offsets[twins] - offsets) % 1.0, 0.5, atol=_SAME):
+        raise ValueError(
+            f"ppo.symmetry=true: with robot.gait.offsets={offsets.tolist()} left and right feet do not step half a"
+            " period apart, as the mirror image of the observed clock does; set ppo.symmetry=false"
+        )
 
 
 def joint_twins(model: mujoco.MjModel, base: str, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

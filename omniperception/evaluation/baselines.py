@@ -20,6 +20,7 @@ from omniperception.env.state import MEASURED_CLOUD
 from omniperception.evaluation.episodes import Policy
 from omniperception.perception import Attitude
 from omniperception.perception.geometry import GeometryConfig, Nearest, Standing, nearest_obstacles
+from omniperception.scene import RobotConfig
 from omniperception.scene.build import FOOT_FORCE
 
 BASELINES = {
@@ -111,12 +112,22 @@ def histogram(
     config: HistogramConfig | None = None,
 ) -> Policy:
     """The policy, driven by V_cmd + V_avoid with V_avoid from the raw noisy clouds by geometry alone."""
-    return _driven(env, policy, _avoiding(env, avoidance, _Histogram(env, config or HistogramConfig())), limits)
+    return _driven(
+        env,
+        policy,
+        _avoiding(env, avoidance, _Histogram(env, config or HistogramConfig(geometry_of(env.robot)))),
+        limits,
+    )
 
 
 def stop(env: OmniEnv, policy: Policy, limits: Limits | None, config: StopConfig | None = None) -> Policy:
     """The policy, driven by V_cmd, which falls to zero while something is near in its direction."""
-    return _driven(env, policy, _Stop(env, config or StopConfig()), limits)
+    return _driven(env, policy, _Stop(env, config or StopConfig.of(env.robot)), limits)
+
+
+def geometry_of(robot: RobotConfig) -> GeometryConfig:
+    """From the clouds of a robot to what stands around it."""
+    return GeometryConfig(body=robot.outline, standing=robot.base_height, headroom=robot.height)
 
 
 @dataclass(frozen=True)
@@ -147,6 +158,12 @@ class StopConfig:
     stand: float = 0.7
     slow: float = 1.4
     half_width: float = 0.35
+
+    @classmethod
+    def of(cls, robot: RobotConfig) -> StopConfig:
+        """As for a Go2, as far from the robot's front and sides."""
+        _, front, side = robot.outline
+        return cls(geometry_of(robot), front + 0.34, front + 1.04, side + 0.03)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.stand < self.slow:

@@ -31,6 +31,9 @@ _PACE, _RISE = 2.5, 0.2
 number); and how high feet rise as a share of the base's height, ..."""
 _MOST_RISE = 0.1
 """... at most so much (m)."""
+_SWING, _SWAY = 0.12, 0.06
+"""Room (m) around the default pose that a robot takes while it walks, beside and above it; the Go2's, rounded."""
+
 _FALL = 0.45
 """Share of the base's height below which it has fallen; the Go2's: 0.15 of 0.33 m."""
 
@@ -243,6 +246,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
     places = np.abs([foot.place(body)[:2] for foot in draft.feet]).mean(0)
     edges = [np.abs(body.bounds(body.geoms(foot.link))).max(0)[:2] for foot in draft.feet]
     gait = _gait(draft, height)
+    low, high = body.bounds(body.touchable)
     pairs = self_collisions(body, draft.pose) if draft.wishes.self_collision else []
     mounts, by_mount = _mounts(draft)
     preset: dict[str, object] = {
@@ -254,6 +258,9 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
         "min_base_height": round(_FALL * height, 3),
         "footprint": [round(float(places[0]), 2), round(float(places[1]), 2)],
         "footing": round(float(np.linalg.norm(np.max(edges, 0))) + 0.05, 2),
+        "outline": [round(_SWING + float(reach), 2) for reach in (-low[0], high[0], max(-low[1], high[1]))],
+        "height": round(height + float(high[2]) + _SWAY, 2),
+        "radius": round(0.5 * float((high - low)[:2].max()), 2),
         "foot_geoms": feet,
         "gait": gait,
         "penalized_geoms": others,
@@ -270,6 +277,9 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
         Finding("base_height", LIKELY, "the lowest point of the default pose"),
         Finding("min_base_height", GUESSED, f"{100 * _FALL:.0f} % of base_height"),
         Finding("footprint, footing", LIKELY, "where the feet are"),
+        Finding("outline", GUESSED, f"what collides, in the default pose, and {_SWING:g} m"),
+        Finding("height", GUESSED, f"likewise, and {_SWAY:g} m"),
+        Finding("radius", GUESSED, "half of its length or width"),
         Finding("gait", GUESSED, "feet beside and behind each other in turn, as fast as legs are long"),
         Finding("torque_limits", SURE if gains.said.all() else GUESSED, limits),
         Finding("kp, kv", GUESSED, f"springs of {rate:g} Hz, damping ratio {ratio:g}, or sag under {SAG:g} rad"),
@@ -397,7 +407,8 @@ def _mounts(draft: _Draft) -> tuple[dict[str, object], Finding]:
         "above": at(middle, top + 0.4, exclude_geoms=names),
     }
     if frame is not None:
-        mounts["head"] = {"pos": [0.0, 0.0, 0.0], "body": frame}
+        housing = [geom.name for link in read_robot(draft.file).bodies if link.name == frame for geom in link.geoms]
+        mounts["head"] = {"pos": [0.0, 0.0, 0.0], "body": frame} | ({"exclude_geoms": housing} if housing else {})
     return mounts, Finding("mounts", SURE if frame or draft.wishes.lidar else GUESSED, why)
 
 
@@ -405,11 +416,13 @@ def _lidar_link(draft: _Draft) -> tuple[int, str | None, str]:
     """The link that carries the LiDAR, a frame of the file that is a LiDAR's, and why."""
     body, model, wanted = draft.body, draft.body.model, draft.wishes.lidar
     if wanted is not None:
-        named = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, wanted)
-        if named < 1:
-            known = ", ".join(model.body(k).name for k in range(1, model.nbody))
-            raise ValueError(f"lidar={wanted} is no moving link of {draft.file}; known: {known}")
-        return int(model.body_weldid[named]), None, f"around {wanted}, as asked for"
+        known = [link.name for link in draft.raw.bodies[1:]]
+        if wanted not in known:
+            raise ValueError(f"lidar={wanted} is no link of {draft.file}; known: {', '.join(known)}")
+        carrier = _carrier(body, wanted)
+        if model.body(carrier).name == wanted:
+            return carrier, None, f"around {wanted}, as asked for"
+        return carrier, wanted, f"head is {wanted}, as asked for; the others around {model.body(carrier).name}"
     for link in draft.raw.bodies:
         if any(word in link.name.lower() for word in _LIDARS):
             carrier = _carrier(body, link.name)

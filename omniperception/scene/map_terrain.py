@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -89,6 +90,20 @@ class MapTerrainConfig:
     def read(self) -> tuple[np.ndarray, tuple[float, float]]:
         """(rows, cols) heights (m), x along columns, y along rows, and where (m) the first point is in the file."""
         raise NotImplementedError
+
+    def check_footing(self, footing: float) -> None:
+        """Refuses places where `RobotConfig.footing` (m) reaches beyond the ground that is known to be level.
+
+        Raises:
+            ValueError: they would be found, and robots start on top of what stands beside them.
+        """
+        cells = math.ceil(footing / self.cell) + 1  # as Ground.highest looks
+        if round(self.start.radius / self.cell) < cells:
+            raise ValueError(
+                f"terrain.start.radius={self.start.radius} is too small for robot.footing={footing} with"
+                f" terrain.cell={self.cell}: robots would start on top of what stands beside a place; give"
+                f" terrain.start.radius={cells * self.cell:g}"
+            )
 
     def floor(self, heights: np.ndarray) -> np.ndarray:
         """(rows, cols) bool: which points of (rows, cols) heights (m) may belong to the ground that is meant."""
@@ -247,6 +262,11 @@ class PlaceConfig(MapTerrainConfig):
         if cols * rows > MAX_POINTS:
             raise ValueError(
                 f"terrain.file={self.file} is {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, too large for"
+                f" terrain.cell={self.cell}; change it or terrain.scale={self.scale}"
+            )
+        if min(cols, rows) < 2:
+            raise ValueError(
+                f"terrain.file={self.file} is {high[0] - low[0]:.2g} x {high[1] - low[1]:.2g} m, smaller than"
                 f" terrain.cell={self.cell}; change it or terrain.scale={self.scale}"
             )
         x, y = (low[k] + self.cell * np.arange(num) for k, num in ((0, cols), (1, rows)))

@@ -102,6 +102,10 @@ class RobotConfig:
         footprint: half length and half width (m) of the rectangle around the base at whose corners, and in whose
             middle, the ground is looked up from which the base's height is measured.
         footing: distance (m) from the base within which no ground is higher than the feet when a robot starts.
+        outline: how far (m) the robot reaches behind, before and beside the base's origin while it walks: what a LiDAR
+            sees within is taken for the robot itself.
+        height: (m) above the ground from which on a thing hangs too high to be in the robot's way.
+        radius: (m) of the disc that avoidance takes the robot for.
         min_base_height: height (m) of the base origin above the ground below which the robot has fallen.
         frictionloss: dry friction (N m) of the actuated joints; None: as in the file.
         armature: rotor inertia (kg m^2) of the actuated joints, seen from the joint; None: as in the file.
@@ -126,6 +130,9 @@ class RobotConfig:
     penalized_geoms: tuple[str, ...]
     footprint: tuple[float, float]
     footing: float
+    outline: tuple[float, float, float]
+    height: float
+    radius: float
     min_base_height: float
     frictionloss: ByJoint | None = None
     armature: ByJoint | None = None
@@ -142,9 +149,14 @@ class RobotConfig:
         object.__setattr__(self, "foot_geoms", feet)
         if not all(feet):
             raise ValueError("robot.foot_geoms has an empty list; a foot needs at least one geom")
-        for name in ("base_height", "footing"):
+        for name in ("base_height", "footing", "height", "radius"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"robot.{name}={getattr(self, name)} must be positive")
+        object.__setattr__(self, "outline", tuple(self.outline))
+        if len(self.outline) != 3 or min(self.outline) <= 0:
+            raise ValueError(
+                f"robot.outline={list(self.outline)} must be three positive lengths (m): behind, before, beside"
+            )
         if self.min_base_height < 0 or min(self.footprint) < 0:
             raise ValueError(
                 f"robot.min_base_height={self.min_base_height} and robot.footprint={list(self.footprint)} must not be"
@@ -197,6 +209,8 @@ class RobotConfig:
     def spec(self) -> mujoco.MjSpec:
         """The robot's file with position actuators (PD with torque limit) in the order of `joints`."""
         spec = read_robot(self.path())
+        for pair in list(spec.pairs):  # who touches whom is said by self_collision alone
+            spec.delete(pair)
         gains = zip(*(self.by_joint(name) for name in ("kp", "kv", "torque_limits")), strict=True)
         for name, (kp, kv, limit) in zip(self.joints, gains, strict=True):
             joint = spec.joint(name)
@@ -207,6 +221,7 @@ class RobotConfig:
             actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             actuator.set_to_position(kp=kp, kv=kv)
             actuator.forcerange = [-limit, limit]
+            joint.actfrcrange = [-limit, limit]  # the file's own, such as a URDF's effort, would cap it besides
         self._add_self_collision(spec)
         return spec
 
@@ -276,6 +291,17 @@ class RobotConfig:
         mujoco.mju_rotVecQuat(pos, pos.copy(), turn)
         mujoco.mju_mulQuat(moved, turn, quat)
         return Place(None if carrier == base else model.body(carrier).name, _vector(at + pos), _quaternion(moved))
+
+    def height_of(self, link: str | None) -> float:
+        """Height (m) of a moving link's origin above the ground in the default pose; of the base's for None."""
+        if link is None:
+            return self.base_height
+        model = self.compiled()
+        data = mujoco.MjData(model)
+        for name, angle in self.default_joint_pos.items():
+            data.joint(name).qpos = angle
+        mujoco.mj_kinematics(model, data)
+        return self.base_height + float(data.body(link).xpos[2] - data.body(self.base).xpos[2])
 
     def path(self) -> Path:
         """The robot's file; a packaged one by its name alone, a downloaded one as `fetched:...`."""

@@ -17,7 +17,9 @@ _LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 
 
 def read_robot(path: Path) -> mujoco.MjSpec:
-    """The robot of a file: its own actuators, sensors and keyframes are left out; a URDF's root link floats.
+    """The robot of a file; a URDF's root link floats.
+
+    The file's own actuators, sensors, keyframes and physics options (gravity, solver, contacts disabled) are left out.
 
     Raises:
         ValueError: one line that names the file, what is wrong with which element, and what to do.
@@ -26,6 +28,7 @@ def read_robot(path: Path) -> mujoco.MjSpec:
     _check(spec, path)
     for thing in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(thing)
+    spec.option = mujoco.MjSpec().option  # how physics is computed is said by `sim`, for every robot alike
     _name_all(spec)
     return spec
 
@@ -189,12 +192,15 @@ def _parse_urdf(robot: ElementTree.Element, path: Path) -> mujoco.MjSpec:
 
 
 def _check_ranges(robot: ElementTree.Element, path: Path) -> None:
-    """MuJoCo takes a range from 0 to 0 for no limit at all."""
+    """MuJoCo takes a range from 0 to 0, or of one end, for no limit at all."""
     for joint in robot.iter("joint"):
         if joint.get("type") not in ("revolute", "prismatic"):
             continue
         limit = joint.find("limit")
         low, high = (float(limit.get(key, 0)) if limit is not None else 0.0 for key in ("lower", "upper"))
+        if limit is not None:  # MuJoCo takes one end alone for no limit at all; the other is 0, as URDF says
+            limit.set("lower", repr(low))
+            limit.set("upper", repr(high))
         if not low < high:
             raise ValueError(
                 f"robot.file={path}: joint {joint.get('name')} has limits from {low:g} to {high:g}; give it a range, or"

@@ -87,6 +87,10 @@ def test_updates_see_both_sides():
             ("experiment=walk", "ppo.symmetry=true", "+observations.groups.privileged.terms.heights={}"),
             "privileged.terms.heights does not say how it looks in the mirror",
         ),
+        (
+            ("experiment=gait", "ppo.symmetry=true", "robot.gait.offsets=[0.0,0.0,0.5,0.5]"),  # a bound
+            "left and right feet do not step half a period apart",
+        ),
     ],
 )
 def test_what_has_no_mirror_image_is_refused_in_one_line(overrides, message):

@@ -35,6 +35,20 @@ def world(tmp_path):
     return world_of(biped(tmp_path))
 
 
+def test_physics_is_that_of_the_configuration_whatever_the_file_says(tmp_path):
+    """Gravity, friction cone and contacts; the pair of the shanks, which self_collision does not name."""
+    options = '<option gravity="0 0 -1" impratio="50" cone="elliptic"><flag contact="disable"/></option><worldbody>'
+    feet = [f"{side}_shank_geom_1" for side in ("right", "left")]
+    pair = f'<contact><pair geom1="{feet[0]}" geom2="{feet[1]}"/></contact></mujoco>'
+    text = BIPED.replace("<worldbody>", options).replace("</mujoco>", pair)
+    for foot in feet:
+        text = text.replace('<geom type="box" size="0.06', f'<geom name="{foot}" type="box" size="0.06', 1)
+    model, plain = world_of(biped(tmp_path, text)).model, world_of(biped(tmp_path)).model
+    assert model.opt.gravity.tolist() == [0.0, 0.0, -9.81] and model.npair == 0
+    for name in ("impratio", "cone", "disableflags", "solver"):
+        assert getattr(model.opt, name) == getattr(plain.opt, name), name
+
+
 # --- joints in any order, and passive ones ----------------------------------------------------------------------------
 
 
@@ -263,6 +277,50 @@ def test_meshes_of_a_urdf_are_found_beside_it_and_in_its_package(tmp_path):
     for name in ("package://spider/meshes/t.obj", "../meshes/t.obj", f"file://{meshes / 't.obj'}"):
         model = read_robot(hexapod(folder, HEXAPOD.replace(box, f'<mesh filename="{name}"/>'))).compile()
         assert model.nmesh == 1 and model.geom_type[0] == mujoco.mjtGeom.mjGEOM_MESH
+
+
+def test_a_urdf_may_leave_out_the_end_of_a_range_that_is_0(tmp_path):
+    """MuJoCo takes a range of one end for none."""
+    one = HEXAPOD.replace('lower="-1.2" upper="1.2"', 'upper="1.2"', 1)
+    model = read_robot(hexapod(tmp_path, one)).compile()
+    assert model.joint("l0_lift").range.tolist() == [0.0, 1.2] and model.jnt_limited[model.joint("l0_lift").id]
+
+
+def test_torque_limits_are_the_presets_where_the_files_are_lower(tmp_path):
+    """An effort of 8 N m in the URDF, 20 N m in the preset."""
+    robot = dataclasses.replace(
+        biped(tmp_path),
+        file=str(hexapod(tmp_path)),
+        base="base_link",
+        joints=("l0_lift",),
+        **dict.fromkeys(("kp", "kv", "action_scale"), 1.0) | {"torque_limits": 20.0, "kp": 1000.0},
+        default_joint_pos={"l0_lift": 0.0},
+    )
+    model = robot.spec().compile()
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 1.0
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_actuator[model.joint("l0_lift").dofadr[0]] == pytest.approx(20.0)
+
+
+def test_meshes_of_the_same_name_in_two_folders_are_told_apart(tmp_path):
+    """The one that is touched is half as large in all directions."""
+    corners = "v 0 0 0\nv {0} 0 0\nv 0 {0} 0\nv 0 0 {0}\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    for folder, size in (("visual", 1.0), ("collision", 0.5)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "trunk.obj").write_text(corners.format(size))
+    text = HEXAPOD
+    for folder in ("visual", "collision"):
+        shape = f'<{folder}><geometry><mesh filename="{folder}/trunk.obj"/></geometry></{folder}>'
+        text = text.replace('<link name="trunk">', f'<link name="trunk">{shape}', 1)
+    model = read_robot(hexapod(tmp_path, text)).compile()
+    spans = {}
+    for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
+        mesh = model.geom_dataid[geom]
+        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        vertices = model.mesh_vert[first : first + number]
+        spans[bool(model.geom_contype[geom])] = np.linalg.norm(np.ptp(vertices, axis=0))
+    assert spans[False] == pytest.approx(2 * spans[True], rel=1e-5)
 
 
 @pytest.mark.parametrize(

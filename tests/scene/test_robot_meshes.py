@@ -86,6 +86,9 @@ def robot(tmp_path_factory):
         penalized_geoms=("trunk",),
         footprint=(0.1, 0.3),
         footing=0.4,
+        outline=(0.5, 0.5, 0.5),
+        height=0.5,
+        radius=0.4,
         min_base_height=0.1,
         ray_groups=(2,),
     )
