@@ -3,7 +3,8 @@
     python -m omniperception.hardware.guard SETTINGS FD
 
 `robot` starts it. Targets and requests come through the socket FD; the robot's state it reads itself. When the other
-end falls silent or closes, the robot lies down, its joints are damped for a while, and the process ends.
+end falls silent or closes, a robot that walks is damped, one that stands lies down and is damped; after a while the
+process ends.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ class Link:
             self.mode, self.reason = MODES[said[0]], said[1:].decode("utf-8", "replace")
 
     def close(self) -> None:
-        """Leaves the guard alone: it lays the robot down and ends."""
+        """Leaves the guard alone: it sees to the robot and ends."""
         self._end.close()
         self.is_closed = True
 

@@ -255,6 +255,13 @@ def hexapod(folder, text=HEXAPOD):
     return path
 
 
+def on_six_legs(folder, **changes):
+    """A preset of the hexapod with one actuated joint."""
+    numbers = dict.fromkeys(("kp", "kv", "torque_limits", "action_scale"), 1.0) | changes
+    own = {"base": "base_link", "joints": ("l0_lift",), "default_joint_pos": {"l0_lift": 0.0}}
+    return dataclasses.replace(biped(folder), file=str(hexapod(folder)), **own, **numbers)
+
+
 def test_a_urdf_floats_keeps_its_feet_and_its_mass(tmp_path):
     model = read_robot(hexapod(tmp_path)).compile()
     assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and model.body(int(model.jnt_bodyid[0])).name == "base_link"
@@ -287,15 +294,8 @@ def test_a_urdf_may_leave_out_the_end_of_a_range_that_is_0(tmp_path):
 
 
 def test_torque_limits_are_the_presets_where_the_files_are_lower(tmp_path):
-    """An effort of 8 N m in the URDF, 20 N m in the preset."""
-    robot = dataclasses.replace(
-        biped(tmp_path),
-        file=str(hexapod(tmp_path)),
-        base="base_link",
-        joints=("l0_lift",),
-        **dict.fromkeys(("kp", "kv", "action_scale"), 1.0) | {"torque_limits": 20.0, "kp": 1000.0},
-        default_joint_pos={"l0_lift": 0.0},
-    )
+    """An effort of 15 N m in the URDF, 20 N m in the preset."""
+    robot = on_six_legs(tmp_path, torque_limits=20.0, kp=1000.0)
     model = robot.spec().compile()
     data = mujoco.MjData(model)
     data.ctrl[0] = 1.0
@@ -376,14 +376,7 @@ def test_an_mjcf_that_cannot_be_right_is_refused_in_one_line(tmp_path, old, new,
 
 def test_a_mount_on_a_fixed_link_is_one_on_the_link_that_carries_it(tmp_path):
     """The lidar's link is fused into the base 0.15 m ahead and 0.1 m up, pitched by 0.2 rad; 0.1 m along its own x."""
-    robot = dataclasses.replace(
-        biped(tmp_path),
-        file=str(hexapod(tmp_path)),
-        base="base_link",
-        joints=("l0_lift",),
-        **dict.fromkeys(("kp", "kv", "torque_limits", "action_scale"), 1.0),
-        default_joint_pos={"l0_lift": 0.0},
-    )
+    robot = on_six_legs(tmp_path)
     place = robot.place(Mount(pos=(0.1, 0.0, 0.0), rpy=(0.0, 0.3, 0.0), body="lidar"))
     assert place.body is None
     np.testing.assert_allclose(place.pos, [0.15 + 0.1 * np.cos(0.2), 0, 0.1 - 0.1 * np.sin(0.2)], atol=1e-9)
