@@ -278,10 +278,6 @@ class ExportedPolicy:
         for name, value in (given | dict(state.other or {})).items():
             if not np.isfinite(np.asarray(value, np.float64)).all():
                 raise SafetyStop(f"{name}: finite numbers were expected, {np.asarray(value).tolist()} given")
-        if np.shape(state.base_quat) == (4,) and not abs(np.linalg.norm(state.base_quat) - 1.0) < _UNIT:
-            raise SafetyStop(
-                f"base_quat: a unit quaternion (w, x, y, z) was expected, {np.asarray(state.base_quat).tolist()} given"
-            )
         joint_pos, joint_vel = (np.asarray(value, np.float32) for value in (state.joint_pos, state.joint_vel))
         if joint_pos.shape == joint_vel.shape == self._default_pos.shape:  # otherwise the observation names it
             safety.check_state(-float(_projected_gravity(self, state, command)[2]), joint_pos, joint_vel)
@@ -428,16 +424,12 @@ def _projected_gravity(policy: ExportedPolicy, state: RobotState, command: Array
     return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], np.float32)
 
 
-_UNIT = 1e-2
-"""By how much the length of a unit quaternion may be off."""
-
-
 def _quaternion(given: ArrayLike) -> np.ndarray:
     """(4,) float64 of unit length."""
     quat = np.asarray(given, np.float64)
     length = float(np.linalg.norm(quat)) if quat.shape == (4,) else float("nan")
-    if not abs(length - 1.0) < _UNIT:
-        raise DeployError(f"base_quat: a unit quaternion (w, x, y, z) was expected, {quat.tolist()} given")
+    if not abs(length - 1.0) < 1e-2:
+        raise SafetyStop(f"base_quat: a unit quaternion (w, x, y, z) was expected, {quat.tolist()} given")
     return quat / length
 
 

@@ -250,7 +250,7 @@ class Mid360:
 
     def _note(self, number: int, time_ns: int) -> None:
         """Counts gaps in the packets' numbers. One that comes late after all is no gap; where a later packet has a
-        lower number, counting began again: the sensor was switched on, or counts the packets of a frame."""
+        lower number, the counter has restarted: after a power cycle, or where it counts the packets of a frame."""
         if self._newest is not None:
             ahead, later = (number - self._newest[0]) & 0xFFFF, time_ns > self._newest[1]
             if 1 <= ahead < 0x8000:

@@ -242,7 +242,8 @@ def _told(result: dict) -> str:
     """A trial in words."""
     outcome = result["outcome"] or {}
     if not outcome.get("stood"):
-        return "refused before a motor moved" if _is_refused(result) else "never stood up"
+        said = result.get("robot_said", "").strip().rpartition("\n")[2]
+        return "refused before a motor moved" if _is_refused(result) else f"never stood up ({said})"
     did = [name for name in ("reached", "touched", "fell") if outcome[name]]
     did.append("lay at the end" if outcome["height"] < _LYING else f"{outcome['speed']:.1f} m/s at the end")
     return ", ".join(did)
@@ -251,7 +252,7 @@ def _told(result: dict) -> str:
 def _is_refused(result: dict) -> bool:
     """Whether `robot` has refused a description that is not the network's, and for no other reason."""
     stood = (result["outcome"] or {}).get("stood")
-    return not stood and result["robot_exit"] == 2 and _NOT_THE_SAME in result["robot_said"]
+    return not stood and result["robot_exit"] == 2 and _NOT_THE_SAME in result.get("robot_said", "")
 
 
 def results(folder: Path) -> list[dict]:

@@ -221,7 +221,7 @@ class RobotConfig:
             actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             actuator.set_to_position(kp=kp, kv=kv)
             actuator.forcerange = [-limit, limit]
-            joint.actfrcrange = [-limit, limit]  # the file's own, such as a URDF's effort, would cap it besides
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # a URDF's effort would cap it besides
         self._add_self_collision(spec)
         return spec
 

@@ -192,20 +192,19 @@ def _parse_urdf(robot: ElementTree.Element, path: Path) -> mujoco.MjSpec:
 
 
 def _check_ranges(robot: ElementTree.Element, path: Path) -> None:
-    """MuJoCo takes a range from 0 to 0, or of one end, for no limit at all."""
+    """MuJoCo takes a range from 0 to 0, or of one end, for no limit at all; an end left out is 0, as URDF says."""
     for joint in robot.iter("joint"):
         if joint.get("type") not in ("revolute", "prismatic"):
             continue
         limit = joint.find("limit")
         low, high = (float(limit.get(key, 0)) if limit is not None else 0.0 for key in ("lower", "upper"))
-        if limit is not None:  # MuJoCo takes one end alone for no limit at all; the other is 0, as URDF says
-            limit.set("lower", repr(low))
-            limit.set("upper", repr(high))
-        if not low < high:
+        if limit is None or not low < high:
             raise ValueError(
                 f"robot.file={path}: joint {joint.get('name')} has limits from {low:g} to {high:g}; give it a range, or"
                 " make it fixed or continuous"
             )
+        limit.set("lower", repr(low))
+        limit.set("upper", repr(high))
 
 
 def _drop_unreadable_visuals(robot: ElementTree.Element) -> None:
