@@ -17,6 +17,7 @@ from omniperception.robots.body import Body
 from omniperception.robots.guess import GUESSED, SURE, Wishes, guess
 from omniperception.robots.stand import flat_world, reached_limits, stand
 from omniperception.scene import RobotConfig
+from omniperception.scene.robot_file import compile_robot, read_robot
 from omniperception.schema import make
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -128,6 +129,23 @@ def test_actuators_of_the_file_say_which_joints_are_driven(tmp_path):
     found = guess(tmp_path / "biped.xml", str(tmp_path / "biped.xml"), Wishes(self_collision=False))
     assert found.preset["joints"] == list(LEGS) and found.preset["torque_limits"] == 18.0
     assert found.preset["self_collision"] == []
+
+
+def test_a_joint_that_follows_another_is_passive(tmp_path):
+    """`<mimic>`: the leg that follows, which nothing drives, bends as the one that is pushed does."""
+    path, driven = tmp_path / "hexapod.urdf", '<joint name="l1_lift" type="revolute">'
+    assert HEXAPOD.count(driven) == 1
+    path.write_text(HEXAPOD.replace(driven, driven + '<mimic joint="l0_lift"/>'))
+    found = guess(path, str(path))
+    assert "l1_lift" not in found.preset["joints"] and len(found.preset["joints"]) == 11
+    assert "1 follow others" in next(finding.why for finding in found.findings if finding.key == "joints")
+    model = compile_robot(read_robot(path), path)
+    data, (first, second) = mujoco.MjData(model), (model.joint(f"l{k}_lift") for k in range(2))
+    data.qfrc_applied[first.dofadr[0]] = 5.0
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+    angles = data.qpos[[first.qposadr[0], second.qposadr[0]]]
+    assert angles[0] > 0.1 and angles[1] == pytest.approx(angles[0], abs=0.02)
 
 
 def test_gains_are_a_spring_of_the_asked_frequency_where_nothing_else_counts(guesses):

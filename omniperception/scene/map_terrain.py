@@ -287,12 +287,16 @@ def _first_of(heights: np.ndarray, cell: float) -> tuple[float, float]:
 def read_image(file: str) -> np.ndarray:
     """(rows, cols) float64 brightness, 0 black to 1 white, of a picture; the first row is its lowest.
 
+    What is transparent is white, as it is seen on paper.
+
     Raises:
         ValueError: it is no picture.
     """
     try:
         with Image.open(file) as image:
             deep = image.mode.startswith("I")  # 16 bit
+            if image.has_transparency_data and not deep:
+                image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image.convert("RGBA"))
             values = np.asarray(image if deep else image.convert("L"), dtype=np.float64)
     except OSError as error:
         raise ValueError(f"terrain.file={file} is no picture that can be read ({str(error).splitlines()[0]})") from None

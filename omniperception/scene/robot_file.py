@@ -39,6 +39,7 @@ def parse(path: Path) -> mujoco.MjSpec:
         root = ElementTree.parse(path).getroot()
         if root.tag == "robot":
             return _parse_urdf(root, path)
+        _check_written_ranges(root, path)
         return mujoco.MjSpec.from_file(str(path))
     except ElementTree.ParseError as error:
         raise ValueError(f"robot.file={path} is not XML: {error}") from None
@@ -140,6 +141,18 @@ def _check(spec: mujoco.MjSpec, path: Path) -> None:
             f"robot.file={path}: no body floats (bodies with a free joint: none); put <freejoint/> into the body of the"
             f" base: {roots}"
         )
+
+
+def _check_written_ranges(root: ElementTree.Element, path: Path) -> None:
+    """Refuses a joint that says `range="0 0"`, which MuJoCo takes for no limit at all."""
+    for world in root.iter("worldbody"):
+        for joint in world.iter("joint"):
+            written = joint.get("range", "").split()
+            if written and all(float(end) == 0 for end in written) and joint.get("limited") != "false":
+                raise ValueError(
+                    f"robot.file={path}: joint {joint.get('name', 'without a name')} has a range from 0 to 0, which"
+                    " MuJoCo takes for no limit; take the joint out to fix its link, or the range to let it turn"
+                )
 
 
 def _name_all(spec: mujoco.MjSpec) -> None:

@@ -68,6 +68,10 @@ def test_a_picture_lies_as_it_is_seen(files):
     assert plan.height_map().shape == (41 + 2 * BORDER, 61 + 2 * BORDER)
     assert at(plan, 0.0, 2.0) == at(plan, 2.1, -1.1) == 1.2
     assert at(plan, 0.0, -2.0) == at(plan, -2.1, -1.1) == at(plan, 2.1, 1.1) == 0.0
+    drawn = np.zeros((41, 61, 4), np.uint8)
+    drawn[..., 3] = 255 - pixels  # black where there is wall, elsewhere nothing at all
+    Image.fromarray(drawn).save("drawn.png")
+    np.testing.assert_array_equal(FloorPlanConfig("drawn.png", CELL, wall_height=1.2).height_map(), plan.height_map())
     thick = np.pad(pixels, 60)  # more wall than floor
     Image.fromarray(thick).save("thick.png")
     walled = FloorPlanConfig("thick.png", CELL)

@@ -358,6 +358,7 @@ LOOP = '<equality><connect body1="head" body2="tail" anchor="0 0 0"/></equality>
             "mass and inertia of moving bodies .*tail.*; give that link",
         ),
         ('range="-1 1"', 'range="1 -1"', "joint tail has a range from 1 to -1; give it a low"),
+        ('range="-1 1"', 'range="0 0"', "joint tail has a range from 0 to 0, which MuJoCo takes for no limit"),
         ('<geom type="sphere" size="0.05"', '<geom type="mesh" mesh="gone"', "gone.stl.*; put the mesh where"),
         ("<mujoco ", "<scene ", "robot.file="),
     ],
