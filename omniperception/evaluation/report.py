@@ -88,8 +88,8 @@ def table(records: Sequence[Record]) -> str:
     return f"{headline(records)}\n\n{markdown(columns, [row + [''] * (len(columns) - len(row)) for row in rows])}\n"
 
 
-def headline(records: Sequence[Record]) -> str:
-    """What all rows of a table share."""
+def headline(records: Sequence[Record], apart: bool = False) -> str:
+    """What all rows of a table share; `apart`: each run has rows of its own."""
     trials = sorted({len(record.episodes) for record in records})
     conditions = sorted({f"{r.condition} (version {r.condition_version})" for r in records if r.condition_version})
     seeds = len({record.run for record in records})
@@ -97,7 +97,7 @@ def headline(records: Sequence[Record]) -> str:
         f"split {', '.join(sorted({record.split for record in records}))}",
         f"condition {', '.join(conditions) or 'none'}",
         f"{' or '.join(map(str, trials))} trials" + (f" of each of {seeds} runs" if seeds > 1 else ""),
-        "rates with 95 % intervals" + (" (least to most of the runs)" if seeds > 1 else ""),
+        "rates with 95 % intervals" + (" (least to most of the runs)" if seeds > 1 and not apart else ""),
     ]
     return "; ".join(parts)
 

@@ -6,6 +6,7 @@
 <!-- table: before view=conditions policy=run,blind -->         untouched and falls: a row for each policy
 <!-- table: gait view=walking -->                              figures of a gait: a row for each ground
 <!-- table: gait view=levels -->                               the same, all kinds of ground together
+<!-- table: gait view=runs -->                                the same, a row for each run
 <!-- table: end_to_end view=study -->                          results of a study: a row for each training and policy
 <!-- end -->
 """
@@ -23,7 +24,7 @@ from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.records import Record, read
 from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, table, without_constants
 from omniperception.evaluation.study_report import study_table
-from omniperception.evaluation.walking_report import level_table, walking_table
+from omniperception.evaluation.walking_report import level_table, run_table, walking_table
 
 _BLOCK = re.compile(r"^<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
 _BEGIN = re.compile(r"^<!-- table:", re.MULTILINE)
@@ -110,6 +111,7 @@ VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
     "conditions": by_condition,
     "walking": walking_table,
     "levels": level_table,
+    "runs": run_table,
     "study": study_table,
 }
 

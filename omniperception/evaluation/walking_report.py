@@ -30,7 +30,8 @@ def walking_table(records: Sequence[Record]) -> str:
     Raises:
         ConfigError: see `check_apart`.
     """
-    return _table(records, grounds)
+    rows = _rows(records, grounds)
+    return f"{headline(records)}\n\n{markdown(*without_constants(KEYS, HEADINGS, rows))}\n"
 
 
 def level_table(records: Sequence[Record]) -> str:
@@ -39,10 +40,25 @@ def level_table(records: Sequence[Record]) -> str:
     Raises:
         ConfigError: see `check_apart`.
     """
-    return _table(records, lambda record: {name: there for name, there in grounds(record).items() if "," not in name})
+    rows = _rows(records, _levels)
+    return f"{headline(records)}\n\n{markdown(*without_constants(KEYS, HEADINGS, rows))}\n"
 
 
-def _table(records: Sequence[Record], parts_of: Callable[[Record], dict[str, torch.Tensor]]) -> str:
+def run_table(records: Sequence[Record]) -> str:
+    """As :func:`level_table`, each run by itself: of other robots, by other recipes.
+
+    Raises:
+        ConfigError: see `check_apart`.
+    """
+    rows = [[run, *row] for (run,), own in grouped(records, "run").items() for row in _rows(own, _levels)]
+    return f"{headline(records, apart=True)}\n\n{markdown(*without_constants(('run', *KEYS), HEADINGS, rows))}\n"
+
+
+def _levels(record: Record) -> dict[str, torch.Tensor]:
+    return {name: there for name, there in grounds(record).items() if "," not in name}
+
+
+def _rows(records: Sequence[Record], parts_of: Callable[[Record], dict[str, torch.Tensor]]) -> list[list[str]]:
     check_apart(records)
     rows = []
     for (world, terrain, condition, policy), seeds in grouped(
@@ -53,7 +69,7 @@ def _table(records: Sequence[Record], parts_of: Callable[[Record], dict[str, tor
             there = zip(seeds, by_seed, strict=True)
             parts = [Part(record, found[ground]) for record, found in there if ground in found]
             rows.append([world, terrain, ground, condition, policy, *figures(parts)])
-    return f"{headline(records)}\n\n{markdown(*without_constants(KEYS, HEADINGS, rows))}\n"
+    return rows
 
 
 def grounds(record: Record) -> dict[str, torch.Tensor]:

@@ -13,7 +13,7 @@ from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.walking import AT_STOP, COLUMNS
-from omniperception.evaluation.walking_report import Part, grounds, level_table, walking_table
+from omniperception.evaluation.walking_report import Part, grounds, level_table, run_table, walking_table
 
 BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk", "num_envs=3")
 
@@ -145,6 +145,13 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     first = replace(record, episodes=replace(episodes, outcome=fell))
     turned = {name: values.flip(0) for name, values in episodes.walking.items()}  # another seed, with other tiles
     second = replace(first, run="b", episodes=replace(episodes, outcome=fell.flip(0), walking=turned))
+    apart = [line.split("|") for line in run_table([first, second]).splitlines() if line.startswith("|")]
+    assert [cells[1].strip() for cells in apart[2:]] == ["run", "run", "b", "b"] and "runs)" not in run_table(
+        [first, second]
+    )
+    assert [cells[2:] for cells in apart[2:4]] == [
+        line.split("|")[2:] for line in level_table([first]).splitlines() if line.startswith("| walk")
+    ]
     lines = [line.split("|") for line in walking_table([first, second]).splitlines() if line.startswith("|")]
     at = [cell.strip() for cell in lines[0]].index("falls, %")
     rows = {cells[2].strip(): cells[at].strip() for cells in lines}
