@@ -295,12 +295,17 @@ def read_image(file: str) -> np.ndarray:
     try:
         with Image.open(file) as image:
             deep = image.mode.startswith("I")  # 16 bit
-            if image.has_transparency_data and not deep:
-                image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image.convert("RGBA"))
-            values = np.asarray(image if deep else image.convert("L"), dtype=np.float64)
+            grey = image if deep else _on_white(image).convert("L")
+            values = np.asarray(grey, dtype=np.float64)
     except OSError as error:
         raise ValueError(f"terrain.file={file} is no picture that can be read ({str(error).splitlines()[0]})") from None
     return values[::-1] / (65535.0 if deep else 255.0)
+
+
+def _on_white(image: Image.Image) -> Image.Image:
+    if not image.has_transparency_data:
+        return image
+    return Image.alpha_composite(Image.new("RGBA", image.size, "white"), image.convert("RGBA"))
 
 
 def read_array(file: str) -> np.ndarray:
