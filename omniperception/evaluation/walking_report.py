@@ -30,8 +30,7 @@ def walking_table(records: Sequence[Record]) -> str:
     Raises:
         ConfigError: see `check_apart`.
     """
-    rows = _rows(records, grounds)
-    return f"{headline(records)}\n\n{markdown(*without_constants(KEYS, HEADINGS, rows))}\n"
+    return _table(records, KEYS, _rows(records, grounds))
 
 
 def level_table(records: Sequence[Record]) -> str:
@@ -40,8 +39,7 @@ def level_table(records: Sequence[Record]) -> str:
     Raises:
         ConfigError: see `check_apart`.
     """
-    rows = _rows(records, _levels)
-    return f"{headline(records)}\n\n{markdown(*without_constants(KEYS, HEADINGS, rows))}\n"
+    return _table(records, KEYS, _rows(records, _levels))
 
 
 def run_table(records: Sequence[Record]) -> str:
@@ -51,7 +49,11 @@ def run_table(records: Sequence[Record]) -> str:
         ConfigError: see `check_apart`.
     """
     rows = [[run, *row] for (run,), own in grouped(records, "run").items() for row in _rows(own, _levels)]
-    return f"{headline(records, apart=True)}\n\n{markdown(*without_constants(('run', *KEYS), HEADINGS, rows))}\n"
+    return _table(records, ("run", *KEYS), rows)
+
+
+def _table(records: Sequence[Record], keys: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return f"{headline(records, apart='run' in keys)}\n\n{markdown(*without_constants(keys, HEADINGS, rows))}\n"
 
 
 def _levels(record: Record) -> dict[str, torch.Tensor]:

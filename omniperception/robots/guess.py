@@ -169,12 +169,12 @@ def _actuated(body: Body, raw: mujoco.MjSpec, file: Path, wishes: Wishes) -> tup
         if unknown:
             raise ValueError(f"joints={','.join(unknown)} are no hinges or slides of {file}; known: {', '.join(names)}")
         return [names[name] for name in wishes.joints], Finding("joints", SURE, "as asked for")
-    following = {joined.name1 for joined in raw.equalities if joined.type == mujoco.mjtEq.mjEQ_JOINT}
     driven = [actuator.target for actuator in raw.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT]
     chosen = [names[name] for name in dict.fromkeys(driven) if name in names]
     if chosen:
         passive = len(names) - len(chosen)
         return chosen, Finding("joints", SURE, f"those with an actuator in the file; {passive} passive")
+    following = {joined.name1 for joined in raw.equalities if joined.type == mujoco.mjtEq.mjEQ_JOINT}
     free = [joint for name, joint in names.items() if name not in following]
     if not free:
         raise ValueError(f"robot.file={file} has no hinge or slide that could be driven")

@@ -39,8 +39,9 @@ def parse(path: Path) -> mujoco.MjSpec:
         root = ElementTree.parse(path).getroot()
         if root.tag == "robot":
             return _parse_urdf(root, path)
-        _check_written_ranges(root, path)
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        _check_written_ranges(root, path)  # later, so that what is no number has been told by MuJoCo
+        return spec
     except ElementTree.ParseError as error:
         raise ValueError(f"robot.file={path} is not XML: {error}") from None
     except ValueError as error:

@@ -145,10 +145,9 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     first = replace(record, episodes=replace(episodes, outcome=fell))
     turned = {name: values.flip(0) for name, values in episodes.walking.items()}  # another seed, with other tiles
     second = replace(first, run="b", episodes=replace(episodes, outcome=fell.flip(0), walking=turned))
-    apart = [line.split("|") for line in run_table([first, second]).splitlines() if line.startswith("|")]
-    assert [cells[1].strip() for cells in apart[2:]] == ["run", "run", "b", "b"] and "runs)" not in run_table(
-        [first, second]
-    )
+    by_run = run_table([first, second])
+    apart = [line.split("|") for line in by_run.splitlines() if line.startswith("|")]
+    assert [cells[1].strip() for cells in apart[2:]] == ["run", "run", "b", "b"] and "runs)" not in by_run
     assert [cells[2:] for cells in apart[2:4]] == [
         line.split("|")[2:] for line in level_table([first]).splitlines() if line.startswith("| walk")
     ]
