@@ -83,6 +83,8 @@ def commit(root: Path = ROOT) -> str | None:
 def command() -> str:
     """The command line of this process; the program's path from the checkout's root, or its name alone."""
     program = Path(sys.argv[0] or "python")
+    if program.name == "__main__.py":  # of python -m: a package is called as its folder
+        program = program.parent
     path = program.resolve()
     name = str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else program.name
     return shlex.join([name, *sys.argv[1:]])
