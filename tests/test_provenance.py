@@ -33,3 +33,5 @@ def test_entries(monkeypatch):
     found = provenance.provenance("cpu", ("numpy", "no-such-distribution"), seed=3)
     assert found["command"] == "scripts/stability.py subject=lidar 'out=a b'" and found["seed"] == 3
     assert set(found["versions"]) == {"python", "numpy"} and found["machine"]["device"] == "cpu"
+    monkeypatch.setattr(sys, "argv", [str(ROOT / "omniperception" / "__main__.py"), "runs"])  # python -m omniperception
+    assert provenance.command() == "omniperception runs"
