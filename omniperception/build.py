@@ -160,9 +160,10 @@ def _resolved(config: DictConfig) -> dict:
         message = one_line(error).partition(" full_key:")[0]
         if "robot.gait" in message:
             raise ConfigError(
-                "robot.gait is missing, and rewards or observations follow its clock; give it, with an offset for"
-                " each foot, such as robot.gait={frequency: 2, offsets: [0, 0.5, 0.5, 0], duty: 0.5, foot_height: 0.1},"
-                " or choose others (rewards=walk observations=walk)"
+                "robot.gait, or part of it, is missing, and rewards, observations or commands follow it; give it, with"
+                " an offset for each foot, such as robot.gait={frequency: 2, offsets: [0, 0.5, 0.5, 0], duty: 0.5,"
+                " foot_height: 0.1, lift: 0, lin_vel_x: [-1, 1], lin_vel_y: [-1, 1], ang_vel_z: [-1, 1]}, or choose"
+                " others (rewards=walk observations=walk commands=velocity stepping=null)"
             ) from None
         raise ConfigError(message.partition("raised while resolving interpolation: ")[2] or message) from None
 

@@ -55,7 +55,13 @@ def _device_figure(name: str, figure: str) -> float:
     return getattr(DEVICES[name], figure)
 
 
+def _within(most: float, values: Sequence[float]) -> list[float]:
+    """Values brought between -most and most, for `${within:1.0,${robot.gait.lin_vel_x}}` in presets."""
+    return [min(max(value, -most), most) for value in values]
+
+
 OmegaConf.register_new_resolver("device", _device_figure, replace=True)
+OmegaConf.register_new_resolver("within", _within, replace=True)
 
 
 def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:

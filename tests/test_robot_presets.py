@@ -44,7 +44,7 @@ def robot_of(name):
 
 
 def test_the_presets_are_these():
-    assert ROBOTS == ("anymal", "g1", "go1", "go2")
+    assert ROBOTS == ("anymal", "g1", "g1_legs", "go1", "go2")
 
 
 def test_it_stands_on_its_feet(name):
@@ -199,7 +199,9 @@ def test_the_ablation_runs_with_it(name, tmp_path):
 
 def test_a_clock_without_a_gait_is_refused_in_one_line(tmp_path):
     folder = write_preset(tmp_path, preset={key: value for key, value in BIPED_PRESET.items() if key != "gait"})
-    with pytest.raises(ConfigError, match=r"robot\.gait is missing, .* robot\.gait=\{frequency") as error:
+    with pytest.raises(
+        ConfigError, match=r"robot\.gait, or part of it, is missing, .* robot\.gait=\{frequency"
+    ) as error:
         build.assemble(config.compose([folder, "robot=biped", "experiment=gait"]))
     assert "\n" not in str(error.value)
 
@@ -211,6 +213,8 @@ def test_a_clock_without_a_gait_is_refused_in_one_line(tmp_path):
         ("robot.gait.offsets=[0.0,0.5,0.5,1.5]", "must be shares of a period"),
         ("robot.gait.duty=1.0", r"duty=1\.0 between 0 and 1"),
         ("robot.gait.frequency=0", "frequency=0"),
+        ("robot.gait.lift=-1", r"robot\.gait\.lift=-1 must be positive, or 0"),
+        ("robot.gait.lin_vel_x=[2,1]", r"robot\.gait\.lin_vel_x=\[2, 1\] must be the least and the most velocity"),
     ],
 )
 def test_a_gait_that_cannot_be_is_refused(change, message):

@@ -97,6 +97,16 @@ def test_neighbouring_feet_step_in_turn(guesses):
     assert guesses["go2"].preset["gait"]["foot_height"] == pytest.approx(0.09, abs=0.01)
 
 
+def test_velocities_grow_with_the_root_of_the_height(guesses):
+    """0.45 of the root of g times the height on two feet, which lift none while the robot stands; 1.1 on more."""
+    for name, share, lift in (("biped", 0.45, 0.0), ("go2", 1.1, 1.6), ("hexapod", 1.1, 1.6)):
+        preset = guesses[name].preset
+        gait, natural = preset["gait"], math.sqrt(9.81 * preset["base_height"])
+        assert gait["lift"] == lift and gait["lin_vel_x"][1] == pytest.approx(share * natural, abs=0.051), name
+        assert gait["lin_vel_x"][0] < 0 and gait["lin_vel_y"][0] == -gait["lin_vel_y"][1] < 0, name
+    assert guesses["go2"].preset["gait"]["lin_vel_x"] == pytest.approx([-1.0, 2.0], abs=0.11)
+
+
 def test_flat_feet_stand_flat_whose_knees_bend_one_way():
     """The knees' range begins at 0. Soles are 3 cm thick boxes; a foot's centre rises by 0.1 m from 1.5 cm."""
     found = guess(DATA / "strider.urdf", str(DATA / "strider.urdf")).preset

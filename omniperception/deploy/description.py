@@ -33,6 +33,7 @@ class Joints:
         torque_limits: N m.
         lower: joint limits, rad; None without; the runtime clips targets to them, training does not.
         upper: rad.
+        locked: rad, by joint: where the robot has to hold others, which the policy neither sees nor drives.
     """
 
     names: Sequence[str]
@@ -44,6 +45,7 @@ class Joints:
     torque_limits: Sequence[float]
     lower: Sequence[float | None]
     upper: Sequence[float | None]
+    locked: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         torque_limits=list(robot.by_joint("torque_limits")),
         lower=_limits(env.state.joint_lower),
         upper=_limits(env.state.joint_upper),
+        locked=dict(robot.locked),
     )
     return Description(
         control_period_s=env.control_dt,

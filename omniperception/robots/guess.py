@@ -31,6 +31,9 @@ _PACE, _RISE = 2.5, 0.2
 number); and how high feet rise as a share of the base's height, ..."""
 _MOST_RISE = 0.1
 """... at most so much (m)."""
+_ON_TWO, _ON_MORE = (0.0, 0.45, 0.2, 0.15, 1.0), (1.6, 1.1, 0.55, 0.85, 1.5)
+"""On two feet and on more: how high feet are lifted on the spot; fastest ahead, back and aside, as a share of the root
+of g times the base's height; and rad/s. The G1's and the Go2's."""
 _SWING, _SWAY = 0.12, 0.06
 """Room (m) around the default pose that a robot takes while it walks, beside and above it; the Go2's, rounded."""
 
@@ -283,7 +286,11 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
         Finding("outline", GUESSED, f"what collides, in the default pose, and {_SWING:g} m"),
         Finding("height", GUESSED, f"likewise, and {_SWAY:g} m"),
         Finding("radius", GUESSED, "half of its length or width"),
-        Finding("gait", GUESSED, "feet beside and behind each other in turn, as fast as legs are long"),
+        Finding(
+            "gait",
+            GUESSED,
+            "feet beside and behind each other in turn, as fast as legs are long; so are its velocities",
+        ),
         Finding("torque_limits", SURE if gains.said.all() else GUESSED, limits),
         Finding("kp, kv", GUESSED, f"springs of {rate:g} Hz, damping ratio {ratio:g}, or sag under {SAG:g} rad"),
         Finding("action_scale", GUESSED, f"{REACH:g} torque limit / kp"),
@@ -312,7 +319,18 @@ def _gait(draft: _Draft, height: float) -> dict[str, object]:
         "offsets": offsets,
         "duty": 0.5,
         "foot_height": round(height + centre + min(_RISE * height, _MOST_RISE), 3),
+        **_pace(len(places), height),
     }
+
+
+def _pace(feet: int, height: float) -> dict[str, object]:
+    """How fast a robot shall walk: with the root of its height, as its legs' pendulum. On two feet it lifts none while
+    it stands."""
+    lift, ahead, back, aside, turn = _ON_TWO if feet <= 2 else _ON_MORE
+    natural = float(np.sqrt(9.81 * height))
+    x = [-round(back * natural, 1), round(ahead * natural, 1)]
+    y = round(aside * natural, 1)
+    return {"lift": lift, "lin_vel_x": x, "lin_vel_y": [-y, y], "ang_vel_z": [-turn, turn]}
 
 
 def _on_self_collision(draft: _Draft, pairs: list[tuple[str, str]]) -> Finding:

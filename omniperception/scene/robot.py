@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from omniperception.scene.fetched import SCHEME, fetched
-from omniperception.scene.robot_file import FRAME, collides, compile_robot, drop_unseen, read_robot, rigid_geoms
+from omniperception.scene.robot_file import FRAME, collides, compile_robot, drop_unseen, lock, read_robot, rigid_geoms
 
 ByJoint = float | Mapping[str, float]
 """One number for all joints, or one for each by name."""
@@ -52,19 +52,26 @@ class Place:
 
 @dataclass(frozen=True)
 class Gait:
-    """The rhythm in which a robot walks, for rewards and observations that follow a clock.
+    """How a robot walks: its rhythm, for rewards and observations that follow a clock, and how fast it shall be.
 
     Attributes:
         frequency: steps of each foot per second (Hz).
         offsets: when each foot's step begins after the clock's, in periods, in the order of the robot's feet.
         duty: share of a step for which a foot is down.
         foot_height: height (m) above the ground to which a foot's centre rises.
+        lift: how high feet are lifted while it steps on the spot (`SteppingConfig`), as a share of foot_height; 0: it
+            has no such motion. A robot on two feet topples with it.
+        lin_vel_x, lin_vel_y, ang_vel_z: least and most velocity (m/s, m/s, rad/s) that experiment=gait asks of it.
     """
 
     frequency: float
     offsets: tuple[float, ...]
     duty: float
     foot_height: float
+    lift: float
+    lin_vel_x: tuple[float, float]
+    lin_vel_y: tuple[float, float]
+    ang_vel_z: tuple[float, float]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "offsets", tuple(float(offset) for offset in self.offsets))
@@ -75,6 +82,13 @@ class Gait:
             )
         if not all(0 <= offset < 1 for offset in self.offsets):
             raise ValueError(f"robot.gait.offsets={list(self.offsets)} must be shares of a period, from 0 to below 1")
+        if self.lift < 0:
+            raise ValueError(f"robot.gait.lift={self.lift} must be positive, or 0 for a robot that does not step so")
+        for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z"):
+            low, high = (float(end) for end in getattr(self, name))
+            object.__setattr__(self, name, (low, high))
+            if not low <= high:
+                raise ValueError(f"robot.gait.{name}=[{low:g}, {high:g}] must be the least and the most velocity")
 
 
 @dataclass(frozen=True)
@@ -89,7 +103,8 @@ class RobotConfig:
             or a path. Its actuators, sensors and keyframes are not used; the root link of a URDF floats.
         base: name of the free-floating base body.
         joints: joints that are actuated, in the order of actions, joint observations and the exported policy; the file
-            may have them in any order. All others but the base's are passive: nothing drives or observes them.
+            may have them in any order. All others but the base's and `locked` are passive: nothing drives or observes
+            them.
         default_joint_pos: joint angle (rad) of the default pose, by joint name; passive joints may be named, too, and
             otherwise start as in the file.
         base_height: height (m) of the base origin above the ground in the default pose.
@@ -114,6 +129,8 @@ class RobotConfig:
             other; none: the robot never touches itself.
         ray_groups: geom groups of the file that LiDAR rays can hit; None: the geoms that can be touched.
         mounts: places for a LiDAR, by name.
+        locked: angle (rad; m of a slide) of joints that are held, by name: their links become part of what carries
+            them. A real robot has to hold them there.
         gait: the rhythm in which it walks; None: nothing may ask for one.
     """
 
@@ -140,6 +157,7 @@ class RobotConfig:
     self_collision: tuple[tuple[str, str], ...] = ()
     ray_groups: tuple[int, ...] | None = None
     mounts: Mapping[str, Mount] = field(default_factory=dict)
+    locked: Mapping[str, float] = field(default_factory=dict)
     gait: Gait | None = None
 
     def __post_init__(self) -> None:
@@ -165,6 +183,12 @@ class RobotConfig:
         if len(set(self.joints)) != len(self.joints):
             twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
             raise ValueError(f"robot.joints names {', '.join(twice)} more than once")
+        posed = sorted(set(self.locked) & {*self.joints, *self.default_joint_pos})
+        if posed:
+            raise ValueError(
+                f"robot.locked names {', '.join(posed)}, which robot.joints or robot.default_joint_pos names, too;"
+                " leave them out of one of the two"
+            )
         missing = sorted(set(self.joints) - set(self.default_joint_pos))
         if missing:
             raise ValueError(f"robot.default_joint_pos must name all of robot.joints; missing: {missing}")
@@ -209,6 +233,7 @@ class RobotConfig:
     def spec(self) -> mujoco.MjSpec:
         """The robot's file with position actuators (PD with torque limit) in the order of `joints`."""
         spec = read_robot(self.path())
+        lock(spec, self.locked, self.file)
         for pair in list(spec.pairs):  # who touches whom is said by self_collision alone
             spec.delete(pair)
         gains = zip(*(self.by_joint(name) for name in ("kp", "kv", "torque_limits")), strict=True)

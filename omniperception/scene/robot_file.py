@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 FRAME = "frame:"
 """Prefix of the sites that mark the frames of fixed links, which are still found when they are fused into others."""
-_FREE = mujoco.mjtJoint.mjJNT_FREE
+_FREE, _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _READABLE = (".stl", ".obj", ".msh")
 _LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 
@@ -54,6 +55,47 @@ def compile_robot(spec: mujoco.MjSpec, path: str | Path) -> mujoco.MjModel:
         return spec.compile()
     except ValueError as error:
         raise _of(path, error) from None
+
+
+def lock(spec: mujoco.MjSpec, angles: Mapping[str, float], path: str | Path) -> None:
+    """Takes joints out of a robot, whose links stay where the joints are at these angles.
+
+    Args:
+        spec: the robot.
+        angles: rad, or m of a slide, by joint.
+        path: of the file, for errors.
+    """
+    if not angles:
+        return
+    model = compile_robot(spec.copy(), path)
+    for name, angle in angles.items():
+        joint = spec.joint(name)
+        if joint is None or joint.type not in (_HINGE, _SLIDE):
+            known = ", ".join(one.name for one in spec.joints if one.type in (_HINGE, _SLIDE))
+            raise ValueError(
+                f"robot.locked names {name}, which {path} does not have as a hinge or slide; known: {known}"
+            )
+        low, high = model.joint(name).range
+        if model.joint(name).limited[0] and not low <= angle <= high:
+            raise ValueError(f"robot.locked.{name}={angle:g} is outside its range in {path}, {low:g} to {high:g}")
+        data, body = mujoco.MjData(model), joint.parent
+        data.joint(name).qpos = angle
+        mujoco.mj_kinematics(model, data)
+        body.pos, body.quat = _relative(data, model.body(body.name).id, int(model.body(body.name).parentid[0]))
+        body.alt = mujoco.MjSpec().worldbody.alt
+        if len(body.joints) == 1:
+            body.add_site(name=FRAME + body.name, group=5)
+        spec.delete(joint)
+        model = compile_robot(spec.copy(), path)
+
+
+def _relative(data: mujoco.MjData, body: int, parent: int) -> tuple[np.ndarray, np.ndarray]:
+    """Position (m) and quaternion of a body in the frame of another."""
+    back, pos, quat = np.empty(4), np.empty(3), np.empty(4)
+    mujoco.mju_negQuat(back, data.xquat[parent])
+    mujoco.mju_rotVecQuat(pos, data.xpos[body] - data.xpos[parent], back)
+    mujoco.mju_mulQuat(quat, back, data.xquat[body])
+    return pos, quat
 
 
 def collides(geom: mujoco.MjsGeom) -> bool:

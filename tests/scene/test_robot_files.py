@@ -219,6 +219,65 @@ def test_a_pose_of_unknown_joints_is_refused(tmp_path):
         world_of(biped(tmp_path, default_joint_pos=pose))
 
 
+# --- joints that are held ---------------------------------------------------------------------------------------------
+
+
+def placed(robot, angles):
+    """The robot with joints at these angles, its base where the file has it."""
+    model = robot.compiled()
+    data = mujoco.MjData(model)
+    for name, angle in angles.items():
+        data.joint(name).qpos = angle
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def test_links_of_locked_joints_are_where_the_joints_at_these_angles_put_them(tmp_path):
+    """Against the same file whose joints turn, by MuJoCo's kinematics, through links that follow one another."""
+    held = {"left_hip": -0.4, "left_knee": 0.7, "tail": -0.9}
+    others = {"neck": 0.3, "right_hip": -0.2, "right_knee": 0.5}
+    names = ("kp", "kv", "torque_limits", "action_scale")
+    numbers = {name: {joint: BIPED_PRESET[name][joint] for joint in others} for name in names}
+    text = BIPED.replace('<mujoco model="biped">', '<mujoco model="biped"><compiler angle="radian"/>')
+    locked = biped(tmp_path, text, joints=tuple(others), default_joint_pos=others, locked=held, **numbers)
+    found, turning = placed(locked, others), placed(biped(tmp_path, text), held | others)
+    assert found[0].nv == turning[0].nv - 3 and found[0].nu == 3
+    for body in (turning[0].body(k).name for k in range(1, turning[0].nbody)):
+        np.testing.assert_allclose(found[1].body(body).xpos, turning[1].body(body).xpos, atol=1e-12)
+        np.testing.assert_allclose(found[1].body(body).xmat, turning[1].body(body).xmat, atol=1e-12)
+    np.testing.assert_allclose(found[1].subtree_com[1], turning[1].subtree_com[1], atol=1e-12)
+    world_of(locked)
+
+
+def test_a_locked_joint_of_a_urdf_carries_its_mounts(tmp_path):
+    """Its link is fused into the one before, and is still found: a foot 0.21 m along a lower leg that is held."""
+    robot = on_six_legs(tmp_path)
+    own = {"joints": ("r0_lift",), "default_joint_pos": {"r0_lift": 0.0}}
+    locked = dataclasses.replace(robot, locked={"l0_lift": 0.5}, **own)
+    mount = Mount(pos=(0.01, 0.02, 0.03), body="l0_foot")
+    place = locked.place(mount)
+    _, data = placed(robot, {"l0_lift": 0.5})
+    link = data.body("l0_lower")
+    carrier = data.body(place.body)
+    at = link.xpos + link.xmat.reshape(3, 3) @ (np.array((0.0, 0.0, -0.21)) + mount.pos)
+    expected = carrier.xmat.reshape(3, 3).T @ (at - carrier.xpos)
+    np.testing.assert_allclose(place.pos, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("locked", "message"),
+    [
+        ({"elbow": 0.0}, "robot.locked names elbow, which .* does not have as a hinge or slide; known: .*tail"),
+        ({"tail": 1.5}, "robot.locked.tail=1.5 is outside its range in .*, -0.0174533 to 0.0174533"),  # 1 degree
+        ({"neck": 0.0}, "robot.locked names neck, which robot.joints or robot.default_joint_pos names, too"),
+    ],
+)
+def test_joints_that_cannot_be_locked_are_named(tmp_path, locked, message):
+    pose = {name: angle for name, angle in BIPED_PRESET["default_joint_pos"].items() if name != "tail"}
+    with pytest.raises(ValueError, match=message):
+        world_of(biped(tmp_path, default_joint_pos=pose, locked=locked))
+
+
 # --- feet of several geoms --------------------------------------------------------------------------------------------
 
 
