@@ -4,9 +4,10 @@
 <!-- table: before view=policies condition=robot split=test --> untouched: a row for each world
 <!-- table: before view=worlds policy=run -->                   the same with a column for each condition
 <!-- table: before view=conditions policy=run,blind -->         untouched and falls: a row for each policy
+<!-- table: avoider,robots view=trained condition=robot -->     the same: a row for each run, a column for each policy
 <!-- table: gait view=walking -->                              figures of a gait: a row for each ground
 <!-- table: gait view=levels -->                               the same, all kinds of ground together
-<!-- table: gait view=runs -->                                the same, a row for each run
+<!-- table: gait,robots view=runs -->                         the same, a row for each run
 <!-- table: end_to_end view=study -->                          results of a study: a row for each training and policy
 <!-- end -->
 """
@@ -49,7 +50,7 @@ def _filled(what: str, data: Path) -> str:
     view = given.pop("view", "all")
     if view not in VIEWS:
         raise ConfigError(f"<!-- table: {what} -->: view={view} is unknown; {suggest(view, tuple(VIEWS))}")
-    records = read(data_file(name, data))
+    records = [record for one in name.split(",") for record in read(data_file(one, data))]
     for key, value in given.items():
         if key not in _FILTERS:
             raise ConfigError(f"<!-- table: {what} -->: {key} is unknown; {suggest(key, _FILTERS)}")
@@ -90,18 +91,39 @@ def _by_world(records: Sequence[Record], column: str, keys: Sequence[str]) -> st
 
 def by_condition(records: Sequence[Record]) -> str:
     """How often each policy arrived untouched, and how often it fell, in the trials of all worlds."""
-    conditions = sorted({record.condition for record in records})
+    return _over_worlds(records, "policy", "condition", sorted({record.condition or "" for record in records}))
+
+
+def by_run(records: Sequence[Record]) -> str:
+    """The same of each run: a column for each policy.
+
+    Raises:
+        ConfigError: runs were in different worlds.
+    """
+    worlds = {key: {record.place for record in theirs} for key, theirs in grouped(records, "run", "policy").items()}
+    (first, most), *others = worlds.items()
+    for key, found in others:
+        if found != most:
+            raise ConfigError(
+                f"{' '.join(key)} and {' '.join(first)} were not in the same worlds (only one of them in"
+                f" {', '.join(sorted(found ^ most))}); filter for what all have: world=... terrain=... condition=..."
+            )
+    return _over_worlds(records, "run", "policy", [policy for (policy,) in grouped(records, "policy")])
+
+
+def _over_worlds(records: Sequence[Record], row: str, column: str, columns: list[str]) -> str:
     rows = []
-    for (policy,), theirs in grouped(records, "policy").items():
+    for (name,), theirs in grouped(records, row).items():
         cells = []
-        for condition in conditions:
-            there = [r.episodes.happened() for r in theirs if r.condition == condition]
-            shares = [torch.cat([happened[name] for happened in there]) for name in ("untouched", "fall") if there]
+        for there in columns:
+            happened = [r.episodes.happened() for r in theirs if getattr(r, column) == there]
+            shares = [torch.cat([one[figure] for one in happened]) for figure in ("untouched", "fall") if happened]
             cells.append(" / ".join(rate_cell([share]) for share in shares) or "–")
-        rows.append([policy, *cells])
+        rows.append([name, *cells])
     worlds = len({(record.world, record.terrain) for record in records})
     what = f"reached, untouched and without a fall / falls, %, over {worlds} worlds"
-    return _titled(records, what, ["policy"], conditions, rows)
+    heading = "run directory" if row == "run" else row  # a policy is called run
+    return _titled(records, what, [heading], columns, rows, apart=row == "run")
 
 
 VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
@@ -109,6 +131,7 @@ VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
     "policies": by_policy,
     "worlds": by_world,
     "conditions": by_condition,
+    "trained": by_run,
     "walking": walking_table,
     "levels": level_table,
     "runs": run_table,
@@ -139,7 +162,14 @@ def _untouched(records: Sequence[Record]) -> str:
     return rate_cell([record.episodes.clean for record in records]) if records else "–"
 
 
-def _titled(records: Sequence[Record], what: str, keys: list[str], columns: list[str], rows: list[list[str]]) -> str:
-    """A table without the columns of keys that are the same everywhere."""
+def _titled(
+    records: Sequence[Record],
+    what: str,
+    keys: list[str],
+    columns: list[str],
+    rows: list[list[str]],
+    apart: bool = False,
+) -> str:
+    """A table without the columns of keys that are the same everywhere; `apart`: a row is of one run."""
     check_apart(records)
-    return f"{what}; {headline(records)}\n\n{markdown(*without_constants(keys, columns, rows))}"
+    return f"{what}; {headline(records, apart)}\n\n{markdown(*without_constants(keys, columns, rows))}"

@@ -68,6 +68,20 @@ def test_views(data):
     assert "| run    | 25.0 [10.2, 49.5] / 25.0 [10.2, 49.5] |" in text  # 4 of 16 trials in two worlds
 
 
+def test_runs_of_several_files_stand_below_each_other_if_they_were_in_the_same_worlds(data):
+    """Of b 4 of 8 trials arrive and are touched; two worlds together have 16."""
+    others = [record(run="b"), record(run="b", world="rod"), record("oracle", run="b", touches=[1] * 8)]
+    write(data / "second.json.gz", [*others, record("oracle", world="rod", run="b", touches=[1] * 8)])
+    text = rendered(page("first,second view=trained condition=ideal policy=run,oracle"), data)
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
+    cell = "25.0 [10.2, 49.5] / 25.0 [10.2, 49.5]"
+    assert rows[0] == ["run directory", "run", "oracle"] and rows[2] == ["a", cell, "–"]
+    assert rows[3][:2] == ["b", cell] and rows[3][2].startswith("0.0 [0.0, 19.4]")
+    assert "over 2 worlds" in text and "least to most" not in text
+    with pytest.raises(ConfigError, match=r"a blind and a run were not in the same worlds \(only one of them in rod\)"):
+        rendered(page("first view=trained condition=ideal"), data)
+
+
 @pytest.mark.parametrize(
     ("what", "message"),
     [
