@@ -213,7 +213,7 @@ def test_a_clock_without_a_gait_is_refused_in_one_line(tmp_path):
         ("robot.gait.offsets=[0.0,0.5,0.5,1.5]", "must be shares of a period"),
         ("robot.gait.duty=1.0", r"duty=1\.0 between 0 and 1"),
         ("robot.gait.frequency=0", "frequency=0"),
-        ("robot.gait.lift=-1", r"robot\.gait\.lift=-1 must be positive, or 0"),
+        ("robot.gait.lift=0", r"robot\.gait\.lift=0 must be positive"),
         ("robot.gait.lin_vel_x=[2,1]", r"robot\.gait\.lin_vel_x=\[2, 1\] must be the least and the most velocity"),
     ],
 )

@@ -137,7 +137,7 @@ LINES = [
     ("train experiment=walk init=RUN robot=anymal", "it moves the robot of go2.xml, this one is that of anymal.xml"),
     ("train init=RUN stepping={lift:1.5,rest_s:1}", "its actions meant another motion, that of 'stepping=null'"),
     ("train init=RUN stepping={lift:1.5}", "stepping"),
-    ("train stepping={lift:-1,rest_s:1}", "stepping.lift=-1 and rest_s=1 must not be negative"),
+    ("train stepping={lift:-1,rest_s:1}", "stepping.lift=-1 must be positive"),
     ("train experiment=avoid init=nowhere", "init=nowhere does not exist; give a run directory or init=latest"),
     ("train experiment=walk ppo.num_learning_epochs=0", "ppo.num_learning_epochs=0 keeps the policy as it is"),
     ("train +rewards.terms.mine={func:wrong_input_terms.wrong_shape,weight:1.0}", "has shape (3, 5), expected (2,)"),

@@ -45,8 +45,7 @@ class EnvConfig:
         lidar: the sensor, or None.
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
-        stepping: the motion to which actions are added; None, which a lift of 0 becomes: they are added to the default
-            pose.
+        stepping: the motion to which actions are added; None: they are added to the default pose.
         base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
         shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
@@ -83,8 +82,6 @@ class EnvConfig:
     def __post_init__(self) -> None:
         if self.num_envs < 1:
             raise ValueError(f"num_envs={self.num_envs} must be at least 1")
-        if self.stepping is not None and self.stepping.lift == 0:
-            object.__setattr__(self, "stepping", None)
         if self.log_interval < 1:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):

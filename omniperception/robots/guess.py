@@ -31,7 +31,7 @@ _PACE, _RISE = 2.5, 0.2
 number); and how high feet rise as a share of the base's height, ..."""
 _MOST_RISE = 0.1
 """... at most so much (m)."""
-_ON_TWO, _ON_MORE = (0.0, 0.45, 0.2, 0.15, 1.0), (1.6, 1.1, 0.55, 0.85, 1.5)
+_ON_TWO, _ON_MORE = (1.0, 0.45, 0.2, 0.15, 1.0), (1.6, 1.1, 0.55, 0.85, 1.5)
 """On two feet and on more: how high feet are lifted on the spot; fastest ahead, back and aside, as a share of the root
 of g times the base's height; and rad/s. The G1's and the Go2's."""
 _SWING, _SWAY = 0.12, 0.06
@@ -324,8 +324,7 @@ def _gait(draft: _Draft, height: float) -> dict[str, object]:
 
 
 def _pace(feet: int, height: float) -> dict[str, object]:
-    """How fast a robot shall walk: with the root of its height, as its legs' pendulum. On two feet it lifts none while
-    it stands."""
+    """How fast a robot shall walk: with the root of its height, as its legs' pendulum."""
     lift, ahead, back, aside, turn = _ON_TWO if feet <= 2 else _ON_MORE
     natural = float(np.sqrt(9.81 * height))
     x = [-round(back * natural, 1), round(ahead * natural, 1)]

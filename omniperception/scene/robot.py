@@ -59,8 +59,7 @@ class Gait:
         offsets: when each foot's step begins after the clock's, in periods, in the order of the robot's feet.
         duty: share of a step for which a foot is down.
         foot_height: height (m) above the ground to which a foot's centre rises.
-        lift: how high feet are lifted while it steps on the spot (`SteppingConfig`), as a share of foot_height; 0: it
-            has no such motion. A robot on two feet topples with it.
+        lift: how high feet are lifted while it steps on the spot (`SteppingConfig`), as a share of foot_height.
         lin_vel_x, lin_vel_y, ang_vel_z: least and most velocity (m/s, m/s, rad/s) that experiment=gait asks of it.
     """
 
@@ -82,8 +81,8 @@ class Gait:
             )
         if not all(0 <= offset < 1 for offset in self.offsets):
             raise ValueError(f"robot.gait.offsets={list(self.offsets)} must be shares of a period, from 0 to below 1")
-        if self.lift < 0:
-            raise ValueError(f"robot.gait.lift={self.lift} must be positive, or 0 for a robot that does not step so")
+        if self.lift <= 0:
+            raise ValueError(f"robot.gait.lift={self.lift} must be positive")
         for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z"):
             low, high = (float(end) for end in getattr(self, name))
             object.__setattr__(self, name, (low, high))

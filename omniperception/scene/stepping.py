@@ -28,8 +28,7 @@ class SteppingConfig:
     frequency: each foot goes straight up and down, and what takes the robot anywhere is learned.
 
     Attributes:
-        lift: how high feet are lifted, as a share of `robot.gait.foot_height`: more than 1 where joints yield; 0: the
-            task has no such motion.
+        lift: how high feet are lifted, as a share of `robot.gait.foot_height`: more than 1 where joints yield.
         rest_s: how long (s) the command has to be to stand until the feet stay down.
     """
 
@@ -37,8 +36,8 @@ class SteppingConfig:
     rest_s: float
 
     def __post_init__(self) -> None:
-        if self.lift < 0 or self.rest_s < 0:
-            raise ValueError(f"stepping.lift={self.lift} and rest_s={self.rest_s} must not be negative")
+        if self.lift <= 0 or self.rest_s < 0:
+            raise ValueError(f"stepping.lift={self.lift} must be positive and rest_s={self.rest_s} not negative")
 
 
 def stepping_offsets(robot: RobotConfig, lift: float) -> np.ndarray:

@@ -109,5 +109,5 @@ def test_what_no_leg_can_do_is_named(tmp_path):
             stepping_offsets(robot, lift)
     with pytest.raises(ValueError, match=r"robot.gait, which is null"):
         stepping_offsets(replace(robot_of("go2"), gait=None), 1)
-    with pytest.raises(ValueError, match="lift=-1.0 and rest_s=1.0 must not be negative"):
-        SteppingConfig(-1.0, 1.0)
+    with pytest.raises(ValueError, match="lift=0.0 must be positive"):
+        SteppingConfig(0.0, 1.0)
