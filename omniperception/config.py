@@ -60,6 +60,19 @@ def _within(most: float, values: Sequence[float]) -> list[float]:
     return [min(max(value, -most), most) for value in values]
 
 
+def _by_speed(value: float, power: float, velocities: Sequence[float], reference: float) -> float:
+    """What a preset has for a robot whose fastest velocity is `reference`, for one of these velocities: times their
+    ratio to a power, so that errors count as shares of what is asked for.
+
+    For `${by_speed:4.0,-2,${robot.gait.lin_vel_x},2.0}` in presets.
+    """
+    fastest = max(abs(velocity) for velocity in velocities)
+    if fastest == 0:
+        raise ValueError("robot.gait: lin_vel_x and ang_vel_z need a fastest velocity above 0")
+    return value * (fastest / reference) ** power
+
+
+OmegaConf.register_new_resolver("by_speed", _by_speed, replace=True)
 OmegaConf.register_new_resolver("device", _device_figure, replace=True)
 OmegaConf.register_new_resolver("within", _within, replace=True)
 
