@@ -68,7 +68,7 @@ def _by_speed(value: float, power: float, velocities: Sequence[float], reference
     """
     fastest = max(abs(velocity) for velocity in velocities)
     if fastest == 0:
-        raise ValueError("robot.gait: lin_vel_x and ang_vel_z need a fastest velocity above 0")
+        raise ValueError(f"{list(velocities)} of the robot's gait (lin_vel_x, ang_vel_z) must reach beyond 0")
     return value * (fastest / reference) ** power
 
 

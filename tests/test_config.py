@@ -118,3 +118,34 @@ class TestRunDirectories:
             path = tmp_path / "outputs" / name / config.CONFIG_FILE
             os.utime(path, (path.stat().st_atime, path.stat().st_mtime - age))
         assert config.find_run("latest") == Path("outputs/a")
+
+
+class TestOfARobotsVelocities:
+    """Of a robot that shall walk at half the Go2's 2 m/s and turn at a third of its 1.5 rad/s."""
+
+    def gait(self, *overrides):
+        composed = build._resolved(config.compose(["experiment=gait", *overrides]))
+        terms = composed["rewards"]["terms"]
+        shown = {name: terms[name] for name in ("velocity_tracking", "yaw_rate_tracking")}
+        weights = [terms[name]["weight"] for name in ("velocity_error", "yaw_rate_error")]
+        levels = [composed[group]["curriculum"]["max_velocity_error"] for group in ("commands", "randomization")]
+        return [term["beta"] for term in shown.values()], weights, levels
+
+    def test_a_go2_has_the_numbers_that_are_written(self):
+        assert self.gait() == ([4.0, 4.0], [-1.0, -0.5], [0.4, 0.4])
+
+    def test_errors_count_as_shares_of_what_is_asked_for(self):
+        """exp(-beta e^2) is the same for half an error, and so is weight times error."""
+        slow = self.gait("robot.gait.lin_vel_x=[-1,0.5]", "robot.gait.ang_vel_z=[-0.5,0.5]")
+        assert slow == ([pytest.approx(16.0), pytest.approx(36.0)], [-2.0, pytest.approx(-1.5)], [0.2, 0.2])
+
+    def test_slower_worlds_stay_within_what_the_robot_is_for(self):
+        commands = build._resolved(config.compose(["scenario=walk_slowly", "robot.gait.lin_vel_x=[-0.2,3]"]))[
+            "commands"
+        ]
+        assert commands["lin_vel_x"] == [-0.2, 1.0] and commands["lin_vel_y"] == [-1.0, 1.0]
+
+    def test_a_robot_that_shall_not_move_is_refused_in_one_line(self):
+        with pytest.raises(ConfigError, match="\\[0, 0\\] of the robot's gait .* must reach beyond 0") as error:
+            self.gait("robot.gait.lin_vel_x=[0,0]")
+        assert "\n" not in str(error.value)
