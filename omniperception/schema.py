@@ -241,7 +241,8 @@ def _imported(path: str, key: str) -> Callable:
     try:
         found = getattr(importlib.import_module(module), name, None)
     except (ImportError, TypeError, ValueError) as error:
-        raise ConfigError(f"{key}={path} cannot be imported: {error}") from None
+        hint = "; PYTHONPATH=. has this folder searched" if isinstance(error, ModuleNotFoundError) else ""
+        raise ConfigError(f"{key}={path} cannot be imported: {error}{hint}") from None
     if not callable(found):
         raise ConfigError(f"{key}={path}: {module} has no function or class {name}")
     return found

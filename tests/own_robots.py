@@ -18,6 +18,7 @@ def skip_if_not_fetched(robot: str) -> None:
 
 BIPED = """
 <mujoco model="biped">
+  <compiler angle="radian"/>
   <default>
     <geom group="3"/>
     <default class="look"><geom contype="0" conaffinity="0" group="2" mass="0"/></default>

@@ -159,8 +159,10 @@ def test_a_joint_that_follows_another_is_passive(tmp_path):
 
 
 def test_gains_are_a_spring_of_the_asked_frequency_where_nothing_else_counts(guesses):
-    """The neck carries a head of 0.5 kg on its own axis: kp = I (2 pi f)^2, kv = 2 zeta sqrt(kp I)."""
-    preset = guesses["biped"].preset
+    """The neck carries a head of 0.5 kg on its own axis: kp = I (2 pi f)^2, kv = 2 zeta sqrt(kp I), and as many times
+    that, and its root, as the robot needs to stand."""
+    preset, notes = guesses["biped"].preset, " ".join(guesses["biped"].notes)
+    stiffer = float(notes.partition("gains are ")[2].split()[0])
     robot = make(RobotConfig, preset, "robot")
     model = robot.compiled()
     data = mujoco.MjData(model)
@@ -171,8 +173,30 @@ def test_gains_are_a_spring_of_the_asked_frequency_where_nothing_else_counts(gue
     neck = int(model.joint("neck").dofadr[0])
     load = 2 * 9.81 * 0.5 * 0.05  # of a head 0.05 m above the joint
     kp = max(full[neck, neck] * (2 * math.pi * 2.0) ** 2, load)
-    assert preset["kp"]["neck"] == pytest.approx(kp, rel=0.01)
-    assert preset["kv"]["neck"] == pytest.approx(2 * 0.5 * math.sqrt(kp * full[neck, neck]), rel=0.01)
+    assert stiffer == 3.0 and preset["kp"]["neck"] == pytest.approx(stiffer * kp, rel=0.01)
+    damping = 2 * 0.5 * math.sqrt(stiffer * kp * full[neck, neck])
+    assert preset["kv"]["neck"] == pytest.approx(damping, rel=0.01)
+
+
+def test_a_shank_that_ends_just_above_its_foots_ball_makes_no_sole(tmp_path):
+    """Four legs of 0.2 + 0.2 m, bent to 80 % of their length, whose shanks' capsules end 7 mm above the balls'."""
+    legs = "".join(
+        f"""<body name="{name}" pos="{x} {y} 0"><joint name="{name}_hip" axis="0 1 0" range="-1.5 1.5"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2" mass="0.5"/><body pos="0 0 -0.2">
+        <joint name="{name}_knee" axis="0 1 0" range="-2.6 -0.1"/>
+        <geom type="capsule" size="0.015" fromto="0 0 0 0 0 -0.2" mass="0.2"/>
+        <geom name="{name}_foot" type="sphere" size="0.022" pos="0 0 -0.2" mass="0.05"/></body></body>"""
+        for name, x, y in (("fl", 0.2, 0.1), ("fr", 0.2, -0.1), ("rl", -0.2, 0.1), ("rr", -0.2, -0.1))
+    )
+    trunk = '<freejoint/><geom type="box" size="0.25 0.1 0.05" mass="5"/>'
+    path = tmp_path / "quad.xml"
+    path.write_text(
+        f'<mujoco><compiler angle="radian"/><worldbody><body name="trunk">{trunk}{legs}</body></worldbody></mujoco>'
+    )
+    preset = guess(path, str(path), Wishes()).preset
+    assert preset["base_height"] == pytest.approx(0.8 * 0.4 + 0.022, abs=0.015)
+    assert preset["default_joint_pos"]["fl_knee"] == pytest.approx(-2 * math.acos(0.8), abs=0.1)
+    assert preset["gait"]["foot_height"] == pytest.approx(0.022 + 0.2 * preset["base_height"], abs=0.01)
 
 
 def test_lowest_points_and_bounds_are_those_of_the_geoms():

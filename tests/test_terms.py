@@ -104,7 +104,10 @@ class TestNames:
             ("+rewards.terms.alive={}", "rewards.terms.alive lacks its weight: give rewards.terms.alive.weight=..."),
             ("rewards.terms.closing_speed.margin=far", "rewards.terms.closing_speed.margin=far must be a number"),
             ("+rewards.terms.x={weight: 1, func: 3}", "rewards.terms.x.func=3 must be text"),
-            ("+rewards.terms.x={weight: 1, func: nowhere.x}", "rewards.terms.x.func=nowhere.x cannot be imported"),
+            (
+                "+rewards.terms.x={weight: 1, func: nowhere.x}",
+                "rewards.terms.x.func=nowhere.x cannot be imported: No module named 'nowhere'; PYTHONPATH=. has",
+            ),
             ("+rewards.terms.x={weight: 1, func: math.nothing}", "math has no function or class nothing"),
             ("observations.groups.command.terms.command.scal=1", "observations.groups.command.terms.command.scal is"),
             ("perception.network.type=pd_risk", "perception.network.type=pd_risk is unknown; did you mean pd_risknet?"),

@@ -33,6 +33,9 @@ HEIGHT_TARGET = "height_target"
 FROM_LIDAR = frozenset({AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD})
 """Requirements that only a LiDAR fulfils."""
 
+_MOST_STEPS = 0.25
+"""Steps of a foot in a control step: with more, a clock has fewer than two control steps for foot up and foot down."""
+
 
 @dataclass(frozen=True)
 class EnvConfig:
@@ -82,6 +85,12 @@ class EnvConfig:
     def __post_init__(self) -> None:
         if self.num_envs < 1:
             raise ValueError(f"num_envs={self.num_envs} must be at least 1")
+        gait, period = self.robot.gait, self.sim.control_dt
+        if gait is not None and gait.frequency * period > _MOST_STEPS:
+            raise ValueError(
+                f"robot.gait.frequency={gait.frequency:g} is too fast for control steps of {period:g} s; at most"
+                f" {_MOST_STEPS / period:g} Hz"
+            )
         if self.log_interval < 1:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):

@@ -120,7 +120,7 @@ def _over_worlds(records: Sequence[Record], row: str, column: str, columns: list
             shares = [torch.cat([one[figure] for one in happened]) for figure in ("untouched", "fall") if happened]
             cells.append(" / ".join(rate_cell([share]) for share in shares) or "–")
         rows.append([name, *cells])
-    worlds = len({(record.world, record.terrain) for record in records})
+    worlds = len({record.place for record in records})
     what = f"reached, untouched and without a fall / falls, %, over {worlds} worlds"
     heading = "run directory" if row == "run" else row  # a policy is called run
     return _titled(records, what, [heading], columns, rows, apart=row == "run")

@@ -92,16 +92,30 @@ class Body:
         return [geom for geom in self.touchable if self.link(geom) == link]
 
     def soles(self, link: int) -> list[int]:
-        """Geoms of a foot that carry the robot in the present pose."""
+        """Geoms of a foot that carry the robot in the present pose; of one that is a point, the lowest alone."""
+        return self._low(link) if self.is_flat(link) else [min(self.geoms(link), key=self.lowest)]
+
+    def _low(self, link: int) -> list[int]:
         low = {geom: self.lowest(geom) for geom in self.geoms(link)}
         return [geom for geom, z in low.items() if z - min(low.values()) <= SOLE]
 
     def is_flat(self, link: int) -> bool:
-        """Tell whether a foot has a sole, not a point."""
-        boxes = [self.bounds([geom]) for geom in self.soles(link)]
-        low, high = np.min([low for low, _ in boxes], 0), np.max([high for _, high in boxes], 0)
-        kinds = {int(self.model.geom_type[geom]) for geom in self.soles(link)}
-        return kinds != {int(mujoco.mjtGeom.mjGEOM_SPHERE)} and float((high - low)[:2].max()) >= FLAT
+        """Tell whether a foot has a sole, not a point: balls and ends of capsules touch below their middle."""
+        ground = min(self.lowest(geom) for geom in self.geoms(link))
+        places = np.concatenate([self._touching(geom, ground + SOLE) for geom in self._low(link)])
+        return float(np.ptp(places, 0).max()) >= FLAT
+
+    def _touching(self, geom: int, height: float) -> np.ndarray:
+        """(P, 2) m: around where a geom is lower than a height."""
+        kind, centre = self.model.geom_type[geom], self.data.geom_xpos[geom]
+        if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+            return centre[None, :2]
+        if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            radius, half = self.model.geom_size[geom, :2]
+            axis = self.data.geom_xmat[geom].reshape(3, 3)[:, 2]
+            ends = centre + np.array([[-half], [half]]) * axis
+            return ends[ends[:, 2] - radius <= height + 1e-9, :2]
+        return np.stack(self.bounds([geom]))[:, :2]
 
     def leg(self, link: int) -> list[int]:
         """Joints that carry a foot, from the base downwards."""

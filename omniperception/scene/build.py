@@ -23,6 +23,8 @@ OBSTACLE_FORCE = "obstacle_force"
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _FOUND, _FORCE = 1, 2
 _REDUCE_NET_FORCE = 3
+_ROUNDING = 1e-6
+"""rad: by which a rounded angle may lie beyond the end of its range."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ def build_world(
     """
     spec = robot.spec()
     _check_geoms(spec, robot)
+    _check_groups(spec, robot)
     drop_unseen(spec, robot.ray_groups)
     for geom in spec.geoms:
         geom.contype, geom.conaffinity, geom.condim = 0, int(collides(geom)), 3
@@ -125,6 +128,16 @@ def _check_geoms(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
             )
 
 
+def _check_groups(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
+    there = sorted({geom.group for geom in spec.geoms})
+    unknown = sorted(set(robot.ray_groups or ()) - set(there))
+    if unknown:
+        raise ValueError(
+            f"robot.ray_groups names {', '.join(map(str, unknown))}, in which {robot.file} has no geom; groups there:"
+            f" {', '.join(map(str, there))}"
+        )
+
+
 def _check_joints(model: mujoco.MjModel, robot: RobotConfig) -> None:
     """Base at qpos[0:7] and joints of one number each: what states are made of."""
     floating = [model.body(model.jnt_bodyid[k]).name for k in range(model.njnt) if model.jnt_type[k] == _FREE]
@@ -143,6 +156,12 @@ def _check_joints(model: mujoco.MjModel, robot: RobotConfig) -> None:
     balls = [name for name in robot.default_joint_pos if model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_BALL]
     if balls:
         raise ValueError(f"robot.joints names {', '.join(balls)}: joints must be hinges or slides, not balls")
+    for name, angle in robot.default_joint_pos.items():
+        low, high = model.joint(name).range
+        if model.joint(name).limited[0] and not low - _ROUNDING <= angle <= high + _ROUNDING:
+            raise ValueError(
+                f"robot.default_joint_pos.{name}={angle:g} is outside its range in {robot.file}, {low:g} to {high:g}"
+            )
 
 
 def _add_contact_sensors(

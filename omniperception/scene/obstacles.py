@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -127,6 +128,14 @@ class ObstaclesConfig:
                 raise ValueError(
                     f"obstacles: approach.distance={list(approach.distance)} lets those of {name} start on the robot;"
                     f" its low end must be at least clearance + radius = {least:.2f}"
+                )
+            x_low, x_high, y_low, y_high = group.area or self.area
+            drawn = approach is None and not group.has_poses
+            if drawn and 2 * group.largest_radius > math.hypot(x_high - x_low, y_high - y_low):
+                raise ValueError(
+                    f"obstacles.groups.{name} are {2 * group.largest_radius:.4g} m across, and the area that they are"
+                    f" placed in {x_high - x_low:g} m x {y_high - y_low:g} m; give size (half extents, m), scale or"
+                    " poses, or a file in metres"
                 )
 
     @property

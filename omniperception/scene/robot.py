@@ -90,6 +90,10 @@ class Gait:
                 raise ValueError(f"robot.gait.{name}=[{low:g}, {high:g}] must be the least and the most velocity")
 
 
+_BY_JOINT = ("kp", "kv", "torque_limits", "action_scale", "frictionloss", "armature", "damping")
+"""What a preset has as one number, or as one by joint."""
+
+
 @dataclass(frozen=True)
 class RobotConfig:
     """A legged robot.
@@ -129,7 +133,7 @@ class RobotConfig:
         ray_groups: geom groups of the file that LiDAR rays can hit; None: the geoms that can be touched.
         mounts: places for a LiDAR, by name.
         locked: angle (rad; m of a slide) of joints that are held, by name: their links become part of what carries
-            them. A real robot has to hold them there.
+            them, and all else that the preset says of them does not count. A real robot has to hold them there.
         gait: the rhythm in which it walks; None: nothing may ask for one.
     """
 
@@ -160,12 +164,17 @@ class RobotConfig:
     gait: Gait | None = None
 
     def __post_init__(self) -> None:
-        for name in ("joints", "penalized_geoms"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, "penalized_geoms", tuple(self.penalized_geoms))
+        object.__setattr__(self, "joints", tuple(joint for joint in self.joints if joint not in self.locked))
+        for name in ("default_joint_pos", *_BY_JOINT):
+            given = getattr(self, name)
+            if isinstance(given, Mapping):
+                kept = {joint: value for joint, value in given.items() if joint not in self.locked}
+                object.__setattr__(self, name, kept)
         feet = tuple(foot if isinstance(foot, str) else tuple(foot) for foot in self.foot_geoms)
         object.__setattr__(self, "foot_geoms", feet)
-        if not all(feet):
-            raise ValueError("robot.foot_geoms has an empty list; a foot needs at least one geom")
+        if not feet or not all(feet):
+            raise ValueError("robot.foot_geoms has an empty list; a robot needs feet, and a foot at least one geom")
         for name in ("base_height", "footing", "height", "radius"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"robot.{name}={getattr(self, name)} must be positive")
@@ -182,12 +191,6 @@ class RobotConfig:
         if len(set(self.joints)) != len(self.joints):
             twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
             raise ValueError(f"robot.joints names {', '.join(twice)} more than once")
-        posed = sorted(set(self.locked) & {*self.joints, *self.default_joint_pos})
-        if posed:
-            raise ValueError(
-                f"robot.locked names {', '.join(posed)}, which robot.joints or robot.default_joint_pos names, too;"
-                " leave them out of one of the two"
-            )
         missing = sorted(set(self.joints) - set(self.default_joint_pos))
         if missing:
             raise ValueError(f"robot.default_joint_pos must name all of robot.joints; missing: {missing}")
@@ -195,10 +198,8 @@ class RobotConfig:
             raise ValueError(
                 f"robot.gait.offsets={list(self.gait.offsets)} must have one for each of the {len(feet)} feet"
             )
-        for name in ("kp", "torque_limits", "action_scale"):
-            self._check_by_joint(name, positive=True)
-        for name in ("kv", "frictionloss", "armature", "damping"):
-            self._check_by_joint(name, positive=False)
+        for name in _BY_JOINT:
+            self._check_by_joint(name, positive=name in ("kp", "torque_limits", "action_scale"))
 
     def _check_by_joint(self, name: str, positive: bool) -> None:
         given = getattr(self, name)
@@ -206,9 +207,11 @@ class RobotConfig:
             differing = sorted(set(self.joints) ^ set(given))
             if differing:
                 raise ValueError(f"robot.{name} must name exactly robot.joints, or be a number; differing: {differing}")
-        for value in given.values() if isinstance(given, Mapping) else () if given is None else (given,):
+        values = given if isinstance(given, Mapping) else {} if given is None else {"": given}
+        for joint, value in values.items():
             if value < 0 or (positive and value == 0):
-                raise ValueError(f"robot.{name}={value} must {'be positive' if positive else 'not be negative'}")
+                key = f"{name}.{joint}".rstrip(".")
+                raise ValueError(f"robot.{key}={value} must {'be positive' if positive else 'not be negative'}")
 
     @property
     def num_joints(self) -> int:
@@ -232,6 +235,9 @@ class RobotConfig:
     def spec(self) -> mujoco.MjSpec:
         """The robot's file with position actuators (PD with torque limit) in the order of `joints`."""
         spec = read_robot(self.path())
+        if spec.body(self.base) is None:
+            known = ", ".join(body.name for body in spec.bodies[1:])
+            raise ValueError(f"robot.base={self.base} is no body of {self.file}; known: {known}")
         lock(spec, self.locked, self.file)
         for pair in list(spec.pairs):  # who touches whom is said by self_collision alone
             spec.delete(pair)

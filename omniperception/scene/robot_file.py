@@ -67,14 +67,14 @@ def lock(spec: mujoco.MjSpec, angles: Mapping[str, float], path: str | Path) -> 
     """
     if not angles:
         return
+    known = [joint.name for joint in spec.joints if joint.type in (_HINGE, _SLIDE)]
+    for name in sorted(angles.keys() - set(known)):
+        raise ValueError(
+            f"robot.locked names {name}, which {path} does not have as a hinge or slide; known: {', '.join(known)}"
+        )
     model = compile_robot(spec.copy(), path)
     for name, angle in angles.items():
         joint = spec.joint(name)
-        if joint is None or joint.type not in (_HINGE, _SLIDE):
-            known = ", ".join(one.name for one in spec.joints if one.type in (_HINGE, _SLIDE))
-            raise ValueError(
-                f"robot.locked names {name}, which {path} does not have as a hinge or slide; known: {known}"
-            )
         low, high = model.joint(name).range
         if model.joint(name).limited[0] and not low <= angle <= high:
             raise ValueError(f"robot.locked.{name}={angle:g} is outside its range in {path}, {low:g} to {high:g}")

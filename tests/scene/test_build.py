@@ -107,8 +107,8 @@ CALF = '<joint name="RR_calf_joint"'
 @pytest.mark.parametrize(
     ("mjcf", "overrides", "message"),
     [
-        (GO2, ["robot.base=trunk"], "robot.base=trunk must be the first body .* bodies with a free joint: base"),
-        (GO2, ["robot.base=FL_hip"], "robot.base=FL_hip must be the first body"),
+        (GO2, ["robot.base=trunk"], "robot.base=trunk is no body of .*; known: base, FL_hip"),
+        (GO2, ["robot.base=FL_hip"], "robot.base=FL_hip must be the first body .* bodies with a free joint: base"),
         (GO2.replace("<freejoint", "<joint"), [], "bodies with a free joint: none"),
         (GO2.replace(CALF, CALF + ' type="ball" range="0 1"'), [], "robot.joints names RR_calf_joint: .* not balls"),
         (GO2.replace("RR_calf_joint", "knee"), [], "robot.joints names RR_calf_joint, which .* known: .*knee"),

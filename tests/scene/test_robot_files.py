@@ -206,6 +206,8 @@ def test_friction_armature_and_damping_are_the_files_unless_given(tmp_path):
         ({"default_joint_pos": {"neck": 0.0}}, "robot.default_joint_pos must name all of robot.joints; missing:"),
         ({"footprint": (0.1, -0.1)}, "robot.footprint=.* must not be negative"),
         ({"foot_geoms": ((),)}, "robot.foot_geoms has an empty list"),
+        ({"foot_geoms": ()}, "robot.foot_geoms has an empty list; a robot needs feet"),
+        ({"kp": {**BIPED_PRESET["kp"], "neck": 0.0}}, r"robot.kp.neck=0.0 must be positive"),
     ],
 )
 def test_numbers_by_joint_must_be_of_the_joints(tmp_path, change, message):
@@ -217,6 +219,19 @@ def test_a_pose_of_unknown_joints_is_refused(tmp_path):
     pose = {**BIPED_PRESET["default_joint_pos"], "elbow": 0.0}
     with pytest.raises(ValueError, match="robot.default_joint_pos names elbow, which .* known: .*tail"):
         world_of(biped(tmp_path, default_joint_pos=pose))
+
+
+def test_a_pose_beyond_a_joints_stop_is_refused(tmp_path):
+    pose = {**BIPED_PRESET["default_joint_pos"], "left_knee": -0.2}
+    with pytest.raises(ValueError, match=r"robot.default_joint_pos.left_knee=-0.2 is outside its range .* -0.1 to 2.2"):
+        world_of(biped(tmp_path, default_joint_pos=pose))
+
+
+def test_a_base_and_groups_of_rays_that_the_file_has_not_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="robot.base=trunk is no body of .*; known: torso, tail"):
+        biped(tmp_path, base="trunk").place(Mount(pos=(0, 0, 0), body="head"))
+    with pytest.raises(ValueError, match="robot.ray_groups names 7, in which .* has no geom; groups there: 2, 3"):
+        world_of(biped(tmp_path, ray_groups=(2, 7)))
 
 
 # --- joints that are held ---------------------------------------------------------------------------------------------
@@ -236,11 +251,9 @@ def test_links_of_locked_joints_are_where_the_joints_at_these_angles_put_them(tm
     """Against the same file whose joints turn, by MuJoCo's kinematics, through links that follow one another."""
     held = {"left_hip": -0.4, "left_knee": 0.7, "tail": -0.9}
     others = {"neck": 0.3, "right_hip": -0.2, "right_knee": 0.5}
-    names = ("kp", "kv", "torque_limits", "action_scale")
-    numbers = {name: {joint: BIPED_PRESET[name][joint] for joint in others} for name in names}
-    text = BIPED.replace('<mujoco model="biped">', '<mujoco model="biped"><compiler angle="radian"/>')
-    locked = biped(tmp_path, text, joints=tuple(others), default_joint_pos=others, locked=held, **numbers)
-    found, turning = placed(locked, others), placed(biped(tmp_path, text), held | others)
+    locked, free = biped(tmp_path, locked=held), biped(tmp_path)
+    assert locked.joints == ("neck", "right_hip", "right_knee") and set(locked.kp) == set(others)
+    found, turning = placed(locked, others), placed(free, held | others)
     assert found[0].nv == turning[0].nv - 3 and found[0].nu == 3
     for body in (turning[0].body(k).name for k in range(1, turning[0].nbody)):
         np.testing.assert_allclose(found[1].body(body).xpos, turning[1].body(body).xpos, atol=1e-12)
@@ -268,14 +281,12 @@ def test_a_locked_joint_of_a_urdf_carries_its_mounts(tmp_path):
     ("locked", "message"),
     [
         ({"elbow": 0.0}, "robot.locked names elbow, which .* does not have as a hinge or slide; known: .*tail"),
-        ({"tail": 1.5}, "robot.locked.tail=1.5 is outside its range in .*, -0.0174533 to 0.0174533"),  # 1 degree
-        ({"neck": 0.0}, "robot.locked names neck, which robot.joints or robot.default_joint_pos names, too"),
+        ({"tail": 1.5}, "robot.locked.tail=1.5 is outside its range in .*, -1 to 1"),
     ],
 )
 def test_joints_that_cannot_be_locked_are_named(tmp_path, locked, message):
-    pose = {name: angle for name, angle in BIPED_PRESET["default_joint_pos"].items() if name != "tail"}
     with pytest.raises(ValueError, match=message):
-        world_of(biped(tmp_path, default_joint_pos=pose, locked=locked))
+        world_of(biped(tmp_path, locked={"neck": 0.0, **locked}))
 
 
 # --- feet of several geoms --------------------------------------------------------------------------------------------
