@@ -11,9 +11,13 @@ from omniperception.scene.fetched import SCHEME, cache
 
 def skip_if_not_fetched(robot: str) -> None:
     """Skips a test of a preset whose file `robot-fetch` has not brought."""
-    file = yaml.safe_load((config.CONFIG_DIR / "robot" / f"{robot}.yaml").read_text())["file"]
+    skip_if_not_there(config.compose([f"robot={robot}"]).robot.file, f"robot={robot}")
+
+
+def skip_if_not_there(file: str, what: str) -> None:
+    """Skips a test of what needs a robot's file that `robot-fetch` has not brought."""
     if file.startswith(SCHEME) and not (cache() / file.removeprefix(SCHEME)).is_file():
-        pytest.skip(f"robot={robot} is downloaded, not shipped: omniperception robot-fetch")
+        pytest.skip(f"{what} is downloaded, not shipped: omniperception robot-fetch")
 
 
 BIPED = """
