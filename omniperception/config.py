@@ -267,7 +267,12 @@ def _check_preset(override: Override, known: Sequence[str]) -> None:
         if override.is_delete() or not isinstance(name, str):
             raise ConfigError(f"{override.input_line}: {group} names a preset; known: {', '.join(known)}")
         if name not in known:
-            raise ConfigError(f"{group}={name} is unknown; {suggest(name, known, and_all=True)}")
+            own = (
+                "; presets of your own are found with --config-dir conf"
+                if Path("conf", group, f"{name}.yaml").is_file()
+                else ""
+            )
+            raise ConfigError(f"{group}={name} is unknown; {suggest(name, known, and_all=True)}{own}")
 
 
 def search_path(overrides: Sequence[Override | str], config: DictConfig | None = None) -> list[Path]:

@@ -120,6 +120,16 @@ class TestRunDirectories:
         assert config.find_run("latest") == Path("outputs/a")
 
 
+def test_a_preset_that_lies_in_the_working_directory_says_how_it_is_found(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf" / "robot").mkdir(parents=True)
+    (tmp_path / "conf" / "robot" / "mine.yaml").write_text("file: mine.xml\n")
+    with pytest.raises(ConfigError, match=r"robot=mine is unknown; .*; .* with --config-dir conf$"):
+        config.compose(["robot=mine"])
+    with pytest.raises(ConfigError, match=r"robot=yours is unknown; known: [a-z0-9_, ]*$"):
+        config.compose(["robot=yours"])
+
+
 class TestOfARobotsVelocities:
     """Of a robot that shall walk at half the Go2's 2 m/s and turn at a third of its 1.5 rad/s."""
 

@@ -138,9 +138,15 @@ class MapTerrainConfig:
                 raise ValueError(f"terrain.start.inside={list(self.start.inside)} lies beside the map")
         found = free_places(heights, self.cell, self.start, near, self.floor(heights))
         if not len(found):
+            where, mend = "nowhere", ""
+            if near is not None:
+                given = list(self.start.inside or ())
+                where = f"around terrain.start.inside={given}, {heights[near[1], near[0]]:.2f} m high, nowhere"
+                mend = "name another point, "
             raise ValueError(
-                f"terrain.file={self.file} has no place to start: nowhere is ground level to {self.start.step} m within"
-                f" {self.start.radius} m; lower terrain.start.radius, raise terrain.start.step, or change terrain.cell"
+                f"terrain.file={self.file} has no place to start: {where} is ground level to {self.start.step} m within"
+                f" {self.start.radius} m (its heights: {heights.min():.2f} to {heights.max():.2f} m); {mend}lower"
+                " terrain.start.radius, raise terrain.start.step, or change terrain.cell"
             )
         return found
 

@@ -172,6 +172,10 @@ PLAN, PLACE = ("terrain=plan",), ("terrain=place",)
         ((*PLAN, "terrain.file=text.png"), "terrain.file=text.png is no picture that can be read"),
         ((*PLAN, "terrain.file=small.png"), "has 5 x 5 points 0.1 m apart; 11 x 11"),
         ((*PLAN, "terrain.file=black.png"), "has no place to start: nowhere is ground level"),
+        (
+            (*PLAN, "terrain.file=black.png", "terrain.start.inside=[0.1,0.1]"),
+            r"around terrain.start.inside=\[0.1, 0.1\], .* m high, nowhere is .* \(its heights: .*; name another point",
+        ),
         ((*PLAN, "terrain.wall_height=0.1"), "terrain.wall_height=0.1 must be above terrain.start.climb"),
         ((*PLAN, "terrain.start.radius=0.4"), "robot.footing=0.35 .* give terrain.start.radius=0.5"),
         ((*PLAN, "robot=anymal"), "robot.footing=0.65 .* give terrain.start.radius=0.8"),
