@@ -210,10 +210,14 @@ class PerceptivePpo(PPO):
         """rsl_rl's update, while the critic warms up without the actor; first of all a teacher's lessons."""
         if self.distillation is not None and self.num_updates < self.distillation.iterations:
             return self._imitate(self.distillation.learning_rate)
-        self.actor.requires_grad_(self.num_updates >= self.critic_warmup)
+        if self.num_updates >= self.critic_warmup:
+            return super().update()
+        schedule, self.schedule = self.schedule, "fixed"  # a policy that stays would have its steps grow without end
+        self.actor.requires_grad_(False)
         try:
             return super().update()
         finally:
+            self.schedule = schedule
             self.actor.requires_grad_(True)
 
     def learn_from(self, teacher: Teacher) -> None:
