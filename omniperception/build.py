@@ -163,7 +163,7 @@ def _resolved(config: DictConfig) -> dict:
                 "robot.gait, or part of it, is missing, and rewards, observations or commands follow it; give it, with"
                 " an offset for each foot, such as robot.gait={frequency: 2, offsets: [0, 0.5, 0.5, 0], duty: 0.5,"
                 " foot_height: 0.1, lift: 1, lin_vel_x: [-1, 1], lin_vel_y: [-1, 1], ang_vel_z: [-1, 1]}, or choose"
-                " others (rewards=walk observations=walk commands=velocity stepping=null)"
+                " another recipe (experiment=walk) or scenario"
             ) from None
         raise ConfigError(message.partition("raised while resolving interpolation: ")[2] or message) from None
 

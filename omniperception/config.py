@@ -57,7 +57,17 @@ def _device_figure(name: str, figure: str) -> float:
 
 def _within(most: float, values: Sequence[float]) -> list[float]:
     """Values brought between -most and most, for `${within:1.0,${robot.gait.lin_vel_x}}` in presets."""
-    return [min(max(value, -most), most) for value in values]
+    return [min(max(value, -most), most) for value in _pair(values)]
+
+
+def _pair(velocities: object) -> list[float]:
+    """Least and most velocity of a robot's gait."""
+    values = list(velocities) if isinstance(velocities, Sequence | ListConfig) else []
+    if len(values) != 2 or not all(isinstance(value, int | float) for value in values):
+        raise ValueError(
+            f"lin_vel_x, lin_vel_y and ang_vel_z of the robot's gait must be [least, most], not {velocities}"
+        )
+    return values
 
 
 def _by_speed(value: float, power: float, velocities: Sequence[float], reference: float) -> float:
@@ -66,9 +76,9 @@ def _by_speed(value: float, power: float, velocities: Sequence[float], reference
 
     For `${by_speed:4.0,-2,${robot.gait.lin_vel_x},2.0}` in presets.
     """
-    fastest = max(abs(velocity) for velocity in velocities)
+    fastest = max(abs(velocity) for velocity in _pair(velocities))
     if fastest == 0:
-        raise ValueError(f"{list(velocities)} of the robot's gait (lin_vel_x, ang_vel_z) must reach beyond 0")
+        raise ValueError("lin_vel_x and ang_vel_z of the robot's gait must reach beyond 0, if only to 0.1")
     return value * (fastest / reference) ** power
 
 

@@ -156,6 +156,11 @@ class TestOfARobotsVelocities:
         assert commands["lin_vel_x"] == [-0.2, 1.0] and commands["lin_vel_y"] == [-1.0, 1.0]
 
     def test_a_robot_that_shall_not_move_is_refused_in_one_line(self):
-        with pytest.raises(ConfigError, match="\\[0, 0\\] of the robot's gait .* must reach beyond 0") as error:
+        with pytest.raises(
+            ConfigError, match="lin_vel_x and ang_vel_z of the robot's gait must reach beyond 0"
+        ) as error:
             self.gait("robot.gait.lin_vel_x=[0,0]")
         assert "\n" not in str(error.value)
+        for wrong in ("1.0", "null", "[]", "[a,b]"):
+            with pytest.raises(ConfigError, match=r"of the robot's gait must be \[least, most\], not "):
+                self.gait(f"robot.gait.lin_vel_x={wrong}")

@@ -33,7 +33,7 @@ class Joints:
         torque_limits: N m.
         lower: joint limits, rad; None without; the runtime clips targets to them, training does not.
         upper: rad.
-        locked: rad, by joint: where the robot has to hold others, which the policy neither sees nor drives.
+        locked: rad (m of a slide), by joint: where the robot has to hold others, which the policy does not drive.
     """
 
     names: Sequence[str]

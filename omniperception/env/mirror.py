@@ -14,6 +14,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.observations import gait_phase
 from omniperception.env.mdp.terms import JOINT_MAGNITUDES, JOINTS, ROTATION, VECTOR
 from omniperception.scene import RobotConfig
+from omniperception.scene.robot_file import compile_robot, read_robot
 
 
 class Mirror:
@@ -71,6 +72,11 @@ def mirrored_joints(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: a joint has no mirror image, or the default pose is not its own.
     """
+    if robot.locked:
+        held, angles = tuple(robot.locked), np.array(list(robot.locked.values()))
+        twins, signs = joint_twins(compile_robot(read_robot(robot.path()), robot.file), robot.base, held)
+        if not np.allclose(angles[twins] * signs, angles, atol=_SAME):
+            raise ValueError("ppo.symmetry=true: robot.locked is not its own mirror image; set ppo.symmetry=false")
     index, sign = joint_twins(robot.compiled(), robot.base, robot.joints)
     default = np.array(robot.by_joint("default_joint_pos"))
     if not np.allclose(default[index] * sign, default, atol=_SAME):

@@ -91,16 +91,17 @@ def _by_world(records: Sequence[Record], column: str, keys: Sequence[str]) -> st
 
 def by_condition(records: Sequence[Record]) -> str:
     """How often each policy arrived untouched, and how often it fell, in the trials of all worlds."""
-    return _over_worlds(records, "policy", "condition", sorted({record.condition or "" for record in records}))
+    return _over_worlds(records, "policy", "condition", sorted({record.condition for record in records}))
 
 
 def by_run(records: Sequence[Record]) -> str:
     """The same of each run: a column for each policy.
 
     Raises:
-        ConfigError: runs were in different worlds.
+        ConfigError: runs were in different worlds, or under different conditions.
     """
-    worlds = {key: {record.place for record in theirs} for key, theirs in grouped(records, "run", "policy").items()}
+    by_run = grouped(records, "run", "policy")
+    worlds = {key: {f"{record.place} ({record.condition})" for record in theirs} for key, theirs in by_run.items()}
     (first, most), *others = worlds.items()
     for key, found in others:
         if found != most:

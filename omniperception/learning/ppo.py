@@ -54,6 +54,8 @@ class PerceptivePpo(PPO):
         estimator_optimizer: of the actor's estimator; None where there is none, or it stays as it is.
     """
 
+    schedule: str
+
     storage: PerceptiveStorage
     entropy_coef: float
     perception_optimizer: torch.optim.Adam | None = None
@@ -212,7 +214,8 @@ class PerceptivePpo(PPO):
             return self._imitate(self.distillation.learning_rate)
         if self.num_updates >= self.critic_warmup:
             return super().update()
-        schedule, self.schedule = self.schedule, "fixed"  # a policy that stays would have its steps grow without end
+        schedule = self.schedule
+        self.schedule = "fixed"  # a policy that stays would have its steps grow without end
         self.actor.requires_grad_(False)
         try:
             return super().update()

@@ -12,6 +12,8 @@ SAME_LEVEL = 0.15
 """Ends of limbs are feet up to this share of the robot's height above the lowest one."""
 SOLE = 0.012
 """Geoms of a foot that reach down to within this (m) of its lowest point carry the robot."""
+POINT = 0.002
+"""The same of a foot that is a point."""
 FLAT = 0.05
 """A foot whose carrying geoms span at least this (m) has to stand flat."""
 
@@ -92,17 +94,18 @@ class Body:
         return [geom for geom in self.touchable if self.link(geom) == link]
 
     def soles(self, link: int) -> list[int]:
-        """Geoms of a foot that carry the robot in the present pose; of one that is a point, the lowest alone."""
-        return self._low(link) if self.is_flat(link) else [min(self.geoms(link), key=self.lowest)]
+        """Geoms of a foot that carry the robot in the present pose."""
+        return self._low(link, SOLE if self.is_flat(link) else POINT)
 
-    def _low(self, link: int) -> list[int]:
+    def _low(self, link: int, above: float) -> list[int]:
+        """Geoms of a link that reach down to `above` (m) over its lowest point."""
         low = {geom: self.lowest(geom) for geom in self.geoms(link)}
-        return [geom for geom, z in low.items() if z - min(low.values()) <= SOLE]
+        return [geom for geom, z in low.items() if z - min(low.values()) <= above]
 
     def is_flat(self, link: int) -> bool:
         """Tell whether a foot has a sole, not a point: balls and ends of capsules touch below their middle."""
         ground = min(self.lowest(geom) for geom in self.geoms(link))
-        places = np.concatenate([self._touching(geom, ground + SOLE) for geom in self._low(link)])
+        places = np.concatenate([self._touching(geom, ground + SOLE) for geom in self._low(link, SOLE)])
         return float(np.ptp(places, 0).max()) >= FLAT
 
     def _touching(self, geom: int, height: float) -> np.ndarray:

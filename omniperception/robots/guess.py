@@ -122,7 +122,7 @@ def guess(file: Path, written: str, wishes: Wishes = Wishes()) -> Guess:
     twins, notes = _twins(body)
     if twins is not None:
         pose = _symmetric(pose, body, *twins)
-    pose = {joint: round(angle, 3) for joint, angle in pose.items()}
+    pose = {joint: round(float(np.clip(angle, *body.limits(joint))), 3) for joint, angle in pose.items()}
     body.place(pose)
     return _settled(_Draft(body, raw, file, written, wishes, joints, feet, pose, twins), (by_joint, by_pose), notes)
 

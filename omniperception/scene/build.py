@@ -12,7 +12,7 @@ import numpy as np
 from omniperception.scene.map_terrain import MapTerrainConfig
 from omniperception.scene.obstacles import ObstaclesConfig
 from omniperception.scene.robot import RobotConfig
-from omniperception.scene.robot_file import collides, compile_robot, drop_unseen
+from omniperception.scene.robot_file import ROUNDING, collides, compile_robot, drop_unseen
 from omniperception.scene.terrain import GROUND, TerrainConfig
 from omniperception.scene.tiled_terrain import TiledTerrainConfig
 
@@ -23,8 +23,6 @@ OBSTACLE_FORCE = "obstacle_force"
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _FOUND, _FORCE = 1, 2
 _REDUCE_NET_FORCE = 3
-_ROUNDING = 1e-6
-"""rad: by which a rounded angle may lie beyond the end of its range."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +156,7 @@ def _check_joints(model: mujoco.MjModel, robot: RobotConfig) -> None:
         raise ValueError(f"robot.joints names {', '.join(balls)}: joints must be hinges or slides, not balls")
     for name, angle in robot.default_joint_pos.items():
         low, high = model.joint(name).range
-        if model.joint(name).limited[0] and not low - _ROUNDING <= angle <= high + _ROUNDING:
+        if model.joint(name).limited[0] and not low - ROUNDING <= angle <= high + ROUNDING:
             raise ValueError(
                 f"robot.default_joint_pos.{name}={angle:g} is outside its range in {robot.file}, {low:g} to {high:g}"
             )

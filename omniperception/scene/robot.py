@@ -11,7 +11,16 @@ import mujoco
 import numpy as np
 
 from omniperception.scene.fetched import SCHEME, fetched
-from omniperception.scene.robot_file import FRAME, collides, compile_robot, drop_unseen, lock, read_robot, rigid_geoms
+from omniperception.scene.robot_file import (
+    FRAME,
+    carrier,
+    collides,
+    compile_robot,
+    drop_unseen,
+    lock,
+    read_robot,
+    rigid_geoms,
+)
 
 ByJoint = float | Mapping[str, float]
 """One number for all joints, or one for each by name."""
@@ -166,6 +175,8 @@ class RobotConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "penalized_geoms", tuple(self.penalized_geoms))
         object.__setattr__(self, "joints", tuple(joint for joint in self.joints if joint not in self.locked))
+        if self.locked and not self.joints:
+            raise ValueError("robot.locked leaves no joint to drive; leave one of robot.joints out of it")
         for name in ("default_joint_pos", *_BY_JOINT):
             given = getattr(self, name)
             if isinstance(given, Mapping):
@@ -277,6 +288,8 @@ class RobotConfig:
                     raise ValueError(
                         f"robot.self_collision names {name}, which {self.file} does not have; known: {known}"
                     )
+            if carrier(bodies[0]) == carrier(bodies[1]):  # locked joints have fixed them to each other
+                continue
             touching = [[geom.name for geom in rigid_geoms(body) if collides(geom)] for body in bodies]
             for geom in touching[0]:
                 for other in touching[1]:

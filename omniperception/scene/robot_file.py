@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
@@ -14,6 +15,8 @@ FRAME = "frame:"
 """Prefix of the sites that mark the frames of fixed links, which are still found when they are fused into others."""
 _FREE, _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _READABLE = (".stl", ".obj", ".msh")
+ROUNDING = 1e-3
+"""rad: by which a rounded angle may lie beyond the end of its range."""
 _LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 
 
@@ -65,28 +68,52 @@ def lock(spec: mujoco.MjSpec, angles: Mapping[str, float], path: str | Path) -> 
         angles: rad, or m of a slide, by joint.
         path: of the file, for errors.
     """
-    if not angles:
-        return
     known = [joint.name for joint in spec.joints if joint.type in (_HINGE, _SLIDE)]
     for name in sorted(angles.keys() - set(known)):
         raise ValueError(
             f"robot.locked names {name}, which {path} does not have as a hinge or slide; known: {', '.join(known)}"
         )
-    model = compile_robot(spec.copy(), path)
+    for equality in spec.equalities:
+        for name in sorted(angles.keys() & {equality.name1, equality.name2}):
+            raise ValueError(
+                f"robot.locked names {name}, but in {path} {equality.name1} and {equality.name2} follow each other;"
+                " take that <equality> or <mimic> out of the file"
+            )
     for name, angle in angles.items():
-        joint = spec.joint(name)
-        low, high = model.joint(name).range
-        if model.joint(name).limited[0] and not low <= angle <= high:
-            raise ValueError(f"robot.locked.{name}={angle:g} is outside its range in {path}, {low:g} to {high:g}")
-        data, body = mujoco.MjData(model), joint.parent
-        data.joint(name).qpos = angle
-        mujoco.mj_kinematics(model, data)
-        body.pos, body.quat = _relative(data, model.body(body.name).id, int(model.body(body.name).parentid[0]))
-        body.alt = mujoco.MjSpec().worldbody.alt
-        if len(body.joints) == 1:
-            body.add_site(name=FRAME + body.name, group=5)
-        spec.delete(joint)
-        model = compile_robot(spec.copy(), path)
+        _lock(spec, name, angle, path)
+
+
+def _lock(spec: mujoco.MjSpec, name: str, angle: float, path: str | Path) -> None:
+    whole = spec.copy()
+    whole.compiler.fusestatic = False  # or a link's parent may be gone
+    model, joint = compile_robot(whole, path), spec.joint(name)
+    low, high = model.joint(name).range
+    if model.joint(name).limited[0] and not low - ROUNDING <= angle <= high + ROUNDING:
+        raise ValueError(f"robot.locked.{name}={angle:g} is outside its range in {path}, {low:g} to {high:g}")
+    data, body = mujoco.MjData(model), joint.parent
+    link, parent = model.body(body.name).id, model.body(body.parent.name).id
+    mujoco.mj_kinematics(model, data)
+    pos_before, quat_before = _relative(data, link, parent)
+    data.joint(name).qpos = angle
+    mujoco.mj_kinematics(model, data)
+    pos, quat = _relative(data, link, parent)
+    before, turned = _matrix(quat_before), _matrix(quat)
+    for other in itertools.takewhile(lambda one: one.name != name, body.joints):  # those turn what this one has turned
+        other.axis = turned.T @ before @ other.axis
+        other.pos = turned.T @ (before @ other.pos + pos_before - pos)
+    body.pos, body.quat, body.alt = pos, quat, mujoco.MjSpec().worldbody.alt
+    if body.frame is not None:  # its pose is in that of the link
+        body.set_frame(body.parent.add_frame())
+    if len(body.joints) == 1:
+        body.add_site(name=FRAME + body.name, group=5)
+    spec.delete(joint)
+
+
+def _matrix(quat: np.ndarray) -> np.ndarray:
+    """(3, 3) of a quaternion."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
 
 
 def _relative(data: mujoco.MjData, body: int, parent: int) -> tuple[np.ndarray, np.ndarray]:
@@ -128,6 +155,13 @@ def _has_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
         inferred = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     weightless = geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0)
     return inferred and not weightless
+
+
+def carrier(body: mujoco.MjsBody) -> str:
+    """Name of the moving link that a body is fixed to, or of the body that moves."""
+    while not body.joints and body.parent is not None and body.parent.name != "world":
+        body = body.parent
+    return body.name
 
 
 def rigid_geoms(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:

@@ -78,7 +78,9 @@ def test_runs_of_several_files_stand_below_each_other_if_they_were_in_the_same_w
     assert rows[0] == ["run directory", "run", "oracle"] and rows[2] == ["a", cell, "–"]
     assert rows[3][:2] == ["b", cell] and rows[3][2].startswith("0.0 [0.0, 19.4]")
     assert "over 2 worlds" in text and "least to most" not in text
-    with pytest.raises(ConfigError, match=r"a blind and a run were not in the same worlds \(only one of them in rod\)"):
+    with pytest.raises(
+        ConfigError, match=r"a blind and a run were not in the same worlds \(only one of them in rod \(ideal\)\)"
+    ):
         rendered(page("first view=trained condition=ideal"), data)
 
 
