@@ -54,10 +54,9 @@ class PerceptivePpo(PPO):
         estimator_optimizer: of the actor's estimator; None where there is none, or it stays as it is.
     """
 
-    schedule: str
-
     storage: PerceptiveStorage
     entropy_coef: float
+    schedule: str
     perception_optimizer: torch.optim.Adam | None = None
     estimator_optimizer: torch.optim.Adam | None = None
     distillation: DistillationConfig | None
