@@ -7,7 +7,7 @@
 <!-- table: avoider,robots view=trained condition=robot -->     the same: a row for each run, a column for each policy
 <!-- table: gait view=walking -->                              figures of a gait: a row for each ground
 <!-- table: gait view=levels -->                               the same, all kinds of ground together
-<!-- table: gait,robots view=runs -->                         the same, a row for each run
+<!-- table: gait,robots view=runs -->                          the same, a row for each run
 <!-- table: end_to_end view=study -->                          results of a study: a row for each training and policy
 <!-- end -->
 """
@@ -100,8 +100,8 @@ def by_run(records: Sequence[Record]) -> str:
     Raises:
         ConfigError: runs were in different worlds, or under different conditions.
     """
-    by_run = grouped(records, "run", "policy")
-    worlds = {key: {f"{record.place} ({record.condition})" for record in theirs} for key, theirs in by_run.items()}
+    groups = grouped(records, "run", "policy").items()
+    worlds = {key: {f"{record.place} ({record.condition})" for record in theirs} for key, theirs in groups}
     (first, most), *others = worlds.items()
     for key, found in others:
         if found != most:

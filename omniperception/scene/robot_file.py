@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
@@ -68,6 +67,8 @@ def lock(spec: mujoco.MjSpec, angles: Mapping[str, float], path: str | Path) -> 
         angles: rad, or m of a slide, by joint.
         path: of the file, for errors.
     """
+    if not angles:
+        return  # nothing to compile for
     known = [joint.name for joint in spec.joints if joint.type in (_HINGE, _SLIDE)]
     for name in sorted(angles.keys() - set(known)):
         raise ValueError(
@@ -79,50 +80,53 @@ def lock(spec: mujoco.MjSpec, angles: Mapping[str, float], path: str | Path) -> 
                 f"robot.locked names {name}, but in {path} {equality.name1} and {equality.name2} follow each other;"
                 " take that <equality> or <mimic> out of the file"
             )
-    for name, angle in angles.items():
-        _lock(spec, name, angle, path)
-
-
-def _lock(spec: mujoco.MjSpec, name: str, angle: float, path: str | Path) -> None:
     whole = spec.copy()
-    whole.compiler.fusestatic = False  # or a link's parent may be gone
-    model, joint = compile_robot(whole, path), spec.joint(name)
-    low, high = model.joint(name).range
-    if model.joint(name).limited[0] and not low - ROUNDING <= angle <= high + ROUNDING:
-        raise ValueError(f"robot.locked.{name}={angle:g} is outside its range in {path}, {low:g} to {high:g}")
-    data, body = mujoco.MjData(model), joint.parent
-    link, parent = model.body(body.name).id, model.body(body.parent.name).id
-    mujoco.mj_kinematics(model, data)
-    pos_before, quat_before = _relative(data, link, parent)
-    data.joint(name).qpos = angle
-    mujoco.mj_kinematics(model, data)
-    pos, quat = _relative(data, link, parent)
-    before, turned = _matrix(quat_before), _matrix(quat)
-    for other in itertools.takewhile(lambda one: one.name != name, body.joints):  # those turn what this one has turned
-        other.axis = turned.T @ before @ other.axis
-        other.pos = turned.T @ (before @ other.pos + pos_before - pos)
-    body.pos, body.quat, body.alt = pos, quat, mujoco.MjSpec().worldbody.alt
-    if body.frame is not None:  # its pose is in that of the link
-        body.set_frame(body.parent.add_frame())
-    if len(body.joints) == 1:
-        body.add_site(name=FRAME + body.name, group=5)
-    spec.delete(joint)
+    whole.compiler.fusestatic = False  # or some links are gone
+    model, placed = compile_robot(whole, path), set()
+    for joint in [joint for joint in spec.joints if joint.name in angles]:
+        angle, body, compiled = angles[joint.name], joint.parent, model.joint(joint.name)
+        low, high = compiled.range
+        if compiled.limited[0] and not low - ROUNDING <= angle <= high + ROUNDING:
+            raise ValueError(f"robot.locked.{joint.name}={angle:g} is outside its range in {path}, {low:g} to {high:g}")
+        if body.name not in placed:  # as compiled: without frames, Euler angles and degrees
+            placed.add(body.name)
+            body.pos, body.quat = model.body(body.name).pos, model.body(body.name).quat
+            body.alt = mujoco.MjSpec().worldbody.alt
+            if body.frame is not None:
+                body.set_frame(body.parent.add_frame())
+        shift, turn = _motion(model, joint.name, angle)
+        before = [other.name for other in body.joints].index(joint.name)
+        for other in body.joints[:before]:  # they turn what this one has moved
+            other.pos, other.axis = _rotated(other.pos - shift, _inverse(turn)), _rotated(other.axis, _inverse(turn))
+        body.pos = body.pos + _rotated(shift, body.quat)
+        mujoco.mju_mulQuat(quat := np.empty(4), body.quat, turn)
+        body.quat = quat
+        if len(body.joints) == 1:
+            body.add_site(name=FRAME + body.name, group=5)
+        spec.delete(joint)
 
 
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    """(3, 3) of a quaternion."""
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quat)
-    return matrix.reshape(3, 3)
+def _motion(model: mujoco.MjModel, name: str, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """How a joint moves its link, in the link's frame: (3,) m and a quaternion."""
+    joint, turn = model.joint(name), np.array((1.0, 0.0, 0.0, 0.0))
+    way = angle - float(model.qpos0[joint.qposadr[0]])
+    if joint.type[0] == _SLIDE:
+        return way * joint.axis, turn
+    mujoco.mju_axisAngle2Quat(turn, joint.axis, way)
+    return joint.pos - _rotated(joint.pos, turn), turn
 
 
-def _relative(data: mujoco.MjData, body: int, parent: int) -> tuple[np.ndarray, np.ndarray]:
-    """Position (m) and quaternion of a body in the frame of another."""
-    back, pos, quat = np.empty(4), np.empty(3), np.empty(4)
-    mujoco.mju_negQuat(back, data.xquat[parent])
-    mujoco.mju_rotVecQuat(pos, data.xpos[body] - data.xpos[parent], back)
-    mujoco.mju_mulQuat(quat, back, data.xquat[body])
-    return pos, quat
+def _rotated(vector: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """(3,) a vector turned by a quaternion."""
+    turned = np.empty(3)
+    mujoco.mju_rotVecQuat(turned, vector, quat)
+    return turned
+
+
+def _inverse(quat: np.ndarray) -> np.ndarray:
+    inverse = np.empty(4)
+    mujoco.mju_negQuat(inverse, quat)
+    return inverse
 
 
 def collides(geom: mujoco.MjsGeom) -> bool:

@@ -277,7 +277,7 @@ def test_a_locked_joint_of_a_urdf_carries_its_mounts(tmp_path):
     np.testing.assert_allclose(place.pos, expected, atol=1e-9)
 
 
-def test_locked_joints_in_a_chain_of_a_urdf_and_on_one_link_and_in_a_frame(tmp_path):
+def test_locked_joints_in_a_chain_of_a_urdf_and_on_one_link_in_a_frame_and_a_slide(tmp_path):
     """Against the same files with joints that turn: where all geoms are. Fixed links are fused in the URDF's model."""
     robot = on_six_legs(tmp_path)
     own = {"joints": ("r0_lift",), "default_joint_pos": {"r0_lift": 0.0}}
@@ -289,13 +289,14 @@ def test_locked_joints_in_a_chain_of_a_urdf_and_on_one_link_and_in_a_frame(tmp_p
     text = text.replace(
         '<joint name="left_knee"', '<joint name="twist" axis="1 0 1" pos="0 0.02 0"/><joint name="left_knee"'
     )
+    text = text.replace('<joint name="tail" axis', '<joint name="tail" type="slide" ref="0.1" axis')
     i = text.index('<body name="head"')
     text = text[:i].rstrip() + "</frame>" + text[i:]
-    held = {"left_knee": 0.9, "left_hip": -0.6}
+    held = {"left_knee": 0.9, "left_hip": -0.6, "tail": 0.3}
     whole = placed(biped(tmp_path, text), held | {"twist": 0.4})
     link = placed(biped(tmp_path, text, locked=held), {"twist": 0.4}), whole
-    for (model, data), (free, turned) in (chain, link):
-        assert free.nv - model.nv == 2
+    for ((model, data), (free, turned)), count in ((chain, 2), (link, 3)):
+        assert free.nv - model.nv == count
         for geom in (free.geom(k).name for k in range(free.ngeom)):
             np.testing.assert_allclose(data.geom(geom).xpos, turned.geom(geom).xpos, atol=1e-9, err_msg=geom)
             np.testing.assert_allclose(data.geom(geom).xmat, turned.geom(geom).xmat, atol=1e-9, err_msg=geom)
