@@ -237,13 +237,14 @@ class PlaceConfig(MapTerrainConfig):
 
     Attributes:
         scale: metres per unit of the file.
-        up: axis of the file that points up, 'z' or 'y'; with 'y' its -z is y here.
+        up: axis of the file that points up, 'z' or 'y'; with 'y' its -z is y here. None: y of a GLB, whose format says
+            so, z of the others, unless the mesh looks as if it were y.
         ceiling: height (m) in the file's frame above which nothing counts; a wall that goes on above ends there.
         outside: height (m) where there is nothing; None: that of the lowest point.
     """
 
     scale: float = 1.0
-    up: str = "z"
+    up: str | None = None
     ceiling: float | None = None
     outside: float | None = None
 
@@ -251,8 +252,8 @@ class PlaceConfig(MapTerrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.up not in ("z", "y"):
-            raise ValueError(f"terrain.up={self.up} must be z or y")
+        if self.up not in ("z", "y", None):
+            raise ValueError(f"terrain.up={self.up} must be z, y or null")
         if not self.scale > 0:
             raise ValueError(f"terrain.scale={self.scale} must be positive")
 
@@ -261,8 +262,10 @@ class PlaceConfig(MapTerrainConfig):
 
         mesh = TriangleMesh.from_file(self.file, self.scale)
         corners = mesh.vertices.astype(np.float64)[mesh.triangles]
-        if self.up == "y":
+        if (self.up or ("y" if Path(self.file).suffix.lower() == ".glb" else "z")) == "y":
             corners = np.stack((corners[..., 0], -corners[..., 2], corners[..., 1]), -1)
+        if self.up is None:
+            self._check_upright(corners)
         low, high = corners.min((0, 1)), corners.max((0, 1))
         cols, rows = (int((high[k] - low[k]) / self.cell + 1e-6) + 1 for k in (0, 1))
         if cols * rows > MAX_POINTS:
@@ -282,6 +285,18 @@ class PlaceConfig(MapTerrainConfig):
             raise ValueError(f"terrain.file={self.file} has nothing below terrain.ceiling={self.ceiling}")
         heights[empty] = heights[~empty].min() if self.outside is None else self.outside
         return heights, (float(low[0]), float(low[1]))
+
+    def _check_upright(self, corners: np.ndarray) -> None:
+        """Refuses a mesh (T, 3, 3) m, z up, that is higher than deep and has more of its area upright than level."""
+        width, depth, height = np.ptp(corners, (0, 1))
+        area = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).sum(0)
+        if height > depth and area[1] > area[2]:
+            taken = "y" if Path(self.file).suffix.lower() == ".glb" else "z"
+            raise ValueError(
+                f"terrain.file={self.file} would be {width:.1f} x {depth:.1f} m and {height:.1f} m high with its {taken}"
+                f" up, and more of its surfaces would be walls than ground; give terrain.up={'zy'[taken == 'z']} or,"
+                f" if that is meant, terrain.up={taken}"
+            )
 
 
 def _first_of(heights: np.ndarray, cell: float) -> tuple[float, float]:

@@ -99,6 +99,23 @@ def test_a_place_is_seen_from_above(files, up):
     assert at(larger, 11.0, 8.4) == pytest.approx(1.5)
 
 
+def test_a_place_on_its_side_is_refused(files):
+    hall = slab((0.0, 8.0), (0.0, 6.0), (-0.1, 0.0)), slab((0.0, 0.1), (0.0, 6.0), (0.0, 2.6))
+    write_obj(files / "stands.obj", *hall)
+    write_obj(files / "lies.obj", *hall, turn=lambda x, y, z: (x, z, -y))
+    with pytest.raises(ValueError, match=r"8\.0 x 2\.7 m and 6\.0 m high with its z up.*terrain\.up=y or"):
+        PlaceConfig("lies.obj", 0.05).height_map()
+    stands = PlaceConfig("stands.obj", 0.05).height_map()
+    np.testing.assert_allclose(PlaceConfig("lies.obj", 0.05, up="y").height_map(), stands, atol=1e-6)
+    assert PlaceConfig("lies.obj", 0.05, up="z").height_map().shape[0] < stands.shape[0]  # meant so
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.load("lies.obj").export("lies.glb")  # as the format wants it
+    trimesh.load("stands.obj").export("stands.glb")
+    np.testing.assert_allclose(PlaceConfig("lies.glb", 0.05).height_map(), stands, atol=1e-6)
+    with pytest.raises(ValueError, match=r"with its y up.*terrain\.up=z or"):
+        PlaceConfig("stands.glb", 0.05).height_map()
+
+
 def test_places_to_start_are_free(files):
     heights = np.zeros((60, 80))
     heights[:, 30:32] = 1.0  # a wall between a small room and a large one
