@@ -156,8 +156,9 @@ def call(target: Callable, keywords: Mapping[str, Any], key: str) -> Any:
     try:
         return target(**keywords)
     except (TypeError, ValueError, OSError, ImportError) as error:
-        text = str(error)
-        raise ConfigError(text if text.startswith(key.partition(".")[0]) else f"{key}: {text}") from None
+        root, text = key.partition(".")[0], str(error)
+        named = text.startswith(root) and not text.startswith(f"{root}: ")
+        raise ConfigError(text if named else f"{key}: {text.removeprefix(f'{root}: ')}") from None
 
 
 def look_up(kind: Kind, name: str, key: str, trust: Sequence[str] | None = ()) -> Callable:

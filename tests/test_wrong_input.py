@@ -116,7 +116,7 @@ LINES = [
     ("train lidar.max_range=-1", "max_range=-1"),
     ("train lidar.num_rays=0", "num_rays=0"),
     ("train lidar.selection=best", "lidar.selection=best"),
-    ("train obstacles.groups.walker.count=-1", "count=-1"),
+    ("train obstacles.groups.walker.count=-1", "obstacles.groups.walker: count=-1"),
     ("train obstacles.area=[5,-5,5,-5]", "area=[5.0, -5.0"),
     ("train obstacles.groups.walker.size=[[300,300],[1,1]]", "obstacles.groups.walker are 600 m across"),
     ("train robot.base=torso", "robot.base=torso is no body of go2.xml; known: base"),

@@ -122,6 +122,8 @@ class PPOConfig:
         num_learning_epochs: passes of PPO over a rollout; 0 keeps the policy as it is, and perception learns alone.
         hidden_dims: hidden layers of the actor and of the critic.
         init_std: initial standard deviation of the actions.
+        start_std: standard deviation of the actions with which a policy that starts from another run's weights (init=)
+            explores; None: what it had there, with which a finished one learns nothing new (docs/lab/learning.md).
         obs_normalization: whether observations are normalised by running statistics.
         mixed_precision: whether updates multiply matrices in bfloat16; None where that is measured to be faster on a
             CPU, on a GPU not.
@@ -154,6 +156,7 @@ class PPOConfig:
     activation: str
     init_std: float
     obs_normalization: bool
+    start_std: float | None = None
     mixed_precision: bool | None = False
     final_entropy_coef: float | None = None
     final_desired_kl: float | None = None
@@ -176,8 +179,9 @@ class PPOConfig:
         for name in ("clip_param", "learning_rate", "max_grad_norm", "init_std", "desired_kl"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive")
-        if self.final_desired_kl is not None and self.final_desired_kl <= 0:
-            raise ValueError(f"ppo.final_desired_kl={self.final_desired_kl} must be positive or null")
+        for name in ("start_std", "final_desired_kl"):
+            if getattr(self, name) is not None and getattr(self, name) <= 0:
+                raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive or null")
         if self.final_desired_kl is not None and self.schedule != "adaptive":
             raise ValueError("ppo.final_desired_kl is for ppo.schedule=adaptive; give one of them")
         for name in ("gamma", "lam"):

@@ -33,7 +33,7 @@ from omniperception.learning.config import LearningConfig
 from omniperception.learning.divergence import TrainingDiverged
 from omniperception.learning.logger import Logger
 from omniperception.learning.ppo import PerceptivePpo
-from omniperception.learning.warm_start import estimating, perceive_as, start_from
+from omniperception.learning.warm_start import estimating, observes_more, observing_more, perceive_as, start_from
 
 
 class Runner:
@@ -178,7 +178,8 @@ class Runner:
 
         Args:
             run_dirs: of these runs.
-            observations: of the last one, which may observe what this one estimates; None: the same as here.
+            observations: of the last one, which may observe what this one estimates, or less than this one; None: the
+                same as here.
 
         Returns:
             The runs whose perception goes on here.
@@ -188,17 +189,27 @@ class Runner:
             perceive_as(self.alg.actor, self._weights(other)["actor_state_dict"], str(other))
         state = self._weights(run_dir)
         weights = state["actor_state_dict"]
-        if observations is not None and self.config.estimator is not None and observations.estimated is None:
+        if observations is not None:
             own = self.env.config.observations
-            truth = self.env.actor_inputs(replace(own, actor=[self.config.estimator.group]))
-            given = self.env.actor_inputs(observations)
-            weights = estimating(self.alg.actor, weights, self.env.actor_inputs(own), given, truth)
+            inputs, given = self.env.actor_inputs(own), self.env.actor_inputs(observations)
+            if self.config.estimator is None:
+                weights = observing_more(weights, inputs, given)
+            elif observations.estimated is None:
+                truth = self.env.actor_inputs(replace(own, actor=[self.config.estimator.group]))
+                weights = estimating(self.alg.actor, weights, inputs, given, truth)
         if start_from(self.alg.actor, weights, str(run_dir)):
             seeing = [run_dir]
+        if self.config.ppo.start_std is not None:
+            with torch.no_grad():
+                self.alg.actor.distribution.std_param.fill_(self.config.ppo.start_std)
         self.alg.actor.reset()
         with contextlib.suppress(CheckpointError):
             start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
         return seeing
+
+    def observes_more_than(self, run_dir: Path) -> bool:
+        """Tell whether this actor observes more than that of another run, whose observations `start_from` then needs."""
+        return observes_more(self.alg.actor, self._weights(run_dir)["actor_state_dict"])
 
     def _weights(self, run_dir: str | Path) -> dict:
         return load_checkpoint(latest_checkpoint(run_dir), self.device)

@@ -63,8 +63,7 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
     for name in [name for name in state if perceives_alike or name not in optional]:
         own, other = state[name], weights.get(name)
         if name == _FIRST_LAYER and other is not None and len(other) == len(own):
-            blind = model.blind_dim if isinstance(model, EstimatingModel) else model.obs_dim
-            shared = own.shape[1] if perceives_alike else blind
+            shared = own.shape[1] if perceives_alike else _blind_dim(model)
             if other.shape[1] >= shared:
                 own[:, :shared] = other[:, :shared]
                 continue
@@ -120,6 +119,40 @@ def estimating(
             rearranged[name] = weights[name][:, kept]
     untrained = {name: value for name, value in model.state_dict().items() if name.startswith("estimator.")}
     return rearranged | untrained
+
+
+def observing_more(
+    weights: Mapping[str, torch.Tensor], own: Sequence[ActorInput], given: Sequence[ActorInput]
+) -> Mapping[str, torch.Tensor]:
+    """The weights of an actor that observes less, for one that at first does not heed what it observes besides.
+
+    Actors that differ in anything else are left as they are.
+
+    Args:
+        weights: the state of the other actor.
+        own: inputs of the one that observes more.
+        given: inputs of the other.
+    """
+    if not set(given) < set(own):
+        return weights
+    at = [own.index(one) for one in given]
+    layer, wider = weights[_FIRST_LAYER], dict(weights)
+    wider[_FIRST_LAYER] = layer.new_zeros(len(layer), len(own) + layer.shape[1] - len(given))
+    wider[_FIRST_LAYER][:, [*at, *range(len(own), wider[_FIRST_LAYER].shape[1])]] = layer
+    for name, unknown in (("_mean", 0.0), ("_var", 1.0), ("_std", 1.0)):
+        if (name := f"obs_normalizer.{name}") in weights:
+            wider[name] = weights[name].new_full((1, len(own)), unknown)
+            wider[name][:, at] = weights[name]
+    return wider
+
+
+def observes_more(model: MLPModel, weights: Mapping[str, torch.Tensor]) -> bool:
+    """Tell whether a model has more one-dimensional observations than another, whose state is given, has inputs."""
+    return _FIRST_LAYER in weights and weights[_FIRST_LAYER].shape[1] < _blind_dim(model)
+
+
+def _blind_dim(model: MLPModel) -> int:
+    return model.blind_dim if isinstance(model, EstimatingModel) else model.obs_dim
 
 
 def _misfit(what: str, name: str, own: torch.Tensor, other: torch.Tensor | None, alike: str) -> CheckpointError:

@@ -109,6 +109,24 @@ def test_an_estimate_takes_over_what_was_measured(make_config, walk):
         assert not torch.allclose(actor(obs), measuring.alg.actor(observed), atol=1e-2)
 
 
+def test_what_is_observed_besides_is_not_heeded_at_first(make_config, walk):
+    """Wherever it stands among the inputs, and whatever it is."""
+    run_dir, blind = walk
+    more = "+observations.groups.height={terms: {base_height: {}}}"
+    actor = "observations.actor=[height,proprioception,command,action,clock]"
+    runner = build_runner(make_config(*BLIND, more, actor, "seed=6"), None)
+    assert runner.observes_more_than(run_dir) and not blind.observes_more_than(run_dir)
+    with pytest.raises(CheckpointError, match="give both the same observations"):
+        runner.start_from(run_dir)
+    runner.start_from(run_dir, observations=blind.env.config.observations)
+    obs = runner.env.get_observations()
+    obs["height"] = torch.randn_like(obs["height"])
+    with torch.no_grad():
+        assert torch.allclose(runner.alg.actor(obs), blind.alg.actor(obs), atol=1e-6)
+        runner.alg.actor.mlp[0].weight[:, 0] += 1.0
+        assert not torch.allclose(runner.alg.actor(obs), blind.alg.actor(obs), atol=1e-2)
+
+
 @pytest.mark.parametrize(
     "other", ["observations.groups.proprioception.history=2", "observations.groups.proprioception.terms.joint_vel=null"]
 )
