@@ -208,7 +208,7 @@ class Runner:
         return seeing
 
     def observes_more_than(self, run_dir: Path) -> bool:
-        """Tell whether this actor observes more than that of another run, whose observations `start_from` then needs."""
+        """Tell whether this actor observes more than another run's, whose observations `start_from` then needs."""
         return observes_more(self.alg.actor, self._weights(run_dir)["actor_state_dict"])
 
     def _weights(self, run_dir: str | Path) -> dict:

@@ -262,7 +262,7 @@ class PlaceConfig(MapTerrainConfig):
 
         mesh = TriangleMesh.from_file(self.file, self.scale)
         corners = mesh.vertices.astype(np.float64)[mesh.triangles]
-        if (self.up or ("y" if Path(self.file).suffix.lower() == ".glb" else "z")) == "y":
+        if self._up == "y":
             corners = np.stack((corners[..., 0], -corners[..., 2], corners[..., 1]), -1)
         if self.up is None:
             self._check_upright(corners)
@@ -286,16 +286,20 @@ class PlaceConfig(MapTerrainConfig):
         heights[empty] = heights[~empty].min() if self.outside is None else self.outside
         return heights, (float(low[0]), float(low[1]))
 
+    @property
+    def _up(self) -> str:
+        return self.up or ("y" if Path(self.file).suffix.lower() == ".glb" else "z")
+
     def _check_upright(self, corners: np.ndarray) -> None:
         """Refuses a mesh (T, 3, 3) m, z up, that is higher than deep and has more of its area upright than level."""
         width, depth, height = np.ptp(corners, (0, 1))
         area = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).sum(0)
         if height > depth and area[1] > area[2]:
-            taken = "y" if Path(self.file).suffix.lower() == ".glb" else "z"
+            taken, other = ("y", "z") if self._up == "y" else ("z", "y")
             raise ValueError(
                 f"terrain.file={self.file} would be {width:.1f} x {depth:.1f} m and {height:.1f} m high with its {taken}"
-                f" up, and more of its surfaces would be walls than ground; give terrain.up={'zy'[taken == 'z']} or,"
-                f" if that is meant, terrain.up={taken}"
+                f" up, and more of its surfaces would be walls than ground; give terrain.up={other} or, if that is"
+                f" meant, terrain.up={taken}"
             )
 
 

@@ -127,6 +127,18 @@ def test_what_is_observed_besides_is_not_heeded_at_first(make_config, walk):
         assert not torch.allclose(runner.alg.actor(obs), blind.alg.actor(obs), atol=1e-2)
 
 
+def test_it_explores_as_much_as_it_is_told_to(make_config, walk):
+    run_dir, blind = walk
+    with torch.no_grad():
+        blind.alg.actor.distribution.std_param.fill_(0.2)
+    blind.save(checkpoint_path(run_dir, 4))
+    for setting, std in ((), 0.2), (("ppo.start_std=0.6",), 0.6):
+        runner = build_runner(make_config(*BLIND, *setting), None)
+        assert torch.allclose(runner.alg.actor.distribution.std_param, torch.full((12,), 0.5))
+        runner.start_from(run_dir)
+        assert torch.allclose(runner.alg.actor.distribution.std_param, torch.full((12,), std))
+
+
 @pytest.mark.parametrize(
     "other", ["observations.groups.proprioception.history=2", "observations.groups.proprioception.terms.joint_vel=null"]
 )
