@@ -297,9 +297,9 @@ class PlaceConfig(MapTerrainConfig):
         if height > depth and area[1] > area[2]:
             taken, other = ("y", "z") if self._up == "y" else ("z", "y")
             raise ValueError(
-                f"terrain.file={self.file} would be {width:.1f} x {depth:.1f} m and {height:.1f} m high with its {taken}"
-                f" up, and more of its surfaces would be walls than ground; give terrain.up={other} or, if that is"
-                f" meant, terrain.up={taken}"
+                f"terrain.file={self.file} would be {width:.1f} x {depth:.1f} m and {height:.1f} m high with its"
+                f" {taken} up, and more of its surfaces would be walls than ground; give terrain.up={other} or,"
+                f" if that is meant, terrain.up={taken}"
             )
 
 
