@@ -96,15 +96,16 @@ def test_studies_that_are_shipped_compose(name):
 
 @pytest.mark.slow
 def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
-    """Two arms, of which the second goes on with the first."""
+    """Two arms, of which the second begins with the weights of the first."""
     study = {"experiment": "avoid", "variants": ["fps_mlp_small"], "seeds": [1, 2], "scenarios": ["corridor"]}
-    study |= {"trials": 2, "arms": {"short": {}, "long": {"after": "short", "overrides": ["ppo.max_iterations=2"]}}}
+    short, longer = ["ppo.max_iterations=1", "ppo.gamma=0.9"], ["ppo.max_iterations=2"]
+    study |= {"trials": 2, "arms": {"short": {"overrides": short}, "long": {"after": "short", "overrides": longer}}}
     (tmp_path / "conf" / "study").mkdir(parents=True)
     (tmp_path / "conf" / "study" / "mine.yaml").write_text(yaml.safe_dump(study, sort_keys=False))
     out = tmp_path / "out"
     arguments = [
         *("--config-dir", str(tmp_path / "conf"), "study=mine", f"out={out}"),
-        *("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1", "ppo.max_iterations=1"),
+        *("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1", "ppo.gamma=0.98"),
         *("obstacles.curriculum=null", "terminations.episode_length_s=0.3"),
     ]
     main(["ablate", "stage=train", *arguments])
@@ -113,10 +114,14 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
     runs = [f"{arm}/fps_mlp_small/seed{seed}" for arm in ("long", "short") for seed in (1, 2)]
     assert {name.split()[0] for name in names} == set(runs)
     assert {f"{run} model_{2 if run.startswith('long') else 1}.pt" for run in runs} <= set(names)
+    for seed in (1, 2):
+        begun = config.load(out / f"long/fps_mlp_small/seed{seed}").init
+        assert str(begun) == str(out / f"short/fps_mlp_small/seed{seed}")
+    assert config.load(out / "short/fps_mlp_small/seed1").ppo.gamma == 0.98  # the command line's, not the arm's
     main(["ablate", *arguments])
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
     table = (out / "ablation.md").read_text()
     assert re.search(r"\| long +\| fps_mlp_small +\| run +\| \d", table) and "each of 4 runs" in table
     with pytest.raises(SystemExit, match="2"):
-        main(["ablate", *arguments, "ppo.gamma=0.9"])
+        main(["ablate", *arguments, "ppo.lam=0.8"])
     assert "holds a run of another configuration" in capfd.readouterr().err

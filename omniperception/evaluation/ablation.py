@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,9 +10,9 @@ from pathlib import Path
 
 import yaml
 
-from omniperception import build, config
+from omniperception import config
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import FOLDER, Record, read, write
+from omniperception.evaluation.records import Record, read, write
 from omniperception.evaluation.study_report import study_table
 from omniperception.evaluation.suite import POLICIES, SPLITS, Evaluation, Task, World, held_out_scenarios, measure_all
 
@@ -37,8 +36,8 @@ class Arm:
     """A way of training.
 
     Attributes:
-        overrides: of the study's experiment, or of the training that this one goes on with.
-        after: the arm whose finished training, with the same network and seed, this one goes on with; None: none.
+        overrides: of the study's experiment; those of the command line go before.
+        after: the arm whose weights, of the same network and seed, this one begins with (`init`); None: none.
     """
 
     overrides: Sequence[str] = ()
@@ -55,7 +54,7 @@ class Study:
         seeds: one run of each variant and arm for each.
         scenarios: names from conf/scenario, on their own terrain.
         trials: of each run in each scenario.
-        arms: ways of training by name; one that goes on with another stands behind it.
+        arms: ways of training by name; one that begins with the weights of another stands behind it.
         conditions: presets of `condition`.
         policies: names from `suite.POLICIES`.
         split: dev or test.
@@ -150,52 +149,36 @@ def train(ablation: Ablation) -> None:
     trained at the same time, otherwise one after the other.
 
     Raises:
-        ConfigError: an arm goes on with another on a cluster, or a training failed.
+        ConfigError: a training failed.
     """
-    study = ablation.study
     together = any(override.startswith("hydra/launcher=") for override in ablation.overrides)
-    for name, arm in study.arms.items():
-        if together and arm.after is not None:
-            raise ConfigError(f"arms={name} goes on with {arm.after}, which hydra/launcher= cannot; leave it out")
+    for arm in ablation.study.arms:
         running = []
-        for variant in study.variants:
-            if arm.after is not None:
-                for seed in study.seeds:
-                    _go_on(ablation, name, variant, seed)
-                continue
-            running.append(subprocess.Popen(_sweep(ablation, name, variant)))
+        for variant in ablation.study.variants:
+            running.append(subprocess.Popen(_sweep(ablation, arm, variant)))
             if not together:
                 _wait(running.pop())
         for process in running:
             _wait(process)
 
 
-def _sweep(ablation: Ablation, arm: str, variant: str) -> list[str]:
+def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:
     """Command of a training over the seeds."""
-    study = ablation.study
+    study, arm = ablation.study, ablation.study.arms[name]
+    subdir = f"{variant}/seed${{seed}}"
+    given = {override.key_or_group for override in config.parse(ablation.overrides)}
+    own = [text for text in arm.overrides if config.parse([text])[0].key_or_group not in given]
     return [
         *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),
         *overrides_of(variant),
-        *study.arms[arm].overrides,
+        *([] if arm.after is None else [f"init='{ablation.out}/{arm.after}/{subdir}'"]),
+        *own,
         f"seed={','.join(map(str, study.seeds))}",
         f"hydra.sweep.dir={ablation.out}",
-        f"hydra.sweep.subdir={arm}/{variant}/seed${{seed}}",
+        f"hydra.sweep.subdir={name}/{subdir}",
+        *([f"trust={','.join(ablation.trust)}"] if ablation.trust else []),
         *ablation.overrides,
     ]
-
-
-def _go_on(ablation: Ablation, name: str, variant: str, seed: int) -> None:
-    """Trains a run of an arm that goes on with another: in a copy, of which the settings are changed once."""
-    arm, run_dir = ablation.study.arms[name], ablation.run_dir(name, variant, seed)
-    if not run_dir.exists():
-        before = ablation.run_dir(str(arm.after), variant, seed)
-        temporary = run_dir.with_name(f"{run_dir.name}.part")
-        shutil.rmtree(temporary, ignore_errors=True)
-        shutil.copytree(before, temporary, ignore=shutil.ignore_patterns(FOLDER))
-        config.save(build.load_run(before, arm.overrides, ablation.trust).composed, temporary)
-        config.save_recipe([*config.read_recipe(before), *arm.overrides], temporary)
-        temporary.rename(run_dir)
-    _wait(subprocess.Popen([sys.executable, "-m", "omniperception", "train", f"run={run_dir}"]))
 
 
 def overrides_of(variant: str) -> tuple[str, ...]:
