@@ -54,8 +54,8 @@ FORMATS = {"onnx": "policy.onnx", "torchscript": "policy.pt"}
 """File of each kind of network."""
 
 TOLERANCE = 1e-5
-"""Most that an output of an exported network may differ from the actor's, as a share of the largest number in it or of 1,
-whichever is larger: rounding grows with the numbers, and processors round in different orders."""
+"""Most that an output of an exported network may differ from the actor's, as a share of its largest number, of 1
+at least: rounding grows with the numbers, and processors round in different orders."""
 
 STEEP_TOLERANCE = 2e-4
 """The same where the risk of velocities chooses the command: its exponentials and the choice between candidates
