@@ -36,7 +36,7 @@ class Arm:
     """A way of training.
 
     Attributes:
-        overrides: of the study's experiment; those of the command line go before.
+        overrides: of the study's experiment; those of the command line replace them.
         after: the arm whose weights, of the same network and seed, this one begins with (`init`); None: none.
     """
 
@@ -167,7 +167,7 @@ def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:
     study, arm = ablation.study, ablation.study.arms[name]
     subdir = f"{variant}/seed${{seed}}"
     given = {override.key_or_group for override in config.parse(ablation.overrides)}
-    own = [text for text in arm.overrides if config.parse([text])[0].key_or_group not in given]
+    own = [override.input_line for override in config.parse(arm.overrides) if override.key_or_group not in given]
     return [
         *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),
         *overrides_of(variant),
