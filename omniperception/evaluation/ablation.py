@@ -167,7 +167,8 @@ def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:
     study, arm = ablation.study, ablation.study.arms[name]
     subdir = f"{variant}/seed${{seed}}"
     given = {override.key_or_group for override in config.parse(ablation.overrides)}
-    own = [override.input_line for override in config.parse(arm.overrides) if override.key_or_group not in given]
+    parsed = zip(arm.overrides, config.parse(arm.overrides), strict=True)
+    own = [text for text, override in parsed if override.key_or_group not in given]
     return [
         *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),
         *overrides_of(variant),
