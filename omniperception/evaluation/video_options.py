@@ -18,7 +18,7 @@ class VideoOptions:
         camera: one of `CAMERAS`.
     """
 
-    size: tuple[int, ...] = (1280, 720)
+    size: tuple[int, ...] = (960, 540)
     env_ids: tuple[int, ...] = (0,)
     camera: str = "chase"
 
