@@ -1,7 +1,7 @@
 """What better perception would bring: a policy's trials with parts of what it perceives replaced by the truth.
 
     python -m benchmarks.perceived_parts                                            # the published avoider, split=dev
-    python -m benchmarks.perceived_parts run=wip/avoider scenarios=moving,corridor condition=ideal trials=200
+    python -m benchmarks.perceived_parts scenarios=moving,corridor condition=ideal trials=200
 
 The rows: as it perceives; with true distances; with true velocities; with both, of obstacles that a ray has hit within
 the network's history; and all obstacles, seen or not, at every control step instead of every frame. The truth passes
