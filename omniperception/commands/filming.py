@@ -23,9 +23,11 @@ class FilmArguments:
     """Arguments that say what a film shows."""
 
     video_s: float = argument(20.0, "length of the video (s)", positive=True)
-    camera: str = argument("chase", "where the video is taken from", choices=tuple(CAMERAS))
-    video_size: tuple[int, ...] = argument((960, 540), "width and height of the video (pixels)", least=2)
-    video_envs: tuple[int, ...] = argument((0,), "environments in the video; several make a grid", least=0)
+    camera: str = argument(VideoOptions.camera, "where the video is taken from", choices=tuple(CAMERAS))
+    video_size: tuple[int, ...] = argument(VideoOptions.size, "width and height of the video (pixels)", least=2)
+    video_envs: tuple[int, ...] = argument(
+        VideoOptions.env_ids, "environments in the video; several make a grid", least=0
+    )
 
     @property
     def video(self) -> VideoOptions:
