@@ -55,10 +55,9 @@ def main(given: Arguments, overrides: list[str]) -> None:
     overrides = [*HELD_OUT, MEASURED, "seed=1000", *overrides, f"num_envs={given.num_envs}"]
     runner = build.build_runner(build.assemble(config.load(run_dir, overrides)), None)
     checkpoint = latest_checkpoint(run_dir)
-    runner.load(str(checkpoint), load_cfg={"actor": True})
-    policy = runner.get_inference_policy(str(runner.env.device))
+    runner.load_policy(checkpoint)
     try:
-        errors = height_errors(runner.env, policy, runner.alg.actor, given.steps)
+        errors = height_errors(runner.env, runner.policy, runner.alg.actor, given.steps)
     except ValueError as error:
         raise ConfigError(str(error)) from None
     report([table(errors)], about(1, checkpoint=checkpoint.name, overrides=overrides), run_dir / FOLDER)

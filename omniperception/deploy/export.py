@@ -260,6 +260,9 @@ def sampler_parameters(sampler: Sampler) -> dict:
     """Kind and parameters of a sampler, as `omniperception.deploy.sampling.make_sampler` takes them."""
     if isinstance(sampler, RawSampler):
         return {"kind": "raw", "num_points": sampler.num_points, "max_range": sampler.max_range}
+    if isinstance(sampler, StandingSampler):
+        geometry = asdict(sampler.geometry)
+        return {"kind": "standing", "max_range": sampler.max_range, **_cells(sampler), "geometry": geometry}
     if not isinstance(sampler, PdSampler):
         raise ConfigError(f"perception.sampler: a {type(sampler).__name__} cannot be exported")
     halves = {
@@ -268,16 +271,14 @@ def sampler_parameters(sampler: Sampler) -> dict:
         "split": sampler.split if sampler.split != -float("inf") else None,
         "ring": sampler.ring,
     }
-    if not isinstance(sampler, ProximitySampler | StandingSampler):
+    if not isinstance(sampler, ProximitySampler):
         return {"kind": "pd", **halves, "num_distal": sampler.num_distal}
-    cells = {
-        "num_sectors": sampler.num_sectors,
-        "band_edges": [float(f"{float(edge):.7g}") for edge in sampler.edges],
-        "decay": sampler.decay,
-    }
-    if isinstance(sampler, StandingSampler):
-        return {"kind": "standing", **halves, **cells, "geometry": asdict(sampler.geometry)}
-    return {"kind": "proximity", **halves, **cells, "blind": sampler.blind, "body": list(sampler.body)}
+    return {"kind": "proximity", **halves, **_cells(sampler), "blind": sampler.blind, "body": list(sampler.body)}
+
+
+def _cells(sampler: ProximitySampler | StandingSampler) -> dict:
+    edges = [float(f"{float(edge):.7g}") for edge in sampler.edges]
+    return {"num_sectors": sampler.num_sectors, "band_edges": edges, "decay": sampler.decay}
 
 
 Outputs = torch.Tensor | tuple[torch.Tensor, ...]

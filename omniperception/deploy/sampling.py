@@ -193,44 +193,42 @@ class ProximitySampler(PdSampler):
         write_nearest(out, at[:, :2], band, self.num_sectors, self.decay)
 
 
-class StandingSampler(PdSampler):
-    """Proximal points as above; the distal half as proximities of what stands on the ground, as in training."""
+class StandingSampler(CloudSampler):
+    """Proximities of what stands on the ground, by band of height and sector, as in training."""
 
     def __init__(
         self,
-        num_proximal: int,
         num_sectors: int,
         max_range: float,
-        split: float,
-        ring: float,
         band_edges: Sequence[float],
         decay: float,
         geometry: Mapping,
     ) -> None:
-        """Configure both halves.
+        """Configure the cells.
 
         Args:
-            num_proximal: slots of the proximal half, written first.
             num_sectors: azimuth sectors.
             max_range: m.
-            split: elevation in the sensor frame above which a point is proximal, rad.
-            ring: height of an elevation ring for sorting the proximal half, rad.
             band_edges: heights that separate the bands, m above the ground.
             decay: distance over which the proximity falls by e, m.
             geometry: settings of training's `GeometryConfig`, by name.
         """
-        super().__init__(num_proximal, num_sectors * (len(band_edges) - 1), max_range, split, ring)
+        self.num_points, self.max_range = num_sectors * (len(band_edges) - 1), max_range
         self.num_sectors, self.decay, self.geometry = num_sectors, decay, dict(geometry)
         self.edges = np.asarray(band_edges, np.float32)
 
-    def _write_distal(self, out: np.ndarray, points: np.ndarray, near: np.ndarray, attitude: Attitude) -> None:
+    def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
+        """See :meth:`CloudSampler.__call__`."""
+        points = points[self._is_hit(points)]
         mount, level = rotation_matrix(attitude.mount_quat), _levelled(rotation_matrix(attitude.base_quat))
         sensor = np.asarray(attitude.mount_pos, np.float64)
         in_base = points @ mount.T.astype(np.float32) + sensor.astype(np.float32)
         places, height = standing(in_base, np.linalg.norm(points, axis=1), level, sensor, self.geometry)
         counts = (height >= self.edges[0]) & (height < self.edges[-1])
         band = np.searchsorted(self.edges, height[counts], side="right") - 1
-        write_nearest(out, places[counts, :2], band, self.num_sectors, self.decay)
+        sampled = np.zeros((self.num_points, 3), np.float32)
+        write_nearest(sampled, places[counts, :2], band, self.num_sectors, self.decay)
+        return sampled
 
 
 def write_nearest(out: np.ndarray, places: np.ndarray, band: np.ndarray, num_sectors: int, decay: float) -> None:

@@ -22,8 +22,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "pd_risknet_no_proximal": ("perception=pd_risknet", *_NO_PROXIMAL),
     "pd_risknet_no_distal": ("perception=pd_risknet", *_NO_DISTAL),
     "proximity_gru_no_proximal": ("perception=proximity_gru", *_NO_PROXIMAL),
-    "polar_rings_no_proximal": ("perception=polar_rings", *_NO_PROXIMAL),
-    "polar_rings_no_height": ("perception=polar_rings", "perception.height_weight=0"),
     "polar_rings_no_match": ("perception=polar_rings", "perception.network.rings.match=null"),
 }
 """Overrides of the variants that are no presets of `perception`; what the perception is supervised with is the

@@ -90,7 +90,7 @@ class PerceptionConfig:
     def build_network(self) -> PerceptionNetwork:
         """The network that fits the sampler's points and the history."""
         sizes = dict(self.sampler().sizes)
-        if self.base_motion:  # one row more for the last half that there is
+        if self.base_motion:  # one row more for the last part that there is
             sizes[[name for name, number in sizes.items() if number][-1]] += 1
         try:
             return self.network(**sizes, history=self.history)

@@ -158,7 +158,6 @@ def nearest_standing(
     band_edges: wp.array(dtype=wp.float32),
     num_sectors: int,
     decay: float,
-    first_slot: int,
     # out
     points_out: wp.array2d(dtype=wp.vec3),
 ):
@@ -169,7 +168,7 @@ def nearest_standing(
     env = env_offset + wp.tid()
     num_bands = band_edges.shape[0] - 1
     for cell in range(num_bands * num_sectors):
-        points_out[env, first_slot + cell] = wp.vec3(0.0, 0.0, 0.0)
+        points_out[env, cell] = wp.vec3(0.0, 0.0, 0.0)
     for ray in range(points.shape[1]):
         height = heights[env, ray]
         if height >= band_edges[0] and height < band_edges[num_bands]:
@@ -177,7 +176,7 @@ def nearest_standing(
             while height >= band_edges[band + 1]:
                 band += 1
             p = points[env, ray]
-            slot = first_slot + band * num_sectors + sector_of(p[0], p[1], num_sectors)
+            slot = band * num_sectors + sector_of(p[0], p[1], num_sectors)
             away = _horizontal(p)
             proximity = wp.exp(-away / decay)
             if proximity > points_out[env, slot][2]:

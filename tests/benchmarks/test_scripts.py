@@ -1,6 +1,8 @@
 """Scripts of studies are found, explain themselves and refuse nonsense without PYTHONPATH, from wherever one is."""
 
+import json
 import os
+import shutil
 import subprocess
 import sys
 from importlib import import_module
@@ -78,3 +80,13 @@ def test_wrong_arguments_are_told_in_one_line(study, arguments, expected, tmp_pa
         import_module(f"benchmarks.{study}").command(arguments.split())
     error = capsys.readouterr().err
     assert error.startswith("error: ") and expected in error and error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_perceived_heights_are_measured(tmp_path, monkeypatch, capsys):
+    run_dir = shutil.copytree(ROOT / "pretrained" / "pd_risknet_taught", tmp_path / "run")
+    monkeypatch.chdir(ROOT)
+    import_module("benchmarks.height_error").command([f"run={run_dir}", "num_envs=2", "steps=15"])
+    assert "| perception  |" in capsys.readouterr().out
+    errors = json.loads((run_dir / "evaluation" / "heights.json").read_text())
+    assert {row["predictor"] for row in errors["rows"]} == {"perception", "constant", "flat ground"}

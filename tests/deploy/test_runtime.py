@@ -63,9 +63,7 @@ ALIKE = {
     "fps_gru_small": "fps_gru",
     "direct_mlp_small": "direct_mlp",
     "pd_risknet_no_proximal": "proximity_gru_no_proximal",
-    "polar_rings_no_height": "polar_rings",
     "polar_rings_no_match": "polar_rings",
-    "polar_rings_no_proximal": "polar_rings",
 }
 """Presets that differ from a recipe's in sizes, or lack a part."""
 DEFAULT_POS = [0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5]

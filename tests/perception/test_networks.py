@@ -104,22 +104,15 @@ def test_paper_dimensions():
     assert (features[0] == 0).all()
 
 
-@pytest.mark.parametrize("proximal_dim", [0, 5])
-def test_rings_stand_beside_the_proximal_gru(proximal_dim):
-    """The last row of a frame is the motion of the base; what a path embeds, it embeds alone."""
+def test_the_last_row_of_rings_is_the_motion_of_the_base():
     match = MotionMatch(speeds=(1.0,), num_directions=4, width=0.4, period_s=0.1)
     rings = functools.partial(RingPath, num_sectors=9, channels=(8,), kernel_sizes=(3,), match=match)
-    near = 4 if proximal_dim else 0
-    network = PolarRings(near, 2 * 9 + 1, H, rings, proximal_dim)
+    network = PolarRings(2 * 9 + 1, H, rings)
     nn.init.normal_(network.rings.layers[-1].weight)
-    frames, count = sequence(near + 19).sigmoid(), counts()
-    around = network.rings(frames[:, :, near:-1], frames[:, :, -1], count)
-    below = [network.proximal(frames[:, :, :near].flatten(2), count)] if proximal_dim else []
+    frames, count = sequence(19).sigmoid(), counts()
     got = network(frames, count)
-    assert around.abs().max() > 0 and torch.equal(got, torch.cat((*below, around), -1))
-    assert torch.equal(got[..., network.supervised["motion_target"]], around)
-    assert network.feature_dim == proximal_dim + 3 * 9
-    assert ("height_target" in network.supervised) == bool(proximal_dim)
+    assert got.abs().max() > 0 and torch.equal(got, network.rings(frames[:, :, :-1], frames[:, :, -1], count))
+    assert network.feature_dim == 3 * 9 and network.supervised == {"motion_target": slice(0, 27)}
 
 
 def test_windowed_linear_equals_linear_on_each_window():

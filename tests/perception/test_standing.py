@@ -14,20 +14,20 @@ from omniperception.deploy.sampling import make_sampler
 from omniperception.perception import Attitude, StandingSampler
 
 SECTORS, DECAY, EDGES = 36, 0.5, (0.0, 0.15, 0.4, 3.0)
-SETTINGS = {"max_range": 6.0, "split_deg": 20.0, "band_edges": EDGES, "decay": DECAY}
+SETTINGS = {"max_range": 6.0, "band_edges": EDGES, "decay": DECAY}
 
 
-def sampler(num_proximal=0, **changes):
-    return StandingSampler(num_proximal, SECTORS, **(SETTINGS | changes))
+def sampler(**changes):
+    return StandingSampler(SECTORS, **(SETTINGS | changes))
 
 
-def sampled(rays, num_proximal=0):
+def sampled(rays):
     """(P, 3) of one cloud as `worlds.cloud` gives it."""
     ranges, directions, attitude = rays
     x, y, z = directions.unbind(-1)
-    out = torch.full((1, num_proximal + 3 * SECTORS, 3), math.nan)
+    out = torch.full((1, 3 * SECTORS, 3), math.nan)
     angles = torch.atan2(z, torch.hypot(x, y)), torch.atan2(y, x) % (2 * math.pi)
-    sampler(num_proximal)(ranges, directions, *angles, out, attitude)
+    sampler()(ranges, directions, *angles, out, attitude)
     return out[0]
 
 
@@ -95,15 +95,15 @@ def test_a_robot_sees_the_same(attitude, given):
     ranges, directions, trained = rays
     points = torch.where(ranges[..., None].isfinite(), ranges[..., None] * directions, 0.0)[0].numpy()
     robot = RobotAttitude(trained.base_quat[0].numpy(), trained.mount_pos, trained.mount_quat)
-    got, expected = make_sampler(sampler_parameters(sampler(16)))(points, robot), sampled(rays, 16).numpy()
-    assert (expected[16:, 2] > 0).sum() > 10
+    got, expected = make_sampler(sampler_parameters(sampler()))(points, robot), sampled(rays).numpy()
+    assert (expected[:, 2] > 0).sum() > 10
     np.testing.assert_allclose(got, expected, atol=2e-5)
 
 
 def test_the_heading_does_not_matter():
     rays, turned = random_rays(2, 400, seed=1), torch.tensor([[1.0, 0, 0, 0], [0.6, 0, 0, 0.8]])
-    first = sample(sampler(4), rays, Attitude(turned[:1].repeat(2, 1), (0.3, 0.0, -0.1), (1.0, 0.0, 0.0, 0.0)))
-    other = sample(sampler(4), rays, Attitude(turned[1:].repeat(2, 1), (0.3, 0.0, -0.1), (1.0, 0.0, 0.0, 0.0)))
+    first = sample(sampler(), rays, Attitude(turned[:1].repeat(2, 1), (0.3, 0.0, -0.1), (1.0, 0.0, 0.0, 0.0)))
+    other = sample(sampler(), rays, Attitude(turned[1:].repeat(2, 1), (0.3, 0.0, -0.1), (1.0, 0.0, 0.0, 0.0)))
     torch.testing.assert_close(first, other, atol=1e-4, rtol=0.0)
 
 

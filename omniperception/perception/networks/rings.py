@@ -33,7 +33,7 @@ def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, s
     """The frames of every window, moved to the pose of the base at the window's newest frame.
 
     Args:
-        cells: (B, F, bands * S, 3) cells of :class:`ProximitySampler`.
+        cells: (B, F, bands * S, 3) cells of :class:`StandingSampler`.
         moved: (B, F, 3) motion of the base since the frame before, in the levelled base of that one: x, y (m), yaw
             (rad).
         count: (B, W) valid frames of each window; the others are empty.
@@ -141,7 +141,7 @@ class RingPath(nn.Module):
 
     def __init__(
         self,
-        num_distal: int,
+        num_cells: int,
         history: int,
         num_sectors: int = 36,
         decay: float = 0.5,
@@ -154,7 +154,7 @@ class RingPath(nn.Module):
         """Configure the path.
 
         Args:
-            num_distal: cells of :class:`ProximitySampler`, bands x sectors.
+            num_cells: of :class:`StandingSampler`, bands x sectors.
             history: H, frames per window.
             num_sectors: S.
             decay: decay of the sampler's proximities, metres.
@@ -165,14 +165,14 @@ class RingPath(nn.Module):
             ground_bands: lowest bands whose hits are not matched, because they hold ground.
         """
         super().__init__()
-        if num_distal % num_sectors:
-            raise ValueError(f"rings: num_distal={num_distal} must be a multiple of num_sectors={num_sectors}")
+        if num_cells % num_sectors:
+            raise ValueError(f"rings: num_cells={num_cells} must be a multiple of num_sectors={num_sectors}")
         if len(kernel_sizes) != len(channels) or any(size % 2 == 0 for size in kernel_sizes):
             raise ValueError(
                 f"rings: kernel_sizes={list(kernel_sizes)} must be one odd number for each of the {len(channels)}"
                 " channels"
             )
-        num_bands = num_distal // num_sectors
+        num_bands = num_cells // num_sectors
         if not 0 <= ground_bands < num_bands:
             raise ValueError(f"rings: ground_bands={ground_bands} must be less than the {num_bands} bands")
         if match is not None and history < 2:
@@ -207,7 +207,7 @@ class RingPath(nn.Module):
         if self.match is not None:
             rings = torch.cat((rings, self._matched(rings, self.match)), 1)
         motion = self.layers(_GAIN * rings)  # (B * W, 3, S)
-        return motion.transpose(1, 2).flatten(1).unflatten(0, count.shape)
+        return motion.transpose(1, 2).reshape(*count.shape, self.feature_dim)
 
     def _matched(self, rings: torch.Tensor, match: MotionMatch) -> torch.Tensor:
         """(n, (H - 1) * K + 2 H, S): scores of candidate velocities, then nearness and bearing of each frame's nearest
