@@ -173,3 +173,6 @@ def _arrow(axis: Any, start: Box, end: Box, dashed: bool = False) -> None:
 
 
 command = Command(main, Arguments, __doc__, errors=(PlotsUnavailable,))
+
+if __name__ == "__main__":
+    command()

@@ -14,6 +14,7 @@ from benchmarks.harness.table import Table, about, report
 from omniperception import build, config
 from omniperception.cli import Command, argument
 from omniperception.config import ConfigError
+from omniperception.env.config import HEIGHT_TARGET
 from omniperception.evaluation.heights import HeightErrors, height_errors
 from omniperception.evaluation.suite import FOLDER
 from omniperception.learning import CheckpointError, latest_checkpoint
@@ -53,7 +54,10 @@ def main(given: Arguments, overrides: list[str]) -> None:
     if not config.load(run_dir).perception:
         raise ConfigError(f"run={given.run} sees nothing; give a run with perception")
     overrides = [*HELD_OUT, MEASURED, "seed=1000", *overrides, f"num_envs={given.num_envs}"]
-    runner = build.build_runner(build.assemble(config.load(run_dir, overrides)), None)
+    run = build.assemble(config.load(run_dir, overrides))
+    if HEIGHT_TARGET not in run.perception.build_network().supervised:
+        raise ConfigError(f"run={given.run} says nothing about heights; give a run of perception=pd_risknet")
+    runner = build.build_runner(run, None)
     checkpoint = latest_checkpoint(run_dir)
     runner.load_policy(checkpoint)
     try:

@@ -10,7 +10,7 @@ Angles are between measured and predicted directions.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -168,9 +168,6 @@ def start_phases(motion: Mid360Motion, shots: Shots, steps: int = 24) -> Mid360M
         found.append((float(np.median(angles(trial, few))), trial))
     best = min(found, key=lambda pair: pair[0])[1]
     return fit(best, shots, PHASES)
-
-
-Hypothesis = Callable[[Shots], Mid360Motion]
 
 
 def mirrored(motion: Mid360Motion) -> Mid360Motion:

@@ -26,7 +26,7 @@ from pathlib import Path
 from benchmarks.harness.table import Table, about, report
 from benchmarks.stability import learning, lidar, physics, plots
 from omniperception import build, config
-from omniperception.cli import Command, argument
+from omniperception.cli import Command, argument, refuse_arguments
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
 from omniperception.env.config import EnvConfig
@@ -36,6 +36,10 @@ PARTS = ("floating", "standing", "scenes")
 """Of subject=physics."""
 AGREEMENT = 0.99
 """Least share of gains where the analytic limit and the simulation must say the same."""
+
+
+OWN = {"physics": ("size", "num_envs", "seconds"), "lidar": ("rays", "many"), "learning": ("iterations",)}
+"""Arguments that one subject alone reads."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,6 +144,9 @@ def main(given: Arguments, overrides: list[str]) -> None:
     """Runs a subject, and exits with 1 if something is not as it should be."""
     if overrides and given.subject != "physics":
         raise ConfigError(f"{overrides[0]} is unknown for subject={given.subject}; overrides are for subject=physics")
+    for subject, names in OWN.items():
+        if subject != given.subject:
+            refuse_arguments(given, names, f"it is of subject={subject}")
     _check_only(given)
     given.folder.mkdir(parents=True, exist_ok=True)
     with contextlib.chdir(given.folder):  # which takes the engine's log of diverged simulations, MUJOCO_LOG.TXT

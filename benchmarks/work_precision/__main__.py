@@ -27,7 +27,7 @@ import torch
 from benchmarks.harness.pareto import Study, plot
 from benchmarks.harness.table import about, machine_line, report
 from omniperception import build, config
-from omniperception.cli import Command, argument
+from omniperception.cli import Command, argument, refuse_arguments
 from omniperception.common.figures import PlotsUnavailable, new_figure
 from omniperception.config import ConfigError
 from omniperception.deploy import DeployError
@@ -91,6 +91,8 @@ SUBJECTS: dict[str, tuple[Callable[[Arguments, list[str]], Iterator[Study]], tup
 def main(given: Arguments, overrides: list[str]) -> None:
     """Measures a subject, prints its tables with what they say, and writes them with the plot."""
     measure, known = SUBJECTS[given.subject]
+    if given.subject != "policy":
+        refuse_arguments(given, ("runs", "default"), "it is of subject=policy")
     if unknown := sorted(set(given.only) - set(known)):
         raise ConfigError(f"only={','.join(unknown)} must be out of {', '.join(known) or 'nothing: leave it out'}")
     new_figure(1.0, 1.0)  # an error now rather than after minutes

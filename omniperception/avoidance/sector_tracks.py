@@ -27,8 +27,8 @@ class TracksConfig:
         turn: a cluster this far (m) off has turned, and its filter restarts.
         min_frames: matches before a cluster has a velocity.
         min_speed, max_speed: slower ones (m/s) stand still, faster ones move at this speed.
-        look_back: frames after which a place that is taken again shows that something stands there.
-        same_place: how near it has to be (m), beside the width of a sector there.
+        look_back: frames after which a place that is taken again, to the width of a sector there, shows that something
+            stands there.
         stands: a cluster stands still where this share of its places was taken.
         remember: frames for which a place that is not seen any more still counts.
         blind, remember_near: those nearer than `blind` (m) count for `remember_near` frames, because the sensor sees
@@ -44,7 +44,6 @@ class TracksConfig:
     min_speed: float = 0.3
     max_speed: float = 2.5
     look_back: int = 5
-    same_place: float = 0.0
     stands: float = 0.95
     remember: int = 1
     blind: float = 0.8
@@ -54,7 +53,7 @@ class TracksConfig:
         for name in ("gate", "widest", "gain", "turn", "max_speed", "look_back", "stands"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"TracksConfig.{name}={getattr(self, name)} must be positive")
-        for name in ("link", "same_place", "min_speed", "min_frames", "remember", "blind", "remember_near"):
+        for name in ("link", "min_speed", "min_frames", "remember", "blind", "remember_near"):
             if getattr(self, name) < 0:
                 raise ValueError(f"TracksConfig.{name}={getattr(self, name)} must not be negative")
 
@@ -152,8 +151,8 @@ class SectorTracks:
     def _stands(self, clusters: _Clusters, distance: torch.Tensor) -> torch.Tensor:
         """(n, S) bool: clusters most of whose places were taken `look_back` frames ago."""
         off = torch.cdist(clusters.place, self._past[:, 0]).amin(2)
-        near = self.config.same_place + self._width(distance)
-        stood = sums_by(clusters.label, (clusters.seen & (off < near)).float(), self._sectors)
+        near = off < self._width(distance)
+        stood = sums_by(clusters.label, (clusters.seen & near).float(), self._sectors)
         return stood >= self.config.stands * clusters.members
 
     def _merge(self, distance: torch.Tensor, place: torch.Tensor, velocity: torch.Tensor) -> None:

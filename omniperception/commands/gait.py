@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omniperception import build, config
-from omniperception.cli import Command, argument, refuse_overrides, trust
+from omniperception.cli import Command, argument, refuse_arguments, refuse_overrides, trust
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.common.tables import markdown
 from omniperception.evaluation import robustness
@@ -26,6 +26,9 @@ from omniperception.evaluation.records import FOLDER, merge
 from omniperception.evaluation.suite import Evaluation, World
 from omniperception.learning import CheckpointError
 from omniperception.scene.build import FOOT_FORCE
+
+RANGES, KICKS = ("rows", "factors", "preset", "trials", "out"), ("speeds", "bearings", "repeats")
+"""Arguments that mean something for these alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +51,8 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Measures, prints a table and draws a picture."""
+    others = {"ranges": (*KICKS, "condition"), "kicks": RANGES, "feet": (*RANGES, *KICKS)}[arguments.what]
+    refuse_arguments(arguments, others, f"it is not read for what={arguments.what}")
     if arguments.what == "kicks":
         refuse_overrides(overrides, {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S})
     if arguments.what == "feet":

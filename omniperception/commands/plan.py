@@ -30,7 +30,7 @@ class Arguments:
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Prints the plan of a configuration."""
     plan = plan_of(overrides)  # first, because modules that were imported stay
-    fuller = plan_of([f"experiment={arguments.beside}", "randomization=paper"]) if arguments.beside else None
+    fuller = plan_of([f"experiment={arguments.beside}"]) if arguments.beside else None
     print(plan.text(fuller))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
@@ -447,3 +448,10 @@ def _outputs(
 def envs_at_once(config: SensorConfig, outputs: Collection[str]) -> int:
     """Environments whose clouds fit into `cloud_mb`, at least one."""
     return max(int(min(1e6 * config.cloud_mb / (config.num_rays * ray_bytes(outputs)), 2**31)), 1)
+
+
+def split_elevation(sampler: Sampler | None, config: SensorConfig) -> float:
+    """Elevation (rad) in the sensor frame above which a point is proximal: where the sampler splits the cloud, or the
+    sensor where it does not."""
+    split = getattr(sampler, "split", None)
+    return math.radians(config.distal_below_deg) if split is None else float(split)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDict
@@ -19,7 +19,7 @@ from omniperception.env.sensing import SensorConfig
 from omniperception.env.state import MEASURED_CLOUD
 from omniperception.evaluation.episodes import Policy
 from omniperception.perception import Attitude
-from omniperception.perception.geometry import GeometryConfig, Nearest, Standing, nearest_obstacles
+from omniperception.perception.geometry import NUM_SECTORS, GeometryConfig, Nearest, Standing, nearest_obstacles
 from omniperception.scene import RobotConfig
 from omniperception.scene.build import FOOT_FORCE
 
@@ -104,25 +104,14 @@ def oracle(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Lim
     return _driven(env, policy, _avoiding(env, avoidance, motion), limits)
 
 
-def histogram(
-    env: OmniEnv,
-    policy: Policy,
-    avoidance: AvoidanceConfig,
-    limits: Limits | None,
-    config: HistogramConfig | None = None,
-) -> Policy:
+def histogram(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
     """The policy, driven by V_cmd + V_avoid with V_avoid from the raw noisy clouds by geometry alone."""
-    return _driven(
-        env,
-        policy,
-        _avoiding(env, avoidance, _Histogram(env, config or HistogramConfig(geometry_of(env.robot)))),
-        limits,
-    )
+    return _driven(env, policy, _avoiding(env, avoidance, _Histogram(env)), limits)
 
 
-def stop(env: OmniEnv, policy: Policy, limits: Limits | None, config: StopConfig | None = None) -> Policy:
+def stop(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
     """The policy, driven by V_cmd, which falls to zero while something is near in its direction."""
-    return _driven(env, policy, _Stop(env, config or StopConfig.of(env.robot)), limits)
+    return _driven(env, policy, _Stop(env, StopConfig.of(env.robot)), limits)
 
 
 def geometry_of(robot: RobotConfig) -> GeometryConfig:
@@ -131,30 +120,15 @@ def geometry_of(robot: RobotConfig) -> GeometryConfig:
 
 
 @dataclass(frozen=True)
-class HistogramConfig:
-    """Settings of `histogram`.
-
-    Attributes:
-        geometry: from a cloud to the nearest obstacle by sector.
-        tracks: from frames to velocities and a memory; its period is the sensor's.
-    """
-
-    geometry: GeometryConfig = field(default_factory=GeometryConfig)
-    tracks: TracksConfig = field(default_factory=TracksConfig)
-
-
-@dataclass(frozen=True)
 class StopConfig:
     """Settings of `stop`.
 
     Attributes:
-        geometry: from a cloud to the nearest obstacle by sector.
         stand, slow: the commanded speed is kept beyond `slow` (m) from the base's origin and falls linearly to zero at
             `stand` (m).
         half_width: (m) of the strip ahead of the base in which obstacles count.
     """
 
-    geometry: GeometryConfig = field(default_factory=GeometryConfig)
     stand: float = 0.7
     slow: float = 1.4
     half_width: float = 0.35
@@ -163,7 +137,7 @@ class StopConfig:
     def of(cls, robot: RobotConfig) -> StopConfig:
         """As for a Go2, as far from the robot's front and sides."""
         _, front, side = robot.outline
-        return cls(geometry_of(robot), front + 0.34, front + 1.04, side + 0.03)
+        return cls(front + 0.34, front + 1.04, side + 0.03)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.stand < self.slow:
@@ -177,7 +151,7 @@ class _Clouds:
         attitude: of the bases as measured when the newest frame came.
     """
 
-    def __init__(self, env: OmniEnv, config: GeometryConfig) -> None:
+    def __init__(self, env: OmniEnv) -> None:
         if env.sensing is None:
             raise ValueError("this policy needs a LiDAR, but the run has none; use lidar=mid360")
         if env.sensing.carrier != env.sensing.base:
@@ -185,7 +159,7 @@ class _Clouds:
                 f"this policy needs the LiDAR on the base, but lidar.mount has it on {env.sensing.config.mount_body}"
             )
         self._env, self._sensing, self._tick = env, env.sensing, -1
-        self._standing = Standing(config)
+        self._standing = Standing(geometry_of(env.robot))
 
     @property
     def is_new(self) -> bool:
@@ -218,13 +192,11 @@ class _Clouds:
 class _Histogram:
     """Distance and velocity of the nearest obstacle by sector, (num_envs, S, 3), at each control step."""
 
-    def __init__(self, env: OmniEnv, config: HistogramConfig) -> None:
-        self._env, self._clouds, self._step = env, _Clouds(env, config.geometry), -1
+    def __init__(self, env: OmniEnv) -> None:
+        self._env, self._clouds, self._step = env, _Clouds(env), -1
         self._odometry = Odometry(env.num_envs, env.control_dt, env.device)
         self._odometry.start(torch.arange(env.num_envs, device=env.device), env.state.measured)
-        self._tracks = SectorTracks(
-            config.tracks, env.num_envs, config.geometry.num_sectors, self._clouds.period_s, env.device
-        )
+        self._tracks = SectorTracks(TracksConfig(), env.num_envs, NUM_SECTORS, self._clouds.period_s, env.device)
 
     def __call__(self) -> torch.Tensor:
         """As of now; takes in the control step that has just been done, once."""
@@ -248,8 +220,8 @@ class _Stop:
     """The commanded velocity, slower while something stands in its way."""
 
     def __init__(self, env: OmniEnv, config: StopConfig) -> None:
-        self._env, self._config, self._clouds = env, config, _Clouds(env, config.geometry)
-        self._place = torch.zeros(env.num_envs, config.geometry.num_sectors, 2, device=env.device)
+        self._env, self._config, self._clouds = env, config, _Clouds(env)
+        self._place = torch.zeros(env.num_envs, NUM_SECTORS, 2, device=env.device)
         self._distance = self._place.new_full(self._place.shape[:2], torch.inf)
 
     def __call__(self) -> torch.Tensor:

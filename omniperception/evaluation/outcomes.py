@@ -102,7 +102,7 @@ class Episodes:
 
     @property
     def verdict(self) -> list[str]:
-        """One of VERDICTS for each trial."""
+        """For each trial: success, success touched, time out, fall, collision end or diverged, in words."""
         words = []
         for succeeded, touched, outcome in zip(self.success, self.collided, self.outcome, strict=True):
             if succeeded:
@@ -176,10 +176,6 @@ class Episodes:
         times = dict(us_per_env_step or {})
         walking = {n: _tensor(n, v) for n, v in plain["walking"].items()} if "walking" in plain else None
         return cls(**named, has_goal=plain["has_goal"], weight=plain["weight"], us_per_env_step=times, walking=walking)
-
-
-VERDICTS = ("success", "success, touched", "time out", "fall", "collision end", "diverged")
-"""Verdicts on a trial, in words."""
 
 
 def _rounded(value: float) -> float | None:

@@ -87,6 +87,11 @@ def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors:
     if unknown:
         raise ConfigError(f"rows={','.join(unknown)} are unknown; {config.suggest(unknown[0], tuple(values))}")
     parts = [("", 0.0)] + [(row, factor) for row in rows for factor in factors if factor > 0]
+    if len(parts) == 1:
+        raise ConfigError(
+            f"nothing is left to measure: preset={preset} has no rows of the robot, or no factor is above 0; give"
+            " rows=, factors= or another preset, such as robot"
+        )
     found = []
     for row, factor in parts:
         override = (stretched(row, values[row], factor),) if row else ()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,14 +11,14 @@ import torch
 from PIL import Image
 from torch import nn
 
-from omniperception.common.rotations import rotate_inverse, rotate_yaw
+from omniperception.common.rotations import rotate, rotate_yaw
 from omniperception.env.env import OmniEnv
+from omniperception.env.sensing import split_elevation
 from omniperception.evaluation.camera import FollowCamera
 from omniperception.evaluation.overlay import PERCEIVED, TRUE, legend, sector_plot
 from omniperception.evaluation.perceived import perceived, true_sectors
 from omniperception.evaluation.render import COMMAND, DISTAL, PROXIMAL, VELOCITY, Arrow, Renderer, View, shown
 from omniperception.evaluation.video_options import VideoOptions
-from omniperception.perception import PdSampler
 from omniperception.scene.rays import HitClass, ray_shapes
 
 FPS = 25
@@ -88,7 +87,6 @@ class Recorder:
         ids = self._options.env_ids
         self._cameras = {k: FollowCamera(dt, self._options.camera) for k in ids}
         self._blind_until = dict.fromkeys(ids, 0)
-        self._split = _split_elevation(env)
         self._best: tuple[float, list[Moment]] | None = None
         width, height = self._options.size
         self._writer = imageio_ffmpeg.write_frames(
@@ -189,12 +187,12 @@ class Recorder:
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         hit = frame.ranges[env_id].isfinite()
         points_s = frame.directions_s[env_id, hit] * frame.ranges[env_id, hit, None]
-        points_c = _rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
+        points_c = rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
         at, turned = (
             sensing.scene.body_pos[env_id, sensing.carrier],
             sensing.scene.body_quat[env_id, sensing.carrier],
         )
-        return _rotate(turned, points_c) + at, frame.elevation[env_id, hit] > self._split
+        return rotate(turned, points_c) + at, frame.elevation[env_id, hit] > split_elevation(sensing.sampler, config)
 
     def _interest(self, env_id: int) -> float:
         """Score of a picture: the robot walks ahead, and its LiDAR sees obstacles."""
@@ -206,17 +204,3 @@ class Recorder:
             seen = float((frame.class_id[env_id] == HitClass.OBSTACLE).float().mean())
             value += min(10.0 * seen, 1.0)
         return value
-
-
-def _split_elevation(env: OmniEnv) -> float:
-    """Elevation (rad) in the sensor frame above which a point is proximal."""
-    sampler = env.config.sampler() if env.config.sampler is not None else None
-    if isinstance(sampler, PdSampler):
-        return sampler.split
-    return math.radians(env.config.lidar.distal_below_deg) if env.config.lidar is not None else 0.0
-
-
-def _rotate(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    """Turns vectors (n, 3) by one quaternion (4,)."""
-    conjugate = quat * quat.new_tensor([1.0, -1.0, -1.0, -1.0])
-    return rotate_inverse(conjugate.expand(len(vec), 4), vec)

@@ -18,21 +18,10 @@ class EstimatorConfig:
     Attributes:
         group: observation group with the true values; neither actor nor robot reads it.
         hidden_dims: hidden layers.
-        learning_rate: of its own optimiser.
-        epochs: passes over each rollout.
     """
 
     group: str
     hidden_dims: Sequence[int] = (128, 64)
-    learning_rate: float = 1.0e-3
-    epochs: int = 1
-
-    def __post_init__(self) -> None:
-        if self.learning_rate <= 0 or self.epochs < 1:
-            raise ValueError(
-                f"observations.estimator: learning_rate={self.learning_rate} must be positive, epochs={self.epochs} at"
-                " least 1"
-            )
 
 
 class EstimatingModel(MLPModel):

@@ -17,9 +17,12 @@ from omniperception.learning.config import LearningConfig
 from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.distributed import average_gradients
 from omniperception.learning.divergence import DivergenceGuard
-from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
+from omniperception.learning.estimator import EstimatingModel
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.storage import PerceptiveStorage, WindowedObservations
+
+ESTIMATOR_LEARNING_RATE = 1.0e-3
+"""Of the estimator's own optimiser, which passes over each rollout once."""
 
 
 class RolloutTooSmall(ValueError):
@@ -152,7 +155,7 @@ class PerceptivePpo(PPO):
                 algorithm.anneal(name, final, ppo.max_iterations)
         algorithm.critic_warmup, algorithm.distillation = ppo.critic_warmup, config.distillation
         if config.estimator is not None and algorithm.learns_policy:
-            algorithm.fit_estimator(config.estimator)
+            algorithm.fit_estimator()
         if perception is not None and perception.supervised_epochs > 0:
             last = perception.final_learning_rate or perception.learning_rate
             algorithm.supervise_perception(
@@ -296,11 +299,10 @@ class PerceptivePpo(PPO):
         """Let one of rsl_rl's settings change evenly to `final` within `num_updates` updates."""
         self._annealed[name] = (getattr(self, name), final, num_updates)
 
-    def fit_estimator(self, config: EstimatorConfig) -> None:
+    def fit_estimator(self) -> None:
         """Let the truth train the actor's estimator."""
-        self._estimator_epochs = config.epochs
         self._estimator_parameters = list(self.actor.estimator.parameters())
-        self.estimator_optimizer = torch.optim.Adam(self._estimator_parameters, lr=config.learning_rate)
+        self.estimator_optimizer = torch.optim.Adam(self._estimator_parameters, lr=ESTIMATOR_LEARNING_RATE)
 
     def train_estimator(self) -> dict[str, float]:
         """Fit the estimates on the steps of a rollout and their mirror images; the mean squared error."""
@@ -308,18 +310,17 @@ class PerceptivePpo(PPO):
         if optimizer is None:
             return {}
         groups, losses = self.storage.observations.flatten(0, 1), []
-        for _ in range(self._estimator_epochs):
-            for steps in torch.randperm(len(groups), device=self.device).tensor_split(self.num_mini_batches):
-                obs = groups[steps]
-                if self.symmetry is not None:
-                    obs, _ = self.symmetry.data_augmentation_func(self.symmetry.env, obs, None)
-                loss = self.actor.estimation_error(obs)
-                optimizer.zero_grad()
-                loss.backward()
-                average_gradients(self._estimator_parameters)
-                self.guard.check_gradients("estimator", self._estimator_parameters)
-                optimizer.step()
-                losses.append(loss.detach())
+        for steps in torch.randperm(len(groups), device=self.device).tensor_split(self.num_mini_batches):
+            obs = groups[steps]
+            if self.symmetry is not None:
+                obs, _ = self.symmetry.data_augmentation_func(self.symmetry.env, obs, None)
+            loss = self.actor.estimation_error(obs)
+            optimizer.zero_grad()
+            loss.backward()
+            average_gradients(self._estimator_parameters)
+            self.guard.check_gradients("estimator", self._estimator_parameters)
+            optimizer.step()
+            losses.append(loss.detach())
         return {"estimate": torch.stack(losses).mean().item()}
 
     def save(self) -> dict:

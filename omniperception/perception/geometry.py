@@ -22,13 +22,18 @@ _SETTINGS = (
     "headroom",
 )
 
+NUM_SECTORS = 72
+"""Azimuth sectors of the nearest obstacles; sector 0 starts at -pi in the yaw-aligned frame."""
+
+_SPREAD = 0.15
+"""Returns up to this share behind the nearest are the same surface; twice what range noise spreads it."""
+
 
 @dataclass(frozen=True)
 class GeometryConfig:
     """What is ground, noise and body; the values were chosen on split=dev, see docs/lab/baselines.md.
 
     Attributes:
-        num_sectors: azimuth sectors of the result; sector 0 starts at -pi in the yaw-aligned frame.
         reach: distance (m) up to which returns tell where the ground is; what lies farther away stands on the ground of
             the outermost ring.
         body: (back, front, side) (m) from the base's origin in the base frame: returns inside are the robot's own.
@@ -45,11 +50,8 @@ class GeometryConfig:
         lift: likewise (m), times the sine of the angle at which they are seen from above: range noise lifts those most
             that lie steeply below.
         headroom: returns at least this (m) above it hang too high to matter.
-        min_points: returns that make an obstacle in a sector.
-        spread: returns up to this share behind the nearest are the same surface; twice what range noise spreads it.
     """
 
-    num_sectors: int = 72
     reach: float = 6.0
     body: tuple[float, float, float] = (0.5, 0.36, 0.32)
     near: float = 0.32
@@ -65,15 +67,13 @@ class GeometryConfig:
     rise: float = 0.005
     lift: float = 0.08
     headroom: float = 0.45
-    min_points: int = 1
-    spread: float = 0.15
 
     def __post_init__(self) -> None:
-        for name in ("num_sectors", "reach", "standing", "fit_reach", "cell_sectors", "ring", "headroom", "min_points"):
+        for name in ("reach", "standing", "fit_reach", "cell_sectors", "ring", "headroom"):
             if getattr(self, name) <= 0:
-                raise ValueError(f"GeometryConfig.{name}={getattr(self, name)} must be positive")
+                raise ValueError(f"perception.sampler.geometry.{name}={getattr(self, name)} must be positive")
         if not 0.0 <= self.near_share <= 1.0:
-            raise ValueError(f"GeometryConfig.near_share={self.near_share} must be in 0..1")
+            raise ValueError(f"perception.sampler.geometry.near_share={self.near_share} must be in 0..1")
 
 
 class Nearest(NamedTuple):
@@ -82,12 +82,10 @@ class Nearest(NamedTuple):
     Attributes:
         distance: (n, S) m, horizontal, from the base's origin; infinite without one.
         place: (n, S, 2) m, in the yaw-aligned frame; 0 without one.
-        returns: (n, S) int64: how many it was told from.
     """
 
     distance: torch.Tensor
     place: torch.Tensor
-    returns: torch.Tensor
 
 
 def nearest_obstacles(
@@ -102,7 +100,7 @@ def nearest_obstacles(
         standing: tells what is ground, noise and body; its memory is used again.
     """
     points, height = standing(ranges, directions_s, attitude)
-    return by_sector(points[..., :2], height < standing.config.headroom, standing.config)
+    return by_sector(points[..., :2], height < standing.config.headroom)
 
 
 class Standing:
@@ -177,36 +175,20 @@ class Standing:
         return tuple(tensor[:n] for tensor in self._memory)
 
 
-def by_sector(places: torch.Tensor, counts: torch.Tensor, config: GeometryConfig) -> Nearest:
-    """Nearest surface by sector.
-
-    A surface is at the mean of its returns, so that range noise evens out. What has fewer than `min_points` is passed
-    over for what stands behind it, once.
+def by_sector(places: torch.Tensor, counts: torch.Tensor, num_sectors: int = NUM_SECTORS) -> Nearest:
+    """Nearest surface by sector, at the mean of its returns, so that range noise evens out.
 
     Args:
         places: (n, R, 2) m, yaw-aligned frame.
         counts: (n, R) bool: returns from obstacles.
-        config: sectors and surfaces.
+        num_sectors: S.
     """
     distance = torch.where(counts, places.norm(dim=-1), math.inf)
-    sector = sector_of(places, config.num_sectors)
-    surface, returns = _nearest_surface(distance, sector, config)
-    if config.min_points > 1:
-        lonely = surface & (returns.gather(1, sector) < config.min_points)
-        distance = torch.where(lonely, math.inf, distance)
-        surface, returns = _nearest_surface(distance, sector, config)
-        surface &= returns.gather(1, sector) >= config.min_points
-        returns = torch.where(returns >= config.min_points, returns, 0.0)
-    total = [sums_by(sector, torch.where(surface, value, 0.0), config.num_sectors) for value in places.unbind(-1)]
-    place = torch.stack(total, -1) / returns.clamp(min=1.0)[..., None]
-    return Nearest(torch.where(returns > 0, place.norm(dim=-1), math.inf), place, returns.long())
-
-
-def _nearest_surface(
-    distance: torch.Tensor, sector: torch.Tensor, config: GeometryConfig
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(n, R) bool: returns of the nearest surface of each sector, and (n, S) how many there are."""
-    nearest = distance.new_full((len(distance), config.num_sectors), math.inf)
+    sector = sector_of(places, num_sectors)
+    nearest = distance.new_full((len(distance), num_sectors), math.inf)
     nearest.scatter_reduce_(1, sector, distance, "amin")
-    surface = distance.isfinite() & (distance <= (1.0 + config.spread) * nearest.gather(1, sector))
-    return surface, sums_by(sector, surface.float(), config.num_sectors)
+    surface = distance.isfinite() & (distance <= (1.0 + _SPREAD) * nearest.gather(1, sector))
+    returns = sums_by(sector, surface.float(), num_sectors)
+    total = [sums_by(sector, torch.where(surface, value, 0.0), num_sectors) for value in places.unbind(-1)]
+    place = torch.stack(total, -1) / returns.clamp(min=1.0)[..., None]
+    return Nearest(torch.where(returns > 0, place.norm(dim=-1), math.inf), place)

@@ -13,7 +13,7 @@ _RIDGE = wp.constant(1.0e-3)
 
 @wp.struct
 class Settings:
-    """`GeometryConfig`, but for the sectors and headroom of its result."""
+    """`GeometryConfig`."""
 
     back: float
     front: float

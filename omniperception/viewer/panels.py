@@ -46,7 +46,6 @@ class Panels:
         self._viewer, self._gui = viewer, viewer.server.gui
         self.num_rays: int | None = None
         self._rewards: dict[str, float] = {}
-        self._showing = False
         self._status = self._gui.add_html("")
         with self._gui.add_folder("Risk of velocities, ahead is up"):
             self._polar = self._gui.add_html("")

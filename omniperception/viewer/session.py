@@ -80,7 +80,6 @@ class Session:
         self._runner.load_policy(self.checkpoint)
         self.policy: Policy = self._contender()
         self.rewards: dict[str, float] = {}
-        self.reward = 0.0
         self.outcomes: list[Outcome] = []
         self.shapes: RayShapes = ray_shapes(self.env.world)
         self._touched = self._given_up = False
@@ -113,7 +112,6 @@ class Session:
         env = self.env
         dt = env.control_dt
         self.rewards = {name: float(value[0]) / dt for name, value in env.rewards.weighted.items()}
-        self.reward = sum(self.rewards.values())
         self._touched |= bool(env.contacts[0])
         if bool(env.done[0]):
             cause = next(name for name, happened in env.outcomes.items() if happened[0])

@@ -12,6 +12,7 @@ import torch
 
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.env.heights import height_grid
+from omniperception.env.sensing import split_elevation
 from omniperception.evaluation.perceived import Perceived
 from omniperception.scene.rays import HitClass
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, HEIGHTS, OBSTACLE, PROXIMAL, SECTORS, TERRAIN, scale
@@ -245,7 +246,9 @@ class Stage:
         if self.points_by == "height":
             return scale(points[:, 2] / 2.0)
         assert cloud.elevation is not None
-        proximal = cloud.elevation[0, hit].numpy(force=True) > split_elevation(self._session)
+        sensing = self._session.env.sensing
+        split = split_elevation(None if sensing is None else sensing.sampler, sensor)
+        proximal = cloud.elevation[0, hit].numpy(force=True) > split
         return np.where(proximal[:, None], np.array(PROXIMAL), np.array(DISTAL)).astype(np.uint8)
 
     def _draw_robot(self) -> None:
@@ -404,12 +407,3 @@ def sector_lines(sectors: np.ndarray, base: np.ndarray, yaw: float, height: floa
             lines.append((middle, middle + 0.5 * turned(np.array(velocity), yaw)))
     flat = np.array(lines, np.float32).reshape(-1, 2, 2)
     return np.concatenate((flat, np.full((*flat.shape[:2], 1), height, np.float32)), -1)
-
-
-def split_elevation(session: Session) -> float:
-    """Elevation (rad, sensor frame) above which a point is proximal."""
-    sensing, sensor = session.env.sensing, session.env.config.lidar
-    split = getattr(sensing.sampler, "split", None) if sensing is not None else None
-    if split is not None:
-        return float(split)
-    return math.radians(sensor.distal_below_deg) if sensor is not None else 0.0

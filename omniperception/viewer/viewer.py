@@ -69,11 +69,10 @@ class Viewer:
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
         self.paused, self._single, self._stopped = False, 0, False
         self.stick, self.push_speed, self.follows, self.message = Stick(), 0.8, False, ""
-        self._stick_keeps = False
         self.clock = Clock(self.session.env.control_dt, PICTURE_HZ)
         self._charts_due = self._status_due = self._look_due = self._lists_due = 0.0
         self._frames_drawn, self._shown_points, self._frames_window = 0, 0, (time.monotonic(), 0)
-        self.points_hz, self._mean_rewards = 0.0, dict[str, float]()
+        self.points_hz = 0.0
         self._redraw = True
         self.stage = Stage(self.server)
         self.stage.show(self.session)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from omniperception.perception import MotionMatch, RingPath
+from omniperception.perception import MotionMatch
 from omniperception.perception.networks.motion_match import NOTHING
 
 SECTORS, HISTORY = 36, 5
@@ -54,21 +54,6 @@ def test_a_match_fades_with_distance():
     assert MATCH(distance, bearing, VELOCITIES)[0, 0, 18].item() == pytest.approx(1 - 0.1 / 0.4, abs=1e-5)
     distance[0, 0, 18] = 2.4
     assert MATCH(distance, bearing, VELOCITIES)[0, 0, 18].item() == pytest.approx(0.0, abs=1e-5)
-
-
-def test_ground_is_not_matched():
-    """What lies in the lowest bands alone is nothing to match, unless they are told to be no ground."""
-    cells = torch.zeros(1, 5, 2 * SECTORS, 3)
-    cells[:, :, 18] = math.exp(-2.0 / 0.5) * torch.tensor([math.cos(0.08), math.sin(0.08), 1.0])
-    moved, count = torch.zeros(1, 5, 3), torch.tensor([[5]])
-    found = []
-    for ground_bands in (0, 1):
-        path = RingPath(2 * SECTORS, 5, match=MATCH, ground_bands=ground_bands)
-        seen_by_layers = []
-        path.layers.register_forward_pre_hook(lambda _, inputs, kept=seen_by_layers: kept.append(inputs[0]))
-        path(cells, moved, count)
-        found.append(bool(seen_by_layers[0][:, 5 * 2 * 3 :].any()))
-    assert found == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,6 @@ def test_a_turned_world_gives_turned_motion():
     [
         ((70, 4), {}, "num_cells=70 must be a multiple of num_sectors=36"),
         ((72, 4), {"channels": (8,), "kernel_sizes": (4,)}, r"kernel_sizes=\[4\] must be one odd number for each of"),
-        ((72, 4), {"ground_bands": 2}, "ground_bands=2 must be less than the 2 bands"),
         ((72, 1), {"match": MATCH}, r"perception\.history=1 shows no motion"),
     ],
 )

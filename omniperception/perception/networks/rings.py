@@ -149,7 +149,6 @@ class RingPath(nn.Module):
         channels: Sequence[int] = (96, 64, 64, 64),
         kernel_sizes: Sequence[int] = (1, 5, 5, 1),
         match: MotionMatch | None = None,
-        ground_bands: int = 0,
     ) -> None:
         """Configure the path.
 
@@ -162,7 +161,6 @@ class RingPath(nn.Module):
             channels: widths of the hidden layers.
             kernel_sizes: sectors that each hidden layer spans, odd.
             match: candidate velocities, scored against the nearest hits; None: the convolutions find motion alone.
-            ground_bands: lowest bands whose hits are not matched, because they hold ground.
         """
         super().__init__()
         if num_cells % num_sectors:
@@ -173,14 +171,12 @@ class RingPath(nn.Module):
                 " channels"
             )
         num_bands = num_cells // num_sectors
-        if not 0 <= ground_bands < num_bands:
-            raise ValueError(f"rings: ground_bands={ground_bands} must be less than the {num_bands} bands")
         if match is not None and history < 2:
             raise ValueError(
                 f"perception.history={history} shows no motion; take 2 or more, or perception.network.rings.match=null"
             )
         self.shape = RingShape(num_sectors, history, decay, tuple(decays))
-        self.match, self.ground_bands = match, ground_bands
+        self.match = match
         width = history * num_bands * self.shape.channels
         if match is not None:
             width += (history - 1) * match.num_velocities + 2 * history
@@ -212,7 +208,7 @@ class RingPath(nn.Module):
     def _matched(self, rings: torch.Tensor, match: MotionMatch) -> torch.Tensor:
         """(n, (H - 1) * K + 2 H, S): scores of candidate velocities, then nearness and bearing of each frame's nearest
         hit."""
-        cells = rings.unflatten(1, (self.shape.history, -1, self.shape.channels))[:, :, self.ground_bands :]
+        cells = rings.unflatten(1, (self.shape.history, -1, self.shape.channels))
         proximity, band = cells[:, :, :, -2].max(2)
         bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (LATERAL * proximity.clamp(min=FAINT))
         reach = -self.shape.decays[-1] * proximity.clamp(min=FAINT).log()

@@ -52,11 +52,6 @@ class Sampler(ABC):
     def sizes(self) -> dict[str, int]:
         return {"num_points": self.num_points}
 
-    @property
-    @abstractmethod
-    def kernels(self) -> tuple[str, ...]:
-        """Names of the kernels that sampling a frame launches on a CPU."""
-
     def __call__(
         self,
         ranges: torch.Tensor,

@@ -29,10 +29,6 @@ class RawSampler(Sampler):
     def sizes(self) -> dict[str, int]:
         return {"num_rays": self.num_points}
 
-    @property
-    def kernels(self) -> tuple[str, ...]:
-        return ("write_raw",)
-
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         launch, lanes = _launcher(ranges, self.num_threads), kernels.LANES[ranges.device.type]
         cloud, points = (view(ranges, wp.float32), view(directions_s, wp.vec3)), view(out, wp.vec3)
@@ -91,12 +87,6 @@ class PdSampler(Sampler):
     @property
     def sizes(self) -> dict[str, int]:
         return {"num_proximal": self.num_proximal, "num_distal": self.num_distal}
-
-    @property
-    def kernels(self) -> tuple[str, ...]:
-        proximal = ("pick_farthest", "write_picked") if self.num_proximal else ()
-        distal = ("write_bins",) if self.num_distal else ()
-        return ("sort_each_environment", *proximal, *distal)
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         self._write_halves(ranges, directions_s, elevation, azimuth, out, num_bins=self.num_distal)
@@ -202,11 +192,6 @@ class ProximitySampler(PdSampler):
         self.num_sectors = num_sectors
         self.edges, self.decay, self.blind, self.body = torch.tensor(edges), decay, blind, tuple(body)
         self._nearest: torch.Tensor | None = None
-
-    @property
-    def kernels(self) -> tuple[str, ...]:
-        proximal = ("sort_each_environment", "pick_farthest", "write_picked") if self.num_proximal else ()
-        return (*proximal, "find_nearest", "write_nearest")
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         if self.num_proximal:

@@ -54,10 +54,6 @@ class StandingSampler(Sampler):
     def sizes(self) -> dict[str, int]:
         return {"num_cells": self.num_points}
 
-    @property
-    def kernels(self) -> tuple[str, ...]:
-        return ("find_standing", "nearest_standing")
-
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
         points, heights = self._standing(ranges, directions_s, attitude)
         cells = view(constant(self.edges, ranges.device), wp.float32), self.num_sectors, self.decay
