@@ -23,12 +23,12 @@ GRID = {
     "blind": 0.3,
     "body": (0.5, 0.28),
 }
-STANDING = {"split_deg": 20.0, "ring_deg": 9.0, "band_edges": (0.0, 0.12, 0.34, 0.8, 3.0), "decay": 0.5}
+STANDING = {"band_edges": (0.0, 0.12, 0.34, 0.8, 3.0), "decay": 0.5}
 SAMPLERS = {
     "pd": lambda: PdSampler(48, 32, max_range=MAX_RANGE, split_deg=20.0, ring_deg=9.0),
     "fps": lambda: FpsSampler(64, max_range=MAX_RANGE, ring_deg=9.0),
     "proximity": lambda: ProximitySampler(32, 36, max_range=MAX_RANGE, **GRID),
-    "standing": lambda: StandingSampler(32, 36, max_range=MAX_RANGE, **STANDING),
+    "standing": lambda: StandingSampler(36, max_range=MAX_RANGE, **STANDING),
     "raw": lambda: RawSampler(RAYS, max_range=MAX_RANGE),
 }
 

@@ -13,6 +13,7 @@ from omniperception.lidar import Lidar
 
 TASK = (
     "experiment=avoid",
+    "perception=proximity_gru",
     "terrain=flat",
     "obstacles=crowd",
     "obstacles.curriculum=null",
