@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from tensordict import TensorDict
@@ -11,6 +12,7 @@ from tensordict import TensorDict
 from omniperception.avoidance.sector_tracks import SectorTracks, TracksConfig
 from omniperception.avoidance.true_sectors import TrueSectors
 from omniperception.avoidance.velocity import AvoidanceConfig, avoidance_velocity
+from omniperception.config import read
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.commands import VelocityCommandConfig
@@ -62,6 +64,12 @@ def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvCon
     if name in ("stop", "histogram"):
         config = replace(config, lidar=lidar, read_besides=(*config.read_besides, MEASURED_CLOUD))
     return config
+
+
+def commanded_ranges(run_dir: Path) -> Limits | None:
+    """What the gait of a run that is not made for V_avoid has learned to follow; None where that was a goal."""
+    commands = read(run_dir).commands
+    return (tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)) if "lin_vel_x" in commands else None
 
 
 def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:

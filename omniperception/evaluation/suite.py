@@ -24,7 +24,7 @@ from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.description import FILE as DESCRIPTION
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.config import EnvConfig
-from omniperception.evaluation.baselines import BASELINES, DRIVEN, Limits, baseline, prepared
+from omniperception.evaluation.baselines import BASELINES, DRIVEN, Limits, baseline, commanded_ranges, prepared
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.exported import ExportedPolicies
 from omniperception.evaluation.plots import draw_worlds
@@ -297,12 +297,8 @@ class Task:
         return [str(override.input_line) for override in parsed if config.group_of(override) not in _SCENE]
 
     def _limits(self) -> Limits | None:
-        """Ranges (m/s) of what the gait has learned to follow; None where it is the run's own, made for V_avoid."""
-        commands = config.read(self.walker).commands
         own = self.walker == self.run_dir and self._own.rewards.avoidance.risk is not None
-        if own or "lin_vel_x" not in commands:
-            return None
-        return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)
+        return None if own else commanded_ranges(self.walker)
 
 
 def _check_exported(policy: ExportedPolicy, newest: Path) -> None:

@@ -6,6 +6,7 @@ cyclonedds brings the network and the description of the types; what is in a sam
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -102,7 +103,7 @@ class Writer:
         from cyclonedds.topic import Topic
         from cyclonedds.util import duration
 
-        self._network, self._type, self.unsent = network, _type(kind), 0
+        self._network, self._type = network, _type(kind)
         participant = network.participant
         qos = Qos(Policy.Reliability.Reliable(duration(milliseconds=1)), Policy.History.KeepLast(1))
         self._writer = DataWriter(participant, Topic(participant, topic, self._type), qos=qos)
@@ -113,10 +114,8 @@ class Writer:
 
         sample: Any = object.__new__(self._type)
         sample.cdr = cdr
-        try:
+        with suppress(DDSException):
             self._writer.write(sample)
-        except DDSException:
-            self.unsent += 1
 
 
 @cache

@@ -22,8 +22,8 @@ import numpy as np
 
 from omniperception.deploy.description import DeployError
 
-DETECTION_PORT, COMMAND_PORT, POINT_PORT = 56000, 56100, 56300
-"""Of the sensor: discovery, control, and where points come from."""
+DETECTION_PORT, POINT_PORT = 56000, 56300
+"""Of the sensor: discovery, and where points come from."""
 HOST_COMMAND_PORT, HOST_POINT_PORT = 56101, 56301
 """Of this machine: where answers and points go to."""
 MID360 = 9

@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from omniperception import build, config
+from omniperception import build
 from omniperception.config import ConfigError
 from omniperception.env.config import FROM_LIDAR, EnvConfig
 from omniperception.env.env import OmniEnv
 from omniperception.env.state import AVOIDANCE, MEASURED_CLOUD
-from omniperception.evaluation.baselines import BASELINES, Limits, baseline
+from omniperception.evaluation.baselines import BASELINES, Limits, baseline, commanded_ranges
 from omniperception.evaluation.episodes import Policy
 from omniperception.evaluation.perceived import Perceived, perceived
 from omniperception.learning import Runner, latest_checkpoint
@@ -256,11 +256,8 @@ class Session:
             raise ConfigError(f"policy={name}: {error}") from None
 
     def _limits(self) -> Limits | None:
-        """Ranges (m/s) of what the gait has learned to follow; None where it is made for V_avoid."""
-        commands = config.read(self.shown.run_dir).commands
-        if self.env.config.rewards.avoidance.risk is not None or "lin_vel_x" not in commands:
-            return None
-        return tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)
+        own = self.env.config.rewards.avoidance.risk is not None
+        return None if own else commanded_ranges(self.shown.run_dir)
 
     # ---- what is seen ------------------------------------------------------------------------------------------------
 

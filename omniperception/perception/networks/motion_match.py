@@ -42,9 +42,9 @@ class MotionMatch:
         """K, standing still included."""
         return 1 + len(self.speeds) * self.num_directions
 
-    def velocities(self, device: torch.device | str | None = None) -> torch.Tensor:
+    def velocities(self) -> torch.Tensor:
         """(K, 2) m/s away from the robot and counter-clockwise around it: standing still, then speed by speed."""
-        index = torch.arange(self.num_directions, dtype=torch.float32, device=device)
+        index = torch.arange(self.num_directions, dtype=torch.float32)
         turn = index * (2 * math.pi / self.num_directions)
         ring = torch.stack((turn.cos(), turn.sin()), -1)
         return torch.cat((ring.new_zeros(1, 2), *(speed * ring for speed in self.speeds)))
