@@ -189,9 +189,8 @@ def _sensor(preset: object, robot: RobotConfig, trust: Sequence[str] | None) -> 
 
 
 def _logger(composed: dict, trust: Sequence[str] | None) -> LoggerConfig | None:
-    """What logs a run; runs of before there was a choice have TensorBoard files."""
-    preset = composed.get("logger", {"type": "tensorboard"})
-    return make(LoggerConfig, preset, "logger", trust) if preset else None
+    """What logs a run."""
+    return make(LoggerConfig, composed["logger"], "logger", trust) if composed["logger"] else None
 
 
 def _names(value: object) -> tuple[str, ...]:

@@ -56,8 +56,7 @@ class EnvRandom:
 
     def load_state_dict(self, state: dict) -> None:
         self.counter.copy_(state["counter"])
-        if "key" in state:  # files from before there were seeded resets go on with the seed of all environments
-            self._key.copy_(state["key"])
+        self._key.copy_(state["key"])
         for name, branch in self._branches.items():
             branch.load_state_dict(state["branches"][name])
 

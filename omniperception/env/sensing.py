@@ -363,7 +363,7 @@ class LidarSensing:
 
     def load_state_dict(self, state: dict) -> None:
         self.tick = state["tick"]
-        clouds = state.get("clouds", {})  # files from before clouds were saved have none until the next tick
+        clouds = state["clouds"]
         self._is_cast = bool(clouds)
         for name, values in clouds.items():
             getattr(self.lidar.frame, name).copy_(values)

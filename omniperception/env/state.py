@@ -235,8 +235,7 @@ class EnvState:
     def load_state_dict(self, state: dict) -> None:
         self.invalidate()
         self.actions = tuple(state["actions"])
-        if "targets" in state:  # files from before they were saved begin with the default pose
-            self.targets = (state["targets"][0], state["targets"][1])
+        self.targets = (state["targets"][0], state["targets"][1])
         self.stand_s, self._reference = state["stand_s"].clone(), state["reference"].clone()
         if self._history is not None:
             self._history.load_state_dict(state["history"])

@@ -158,7 +158,7 @@ class Runner:
         self.current_learning_iteration, self.total_time = state["iteration"], state["total_time"]
         self.logger.load_state_dict(state["logger"])
         if self.config.ppo.mixed_precision is None:
-            self.alg.use_mixed_precision = state.get("use_mixed_precision", self.alg.use_mixed_precision)
+            self.alg.use_mixed_precision = state["use_mixed_precision"]
         if distributed.rank() == 0:
             self.env.load_state_dict(state["env"])
             set_rng_state(state["rng"])

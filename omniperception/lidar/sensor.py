@@ -269,11 +269,8 @@ class Lidar:
     def load_state_dict(self, state: dict) -> None:
         """Resumes where ``state_dict`` was taken."""
         self.frame_count.copy_(state["frame_count"])
-        if "seeded" in state:  # files from before there were seeded resets go on with the seed of all environments
-            for own, saved in zip(
-                (self._noise_seed, self._noise_stream, self.phase_rows), state["seeded"], strict=True
-            ):
-                own.copy_(saved)
+        for own, saved in zip((self._noise_seed, self._noise_stream, self.phase_rows), state["seeded"], strict=True):
+            own.copy_(saved)
         if self._track is not None:
             self._track.load_state_dict(state["track"])
 
