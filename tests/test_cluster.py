@@ -21,7 +21,7 @@ def run(folder, *command):
 
 
 @pytest.mark.slow
-def test_torchrun_trains_one_run_and_one_process_resumes_it(tmp_path):
+def test_torchrun_trains_one_run_and_one_process_or_two_resume_it(tmp_path):
     torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", str(ROOT / "train.py"))
     output = run(tmp_path, *torchrun, *TINY, "ppo.max_iterations=1")
     assert output.count("run directory") == output.count("completed: 1 iterations") == 1
@@ -30,6 +30,8 @@ def test_torchrun_trains_one_run_and_one_process_resumes_it(tmp_path):
     assert len(list(folder.glob("events.*"))) == 1 and (folder / "checkpoints" / "model_1.pt").is_file()
     output = run(tmp_path, str(ROOT / "train.py"), f"run={folder.relative_to(tmp_path)}", "ppo.max_iterations=2")
     assert "after 1 iterations" in output and (folder / "checkpoints" / "model_2.pt").is_file()
+    output = run(tmp_path, *torchrun, f"run={folder.relative_to(tmp_path)}", "ppo.max_iterations=3")
+    assert "after 2 iterations" in output and (folder / "checkpoints" / "model_3.pt").is_file()
 
 
 @pytest.mark.slow

@@ -56,7 +56,8 @@ class EnvRandom:
 
     def load_state_dict(self, state: dict) -> None:
         self.counter.copy_(state["counter"])
-        self._key.copy_(state["key"])
+        if "key" in state:  # of the processes of one training all but the first go on with streams of their own
+            self._key.copy_(state["key"])
         for name, branch in self._branches.items():
             branch.load_state_dict(state["branches"][name])
 

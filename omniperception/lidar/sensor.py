@@ -269,7 +269,8 @@ class Lidar:
     def load_state_dict(self, state: dict) -> None:
         """Resumes where ``state_dict`` was taken."""
         self.frame_count.copy_(state["frame_count"])
-        for own, saved in zip((self._noise_seed, self._noise_stream, self.phase_rows), state["seeded"], strict=True):
+        seeded = self._noise_seed, self._noise_stream, self.phase_rows
+        for own, saved in zip(seeded, state.get("seeded", seeded), strict=True):  # without: keeps its own streams
             own.copy_(saved)
         if self._track is not None:
             self._track.load_state_dict(state["track"])
