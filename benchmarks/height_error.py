@@ -60,10 +60,7 @@ def main(given: Arguments, overrides: list[str]) -> None:
     runner = build.build_runner(run, None)
     checkpoint = latest_checkpoint(run_dir)
     runner.load_policy(checkpoint)
-    try:
-        errors = height_errors(runner.env, runner.policy, runner.alg.actor, given.steps)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
+    errors = height_errors(runner.env, runner.policy, runner.alg.actor, given.steps)
     report([table(errors)], about(1, checkpoint=checkpoint.name, overrides=overrides), run_dir / FOLDER)
 
 

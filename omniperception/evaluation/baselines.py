@@ -67,7 +67,7 @@ def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvCon
 
 
 def commanded_ranges(run_dir: Path) -> Limits | None:
-    """What the gait of a run that is not made for V_avoid has learned to follow; None where that was a goal."""
+    """Ranges (m/s) of the commands that the gait of a run has learned to follow; None where it was given goals."""
     commands = read(run_dir).commands
     return (tuple(commands.lin_vel_x), tuple(commands.lin_vel_y)) if "lin_vel_x" in commands else None
 

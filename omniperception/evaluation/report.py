@@ -63,7 +63,7 @@ def table(records: Sequence[Record]) -> str:
     """All figures: a row for each world and policy, runs of several training seeds together.
 
     With REFERENCE among the policies, each other one has a row with the difference in the first column, trial by trial;
-    the last rows are means over the worlds.
+    the last rows are means over the worlds, and that difference over the trials of all of them.
 
     Raises:
         ConfigError: see `check_apart`.
@@ -83,6 +83,9 @@ def table(records: Sequence[Record]) -> str:
         for (condition, policy), theirs in grouped(records, "condition", "policy").items():
             where = [f"mean of {places}", *([""] if several else []), *([condition] if len(conditions) > 1 else [])]
             rows.append([*where, policy, *mean_figures(theirs)])
+            reference = [one for one in records if (one.condition, one.policy) == (condition, REFERENCE)]
+            if reference and policy != REFERENCE:
+                rows.append([*where, f"{policy}: difference to {REFERENCE}", difference(theirs, reference)])
     heads = ["world", *(["terrain"] if several else []), *(["condition"] if len(conditions) > 1 else [])]
     columns = [*heads, "policy", *COLUMNS.values()]
     return f"{headline(records)}\n\n{markdown(columns, [row + [''] * (len(columns) - len(row)) for row in rows])}\n"
@@ -136,8 +139,9 @@ def mean_figures(records: Sequence[Record]) -> list[str]:
 
 def difference(ours: Sequence[Record], theirs: Sequence[Record]) -> str:
     """Difference of the first column between two policies on the same trials, in percentage points."""
-    pairs = {record.run: record for record in theirs}
-    matched = [(record, pairs[record.run]) for record in ours if record.run in pairs]
+    pairs = {(record.run, record.world, record.terrain): record for record in theirs}
+    at = [(record, (record.run, record.world, record.terrain)) for record in ours]
+    matched = [(record, pairs[key]) for record, key in at if key in pairs]
     matched = [(a, b) for a, b in matched if a.seed == b.seed and len(a.episodes) == len(b.episodes)]
     if not matched:
         return "not the same trials"

@@ -269,9 +269,10 @@ class Lidar:
     def load_state_dict(self, state: dict) -> None:
         """Resumes where ``state_dict`` was taken."""
         self.frame_count.copy_(state["frame_count"])
-        seeded = self._noise_seed, self._noise_stream, self.phase_rows
-        for own, saved in zip(seeded, state.get("seeded", seeded), strict=True):  # without: keeps its own streams
-            own.copy_(saved)
+        if "seeded" in state:  # of the processes of one training all but the first go on with streams of their own
+            self._noise_seed.copy_(state["seeded"][0])
+            self._noise_stream.copy_(state["seeded"][1])
+            self.phase_rows.copy_(state["seeded"][2])
         if self._track is not None:
             self._track.load_state_dict(state["track"])
 

@@ -158,6 +158,20 @@ def test_a_table_has_a_row_for_each_policy_and_the_difference_trial_by_trial():
     assert "8 trials" in text and "ideal (version 1)" in text and len({len(row) for row in cells(text)}) == 1
 
 
+def test_the_difference_over_all_worlds_is_that_of_their_trials():
+    """Two worlds of 8 trials each: 1 more untouched in one of them, as many in the other; other trials do not count."""
+    never = torch.zeros(8, dtype=torch.int64)
+    here = [record(contacts=never), record(policy="histogram")]
+    there = [replace(one, world="moving") for one in (record(), record(policy="histogram"))]
+    rows = {row[1]: row for row in cells(table([*here, *there])) if row[0] == "mean of 2"}
+    assert list(rows) == ["run", "run: difference to histogram", "histogram"]
+    pooled = rows["run: difference to histogram"][2]
+    assert pooled.startswith("+6.2 [") and pooled != cells(table(here))[3][2]
+    other = [replace(one, seed=one.seed + 1) for one in there[1:]]
+    rows = {row[1]: row for row in cells(table([*here, there[0], *other])) if row[0] == "mean of 2"}
+    assert rows["run: difference to histogram"][2] == cells(table(here))[3][2]
+
+
 def test_seeds_are_pooled_and_their_spread_is_shown():
     never = torch.zeros(8, dtype=torch.int64)
     text = table([record(), record(run="runs/b", contacts=never)])
