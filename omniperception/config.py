@@ -106,6 +106,10 @@ def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
             named = [o for o in chosen if not _chooses_none(o)]
             given = [*(str(o.input_line) for o in named), *as_override(folders)]
             config = hydra_compose("config", given, return_hydra_config=True)
+            condition = config.hydra.runtime.choices.get("condition")
+            if condition is not None:  # wins over what recipe and scenario say of the randomization, too
+                alone = hydra_compose("config", [f"condition={condition}", *as_override(folders)])
+                config["randomization"] = alone["randomization"]
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(one_line(error)) from None
     apply(config, values)

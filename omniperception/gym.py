@@ -185,6 +185,8 @@ class OmniSingleEnv:
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """A new episode; see `Env.reset`. Without a seed the random numbers go on."""
+        if options:
+            raise ConfigError(f"options={sorted(options)} is unknown; one robot takes none")
         super().reset(seed=seed)  # type: ignore[misc]  # gymnasium's own generator
         if seed is None and self._next is not None:
             observation, self._next = self._next, None  # it has begun already

@@ -105,6 +105,19 @@ def test_it_wins_over_recipe_and_scenario(make_config, recipe, scenario):
     assert without.condition is None and without.env.randomization == alone.env.randomization
 
 
+def test_it_wins_over_the_curriculum_of_a_recipe(make_config):
+    assert make_config("experiment=gait").env.randomization.curriculum is not None
+    assert values(make_config("experiment=gait", "condition=robot").env.randomization) == ROBOT
+
+
+def test_it_wins_over_the_body_of_a_recipe_of_ones_own(make_config, tmp_path):
+    (tmp_path / "experiment").mkdir()
+    body = "# @package _global_\nrandomization: {added_mass: [0.0, 0.5], latency_s: null, curriculum: null}\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(body)
+    run = make_config(f"hydra.searchpath=['file://{tmp_path}']", "experiment=mine", "condition=robot")
+    assert run.condition == Condition("robot", 2) and values(run.env.randomization) == ROBOT
+
+
 def test_no_scenario_chooses_the_randomization(make_config):
     ideal = make_config().env.randomization
     assert all(make_config(f"scenario={name}").env.randomization == ideal for name in config.presets("scenario"))

@@ -147,6 +147,12 @@ def vector_with_lidar():
     return lambda *overrides: omniperception.make(*WITH_LIDAR, *overrides, num_envs=3)
 
 
+def test_one_robot_takes_no_options():
+    env = omniperception.make_single(*BLIND)
+    with pytest.raises(ConfigError, match=r"options=\['reset_mask'\] is unknown; one robot takes none"):
+        env.reset(options={"reset_mask": [True]})
+
+
 @pytest.fixture(scope="module")
 def vector_of_two():
     return omniperception.make(*BLIND, num_envs=2)

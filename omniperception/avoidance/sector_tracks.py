@@ -185,8 +185,9 @@ class _Clusters:
         self.place, self.seen = place, seen
         apart = (place - place.roll(1, 1)).norm(dim=-1) > link
         linked = seen & seen.roll(1, 1) & ~apart  # to the sector before
-        label = (~linked).long().cumsum(1).clamp(max=seen.shape[1] - 1)
-        self.label = torch.where(linked[:, :1] & (label == label[:, -1:]), label[:, :1], label)  # closes the ring
+        label = (~linked[:, 1:]).long().cumsum(1)
+        label = torch.cat((torch.zeros_like(label[:, :1]), label), 1)
+        self.label = torch.where(linked[:, :1] & (label == label[:, -1:]), 0, label)  # closes the ring
         self.members = sums_by(self.label, seen.float(), seen.shape[1])
         self.exists = self.members > 0
         total = torch.stack(

@@ -258,7 +258,7 @@ class OmniEnv(VecEnv):
 
     def _lidar_is_awake(self) -> bool:
         """Tell whether frames are cast: there is a LiDAR, somebody to see them, and the curriculum has an obstacle."""
-        something_there = self.obstacles is None or self.obstacles.level > 0.0
+        something_there = self.obstacles is None or self.obstacles.level > 0.0 or self.obstacles.any_fixed
         return self.sensing is not None and self.config.casts_frames and something_there
 
     def _follow_terrain(self) -> None:
@@ -293,7 +293,9 @@ class OmniEnv(VecEnv):
         self.velocity_error = torch.where(healthy, lin_error, 0.0)
         self.yaw_rate_error = torch.where(healthy, yaw_error, 0.0)
         self.contacts = self.state.obstacle_contact
-        self.no_obstacle_near = None if self.avoidance is None else self.avoidance.no_obstacle_near()
+        self.no_obstacle_near = None
+        if self.avoidance is not None and self.config.casts_frames:
+            self.no_obstacle_near = self.avoidance.no_obstacle_near()
         self.metrics.record_rewards(tuple(self.rewards.weighted.values()))
         calm = healthy if self.no_obstacle_near is None else healthy & self.no_obstacle_near
         if isinstance(self.command, VelocityCommand):
@@ -328,6 +330,7 @@ class OmniEnv(VecEnv):
                 self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
             self.obstacles.approach(env_ids, pose[:, :2], rotate_yaw(pose[:, 2], self.command.value[env_ids, :2]))
         self.episode_length_buf[env_ids] = 0
+        self.metrics.reset(env_ids)
         if self.sensing is not None:
             self.sensing.reset(env_ids, self.state.measured, seeds)
         if self.avoidance is not None:

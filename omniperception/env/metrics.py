@@ -47,6 +47,10 @@ class EpisodeMetrics:
         self._healthy_steps += healthy.float().mean()
         self._steps += 1
 
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Begins episodes in environments (n,): what was touched before does not count for them."""
+        self.collided[env_ids] = False
+
     def record_clipped(self, clipped: torch.Tensor) -> None:
         """Environments (num_envs,) bool whose action was out of bounds."""
         self._clipped += clipped.sum()
@@ -60,7 +64,6 @@ class EpisodeMetrics:
             [outcomes[name].sum() for name in OUTCOMES] + [(done & self.collided).sum(), done.sum()]
         )
         self._failures += (failure[:, None] == self._causes).sum(0)
-        self.collided &= ~done
 
     def calm_velocity_error(self) -> float:
         """Mean linear velocity error (m/s) in calm moments since the last drain; inf if there were none."""

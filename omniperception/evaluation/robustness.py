@@ -74,7 +74,7 @@ class Stretch:
 
 
 def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors: Sequence[float]) -> list[Stretch]:
-    """All measurements: one without randomization, and each row with each factor above 0.
+    """All measurements: one without randomization, and each row with each factor above 0 that stretches its range.
 
     Args:
         evaluation: of one run with one policy in one world; its condition is replaced.
@@ -92,9 +92,13 @@ def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors:
             f"nothing is left to measure: preset={preset} has no rows of the robot, or no factor is above 0; give"
             " rows=, factors= or another preset, such as robot"
         )
-    found = []
+    found: list[Stretch] = []
+    seen: set[tuple[str, ...]] = set()
     for row, factor in parts:
         override = (stretched(row, values[row], factor),) if row else ()
+        if override in seen:
+            continue  # its BOUNDS are reached: the same range again
+        seen.add(override)
         changed = replace(
             evaluation, condition=None, overrides=(*evaluation.overrides, "randomization=none", *override)
         )
@@ -124,7 +128,7 @@ def table(measured: Sequence[tuple[Stretch, Record]]) -> str:
         rows.append([row, *(_cell(by_place.get((row, factor))) for factor in factors)])
     nothing = _cell(by_place.get(("", 0.0)))
     return (
-        f"falls, % / velocity error, m/s; nothing randomized: {nothing}\n\n"
+        f"falls, % / velocity error, m/s (–: no wider than before); nothing randomized: {nothing}\n\n"
         + markdown(["row", *(f"x {factor:g}" for factor in factors)], rows)
         + "\n"
     )

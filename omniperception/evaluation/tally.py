@@ -107,9 +107,11 @@ class Tally:
         self._sums += torch.where(env.healthy[:, None], torch.stack([step[name].double() for name in _SUMS], 1), 0.0)
         time = self._sums[:, 0] * dt
         self._first_contact = torch.where(began, torch.minimum(self._first_contact, time), self._first_contact)
-        if self._clearance is not None and env.step_count % CLEARANCE_EVERY == 0:
-            known = (self._trial >= self._count) | self._first_contact.isfinite()
-            self._least = self._clearance.measure(self._least.masked_fill(known, 0.0))
+        if self._clearance is not None:
+            between = (env.episode_length_buf % CLEARANCE_EVERY != 0) & ~env.done
+            skipped = between | (self._trial >= self._count) | self._first_contact.isfinite()
+            nearer = self._clearance.measure(self._least.masked_fill(skipped, 0.0))
+            self._least = torch.where(skipped, self._least, nearer)
         self._was_touching = env.contacts & ~env.done
 
     def _file_ended(self) -> None:

@@ -91,7 +91,8 @@ def build_world(
     """Compiles one environment: the robot touches the ground and the obstacles, and itself where its preset says so.
 
     Of the robot those geoms touch something that can be touched according to its file (contype or conaffinity), with
-    contacts of three dimensions (condim 3); the ground decides the friction.
+    contacts of three dimensions (condim 3) where they meet it (no margin, no gap); the ground decides the friction,
+    whatever priority the file gives the robot's geoms.
 
     Raises:
         ValueError: the preset names a part that the robot does not have, or the base does not float.
@@ -102,6 +103,7 @@ def build_world(
     drop_unseen(spec, robot.ray_groups)
     for geom in spec.geoms:
         geom.contype, geom.conaffinity, geom.condim = 0, int(collides(geom)), 3
+        geom.priority, geom.margin, geom.gap = 0, 0.0, 0.0
     terrain.add_to(spec)
     obstacles.add_to(spec)
     _add_contact_sensors(spec, robot, obstacles, frozenset(sensors))

@@ -42,6 +42,7 @@ class ObstacleField:
         radius: (num_envs, P) m, of the circle around the outline.
         half_height: (num_envs, P) m.
         free: index of the parts that have no fixed pose.
+        any_fixed: whether some are there whatever the level is.
         articulation: how parts belong to their obstacles; None where every obstacle is its own only part.
         root_pos_w: (num_envs, O, 3) m, where the obstacles are: the parts' middles without an articulation.
         root_velocity_w: (num_envs, O, 2) m/s.
@@ -88,6 +89,7 @@ class ObstacleField:
         self._yaw = torch.deg2rad(column(*(group.yaw_deg for group in groups)))
         self._placement = Placement(config, random, pos_w)
         self._poses, self._presence = Poses(config, random, pos_w), Presence(config, random)
+        self.any_fixed = bool(self._poses.fixed.any())
         loose = [k for k, part in enumerate(self.parts) if part.group.poses is None]
         self.free = slice(None) if len(loose) == len(self.parts) else torch.tensor(loose, device=device)
         self._approach = Approach(groups, random, pos_w)

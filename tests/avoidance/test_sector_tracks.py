@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from omniperception.avoidance.sector_motion import sector_bearings
-from omniperception.avoidance.sector_tracks import SectorTracks, TracksConfig
+from omniperception.avoidance.sector_tracks import SectorTracks, TracksConfig, _Clusters
 
 S, PERIOD = 72, 0.1
 CONFIG = TracksConfig()
@@ -130,6 +130,16 @@ def test_a_cluster_across_the_ends_of_the_ring_is_one():
     known = motion[:, 0].isfinite()
     assert known[0] and known[-1]
     assert (motion[known, 1:] - motion[0, 1:]).abs().max() < 1e-6 and abs(motion[0, 1] - 1.0) < 0.15
+
+
+@pytest.mark.parametrize("first", [0, 5, S - 2])
+def test_places_apart_are_clusters_apart_wherever_they_are(first):
+    seen, distance = torch.zeros(1, S, dtype=torch.bool), torch.tensor([1.0, 3.0])
+    place = torch.zeros(1, S, 2)
+    seen[0, first : first + 2], place[0, first : first + 2, 0] = True, distance
+    clusters = _Clusters(place, seen, torch.tensor(0.5))
+    assert clusters.label[0, first] != clusters.label[0, first + 1]
+    assert clusters.exists.sum() == 2 and clusters.extent.max() == 0.0
 
 
 def test_resetting_an_environment_leaves_the_others():

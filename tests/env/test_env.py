@@ -58,6 +58,14 @@ class TestTerminations:
         assert done.tolist() == [0, 0, int(ends), 0]
         assert self.outcome(env, "collision_end") == ([2] if ends else [])
 
+    def test_a_touch_belongs_to_the_episode_that_was_interrupted(self, make_env):
+        env = make_env("obstacles=static", "terminations.episode_length_s=0.1", blind=True)
+        env.sim.mocap_pos[2, 0, :2], env.sim.mocap_pos[2, 0, 2] = env.sim.qpos[2, :2], 0.3
+        env.step(still(env))
+        assert env.metrics.collided.tolist() == [False, False, True, False]
+        env.reset(torch.tensor([2]))
+        assert not env.metrics.collided.any()
+
     def test_a_contact_in_any_physics_step_counts(self, make_env):
         """An obstacle that goes through the trunk's corner within one control step is felt at its end."""
         env = make_env("obstacles=moving", "obstacles.groups.walker.count=1", blind=True)

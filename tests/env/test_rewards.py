@@ -158,10 +158,17 @@ class TestTerms:
         state = given(kinematics={"joint_vel": joint_vel}, command=command, stand_s=stand_s)
         assert rewards.standing_joint_velocity_squared(state, rest_s=0.4).tolist() == [5.0, 0.0, 0.0, 0.0]
 
-    def closing(self, pos, vel, base_vel=(0.0, 0.0), active=True):
+    def closing(self, pos, vel, base_vel=(0.0, 0.0), active=True, axis=(1.0, 0.0), half_sides=(0.2, -1.0)):
         state = given(
             kinematics={"base_lin_vel_yaw": tensor(base_vel)},
-            obstacles=Obstacles(tensor([pos]), tensor([vel]), torch.tensor([0.2]), torch.tensor([[active]])),
+            obstacles=Obstacles(
+                tensor([pos]),
+                tensor([vel]),
+                torch.tensor([0.2]),
+                torch.tensor([[active]]),
+                tensor([axis]),
+                tensor([half_sides]),
+            ),
         )
         return rewards.closing_speed(state, horizon=2.0, margin=0.5).item()
 
@@ -173,6 +180,16 @@ class TestTerms:
         assert self.closing((1.0, 0.0), (1.0, 0.0)) == 0.0  # goes away
         assert self.closing((3.0, 0.0), (-1.0, 0.0)) == 0.0  # beyond the horizon
         assert self.closing((1.0, 0.0), (-1.0, 0.0), active=False) == 0.0
+
+    def test_closing_speed_towards_a_wall_is_that_towards_its_side(self):
+        wall = {"axis": (0.6, 0.8), "half_sides": (3.0, 0.05)}  # its normal is (0.8, -0.6)
+        ahead, normal = (0.8 * 1.05 + 0.6, -0.6 * 1.05 + 0.8), (0.8, -0.6)  # its side 1 m away, its middle 1 m along it
+        assert self.closing(ahead, (0.0, 0.0), **wall) == 0.0  # stands beside it
+        assert self.closing(ahead, (0.0, 0.0), base_vel=normal, **wall) == pytest.approx(0.5)  # meets after 1 s of 2
+        assert self.closing(ahead, (0.0, 0.0), base_vel=(0.6, 0.8), **wall) == 0.0  # walks along it
+        beyond = (0.8 * 1.05 + 3.3 * 0.6, -0.6 * 1.05 + 3.3 * 0.8)  # walks past its end, 0.3 m off
+        assert 0.0 < self.closing(beyond, (0.0, 0.0), base_vel=normal, **wall) < 0.3
+        assert self.closing((0.8 + 4.0 * 0.6, -0.6 + 4.0 * 0.8), (0.0, 0.0), base_vel=normal, **wall) == 0.0  # 1 m off
 
 
 class TestFeet:

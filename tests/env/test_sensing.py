@@ -151,6 +151,14 @@ def test_no_frames_until_the_curriculum_has_obstacles(make_env):
     assert env.sensing.tick == 1 and (observations["frame_count"] == 1).all()
 
 
+def test_walls_are_seen_at_every_level_of_the_curriculum(make_env):
+    env = make_env("experiment=quickstart", "obstacles=corridor", "commands=corridor", "lidar.num_rays=2000")
+    for _ in range(6):
+        env.step(still(env))
+    assert env.obstacles.level == 0.0 and env.sensing.tick > 0
+    assert (env.avoidance.sector_distance.amin(1) < 2.6).all()  # from half a metre beside the middle of four
+
+
 def test_nothing_is_computed_that_the_task_does_not_read(make_env):
     def outputs(*overrides):
         frame = make_env(*overrides).sensing.lidar.frame

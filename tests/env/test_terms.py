@@ -95,7 +95,7 @@ def test_a_quantity_that_is_not_read_is_not_computed(make_env):
 
 def test_without_obstacles_there_are_none(make_env):
     state = make_env("obstacles=none", blind=True).state
-    assert [tuple(part.shape) for part in state.obstacles] == [(4, 0, 2), (4, 0, 2), (4, 0), (4, 0)]
+    assert [tuple(part.shape) for part in state.obstacles] == [(4, 0, 2)] * 2 + [(4, 0)] * 2 + [(4, 0, 2)] * 2
     assert rewards.closing_speed(state, horizon=1.0, margin=0.5).tolist() == [0.0] * 4
 
 

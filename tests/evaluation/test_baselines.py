@@ -18,10 +18,10 @@ BLIND = ("experiment=walk", "rewards=walk")
 CONTROLLER = AvoidanceConfig(num_sectors=36, threshold=1.5, alpha=2.0, max_speed=None)
 
 
-def trained(name: str, *overrides: str) -> TrainedPolicy:
+def trained(name: str, *overrides: str, run_dir: Path = AVOIDER) -> TrainedPolicy:
     """The published policy, in an environment for the policy of this name."""
-    run = build.assemble(config.load(AVOIDER, ["num_envs=4", *overrides]))
-    return load_policy(replace(run, env=prepared(name, run.env, run.env.lidar)), AVOIDER)
+    run = build.assemble(config.load(run_dir, ["num_envs=4", *overrides]))
+    return load_policy(replace(run, env=prepared(name, run.env, run.env.lidar)), run_dir)
 
 
 def walk(env, policy, steps):
@@ -47,6 +47,13 @@ class TestBlind:
             assert not torch.allclose(policy(felt), seeing.policy(before))
             before["frame_count"] = torch.zeros_like(before["frame_count"])
             assert torch.allclose(policy(felt), seeing.policy(before), atol=1e-6)
+
+    def test_nobody_measures_whether_something_is_near(self):
+        pd_risknet = config.find_run("pretrained/pd_risknet_taught")
+        seeing, unseeing = (trained(name, "scenario=corridor", run_dir=pd_risknet) for name in ("run", "blind"))
+        for each in (seeing, unseeing):
+            each.env.step(torch.zeros(4, 12))
+        assert seeing.env.no_obstacle_near is not None and unseeing.env.no_obstacle_near is None
 
     def test_a_task_that_shows_frames_is_refused(self):
         avoider = trained("run", "scenario=corridor")

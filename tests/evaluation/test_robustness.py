@@ -9,7 +9,8 @@ import yaml
 from omniperception import config
 from omniperception.config import ConfigError
 from omniperception.evaluation.kicks import AFTER_S, KickResults, Kicks
-from omniperception.evaluation.robustness import rows_of_the_robot, stretched
+from omniperception.evaluation.robustness import rows_of_the_robot, stretched, stretches
+from omniperception.evaluation.suite import Evaluation, World
 from omniperception.scene.build import FOOT_FORCE
 
 
@@ -42,6 +43,17 @@ def test_a_range_is_stretched_about_what_is_normal(row, value, factor, expected)
 def test_what_has_no_range_is_refused():
     with pytest.raises(ConfigError, match=r"randomization\.lidar_device=True has no range"):
         stretched("lidar_device", True, 2.0)
+
+
+def test_a_range_that_ends_where_it_did_is_not_measured_again():
+    evaluation = Evaluation(runs=[config.find_run("pretrained/gait")], worlds=[World("walk")])
+    found = stretches(evaluation, "robot", ("ground_restitution", "ground_friction"), (1.0, 2.0, 3.0))
+    rows = [(one.row, one.factor) for one in found]
+    assert rows == [
+        ("", 0.0),
+        ("ground_restitution", 1.0),
+        *(("ground_friction", factor) for factor in (1.0, 2.0, 3.0)),
+    ]
 
 
 def test_rows_of_the_robot_are_the_papers_and_the_robots_without_the_lidars():

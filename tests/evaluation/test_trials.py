@@ -5,6 +5,7 @@ import torch
 
 from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.evaluation import run_episodes
+from omniperception.evaluation.outcomes import CLEARANCE_CAP
 from omniperception.evaluation.tracks import footprints
 
 WALK = ("experiment=walk", "rewards=walk")
@@ -50,6 +51,13 @@ def scenes(env, policy, trials):
     look()
     run_episodes(env, policy, trials, on_step=look)
     return found
+
+
+def test_clearance_does_not_depend_on_how_many_environments_there_are(make_env):
+    crowd = ("obstacles=crowd", "obstacles.curriculum=null", "terminations.episode_length_s=0.5")  # 25 steps: odd
+    alone, *others = (run_episodes(make_env(*WALK, *crowd, f"num_envs={n}"), stand, 7).clearance for n in (1, 3, 5))
+    assert (alone < CLEARANCE_CAP).sum() > 3
+    assert all(torch.equal(alone, other) for other in others)
 
 
 @pytest.mark.parametrize("scene", ["scenario=moving", "scenario=abs_hard", "terrain=mixed obstacles=static", DRAWN])

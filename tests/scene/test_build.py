@@ -174,3 +174,22 @@ def test_the_ground_decides_the_friction(mixed):
     mujoco.mj_forward(mixed.model, data)
     assert data.ncon > 0
     assert np.unique(data.contact.friction[:, 0]).tolist() == [0.8]
+
+
+def test_the_ground_decides_whatever_the_file_says_of_its_feet(make_config, monkeypatch):
+    run = make_config("obstacles=none", "terrain.friction=0.3")
+    plain = run.env.robot.spec
+
+    def insisting(robot):
+        spec = plain()
+        for geom in spec.geoms:
+            geom.priority, geom.margin, geom.friction = 2, 0.05, (0.9, 0.02, 0.01)
+        return spec
+
+    monkeypatch.setattr(type(run.env.robot), "spec", insisting)
+    model = world_of(run).model
+    data = mujoco.MjData(model)
+    data.qpos[2] = 0.25
+    mujoco.mj_forward(model, data)
+    assert data.ncon > 0 and (data.contact.dist <= 0.0).all()
+    assert np.unique(data.contact.friction[:, 0]).tolist() == [0.3]

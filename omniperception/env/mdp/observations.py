@@ -107,10 +107,10 @@ def nearest_obstacles(state: EnvState, count: int, max_distance: float) -> torch
     """Relative position, relative velocity, radius and nearness of the nearest obstacles: privileged.
 
     Per obstacle, nearest edge first, in the yaw-aligned frame: x, y (m, divided by max_distance), v_x, v_y (m/s),
-    radius (m), and 1 - distance / max_distance (0 beyond, or when fewer obstacles take part). No wider than there are
-    obstacles.
+    radius (m), and 1 - distance / max_distance (0 beyond, or when fewer obstacles take part). Edges and radii are those
+    of the circles around the footprints, which say little about long walls. No wider than there are obstacles.
     """
-    pos, vel, radius, active = state.obstacles
+    pos, vel, radius, active, *_ = state.obstacles
     distance = (pos.norm(dim=-1) - radius).masked_fill(~active, float("inf"))
     nearest, index = distance.topk(min(count, distance.shape[1]), dim=1, largest=False)
     nearness = (1 - nearest / max_distance).clamp(min=0.0)

@@ -91,20 +91,34 @@ def obstacle_contact(state: EnvState) -> torch.Tensor:
 
 
 def closing_speed(state: EnvState, horizon: float, margin: float) -> torch.Tensor:
-    """Imminence of the worst collision course is, 0 to 1.
+    """Imminence of the worst collision course, 0 to 1.
 
     For each obstacle, its distance from the robot at the closest approach within `horizon` (s) if both keep their
     velocities; the term is the largest (1 - clearance / margin) (1 - time / horizon) with clearance (m) to the
-    obstacle's edge below `margin` (m). It sees the approach, where the sector distances see only the distance.
+    obstacle's edge below `margin` (m). It sees the approach, where the sector distances see only the distance. The
+    approach is to the middle of a round obstacle, and to the point of a rectangular one that is nearest now.
     """
-    pos, vel, radius, active = state.obstacles
+    pos, vel, radius, active, axis, half_sides = state.obstacles
     if pos.shape[1] == 0:
         return torch.zeros(state.num_envs, device=state.device)
     rel_vel = vel - state.kinematics.base_lin_vel_yaw[:, None]
-    time = (-(pos * rel_vel).sum(-1) / rel_vel.square().sum(-1).clamp(min=1e-6)).clamp(0.0, horizon)
-    closest = (pos + rel_vel * time[..., None]).norm(dim=-1) - radius
-    danger = (1 - closest.clamp(min=0.0) / margin).clamp(min=0.0) * (1 - time / horizon)
+    round_ones = half_sides[..., 1] < 0
+    aim = torch.where(round_ones[..., None], pos, _nearest_point(pos, axis, half_sides))
+    time = (-(aim * rel_vel).sum(-1) / rel_vel.square().sum(-1).clamp(min=1e-6)).clamp(0.0, horizon)
+    place = pos + rel_vel * time[..., None]
+    clearance = torch.where(
+        round_ones, place.norm(dim=-1) - radius, _nearest_point(place, axis, half_sides).norm(dim=-1)
+    )
+    danger = (1 - clearance.clamp(min=0.0) / margin).clamp(min=0.0) * (1 - time / horizon)
     return (danger * active).amax(1)
+
+
+def _nearest_point(pos: torch.Tensor, axis: torch.Tensor, half_sides: torch.Tensor) -> torch.Tensor:
+    """(n, O, 2) the point nearest to the origin of rectangles around `pos`, whose first sides are along `axis`."""
+    across = torch.stack((-axis[..., 1], axis[..., 0]), -1)
+    middle, half = torch.stack(((pos * axis).sum(-1), (pos * across).sum(-1)), -1), half_sides.clamp(min=0.0)
+    nearest = middle - middle.clamp(-half, half)
+    return nearest[..., :1] * axis + nearest[..., 1:] * across
 
 
 @requires("foot_force")
