@@ -405,9 +405,14 @@ def is_begun(run_dir: Path, composed: dict) -> bool:
 
 
 def find_run(name: str, key: str = "run") -> Path:
-    """The run directory that `run=...`, or another key, names: a path, or `latest` for the newest under outputs/."""
+    """The run directory that `run=...`, or another key, names: a path, or `latest` for the newest under outputs/.
+
+    Outside a checkout, too, pretrained/avoider and its like are those that come with the package.
+    """
     if name != "latest":
         path = Path(name)
+        if not path.is_dir() and path.parts[:1] == (SHIPPED_RUNS.name,):
+            path = SHIPPED_RUNS.parent / path
         if not path.is_dir():
             raise ConfigError(f"{key}={name} does not exist; give a run directory or {key}=latest")
         return path

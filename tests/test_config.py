@@ -120,6 +120,15 @@ class TestRunDirectories:
         assert config.find_run("latest") == Path("outputs/a")
 
 
+def test_what_comes_with_the_package_is_found_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert (config.find_run("pretrained/gait") / config.CONFIG_FILE).is_file()
+    with pytest.raises(ConfigError, match="run=pretrained/gate does not exist"):
+        config.find_run("pretrained/gate")
+    (tmp_path / "pretrained" / "gait").mkdir(parents=True)
+    assert config.find_run("pretrained/gait") == Path("pretrained/gait")  # one's own comes first
+
+
 def test_a_preset_that_lies_in_the_working_directory_says_how_it_is_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "conf" / "robot").mkdir(parents=True)

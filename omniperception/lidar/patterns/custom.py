@@ -52,7 +52,9 @@ def custom(
 
 def _read(path: Path) -> np.ndarray:
     if not path.is_file():
-        raise FileNotFoundError(f"lidar.pattern.path={path} does not exist; give a .npy or .csv file")
+        raise ValueError(
+            f"lidar.pattern.path={path} does not exist (working directory: {Path.cwd()}); give a .npy or .csv file"
+        )
     try:
         if path.suffix == ".npy":
             return np.asarray(np.load(path), dtype=np.float64)
