@@ -123,7 +123,7 @@ class PPOConfig:
         hidden_dims: hidden layers of the actor and of the critic.
         init_std: initial standard deviation of the actions.
         start_std: standard deviation of the actions with which a policy that starts from another run's weights (init=)
-            explores; None: what it had there, with which a finished one learns nothing new (docs/lab/learning.md).
+            explores; None: what it had there, with which a finished one learns nothing new (docs/lab/end_to_end.md).
         obs_normalization: whether observations are normalised by running statistics.
         mixed_precision: whether updates multiply matrices in bfloat16; None where that is measured to be faster on a
             CPU, on a GPU not.
