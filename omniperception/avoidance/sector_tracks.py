@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from torch.nn import functional
 
 from omniperception.common.rotations import rotate_yaw
 from omniperception.common.sectors import sector_of, sums_by
@@ -185,8 +186,7 @@ class _Clusters:
         self.place, self.seen = place, seen
         apart = (place - place.roll(1, 1)).norm(dim=-1) > link
         linked = seen & seen.roll(1, 1) & ~apart  # to the sector before
-        label = (~linked[:, 1:]).long().cumsum(1)
-        label = torch.cat((torch.zeros_like(label[:, :1]), label), 1)
+        label = functional.pad((~linked[:, 1:]).long().cumsum(1), (1, 0))
         self.label = torch.where(linked[:, :1] & (label == label[:, -1:]), 0, label)  # closes the ring
         self.members = sums_by(self.label, seen.float(), seen.shape[1])
         self.exists = self.members > 0

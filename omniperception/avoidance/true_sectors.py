@@ -35,7 +35,6 @@ class TrueSectors:
     ) -> None:
         """Args: num_sectors: S; obstacles: every obstacle; field: where they are, or None without any."""
         self.num_sectors, self._field, self._num_envs, self._device = num_sectors, field, num_envs, device
-        self._headroom = obstacles.headroom
         self.names = obstacles.geom_names()
 
     def measure(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, known: torch.Tensor | None = None) -> torch.Tensor:
@@ -52,7 +51,7 @@ class TrueSectors:
         out = nothing_near(self._num_envs, self.num_sectors, self._device)
         field = self._field
         if field is not None:
-            counts = field.active & (field.bottom_above_ground() < self._headroom)
+            counts = field.in_the_way()
             if known is not None:
                 counts = counts & known
             place = rotate_yaw(-yaw, field.pos_w[..., :2].float() - base_pos_w[:, None, :2])

@@ -66,13 +66,11 @@ def requirements(term: Callable) -> frozenset[str]:
 class Obstacles(NamedTuple):
     """The parts of obstacles whose poses are not fixed; without any, O = 0.
 
-    What hangs high enough to pass under (`ObstaclesConfig.headroom`) takes no part.
-
     Attributes:
         pos_yaw: (n, O, 2) m, from the base's origin, in the yaw-aligned frame.
         vel_yaw: (n, O, 2) m/s, in the yaw-aligned frame.
         radius: (n, O) m, of the circles around the footprints.
-        active: (n, O) bool: which take part in the episode.
+        active: (n, O) bool: which take part in the episode and do not hang high enough to pass under.
         axis_yaw: (n, O, 2) unit vectors along the first sides of the footprints, in the yaw-aligned frame.
         half_sides: (n, O, 2) m, of the footprints that are rectangles; the second is negative for a circle.
     """
@@ -395,13 +393,12 @@ class EnvState:
             nothing = torch.zeros(n, 0, 2, device=self.device)
             return Obstacles(nothing, nothing, nothing[..., 0], nothing[..., 0].bool(), nothing, nothing)
         free = field.free
-        active = field.active & (field.bottom_above_ground() < field.config.headroom)
         offset = field.pos_w[:, free, :2].float() - self.kinematics.base_pos_w[:, None, :2]
         velocity = rotate_yaw(-yaw, field.velocity_w[:, free].float())
         heading = field.yaw[:, free].float() - yaw[:, None]
         axis = torch.stack((heading.cos(), heading.sin()), -1)
         radius, outline = field.radius[:, free].float(), field.outline[:, free].float()
-        return Obstacles(rotate_yaw(-yaw, offset), velocity, radius, active[:, free], axis, outline)
+        return Obstacles(rotate_yaw(-yaw, offset), velocity, radius, field.in_the_way()[:, free], axis, outline)
 
     @property
     def avoidance_velocity(self) -> torch.Tensor:

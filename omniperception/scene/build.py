@@ -91,8 +91,8 @@ def build_world(
     """Compiles one environment: the robot touches the ground and the obstacles, and itself where its preset says so.
 
     Of the robot those geoms touch something that can be touched according to its file (contype or conaffinity), with
-    contacts of three dimensions (condim 3) where they meet it (no margin, no gap); the ground decides the friction,
-    whatever priority the file gives the robot's geoms.
+    contacts of three dimensions (condim 3) that begin at distance 0 (margin and gap are 0). The ground decides the
+    friction, whatever priority the file gives the robot's geoms.
 
     Raises:
         ValueError: the preset names a part that the robot does not have, or the base does not float.

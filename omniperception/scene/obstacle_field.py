@@ -141,6 +141,10 @@ class ObstacleField:
         bottom = self.pos_w[..., 2] - self.half_height
         return bottom if self._ground is None else bottom - self._ground.height(self.pos_w[..., :2])
 
+    def in_the_way(self) -> torch.Tensor:
+        """(num_envs, P) bool: which take part and do not hang as high as `ObstaclesConfig.headroom`."""
+        return self.active & (self.bottom_above_ground() < self.config.headroom)
+
     def reset(
         self,
         env_ids: torch.Tensor,

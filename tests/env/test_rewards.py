@@ -185,7 +185,7 @@ class TestTerms:
         wall = {"axis": (0.6, 0.8), "half_sides": (3.0, 0.05)}  # its normal is (0.8, -0.6)
         ahead, normal = (0.8 * 1.05 + 0.6, -0.6 * 1.05 + 0.8), (0.8, -0.6)  # its side 1 m away, its middle 1 m along it
         assert self.closing(ahead, (0.0, 0.0), **wall) == 0.0  # stands beside it
-        assert self.closing(ahead, (0.0, 0.0), base_vel=normal, **wall) == pytest.approx(0.5)  # meets after 1 s of 2
+        assert self.closing(ahead, (0.0, 0.0), base_vel=normal, **wall) == pytest.approx(0.5)  # after 1 s of 2
         assert self.closing(ahead, (0.0, 0.0), base_vel=(0.6, 0.8), **wall) == 0.0  # walks along it
         beyond = (0.8 * 1.05 + 3.3 * 0.6, -0.6 * 1.05 + 3.3 * 0.8)  # walks past its end, 0.3 m off
         assert 0.0 < self.closing(beyond, (0.0, 0.0), base_vel=normal, **wall) < 0.3

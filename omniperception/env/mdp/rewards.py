@@ -102,13 +102,12 @@ def closing_speed(state: EnvState, horizon: float, margin: float) -> torch.Tenso
     if pos.shape[1] == 0:
         return torch.zeros(state.num_envs, device=state.device)
     rel_vel = vel - state.kinematics.base_lin_vel_yaw[:, None]
-    round_ones = half_sides[..., 1] < 0
-    aim = torch.where(round_ones[..., None], pos, _nearest_point(pos, axis, half_sides))
+    is_round = half_sides[..., 1] < 0  # a point with a radius, then
+    half_sides = half_sides.masked_fill(is_round[..., None], 0.0)
+    aim = _nearest_point(pos, axis, half_sides)
     time = (-(aim * rel_vel).sum(-1) / rel_vel.square().sum(-1).clamp(min=1e-6)).clamp(0.0, horizon)
-    place = pos + rel_vel * time[..., None]
-    clearance = torch.where(
-        round_ones, place.norm(dim=-1) - radius, _nearest_point(place, axis, half_sides).norm(dim=-1)
-    )
+    nearest = _nearest_point(pos + rel_vel * time[..., None], axis, half_sides)
+    clearance = nearest.norm(dim=-1) - radius * is_round
     danger = (1 - clearance.clamp(min=0.0) / margin).clamp(min=0.0) * (1 - time / horizon)
     return (danger * active).amax(1)
 
@@ -116,8 +115,8 @@ def closing_speed(state: EnvState, horizon: float, margin: float) -> torch.Tenso
 def _nearest_point(pos: torch.Tensor, axis: torch.Tensor, half_sides: torch.Tensor) -> torch.Tensor:
     """(n, O, 2) the point nearest to the origin of rectangles around `pos`, whose first sides are along `axis`."""
     across = torch.stack((-axis[..., 1], axis[..., 0]), -1)
-    middle, half = torch.stack(((pos * axis).sum(-1), (pos * across).sum(-1)), -1), half_sides.clamp(min=0.0)
-    nearest = middle - middle.clamp(-half, half)
+    middle = torch.stack(((pos * axis).sum(-1), (pos * across).sum(-1)), -1)
+    nearest = middle - middle.clamp(-half_sides, half_sides)
     return nearest[..., :1] * axis + nearest[..., 1:] * across
 
 
