@@ -287,7 +287,7 @@ def _judged(table: Table, passed: bool) -> Table:
 
 
 def _simulator(given: Arguments, device: str, num_envs: int) -> MujocoWarpSimulator:
-    env = given.run("obstacles=static").env
+    env = given.run("terrain=flat", "obstacles=static").env  # `step_errors` stands the robots on a plane
     world = build_world(env.robot, env.terrain, env.obstacles, (FOOT_FORCE, OBSTACLE_CONTACT))
     return replace(env.sim, device=device).build(world, num_envs)
 
