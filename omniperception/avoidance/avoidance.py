@@ -116,7 +116,7 @@ class Avoidance:
         """Clears avoidance velocity and sector distances of environments (n,)."""
         self.velocity = self.velocity.index_fill(0, env_ids, 0.0)
         if self.sector_distance is not None:
-            self.sector_distance[env_ids] = self._max_distance
+            self.sector_distance.index_fill_(0, env_ids, self._max_distance)
         if self.motion is not None:
             nothing = nothing_near(len(env_ids), self.config.num_sectors, self.motion.device)
             self.motion = self.motion.index_copy(0, env_ids, nothing)

@@ -47,7 +47,7 @@ class EnvRandom:
         The stream of a seed is that of the first environment of as many as have this seed in common.
         """
         self._key[env_ids] = _mix((seeds + 1) * _PER_SEED)
-        self.counter[env_ids] = 0
+        self.counter.index_fill_(0, env_ids, 0)
 
     def state_dict(self) -> dict:
         """How often each environment has drawn of which stream, here and in the branches."""
@@ -123,7 +123,7 @@ class TrialRandom(EnvRandom):
         self._begun += len(env_ids)
         self.trial[env_ids] = numbers
         self._key[env_ids] = self._keys(numbers)
-        self.counter[env_ids] = 0
+        self.counter.index_fill_(0, env_ids, 0)
 
 
 def _shift(x: torch.Tensor, bits: int) -> torch.Tensor:

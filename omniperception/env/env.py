@@ -329,7 +329,7 @@ class OmniEnv(VecEnv):
             if isinstance(self.command, GoalCommand) and self.command.config.route_ahead is not None:
                 self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
             self.obstacles.approach(env_ids, pose[:, :2], rotate_yaw(pose[:, 2], self.command.value[env_ids, :2]))
-        self.episode_length_buf[env_ids] = 0
+        self.episode_length_buf.index_fill_(0, env_ids, 0)
         self.metrics.reset(env_ids)
         if self.sensing is not None:
             self.sensing.reset(env_ids, self.state.measured, seeds)

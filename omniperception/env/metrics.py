@@ -49,7 +49,7 @@ class EpisodeMetrics:
 
     def reset(self, env_ids: torch.Tensor) -> None:
         """Begins episodes in environments (n,): what was touched before does not count for them."""
-        self.collided[env_ids] = False
+        self.collided.index_fill_(0, env_ids, False)
 
     def record_clipped(self, clipped: torch.Tensor) -> None:
         """Environments (num_envs,) bool whose action was out of bounds."""

@@ -397,13 +397,13 @@ class LidarSensing:
         if self._past is not None:
             self._past.reset(env_ids, *self._sim.body_poses(self._bodies))
         self.lidar.reset(env_ids, seeds)
-        self.frame_count[env_ids] = 0
+        self.frame_count.index_fill_(0, env_ids, 0)
         if self.frames is not None:
             self.frames = self.frames.index_fill(0, env_ids, 0.0)  # observations keep the tensor of before
         if self.unseen is not None:
-            self.unseen[env_ids] = NEVER
+            self.unseen.index_fill_(0, env_ids, NEVER)
         for max_distance, mean in self._distal_range.items():
-            mean[env_ids] = max_distance
+            mean.index_fill_(0, env_ids, max_distance)
 
     def _record_sectors(self, out: torch.Tensor, num_threads: int | None) -> list[SectorDistances]:
         """A launch for each slice of environments."""

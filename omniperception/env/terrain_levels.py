@@ -82,7 +82,7 @@ class TerrainLevels:
         ground.move(env_ids, level)
         self._start[env_ids] = xy_w
         for total in (self.walked, self.commanded, self.reach, self._steps):
-            total[env_ids] = 0.0
+            total.index_fill_(0, env_ids, 0.0)
 
     def steps_up(self, env_ids: torch.Tensor, complete: torch.Tensor) -> torch.Tensor:
         """(n,) int64: 1 for environments that move up a level, -1 for those that move down; see `start`."""

@@ -73,7 +73,7 @@ class PoseTrack:
             self._forget.fill_(True)
             self._num_recorded, self._is_complete = 0, False
         else:
-            self._forget[env_ids] = True
+            self._forget.index_fill_(0, env_ids.to(self._forget.device), True)
 
     def state_dict(self) -> dict:
         """A copy of the poses."""

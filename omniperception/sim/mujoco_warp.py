@@ -204,9 +204,9 @@ class MujocoWarpSimulator:
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self.qpos[env_ids], self.qvel[env_ids] = self._joints.engine_state(qpos.float(), qvel.float())
-        self.failure[env_ids] = int(Failure.NONE)
+        self.failure.index_fill_(0, env_ids, int(Failure.NONE))
         for values in (*self._forgotten, *self._records.values()):
-            values[env_ids] = 0.0
+            values.index_fill_(0, env_ids, 0.0)
 
     def joint_torque(self) -> torch.Tensor:
         return self._torque.clone()

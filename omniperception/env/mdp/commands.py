@@ -214,7 +214,7 @@ class VelocityCommand:
         self.value[env_ids] = velocity * (u[:, 3:4] >= self.config.standing)
         shortest, longest = self.config.resample_s
         self.time_left[env_ids] = shortest + u[:, 4] * (longest - shortest)
-        self.age[env_ids] = 0.0
+        self.age.index_fill_(0, env_ids, 0.0)
 
 
 ROUTE_WINDOW = 1.0
@@ -245,7 +245,7 @@ class GoalCommand:
 
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
         self.goal_w[env_ids] = self._low + self._random.uniform(env_ids, (2,)) * (self._high - self._low)
-        self.elapsed[env_ids] = 0.0
+        self.elapsed.index_fill_(0, env_ids, 0.0)
         self._steer(kinematics)
 
     def follow(self, env_ids: torch.Tensor, route: torch.Tensor, kinematics: Kinematics) -> None:
