@@ -22,6 +22,8 @@ from omniperception.sim.mujoco import SimConfig, apply_options
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 """Model fields that the engine derives from masses and inertias."""
 _MASSES = ("body_mass", "body_ipos", "body_inertia")
+_DERIVED_AT_ONCE = 32
+"""Worlds whose constants are derived in one launch."""
 _GROUND_CONTACTS = {mujoco.mjtGeom.mjGEOM_SPHERE: 1, mujoco.mjtGeom.mjGEOM_CAPSULE: 2}
 """Most contacts of a geom with a plane; every other kind has up to _MANY."""
 _MANY = 4
@@ -157,6 +159,7 @@ class MujocoWarpSimulator:
         self._sized: dict[tuple[int, ...], SizedGeoms] = {}
         self._indices: dict[tuple[int, ...], torch.Tensor] = {}
         self._graphs: dict[str, wp.Graph | None] = {}
+        self._constants: Constants | None = None
         self._allocate_steps(config.decimation)
 
     @property
@@ -254,14 +257,22 @@ class MujocoWarpSimulator:
         if name not in self._fields:
             self._expand(name)
             if name in _MASSES:
-                for derived in _DERIVED:
-                    self._expand(derived)
+                for field in (*_MASSES, *_DERIVED):
+                    self._expand(field)
                 self.update_model(torch.arange(self.num_envs, device=self.device))
         return self._fields[name]
 
     def update_model(self, env_ids: torch.Tensor) -> None:
-        """Derives them for all worlds in one launch; those of the others come out as they were."""
-        self._launch("constants", self._constants)
+        if self._constants is None:
+            with wp.ScopedDevice(self._wp_device):
+                self._constants = Constants(self._engine, _supported(self.world.model))
+        constants = self._constants
+        for ids in env_ids.split(_DERIVED_AT_ONCE):
+            for name in _MASSES:
+                constants.fields[name][: len(ids)] = self._fields[name][ids]
+            self._launch("constants", constants.derive)
+            for name in _DERIVED:
+                self._fields[name][ids] = constants.fields[name][: len(ids)]
 
     def anomalies(self) -> dict[str, float]:
         """Environments for whose contacts or constraints there was no room since the last call; synchronises the host.
@@ -331,10 +342,6 @@ class MujocoWarpSimulator:
         self._engine.com_pos(self.model, self.data)
         self._engine.com_vel(self.model, self.data)
 
-    def _constants(self) -> None:
-        groups = self._engine.SetConstGroup
-        self._engine.set_const(self.model, self.data, groups.FIXED | groups.INERT0, restore=False)
-
     def _launch(self, name: str, work: Callable[[], None]) -> None:
         """Runs device work on PyTorch's stream: the first time as it is, which compiles kernels, then as a graph."""
         with wp.ScopedDevice(self._wp_device):
@@ -383,20 +390,10 @@ class MujocoWarpSimulator:
             self._wp_turn = wp.from_torch(self._turn, dtype=wp.quat)
         return self._turn
 
-    @torch.inference_mode(False)
     def _expand(self, name: str) -> None:
-        """Gives every world values of its own of a model field."""
-        if name in self._fields:
-            return
-        *path, last = name.split(".")
-        owner = getattr(self.model, path[0]) if path else self.model
-        shared = getattr(owner, last)
-        values = wp.to_torch(shared)
-        self._fields[name] = values.expand(self.num_envs, *values.shape[1:]).clone()
-        own = wp.from_torch(self._fields[name], dtype=shared.dtype)
-        own._is_batched = True  # type: ignore[union-attr]  # as the engine marks its own; Warp does not declare it
-        setattr(owner, last, own)
-        self._graphs.clear()  # they hold the old address
+        if name not in self._fields:
+            self._fields[name] = _own_values(self.model, name, self.num_envs)
+            self._graphs.clear()  # they hold the old address
 
     def _index(self, ids: tuple[int, ...]) -> torch.Tensor:
         if ids not in self._indices:
@@ -406,6 +403,42 @@ class MujocoWarpSimulator:
     def _warn(self, what: str, override: str, capacity: int) -> None:
         message = f"{what}, which are missing in the physics; raise sim.{override} (now {capacity})"
         warnings.warn(message, RuntimeWarning, stacklevel=3)
+
+
+class Constants:
+    """Model fields that the engine derives from masses and inertias, in a small model of their own.
+
+    The engine derives those of all worlds of a model, one launch after the other for each degree of freedom and body,
+    while few robots are reset at a time.
+
+    Attributes:
+        fields: by name of the model field, (_DERIVED_AT_ONCE, ...): masses to be written, and what `derive` makes of
+            them.
+    """
+
+    def __init__(self, engine: ModuleType, model: mujoco.MjModel) -> None:
+        self._engine, self._model = engine, engine.put_model(model)
+        self._data = engine.make_data(model, _DERIVED_AT_ONCE, nconmax=1, njmax=1)
+        names = (*_MASSES, *_DERIVED)
+        self.fields = {name: _own_values(self._model, name, _DERIVED_AT_ONCE) for name in names}
+
+    def derive(self) -> None:
+        groups = self._engine.SetConstGroup
+        self._engine.set_const(self._model, self._data, groups.FIXED | groups.INERT0, restore=False)
+
+
+@torch.inference_mode(False)  # what is allocated within a rollout is written outside of one, too
+def _own_values(model: object, name: str, num_worlds: int) -> torch.Tensor:
+    """Gives every world values of its own of an engine's model field; the memory that it then reads."""
+    *path, last = name.split(".")
+    owner = getattr(model, path[0]) if path else model
+    shared = getattr(owner, last)
+    values = wp.to_torch(shared)
+    fields = values.expand(num_worlds, *values.shape[1:]).clone()
+    own = wp.from_torch(fields, dtype=shared.dtype)
+    own._is_batched = True  # type: ignore[union-attr]  # as the engine marks its own; Warp does not declare it
+    setattr(owner, last, own)
+    return fields
 
 
 _STATE = ("qpos", "qvel", "qacc_warmstart", "time", "ctrl", "mocap_pos", "mocap_quat", "actuator_force")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import html
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omniperception.config import CONFIG_FILE, OUTPUTS
+from omniperception.config import OUTPUTS, SHIPPED_RUNS, find_runs
 from omniperception.evaluation.baselines import BASELINES
 from omniperception.evaluation.perceived import Perceived
 from omniperception.viewer import charts
@@ -311,10 +311,8 @@ def _point_legend(name: str) -> str:
 
 
 def _runs(first: Path) -> list[str]:
-    """Run directories that there are, the given one first."""
-    found = [path.parent for path in (*_below(OUTPUTS), *_below(Path("pretrained")))]
-    return list(dict.fromkeys(str(path) for path in (first, *found)))
-
-
-def _below(folder: Path) -> Iterator[Path]:
-    yield from sorted(folder.glob(f"**/{CONFIG_FILE}"))
+    """Run directories that there are: the given one, those of outputs/, the newest first, and those of the package."""
+    names: dict[Path, str] = {}
+    for run in (first, *reversed(find_runs(OUTPUTS)), *find_runs(SHIPPED_RUNS)):
+        names.setdefault(run.resolve(), str(run))
+    return list(names.values())

@@ -47,6 +47,21 @@ def test_masses_bring_what_the_engine_derives_from_them(run):
     assert np.array_equal(sim.model.body_invweight0.numpy()[[0, 1, 3]], before)
 
 
+def test_masses_of_more_worlds_than_are_derived_at_once(run):
+    """Every world's inverse weights against `mj_setConst`, in an order that is not that of the worlds."""
+    num_envs = 70
+    sim = simulator(run, CPU, num_envs)
+    model, base = sim.world.model, sim.world.base_body
+    sim.model_field("body_mass")[:, base] += torch.linspace(-1.0, 5.0, num_envs)
+    sim.update_model(torch.arange(num_envs).flip(0))
+    nominal = float(model.body_mass[base])
+    for env in (0, 31, 32, 37, 38, 69):
+        model.body_mass[base] = nominal - 1.0 + 6.0 * env / (num_envs - 1)
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        weight = sim.model.body_invweight0.numpy()[env]
+        np.testing.assert_allclose(weight, model.body_invweight0, rtol=2e-3, atol=1e-6)
+
+
 def test_an_overflow_is_reported_and_names_the_override(run):
     sim = simulator(run, MujocoWarpConfig(device="cpu", rows_per_env=10))
     stand(sim)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import os
 import socket
 
 import numpy as np
 import pytest
 
+from omniperception import config
 from omniperception.lidar import Shape, ShapeKind
 from omniperception.viewer import PageOptions, ViewerError
 from omniperception.viewer.clock import BEHIND_S, Clock
 from omniperception.viewer.drive import Stick
 from omniperception.viewer.meshes import grid_surface, triangles
+from omniperception.viewer.panels import _runs
 from omniperception.viewer.stage import on_level, sector_lines, turned
 
 
@@ -105,6 +108,19 @@ def test_a_surface_over_a_grid_looks_up():
     mesh = grid_surface(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0]), np.array([[0, 1, 2], [0, 1, 2]]))
     assert mesh.area == pytest.approx(2 * math.sqrt(2))
     assert (mesh.face_normals[:, 2] > 0).all()
+
+
+def test_runs_to_choose_from_are_the_newest_first_and_the_shipped_ones_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for k, name in enumerate(("old", "new")):
+        run = tmp_path / "outputs" / name
+        run.mkdir(parents=True)
+        (run / config.CONFIG_FILE).touch()
+        os.utime(run / config.CONFIG_FILE, (k, k))
+    shipped = config.SHIPPED_RUNS / "avoider"
+    found = _runs(shipped)
+    assert found[:3] == [str(shipped), "outputs/new", "outputs/old"] and found.count(str(shipped)) == 1
+    assert str(config.SHIPPED_RUNS / "gait") in found
 
 
 def test_options_say_what_is_wrong():
