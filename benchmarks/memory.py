@@ -14,10 +14,8 @@ import gc
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 import warp as wp
-from tensordict import TensorDictBase
 
 from benchmarks.harness.memory import buffer_bytes, resident_bytes
 from benchmarks.harness.table import Table, about, report
@@ -74,9 +72,8 @@ def held_bytes(runner: Runner) -> dict[str, int]:
 
     Gradients and Adam's moments are counted as if they existed already.
     """
-    env, storage = runner.env, vars(runner.alg.storage)
-    rollout = [dict(v.items()) if isinstance(v, TensorDictBase) else v for v in storage.values()]
-    physics = buffer_bytes(env.sim) + _native_bytes(env.sim)
+    env = runner.env
+    physics = buffer_bytes(env.sim)
     rays = buffer_bytes(env.sim, env.sensing) - buffer_bytes(env.sim)
     rest = buffer_bytes(env) - buffer_bytes(env.sim, env.sensing)
     models = (runner.alg.actor, runner.alg.critic)
@@ -85,7 +82,7 @@ def held_bytes(runner: Runner) -> dict[str, int]:
         "physics": physics,
         "rays": rays,
         "environment": rest,
-        "rollout": buffer_bytes(*rollout),
+        "rollout": buffer_bytes(runner.alg.storage),
         "networks": 4 * weights,
     }
 
@@ -128,15 +125,6 @@ def _clouds_at_once(env: OmniEnv, num_envs: int) -> int:
 
 def _build(run: RunConfig, num_envs: int) -> Runner:
     return build_runner(replace(run, env=replace(run.env, num_envs=num_envs, initial_level=1.0)), None)
-
-
-def _native_bytes(sim: object) -> int:
-    """Bytes of the CPU engine's state rows and bound arrays, which lie outside of PyTorch."""
-    batch = getattr(sim, "batch", None)
-    if batch is None:
-        return 0
-    bound = [value for value in vars(sim).values() if isinstance(value, np.ndarray)]
-    return batch.state.nbytes + sum(array.nbytes for array in bound)
 
 
 def _update_bytes(run: RunConfig) -> int:

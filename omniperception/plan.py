@@ -134,7 +134,7 @@ def describe(runner: Runner, computed: Iterable[str] = (), stages: Iterable[str]
         "kernels": dict.fromkeys(sorted({launch.name for launch in launches}), ""),
         "modules": dict.fromkeys(modules, ""),
     }
-    return Plan(env.num_envs, sections, _buffers(things))
+    return Plan(env.num_envs, sections, buffers(things))
 
 
 def contact_pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
@@ -210,23 +210,22 @@ def _children(thing: object) -> Iterable[tuple[object, object]]:
     if isinstance(thing, list | tuple):
         return list(enumerate(thing))
     kind: Any = type(thing)
-    if kind.__name__ == "StructInstance":  # of Warp
-        return [(name, getattr(thing, name)) for name in kind._cls.vars]
-    if kind.__module__.startswith(_ENTERED) and hasattr(thing, "__dict__"):
+    of_warp = any(base.__name__ in ("StructInstance", "Mesh") for base in kind.__mro__)
+    if hasattr(thing, "__dict__") and (of_warp or kind.__module__.startswith(_ENTERED)):
         return list(vars(thing).items())
     return []
 
 
-def _buffers(things: Mapping[str, object]) -> dict[str, int]:
+def buffers(things: Mapping[str, object]) -> dict[str, int]:
     """Bytes of the arrays, the largest first; one that lies within another's memory is not counted again."""
     extents = {name: extent for name, thing in things.items() if (extent := _extent(thing)) is not None}
-    buffers: dict[str, int] = {}
+    sizes: dict[str, int] = {}
     spans: list[tuple[int, int]] = []
     for name, (start, size) in sorted(extents.items(), key=lambda item: -item[1][1]):
         if size and not any(low <= start and start + size <= high for low, high in spans):
             spans.append((start, start + size))
-            buffers[name] = size
-    return buffers
+            sizes[name] = size
+    return sizes
 
 
 def _extent(thing: object) -> tuple[int, int] | None:
