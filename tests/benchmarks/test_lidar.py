@@ -169,7 +169,7 @@ def test_memory_per_environment_holds_the_ranges_and_poses_at_least():
 
 
 def test_memory_shared_by_all_environments_holds_the_triangles():
-    """Nine floats of a triangle, its share of a tree, and the host's arrays; a height field is a float for two triangles."""
+    """Nine floats of a triangle, its share of a tree, and the host's arrays; a field has a float for two."""
     scenes = [terrain_scene(mid360_scan(1, 10), cells=n) for n in (10, 30)]
     coarse, fine = (buffer_sizes(scene, terrain="mesh")[1] for scene in scenes)
     assert 9 * 4 * 1600 < fine - coarse < 30 * 4 * 1600
