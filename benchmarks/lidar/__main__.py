@@ -74,10 +74,8 @@ def _scaling(given: Arguments) -> list[Table]:
 
 def _paper(given: Arguments) -> list[Table]:
     appendix = measure_appendix(given.options, scale=0.02 if given.small else 1.0)
-    device = "cuda:0" if torch.cuda.is_available() and given.device == "cpu" else given.device
-    rivals = GPU_RIVALS if device.startswith("cuda") else ()
-    options = replace(given.options, device=device)
-    return [appendix, measure_table(options, max_rays=300_000 if given.small else None, rivals=rivals)]
+    rivals = GPU_RIVALS if given.device.startswith("cuda") else ()
+    return [appendix, measure_table(given.options, max_rays=300_000 if given.small else None, rivals=rivals)]
 
 
 STUDIES: dict[str, Callable[[Arguments], list[Table]]] = {

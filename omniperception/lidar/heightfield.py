@@ -31,7 +31,7 @@ class HeightField:
     def __init__(
         self, heights: np.ndarray, half_x: float, half_y: float, base: float = 0.0, scale: float = 1.0
     ) -> None:
-        self.heights = np.ascontiguousarray(heights, dtype=np.float32)
+        self.heights = np.array(heights, dtype=np.float32, order="C")  # its own: what follows from it is kept
         self.half_x, self.half_y, self.base, self.scale = float(half_x), float(half_y), float(base), float(scale)
         if self.heights.ndim != 2 or min(self.heights.shape) < 2:
             raise ValueError(f"heights {self.heights.shape} must be (rows, cols) with at least 2 of each")

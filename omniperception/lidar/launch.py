@@ -80,6 +80,10 @@ def thread_pool(num_workers: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_workers, thread_name_prefix="lidar")
 
 
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=thread_pool.cache_clear)  # a forked process has none of its parent's threads
+
+
 def split(num_envs: int, work_per_env: int, num_threads: int) -> list[tuple[int, int]]:
     """(first environment, number of environments) of each chunk; no more chunks than the work is worth."""
     worth = max(1, num_envs * work_per_env // MIN_CHUNK_WORK)
@@ -124,7 +128,7 @@ class SplitLaunch:
                 )
                 for low, count in chunks
             ]
-        self.pool = thread_pool(threads - 1) if len(chunks) > 1 else None
+        self.helpers = threads - 1 if len(chunks) > 1 else 0
         self.width = min(threads, len(chunks))
 
     def __call__(self) -> None:
@@ -132,11 +136,11 @@ class SplitLaunch:
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.cuda_device))
             for command in self.commands:
                 command.launch(stream=stream)
-        elif self.pool is None:
+        elif not self.helpers:
             for command in self.commands:
                 command.launch()
         else:
-            self._run_in_threads(self.pool)
+            self._run_in_threads(thread_pool(self.helpers))
 
     def _run_in_threads(self, pool: ThreadPoolExecutor) -> None:
         queue = iter(self.commands)  # next() of a list iterator is atomic: each command is run by one thread

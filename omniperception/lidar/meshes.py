@@ -48,7 +48,7 @@ class TriangleMesh:
     """
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
-        self.vertices = np.ascontiguousarray(vertices, dtype=np.float32)
+        self.vertices = np.array(vertices, dtype=np.float32, order="C")  # its own: what follows from it is kept
         triangles = np.ascontiguousarray(triangles, dtype=np.int64)
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
             raise ValueError(f"mesh needs vertices (V, 3), triangles (T, 3); got {vertices.shape}, {triangles.shape}")

@@ -68,8 +68,8 @@ class PoseTrack:
         self._num_recorded, self._is_complete = 0, True
 
     def forget(self, env_ids: torch.Tensor | None = None) -> None:
-        """Makes the next poses of some environments, or of all, those of all moments."""
-        if env_ids is None or len(env_ids) == len(self._forget):
+        """Makes the next poses of some environments, (n,) int64, or of all, those of all moments."""
+        if env_ids is None:
             self._forget.fill_(True)
             self._num_recorded, self._is_complete = 0, False
         else:

@@ -112,6 +112,7 @@ class MujocoScene(RayScene):
         found = geom_shapes(model, class_of, geoms)
         self.geom_ids, self.body_ids = found.geom_ids, found.body_ids
         self.body_names = tuple(model.body(k).name for k in found.body_ids)
+        self._nbody = model.nbody
         self._rows = torch.tensor(found.body_ids, dtype=torch.int64, device=device)
         super().__init__(found.shapes, num_envs, len(found.body_ids), device, num_threads, pose_dtype)
 
@@ -121,9 +122,18 @@ class MujocoScene(RayScene):
         Args:
             xpos: Positions, metres, (nbody, 3), or (num_envs, nbody, 3).
             xquat: Orientations, (w, x, y, z), (nbody, 4), or (num_envs, nbody, 4).
+
+        Raises:
+            ValueError: They are not of this model's bodies, or of another number of environments.
         """
-        for own, given in ((self.body_pos, xpos), (self.body_quat, xquat)):
-            own.copy_(torch.as_tensor(given, device=self.device)[..., self._rows, :])
+        for name, own, given in (("xpos", self.body_pos, xpos), ("xquat", self.body_quat, xquat)):
+            rows, width = torch.as_tensor(given, device=self.device), own.shape[-1]
+            if tuple(rows.shape) not in ((self._nbody, width), (self.num_envs, self._nbody, width)):
+                raise ValueError(
+                    f"{name} must be ({self._nbody}, {width}) or ({self.num_envs}, {self._nbody}, {width}),"
+                    f" got {tuple(rows.shape)}"
+                )
+            own.copy_(rows[..., self._rows, :])
 
     def copy_data(self, data: mujoco.MjData) -> None:
         """Takes the bodies' poses from a simulation, the same for all environments."""

@@ -173,9 +173,10 @@ class RayScene:
     caller's own rounding (6e-5 m at 1 km) comes on top.
 
     What cannot be placed is not there: a ray passes through a shape whose body has a position or a quaternion that is
-    not finite or a quaternion of norm 0 (below 1e-6), and a sensor on such a body misses everything; ``broken_poses``
-    finds them. A quaternion of any other norm is normalised. A triangle of a deformable with a vertex that is not
-    finite is not there. A ray whose origin or direction is not finite, or whose direction has length 0, misses.
+    not finite, a position 1e15 m or more from the origin, or a quaternion whose norm is 1e-6 or less, or 1e6 or more; a
+    sensor on such a body misses everything; ``broken_poses`` finds them. A quaternion of any other norm is normalised.
+    A triangle of a deformable with a vertex that is not finite is not there. A ray whose origin or direction is not
+    finite, or whose direction has length 0, misses.
 
     Args:
         shapes: The shapes; may be empty.
@@ -338,10 +339,9 @@ class RayScene:
         return self._sized[key]
 
     def broken_poses(self) -> torch.Tensor:
-        """Bodies that have a pose that is not finite or a quaternion of norm 0, (num_envs, num_bodies) bool."""
-        norm = torch.linalg.vector_norm(self.body_quat.double(), dim=-1)
-        finite = self.body_pos.isfinite().all(-1) & norm.isfinite()
-        return ~finite | (norm <= 1e-6)
+        """Bodies that cannot be placed, see the class, (num_envs, num_bodies) bool."""
+        norm, away = (values.double().square().sum(-1) for values in (self.body_quat, self.body_pos))
+        return ~((norm > 1e-12) & (norm < 1e12) & (away < 1e30))  # as the kernels' is_pose
 
     def vertices(self, shape_id: int) -> torch.Tensor:
         """Vertices of a deformable shape in its frame, metres, (num_envs, V, 3) float32.

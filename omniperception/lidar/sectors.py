@@ -60,6 +60,12 @@ class SectorDistances:
             raise ValueError(f"num_sectors={num_sectors} must be at least 1")
         if not max_distance > 0.0:
             raise ValueError(f"max_distance={max_distance} must be > 0")
+        for name, given, shape in (
+            ("directions_s", directions_s, (num_envs, num_rays, 3)),
+            ("class_id", class_id, true_ranges.shape),
+        ):
+            if given.shape != shape:
+                raise ValueError(f"{name} must be {tuple(shape)}, got {tuple(given.shape)}")
         if body_quat.ndim != 3 or body_quat.shape[::2] != (num_envs, 4) or not 0 <= base < body_quat.shape[1]:
             raise ValueError(
                 f"body_quat must be ({num_envs}, bodies, 4) with bodies > base={base}, got {tuple(body_quat.shape)}"

@@ -68,8 +68,7 @@ class LidarConfig:
     motion_jump: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.num_rays < 1 or self.num_rays != int(self.num_rays):
-            raise ValueError(f"lidar.num_rays={self.num_rays} must be a whole number >= 1")
+        _require_whole("lidar.num_rays", self.num_rays, 1)
         if not (self.period_s > 0.0 and math.isfinite(self.period_s)):
             raise ValueError(f"lidar.period_s={self.period_s} must be positive and finite")
         if not self.min_range >= 0.0:
@@ -81,8 +80,7 @@ class LidarConfig:
         if self.selection not in get_args(Strategy):
             known = ", ".join(get_args(Strategy))
             raise ValueError(f"lidar.selection={self.selection!r} must be one of {known}")
-        if self.motion_segments < 0 or self.motion_segments != int(self.motion_segments):
-            raise ValueError(f"lidar.motion_segments={self.motion_segments} must be a whole number >= 0")
+        _require_whole("lidar.motion_segments", self.motion_segments, 0)
         if not self.motion_jump > 0.0:
             raise ValueError(f"lidar.motion_jump={self.motion_jump} must be a positive distance in metres")
         object.__setattr__(self, "mount_pos", finite_tuple("lidar.mount_pos", self.mount_pos, 3))
@@ -150,7 +148,8 @@ class Lidar:
             mount_body: Body of the scene that carries the sensor; -1 for a sensor fixed in each environment.
             exclude_shapes: Indices of shapes that the rays pass through.
             noise: At most one model of each kind.
-            seed: Of the device's phases and of the noise.
+            seed: Of the device's phases and of the noise. Sensors with the same seed draw the same ones: give each
+                sensor of a robot a seed of its own.
             outputs: What to compute, names from ``OUTPUTS``.
             reflectivity: Of each class of shapes, 0 to 1 for matt surfaces; 1 for classes not named. Read by
                 the output ``intensity`` only.
@@ -195,7 +194,7 @@ class Lidar:
         """Casts the frame that ends at ``time_s`` from the scene's poses and, with motion, those recorded before.
 
         Args:
-            time_s: Each environment's time, s, (num_envs,) float64, or one number for all of them.
+            time_s: Each environment's time, s, finite, (num_envs,) float64, or one number for all of them.
 
         Returns:
             ``self.frame``, every element of it rewritten.
@@ -217,6 +216,8 @@ class Lidar:
             Which environments, and their frame with as many rows. It lasts until the next slice.
         """
         if not isinstance(time_s, torch.Tensor):
+            if not np.isfinite(time_s).all():
+                raise ValueError(f"time_s={time_s} must be finite, in seconds")
             time_s = torch.as_tensor(time_s, dtype=torch.float64, device=self.scene.device)
             time_s = time_s.expand(self.scene.num_envs) if time_s.ndim == 0 else time_s
         if time_s.dtype != torch.float64 or time_s.shape != (self.scene.num_envs,):
@@ -236,13 +237,19 @@ class Lidar:
         """Begins an episode in some environments, or in all: their bodies have been all along where they are next.
 
         Args:
-            env_ids: Indices, (n,) int64; None for all.
+            env_ids: Indices, (n,) int64; None for all, whose next frame may then be recorded from its start.
             seeds: (n,) int64, of the noise and of the device's phase from now on, whichever environment it is; None:
                 both go on, so that no episode repeats another's noise.
         """
+        for name, given in (("env_ids", env_ids), ("seeds", seeds)):
+            if given is not None and (given.dtype != torch.int64 or given.ndim != 1):
+                raise ValueError(f"{name} must be int64 (n,), got {given.dtype} {tuple(given.shape)}")
+        count = self.scene.num_envs if env_ids is None else len(env_ids)
+        if seeds is not None and len(seeds) != count:
+            raise ValueError(f"seeds must be one for each of {count} environments, got {len(seeds)}")
         if self._track is not None:
             self._track.forget(env_ids)
-        if seeds is not None:
+        if seeds is not None and count:
             which = slice(None) if env_ids is None else env_ids
             self._noise_seed[which] = (seeds & _SEEDS).int().to(self._noise_seed.device)
             self._noise_stream[which] = 0
@@ -267,7 +274,15 @@ class Lidar:
         return {"frame_count": self.frame_count.clone(), "seeded": seeded, "track": track}
 
     def load_state_dict(self, state: dict) -> None:
-        """Resumes where ``state_dict`` was taken."""
+        """Resumes where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: It was taken of another number of environments.
+        """
+        if state["frame_count"].shape != self.frame_count.shape:
+            raise ValueError(
+                f"the state is of {len(state['frame_count'])} environments, this lidar has {self.scene.num_envs}"
+            )
         self.frame_count.copy_(state["frame_count"])
         if "seeded" in state:  # of the processes of one training all but the first go on with streams of their own
             self._noise_seed.copy_(state["seeded"][0])
@@ -453,6 +468,11 @@ def env_slices(num_envs: int, most: int) -> tuple[slice, ...]:
     count = -(-num_envs // most)
     edges = [num_envs * k // count for k in range(count + 1)]
     return tuple(slice(low, high) for low, high in itertools.pairwise(edges))
+
+
+def _require_whole(name: str, value: object, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name}={value!r} must be a whole number >= {least}")
 
 
 def _known_outputs(outputs: Sequence[str]) -> frozenset[str]:

@@ -44,12 +44,12 @@ def frame():
     return lidar.cast(0.1)
 
 
-def a_table(count=6):
+def a_table(count=6, frame="lidar_link", time_s=1234.5):
     rng = np.random.default_rng(1)
     columns = {axis: rng.normal(size=count).astype(np.float32) for axis in "xyz"}
     columns |= {"intensity": rng.random(count).astype(np.float32), "ring": np.arange(count, dtype=np.uint16)}
     columns["z"][2] = np.nan
-    return table_of(columns, "lidar_link", 1234.5)
+    return table_of(columns, frame, time_s)
 
 
 def test_a_frame_comes_back_as_it_was(frame, suffix, tmp_path):
@@ -72,6 +72,35 @@ def test_a_table_keeps_its_frame_and_time(suffix, tmp_path):
     assert set(back.names) == set(table.names) and len(back) == len(table)
     np.testing.assert_array_equal(back.points["ring"], np.arange(6))
     assert np.isnan(back.xyz).any(axis=1).tolist() == [False, False, True, False, False, False]
+
+
+@pytest.mark.parametrize("frame", ["", "lidar link  2", "-front-", "rückwärts 3.5"])
+def test_any_name_of_a_frame_comes_back(suffix, frame, tmp_path):
+    if suffix == ".las" and not frame.isascii():
+        pytest.skip("LAS knows ASCII only")
+    write_points(tmp_path / f"a{suffix}", a_table(frame=frame))
+    back = read_points(tmp_path / f"a{suffix}")
+    assert (back.frame, back.time_s) == (frame, 1234.5)
+
+
+@pytest.mark.parametrize("away", [0.0, 4.5e6])
+def test_points_in_the_coordinates_of_a_survey_come_back(suffix, away, tmp_path):
+    """Northings of UTM reach 10,000 km."""
+    columns = {axis: np.array([away - 1.25, np.nan, away + 700.5]) for axis in "xyz"}
+    write_points(tmp_path / f"a{suffix}", table_of(columns))
+    np.testing.assert_allclose(read_points(tmp_path / f"a{suffix}").points["x"], columns["x"], rtol=0.0, atol=1e-4)
+
+
+def test_a_cloud_too_wide_for_las_and_a_time_before_zero_are_refused(tmp_path):
+    pytest.importorskip("laspy")
+    pytest.importorskip("mcap_ros2")
+    wide = table_of({axis: np.array([0.0, 5e5]) for axis in "xyz"})
+    with pytest.raises(ValueError, match="within 429 km"):
+        write_points(tmp_path / "a.las", wide)
+    with pytest.raises(ValueError, match="time_s=-0.5"):
+        write_points(tmp_path / "a.mcap", a_table(time_s=-0.5))
+    with pytest.raises(ValueError, match="one line"):
+        a_table(frame="two\nlines")
 
 
 def test_a_binary_ply_is_what_its_description_says(tmp_path):

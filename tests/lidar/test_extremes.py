@@ -128,7 +128,8 @@ def test_a_direction_of_any_other_length_is_one(length):
             for field in ("body_pos", "body_quat")
             for value in (math.nan, math.inf, -math.inf)
         ),
-        *(("body_quat", [norm, 0.0, 0.0, 0.0]) for norm in (0.0, 1e-9)),
+        *(("body_quat", [norm, 0.0, 0.0, 0.0]) for norm in (0.0, 1e-9, 0.99e-6, 1.01e6, 1e30)),
+        *(("body_pos", [0.0, value, 0.0, 0.0]) for value in (1.01e15, -1e30)),
     ],
 )
 @every_shape
@@ -141,7 +142,7 @@ def test_a_body_without_a_pose_is_not_there(shape, field, value):
     assert scene.broken_poses().tolist() == [[False], [True]]
 
 
-@pytest.mark.parametrize("norm", [1e-3, 1 - 1e-3, 1 + 1e-3, 1e3])
+@pytest.mark.parametrize("norm", [1.01e-6, 1e-3, 1 - 1e-3, 1 + 1e-3, 1e3, 0.99e6])
 def test_a_quaternion_of_another_norm_is_normalised(norm):
     scene = RayScene([carried(BODIES[0])], num_envs=2, num_bodies=1)
     quat = torch.tensor([0.9, 0.1, -0.2, 0.3])

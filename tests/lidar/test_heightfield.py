@@ -183,3 +183,21 @@ def test_a_scan_hits_what_single_rays_hit(base, scale):
     assert same.float().mean() > 0.9998  # beside the others, rays that graze an edge
     normals_agree = (frame.normals_w - single.normals_w).abs().amax(-1) < 1e-3
     assert normals_agree.float().mean() > 0.999
+
+
+def test_a_field_keeps_its_heights_when_the_callers_array_is_filled_again():
+    heights = np.full((3, 3), 1.0, dtype=np.float32)
+    scene = RayScene([Shape(ShapeKind.HEIGHTFIELD, asset=HeightField(heights, 1.0, 1.0))], 1, 0)
+    heights[:] = 3.0
+    hits = scene.cast(np.array([[[0.1, 0.2, 10.0]]]), np.array([[[0.0, 0.0, -1.0]]]))
+    assert float(hits.ranges[0, 0]) == pytest.approx(9.0)
+
+
+def test_a_mesh_keeps_its_vertices_when_the_callers_array_is_filled_again():
+    vertices = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]], dtype=np.float32)
+    mesh = TriangleMesh(vertices, np.array([[0, 1, 2]]))
+    vertices[:, 2] = 3.0
+    hits = RayScene([Shape(ShapeKind.MESH, asset=mesh)], 1, 0).cast(
+        np.array([[[0.0, 0.0, 10.0]]]), np.array([[[0.0, 0.0, -1.0]]])
+    )
+    assert float(hits.ranges[0, 0]) == pytest.approx(10.0)

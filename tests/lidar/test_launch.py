@@ -1,5 +1,8 @@
 """How launches are divided among CPU threads."""
 
+import os
+import subprocess
+import sys
 import time
 
 import pytest
@@ -50,3 +53,24 @@ def test_compiling_is_said_once(monkeypatch, tmp_path, capfd):
         time.sleep(0.05)
     assert values.numpy().tolist() == [0, 1, 2]
     assert capfd.readouterr().err.count("compiling count_up for 0.01 s and more, once on this machine") == 1
+
+
+FORKED = """
+import os
+import numpy as np
+from omniperception.lidar import RayScene, Shape, ShapeKind
+scene = RayScene([Shape(ShapeKind.PLANE)], 64, 0, num_threads=2)
+origins, down = np.full((64, 2000, 3), [0.0, 0.0, 2.0]), np.full((64, 2000, 3), [0.0, 0.0, -1.0])
+scene.cast(origins, down)
+child = os.fork()
+if not child:
+    os._exit(int(scene.cast(origins, down).ranges[0, 0]))
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_process_casts_after_its_parent_did():
+    """A child has none of its parent's threads: loaders of data and vector environments fork."""
+    done = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, timeout=120)
+    assert done.stdout.split()[-1:] == ["2"], done.stderr

@@ -198,7 +198,7 @@ def test_a_reset_forgets_the_motion_of_its_environment_only():
     lidar.phase_rows.zero_()
     still.phase_rows.zero_()
     now = torch.full((2,), PERIOD, dtype=torch.float64)
-    for which in (None, torch.tensor([1])):
+    for which in (None, torch.tensor([1]), torch.tensor([1, 1])):
         scene.body_quat[:, 0] = yaw_quat(-0.5)
         lidar.cast(now)
         scene.body_quat[:, 0] = yaw_quat(0.5)

@@ -186,6 +186,23 @@ def test_mixed_pixels_lie_between_foreground_and_background_at_edges_only():
     assert torch.equal(edges(noise, seed=4).ranges, edges(noise, seed=9).ranges)  # a function of the scene alone
 
 
+def test_a_beam_is_mixed_whichever_other_rows_are_kept():
+    """Of a frame with every third row each ray measures what it does in the whole frame, from frame to frame."""
+    post, wall = Shape(ShapeKind.BOX, (0.01, 0.5, 2.0), pos=(3.01, 0.0, 0.0)), Shape(ShapeKind.PLANE, pos=(0, 0, -1))
+    scene = RayScene([post, wall], 2, 0, num_threads=2)
+    pattern, outputs = grid(160, 120, 60.0), ("ranges", "true_ranges", "row")
+    every, third = (
+        Lidar(LidarConfig(count, 1 / 30, 0.0, 30.0), pattern, scene, -1, noise=[MixedPixels(1.0)], outputs=outputs)
+        for count in (160 * 120, 160 * 120 // 7)
+    )
+    for frame in range(1, 3):
+        whole, part = every.cast(frame / 30), third.cast(frame / 30)
+        assert torch.equal(whole.row, torch.arange(160 * 120).expand(2, -1))
+        of_row = whole.ranges.gather(1, part.row.long())
+        assert torch.equal(part.ranges, of_row)
+        assert (part.ranges != part.true_ranges).sum() > 10
+
+
 def test_gaps_beyond_the_largest_are_two_echoes():
     frame = edges(MixedPixels(1.0, min_gap=1.0, max_gap=4.0))
     assert torch.equal(frame.ranges, frame.true_ranges)

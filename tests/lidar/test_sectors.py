@@ -80,3 +80,20 @@ def test_pitch_is_levelled_and_the_mount_offset_counts():
 def test_wrong_arguments_are_refused(option, value):
     with pytest.raises(ValueError, match=f"{option}=0"):
         sectors([(1.0, 0.0, 0.0)], [OBSTACLE], **{option: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [("directions_s", torch.zeros(2, 3, 3)), ("class_id", torch.zeros(2, 4, dtype=torch.int32))]
+)
+def test_other_numbers_of_rays_are_refused(name, given):
+    right = {"directions_s": torch.zeros(2, 5, 3), "class_id": torch.zeros(2, 5, dtype=torch.int32)}
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        sector_distances(
+            torch.ones(2, 5),
+            *(right | {name: given}).values(),
+            torch.tensor([UPRIGHT] * 2),
+            (0.0, 0.0, 0.0),
+            UPRIGHT,
+            obstacle_class=OBSTACLE,
+            max_distance=5.0,
+        )

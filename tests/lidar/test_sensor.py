@@ -5,6 +5,7 @@ import itertools
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from lidar_helpers import clock, closed_shapes, random_quats, rotate
@@ -142,7 +143,9 @@ def test_mount_published_for_the_go2_looks_forward_and_down():
         ({"mount_pos": (0.0, 0.0)}, "lidar.mount_pos"),
         ({"mount_quat": (1.0, 1.0, 0.0, 0.0)}, "lidar.mount_quat"),
         ({"mount_quat": (1.0, 0.0, 0.0, 0.0), "mount_rpy": (0.0, 0.0, 0.0)}, "both given"),
+        ({"num_rays": 100.0}, "lidar.num_rays=100.0 must be a whole number"),
         ({"motion_segments": -1}, "lidar.motion_segments=-1"),
+        ({"motion_segments": 2.0}, "lidar.motion_segments=2.0 must be a whole number"),
         ({"motion_jump": 0.0}, "lidar.motion_jump=0.0"),
     ],
 )
@@ -173,7 +176,12 @@ def test_wrong_sensors_are_refused(pattern, num_rays, body, options, message):
 
 @pytest.mark.parametrize(
     ("envs_at_once", "time", "message"),
-    [(None, torch.zeros(2), "float64"), (2, 0.1, "2 slices; use cast_slices, or envs_at_once=None")],
+    [
+        (None, torch.zeros(2), "float64"),
+        (2, 0.1, "2 slices; use cast_slices, or envs_at_once=None"),
+        (None, math.nan, "time_s=nan must be finite"),
+        (None, np.array([0.1, math.inf, 0.1]), "must be finite"),
+    ],
 )
 def test_wrong_casts_are_refused(pattern, envs_at_once, time, message):
     with pytest.raises(ValueError, match=message):
@@ -298,3 +306,37 @@ class TestEnvSlices:
                     )
             assert seen == [0, 1, 2, 3, 4]
         assert sliced.frame_count.tolist() == whole.frame_count.tolist() == [2] * 5
+
+
+@pytest.mark.parametrize(
+    ("env_ids", "seeds", "message"),
+    [
+        (torch.tensor([True, False, True]), None, "env_ids must be int64"),
+        (torch.tensor([0], dtype=torch.int32), None, "env_ids must be int64"),
+        (torch.tensor([[0]]), None, "env_ids must be int64"),
+        (torch.tensor([0, 1]), torch.tensor([5]), "one for each of 2"),
+        (None, torch.tensor([5]), "one for each of 3"),
+        (torch.tensor([0]), torch.tensor([5.0]), "seeds must be int64"),
+    ],
+)
+def test_wrong_resets_are_refused(pattern, env_ids, seeds, message):
+    lidar = Lidar(LidarConfig(100), pattern, RayScene([Shape(K.PLANE)], 3, 1), -1)
+    with pytest.raises(ValueError, match=message):
+        lidar.reset(env_ids, seeds)
+
+
+def test_a_reset_of_no_environment_changes_nothing(pattern):
+    lidar = Lidar(
+        LidarConfig(100, motion_segments=1), pattern, RayScene([Shape(K.PLANE)], 3, 1), -1, noise=[GaussianNoise()]
+    )
+    lidar.cast(0.1)
+    before = lidar.state_dict()
+    lidar.reset(torch.zeros(0, dtype=torch.int64))
+    lidar.reset(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64))
+    torch.testing.assert_close(lidar.state_dict(), before)
+
+
+def test_a_state_of_other_environments_is_refused(pattern):
+    one, three = (Lidar(LidarConfig(100), pattern, RayScene([Shape(K.PLANE)], n, 1), -1) for n in (1, 3))
+    with pytest.raises(ValueError, match="of 1 environments, this lidar has 3"):
+        three.load_state_dict(one.state_dict())

@@ -81,12 +81,13 @@ def read_points(path: str | Path, index: int = 0, topic: str | None = None) -> P
 def write_points(path: str | Path, table: PointTable) -> None:
     """Writes one frame; the suffix names the format: .pcd, .ply, .las, .npz or .mcap.
 
-    Coordinates that are not finite (misses) stay so, but in LAS, where they lie at the origin with the flag "withheld",
-    and come back as NaN. LAS keeps coordinates to 0.1 mm.
+    Coordinates that are not finite (misses) stay so, but in LAS, where they lie amid the others with the flag
+    "withheld", and come back as NaN. LAS keeps coordinates to 0.1 mm, and the time with the points: that of an empty
+    cloud is lost.
 
     Raises:
         ModuleNotFoundError: The library for this format is not installed.
-        ValueError: The format is unknown.
+        ValueError: The format is unknown, or cannot hold these points.
     """
     write_scans(path, [table])
 

@@ -41,14 +41,18 @@ def write(path: Path, table: PointTable) -> None:
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.system_identifier = np.full(3, SCALE), table.frame
+    xyz = table.xyz
+    missed = ~np.isfinite(xyz).all(axis=1)
+    seen = np.zeros((1, 3)) if missed.all() else xyz[~missed]
+    middle = np.round((seen.min(axis=0) + seen.max(axis=0)) / 2.0)
+    if np.abs(seen - middle).max() >= 2**31 * SCALE:
+        raise ValueError(f"{path}: LAS keeps points to {SCALE} m within 429 km; write these to another format")
+    header.scales, header.offsets, header.system_identifier = np.full(3, SCALE), middle, table.frame
     standard = {name.lower() for name in header.point_format.dimension_names}
     stored = {name: name + SUFFIX * (name.lower() in standard) for name in table.names if name not in ("x", "y", "z")}
     header.add_extra_dims([laspy.ExtraBytesParams(to, table.points.dtype[name]) for name, to in stored.items()])
     file = laspy.LasData(header)
-    xyz = table.xyz
-    missed = ~np.isfinite(xyz).all(axis=1)
-    file.xyz = np.where(missed[:, None], 0.0, xyz)
+    file.xyz = np.where(missed[:, None], middle, xyz)
     file.withheld = missed.astype(np.uint8)
     file.gps_time = np.full(len(table), table.time_s)
     for name, to in stored.items():

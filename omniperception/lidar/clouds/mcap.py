@@ -36,5 +36,7 @@ def write(path: Path, tables: Sequence[PointTable]) -> None:
     with path.open("wb") as file, Writer(file) as writer:
         schema = writer.register_msgdef(MESSAGE, DEFINITION)
         for table in tables:
+            if table.time_s < 0.0:
+                raise ValueError(f"{path}: MCAP keeps times from 0, and time_s={table.time_s} was given")
             now = round(table.time_s * 1e9)
             writer.write_message(TOPIC, schema, message_from_table(table), log_time=now, publish_time=now)

@@ -15,7 +15,7 @@ def read(path: Path) -> PointTable:
     from pypcd4 import PointCloud
 
     with path.open("rb") as file:
-        first = file.readline().decode("ascii", "replace").strip()
+        first = file.readline().decode("utf-8", "replace").rstrip("\r\n")
     try:
         cloud = PointCloud.from_path(path)
         points = np.empty(cloud.points, dtype=list(zip(cloud.fields, cloud.types, strict=True)))
@@ -23,8 +23,7 @@ def read(path: Path) -> PointTable:
             points[name] = cloud.pc_data[name]
     except Exception as error:  # pypcd4 raises whatever its parsing meets
         raise ValueError(f"{path} is not a PCD file: {str(error).splitlines()[0]}") from error
-    said = first.removeprefix(FIRST_LINE).split() if first.startswith(FIRST_LINE) else []
-    return PointTable(points, *((said[0].strip("-"), float(said[1])) if len(said) == 2 else ()))
+    return PointTable(points, *_said(first))
 
 
 def write(path: Path, table: PointTable) -> None:
@@ -37,3 +36,12 @@ def write(path: Path, table: PointTable) -> None:
     _, _, rest = path.read_bytes().partition(b"\n")
     said = f"{FIRST_LINE} {table.frame or '-'} {table.time_s!r}\n"
     path.write_bytes(said.encode() + rest)
+
+
+def _said(first: str) -> tuple[str, float] | tuple[()]:
+    """Frame and time of a first line that `write` wrote."""
+    frame, _, time_s = first.removeprefix(f"{FIRST_LINE} ").rpartition(" ")
+    try:
+        return ("" if frame == "-" else frame, float(time_s)) if first.startswith(f"{FIRST_LINE} ") and frame else ()
+    except ValueError:
+        return ()

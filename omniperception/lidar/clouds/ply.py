@@ -21,7 +21,8 @@ def read(path: Path) -> PointTable:
     """The vertices of a file, the first of its elements."""
     content = path.read_bytes()
     head, mark, body = content.partition(b"end_header")
-    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    texts = head.decode("utf-8", "replace").splitlines()
+    lines = [text.split() for text in texts]
     if not mark or lines[:1] != [["ply"]]:
         raise ValueError(f"{path} is not a PLY file: it does not begin with 'ply' and 'end_header'")
     order = next((line[1] for line in lines if line[:1] == ["format"]), "")
@@ -43,7 +44,8 @@ def read(path: Path) -> PointTable:
         points = np.frombuffer(body, dtype, min(count, len(body) // dtype.itemsize))
     if len(points) < count:
         raise ValueError(f"{path} ends after {len(points)} of {count} points")
-    said = {line[1]: line[2] for line in lines if line[:1] == ["comment"] and len(line) > 2}
+    comments = [text.removeprefix("comment ").partition(" ") for text in texts if text.startswith("comment ")]
+    said = {word: rest for word, _, rest in comments if rest}
     return PointTable(points, said.get(FRAME, ""), float(said.get(TIME, 0.0)))
 
 

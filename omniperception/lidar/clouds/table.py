@@ -27,6 +27,8 @@ class PointTable:
         missing = {"x", "y", "z"} - set(names)
         if missing:
             raise ValueError(f"points need columns x, y and z; there are {', '.join(names) or 'none'}")
+        if not self.frame.isprintable():
+            raise ValueError(f"frame={self.frame!r} must be a name in one line of printable characters")
 
     @property
     def xyz(self) -> np.ndarray:

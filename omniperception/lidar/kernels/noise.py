@@ -120,7 +120,7 @@ def jittered(d: wp.vec3, sigma: float, key: wp.uint32):
 
 @wp.func
 def beside(d: wp.vec3, radius: float, row: int):
-    """A direction across d by ``radius``, on a side that changes evenly from row to row."""
+    """A direction across d by ``radius``, on a side that changes evenly from row to row of the pattern."""
     bearing = GOLDEN_ANGLE * float(row % 4096)
     return deflected(d, radius * wp.vec2(wp.cos(bearing), wp.sin(bearing)))
 

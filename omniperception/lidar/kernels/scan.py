@@ -210,7 +210,8 @@ def scan_kernel(has: frozenset[str]) -> wp.Kernel:
             if wp.static(noisy):
                 if is_hit:
                     if wp.static("mixed" in has):
-                        second_d = beside(cast_d, noise.mixed_radius, at)
+                        side = (rays.first_row[env] + wp.int64(row)) % wp.int64(rays.num_rows)
+                        second_d = beside(cast_d, noise.mixed_radius, int(side))
                         second = search(geometry, slots, track, moment, env, -1, second_d, rays.max_range)
                         if second.slot >= 0 and second.t >= rays.min_range:
                             measured = mixed(noise, measured, second.t)
