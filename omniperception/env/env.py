@@ -181,6 +181,8 @@ class OmniEnv(VecEnv):
             self.random.seed(env_ids, seeds)
             if len(env_ids) == self.num_envs:
                 self.step_count = 0
+                if self.sensing is not None:
+                    self.sensing.lidar.reset()
         self._reset(env_ids, seeds, interrupted=True)
         self.healthy = ~self.sim.failed
         everybody = len(env_ids) == self.num_envs

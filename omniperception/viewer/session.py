@@ -294,7 +294,7 @@ class Session:
         if lidar is None or env.sensing is None:
             return
         if bool(env.done[0]):
-            lidar.reset(torch.zeros(1, dtype=torch.int64, device=env.device))
+            lidar.reset()
             self.cloud, self._tick = None, env.sensing.tick
             return
         sensor = env.config.lidar

@@ -61,6 +61,15 @@ def test_points_are_those_that_the_policy_is_given(session):
     assert distance == pytest.approx(given.ranges[0, hit].numpy(), abs=2e-5)
 
 
+def test_trials_end_anywhere_within_a_frame_of_several_segments():
+    session = Session(Shown(PRETRAINED / "avoider", (*OVERRIDES, "lidar.motion_segments=5")))
+    for steps in range(9, 16):  # a frame takes 5, a segment 1
+        session.reset()
+        for _ in range(steps):
+            session.step()
+        assert session.cloud is not None
+
+
 def test_an_obstacle_is_brought_seen_dragged_and_taken_away(session):
     field, base = session.env.obstacles, session.env.state.kinematics.base_pos_w[0, :2]
     session.drive((0.0, 0.0, 0.0))
