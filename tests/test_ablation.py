@@ -52,6 +52,23 @@ def test_a_row_for_each_arm_and_every_line_has_as_many_cells(tmp_path):
     assert study_table(records) == (tmp_path / "ablation.md").read_text()
 
 
+def test_the_worlds_of_a_suite_stand_in_one_table_first(tmp_path):
+    (tmp_path / "suite").mkdir()
+    (tmp_path / "suite" / "mine.yaml").write_text("worlds: {corridor: [flat], rod: [flat]}\n")
+    study = replace(STUDY, suite="mine", scenarios=[], arms={"alone": Arm(), "taught": Arm()})
+    ablation = Ablation(study, tmp_path, (f"hydra.searchpath=[file://{tmp_path}]",))
+    assert [(world.name, world.terrain) for world in ablation.worlds()] == [("corridor", "flat"), ("rod", "flat")]
+    for world in ("corridor", "rod"):
+        evaluated(ablation, arm="alone", world=world, terrain="flat")
+        evaluated(ablation, arm="taught", world=world, terrain="flat")
+    rows = [line.split("|") for line in write_tables(ablation).splitlines() if line.startswith("|")]
+    assert [cell.strip() for cell in rows[0][1:-1]] == ["world", "alone/fps_gru", "taught/fps_gru"]
+    assert [row[1].strip() for row in rows[2:5]] == ["corridor", "rod", "all 2"]
+    assert [cell.strip() for cell in rows[4][2:-1]] == ["50.0 [15.0, 85.0]"] * 2  # 2 of 4 trials
+    with pytest.raises(ConfigError, match="suite=held is unknown; did you mean held_out"):
+        Ablation(replace(STUDY, suite="held", scenarios=[]), tmp_path)
+
+
 @pytest.mark.parametrize(
     "given", [{"trials": 1}, {"condition": "robot"}, {"split": "test"}, {"weights": "0f"}], ids=str
 )
@@ -71,6 +88,8 @@ def test_results_of_other_evaluations_are_not_in_the_table(tmp_path, given):
         ({"arms": {"taught": Arm(after="lesson"), "lesson": Arm()}}, "after=lesson must be an arm before it"),
         ({"split": "tests"}, "split=tests is unknown; did you mean test"),
         ({"policies": ["blinded"]}, "policies=blinded is unknown; did you mean blind"),
+        ({"suite": "held_out"}, "either scenarios or a suite, got scenarios=corridor and suite=held_out"),
+        ({"scenarios": []}, "either scenarios or a suite, got neither"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )

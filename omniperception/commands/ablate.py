@@ -38,6 +38,7 @@ class Arguments:
     variants: tuple[str, ...] | None = argument(None, "perception variants")
     seeds: tuple[int, ...] | None = argument(None, "seeds; each variant is trained with each", least=0)
     scenarios: tuple[str, ...] | None = argument(None, "where they are evaluated; all: those of the held-out suite")
+    suite: str | None = argument(None, "file of conf/suite, such as held_out, in place of scenarios")
     conditions: tuple[str, ...] | None = argument(None, "presets of conf/condition")
     policies: tuple[str, ...] | None = argument(None, "policies, as of evaluate", choices=tuple(POLICIES))
     split: str | None = argument(None, "obstacles and seeds for choosing, or for reporting", choices=SPLITS)
@@ -45,12 +46,14 @@ class Arguments:
     trust: tuple[str, ...] = trust()
 
 
-_OF_THE_STUDY = ("experiment", "variants", "seeds", "scenarios", "conditions", "policies", "split", "trials")
+_OF_THE_STUDY = ("experiment", "variants", "seeds", "scenarios", "suite", "conditions", "policies", "split", "trials")
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Runs the stages of the study."""
     given = {name: value for name in _OF_THE_STUDY if (value := getattr(arguments, name)) is not None}
+    if ("suite" in given) != ("scenarios" in given):  # one takes the place of the other
+        given = {"suite": None, "scenarios": ()} | given
     study = replace(load_study(arguments.study, config.search_path(overrides)), **given)
     if arguments.arms is not None:
         study = _with_arms(study, arguments.arms)

@@ -14,7 +14,17 @@ from omniperception import config
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record, read, write
 from omniperception.evaluation.study_report import study_table
-from omniperception.evaluation.suite import POLICIES, SPLITS, Evaluation, Task, World, held_out_scenarios, measure_all
+from omniperception.evaluation.suite import (
+    POLICIES,
+    SPLITS,
+    Evaluation,
+    Task,
+    World,
+    held_out_scenarios,
+    measure_all,
+    suite_worlds,
+)
+from omniperception.evaluation.tables import by_training
 
 _NO_PROXIMAL = ("perception.height_weight=0", "perception.sampler.num_proximal=0", "perception.network.proximal_dim=0")
 _NO_DISTAL = ("perception.sampler.num_distal=0", "perception.network.distal_dim=0")
@@ -50,7 +60,8 @@ class Study:
         experiment: the recipe that all trainings share.
         variants: perception presets, or names from VARIANTS.
         seeds: one run of each variant and arm for each.
-        scenarios: names from conf/scenario, on their own terrain.
+        scenarios: names from conf/scenario, on their own terrain; none where there is a suite.
+        suite: file of conf/suite, whose worlds take the place of scenarios.
         trials: of each run in each scenario.
         arms: ways of training by name; one that begins with the weights of another stands behind it.
         conditions: presets of `condition`.
@@ -61,8 +72,9 @@ class Study:
     experiment: str
     variants: Sequence[str]
     seeds: Sequence[int]
-    scenarios: Sequence[str]
     trials: int
+    scenarios: Sequence[str] = ()
+    suite: str | None = None
     arms: Mapping[str, Arm] = field(default_factory=lambda: {"own": Arm()})
     conditions: Sequence[str] = ("ideal",)
     policies: Sequence[str] = ("run",)
@@ -71,6 +83,9 @@ class Study:
     def __post_init__(self) -> None:
         if len(set(self.seeds)) < len(self.seeds):
             raise ConfigError(f"seeds={','.join(map(str, self.seeds))} names one twice; each is one run")
+        if bool(self.scenarios) == (self.suite is not None):
+            given = f"scenarios={','.join(self.scenarios)} and suite={self.suite}" if self.suite else "neither"
+            raise ConfigError(f"a study has either scenarios or a suite, got {given}")
         before: set[str] = set()
         for name, arm in self.arms.items():
             if arm.after is not None and arm.after not in before:
@@ -121,6 +136,8 @@ class Ablation:
         for scenario in self.study.scenarios:
             if scenario not in (known := (*config.presets("scenario", folders), "all")):
                 raise ConfigError(f"scenarios={scenario} is unknown; {config.suggest(scenario, known)}")
+        if self.study.suite is not None:
+            suite_worlds(self.study.suite, folders)
         for override in config.parse(self.overrides):
             if override.key_or_group in ("experiment", "perception", "seed"):
                 raise ConfigError(f"{override.input_line}: give study=, variants= and seeds= instead")
@@ -136,6 +153,8 @@ class Ablation:
                     yield self.run_dir(arm, variant, seed)
 
     def worlds(self) -> list[World]:
+        if self.study.suite is not None:
+            return suite_worlds(self.study.suite, config.search_path(self.overrides))
         names = self.study.scenarios
         return [World(name) for name in (held_out_scenarios() if list(names) == ["all"] else names)]
 
@@ -221,12 +240,16 @@ def evaluate_all(ablation: Ablation) -> None:
 def write_tables(ablation: Ablation) -> str:
     """Writes the results, trial by trial, and ablation.md into the study's folder; the latter's text.
 
+    Of a suite's many worlds it has a table of all of them first.
+
     Raises:
         ConfigError: a run has not been evaluated in a scenario with its newest checkpoint.
     """
     tasks = [task for evaluation in _evaluations(ablation) for task in evaluation.tasks()]
     records = [replace(_found(task), run=str(task.run_dir.relative_to(ablation.out))) for task in tasks]
     text = study_table(records)
+    if ablation.study.suite is not None:
+        text = f"{by_training(records)}\n\n{text}"
     write(ablation.out / RESULTS, records)
     (ablation.out / "ablation.md").write_text(text)
     return text

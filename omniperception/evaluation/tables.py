@@ -5,6 +5,7 @@
 <!-- table: before view=worlds policy=run -->                   the same with a column for each condition
 <!-- table: before view=conditions policy=run,blind -->         untouched and falls: a row for each policy
 <!-- table: avoider,robots view=trained condition=robot -->     the same: a row for each run, a column for each policy
+<!-- table: avoider,ppo view=trainings condition=robot -->      the same: a row for each world, a column for a training
 <!-- table: gait view=walking -->                              figures of a gait: a row for each ground
 <!-- table: gait view=levels -->                               the same, all kinds of ground together
 <!-- table: gait,robots view=runs -->                          the same, a row for each run
@@ -112,6 +113,30 @@ def by_run(records: Sequence[Record]) -> str:
     return _over_worlds(records, "run", "policy", [policy for (policy,) in grouped(records, "policy")])
 
 
+def by_training(records: Sequence[Record]) -> str:
+    """How often each training, its seeds together, arrived untouched: a row for each world, and one for all of them.
+
+    A run in a folder seed<n> is one of the training that the folder above it names, any other its own.
+    """
+    trainings = list(dict.fromkeys(_training(record) for record in records))
+    rows = []
+    for key, here in sorted(grouped(records, "terrain", "condition", "policy").items()):
+        of_each = [[record for record in here if _training(record) == training] for training in trainings]
+        worlds = sorted({record.world for record in here})
+        for world in worlds:
+            rows.append([world, *key, *(_untouched([r for r in theirs if r.world == world]) for theirs in of_each)])
+        everywhere = [theirs if {r.world for r in theirs} == set(worlds) else [] for theirs in of_each]
+        if len(worlds) > 1:
+            rows.append([f"all {len(worlds)}", *key, *(_untouched(theirs) for theirs in everywhere)])
+    keys = ["world", "terrain", "condition", "policy"]
+    return _titled(records, "reached, untouched and without a fall, %", keys, trainings, rows)
+
+
+def _training(record: Record) -> str:
+    run = Path(record.run)
+    return str(run.parent if re.fullmatch(r"seed\d+", run.name) else run)
+
+
 def _over_worlds(records: Sequence[Record], row: str, column: str, columns: list[str]) -> str:
     rows = []
     for (name,), theirs in grouped(records, row).items():
@@ -133,6 +158,7 @@ VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
     "worlds": by_world,
     "conditions": by_condition,
     "trained": by_run,
+    "trainings": by_training,
     "walking": walking_table,
     "levels": level_table,
     "runs": run_table,
@@ -160,7 +186,8 @@ def _changed(commit: str | None) -> str:
 
 
 def _untouched(records: Sequence[Record]) -> str:
-    return rate_cell([record.episodes.clean for record in records]) if records else "–"
+    by_run = grouped(records, "run").values()
+    return rate_cell([torch.cat([record.episodes.clean for record in run]) for run in by_run]) if records else "–"
 
 
 def _titled(
