@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from tensordict import TensorDict
 
 from omniperception import build, config
 from omniperception.common.errors import ConfigError
+from omniperception.common.random import MOST_SEEDS
 from omniperception.env.env import MAX_ACTION, OmniEnv
 
 if TYPE_CHECKING:
@@ -85,7 +87,8 @@ class OmniVectorEnv:
         env_ids = self._chosen(options.get("reset_mask"))
         if seed is not None:
             seeds, given = self._seeds(seed, env_ids)
-            self.env.reset(env_ids[given], seeds)
+            if len(seeds):
+                self.env.reset(env_ids[given], seeds)
             env_ids = env_ids[~given]
         if len(env_ids) and not self._is_fresh:
             self.env.reset(env_ids)
@@ -128,12 +131,15 @@ class OmniVectorEnv:
 
     def _seeds(self, seed: int | Sequence[int | None], env_ids: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Seeds (m,) of those of environments (n,) that get one, and which do (n,) bool."""
-        many = [seed + k for k in range(self.num_envs)] if isinstance(seed, int) else list(seed)
-        if len(many) != self.num_envs or any(one is not None and one < 0 for one in many):
-            raise ConfigError(f"seed={seed} must be a number >= 0, or {self.num_envs} of them or None")
+        many = [seed + k for k in range(self.num_envs)] if isinstance(seed, Integral) else list(seed)
+        if len(many) != self.num_envs or not all(one is None or _is_seed(one) for one in many):
+            raise ConfigError(
+                f"seed={seed} must be a whole number from 0 to {MOST_SEEDS - 1}, or {self.num_envs} of them or None"
+            )
         chosen = [many[k] for k in env_ids.tolist()]
         given = torch.tensor([one is not None for one in chosen], device=env_ids.device)
-        return torch.tensor([one for one in chosen if one is not None], device=env_ids.device), given
+        seeds = [int(one) for one in chosen if one is not None]
+        return torch.tensor(seeds, dtype=torch.int64, device=env_ids.device), given
 
     def _space(self, observations: TensorDict) -> gymnasium.Space:
         """Space of one environment's observation."""
@@ -272,6 +278,10 @@ def _box(values: torch.Tensor, most: int | None = None) -> gymnasium.spaces.Box:
     low, high = (-np.inf, np.inf) if most is None else (0, most)
     dtype = np.dtype(str(values.dtype).removeprefix("torch."))
     return Box(low, high, tuple(values.shape[1:]), dtype.type)
+
+
+def _is_seed(value: object) -> bool:
+    return isinstance(value, Integral) and 0 <= value < MOST_SEEDS
 
 
 def _first(observations: Observation) -> Observation:

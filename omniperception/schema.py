@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import importlib
 import inspect
+import math
 import sys
 import types
 import typing
@@ -89,6 +90,9 @@ NAMES: dict[str, Kind] = {
 }
 """Names allowed, by key; `*` is any one name."""
 
+_UNBOUNDED = ("lidar.max_range", "lidar.motion_jump", "rewards.terms.*.most")
+"""Keys that may be infinite; none may be NaN."""
+
 
 def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -> Any:
     """Builds the object of a value of a configuration.
@@ -117,6 +121,8 @@ def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -
                 return call(option, arguments(option, value, key, trust), key)
     if not _fits(value, hint):
         raise DoesNotFit(f"{key}={_shown(value)} must be {_expected(hint)}")
+    if not _is_finite(value, any(fnmatchcase(key, place) for place in _UNBOUNDED)):
+        raise DoesNotFit(f"{key}={_shown(value)} must be finite")
     return tuple(make(Any, item, key, trust) for item in value) if isinstance(value, list) else value
 
 
@@ -292,6 +298,13 @@ def _fits(value: object, hint: Any) -> bool:
         hints = list(args) if origin is tuple and args[-1] is not Ellipsis else [args[0]] * len(value)
         return len(value) == len(hints) and all(map(_fits, value, hints))
     return hint in _WORDS and isinstance(value, hint)
+
+
+def _is_finite(value: object, or_infinite: bool) -> bool:
+    """Tell whether no number of a value is NaN, nor, unless it may be, infinite."""
+    if isinstance(value, (list, tuple)):
+        return all(_is_finite(item, or_infinite) for item in value)
+    return not isinstance(value, float) or math.isfinite(value) or (or_infinite and math.isinf(value))
 
 
 def _expected(hint: Any) -> str:

@@ -128,7 +128,9 @@ def test_tensors_stay_where_they_are():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda env: env.reset(seed=[1]), r"seed=\[1\] must be a number >= 0, or 2 of them"),
+        (lambda env: env.reset(seed=[1]), r"seed=\[1\] must be a whole number from 0 to 4294967295, or 2 of"),
+        (lambda env: env.reset(seed=[1.5, 2]), r"seed=\[1.5, 2\] must be a whole number from 0"),
+        (lambda env: env.reset(seed=2**64), "seed=18446744073709551616 must be a whole number from 0"),
         (lambda env: env.reset(options={"mask": 1}), r"options=\['mask'\] is unknown; known: reset_mask"),
         (lambda env: env.reset(options={"reset_mask": [True]}), r"reset_mask must be \(2,\) bool"),
         (lambda env: env.step(np.zeros((2, 3))), r"actions: shape \(2, 12\) was expected, \(2, 3\) given"),
@@ -145,6 +147,14 @@ def test_wrong_calls_get_one_line(vector_of_two, call, message):
 @pytest.fixture(scope="module")
 def vector_with_lidar():
     return lambda *overrides: omniperception.make(*WITH_LIDAR, *overrides, num_envs=3)
+
+
+def test_seeds_are_numbers_of_any_kind_or_none(vector_of_two):
+    first, _ = vector_of_two.reset(seed=3)
+    assert np.array_equal(vector_of_two.reset(seed=np.int64(3))[0], first)
+    assert np.array_equal(vector_of_two.reset(seed=np.array([3, 4]))[0], first)
+    again, _ = vector_of_two.reset(seed=[None, None])
+    assert not np.array_equal(again, first)
 
 
 def test_one_robot_takes_no_options():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
+from omniperception.common.random import MOST_SEEDS
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mdp.terminations import TerminationsConfig
@@ -85,6 +86,13 @@ class EnvConfig:
     def __post_init__(self) -> None:
         if self.num_envs < 1:
             raise ValueError(f"num_envs={self.num_envs} must be at least 1")
+        if not 0 <= self.seed < MOST_SEEDS:
+            raise ValueError(f"seed={self.seed} must lie in 0 to {MOST_SEEDS - 1}")
+        if round(self.terminations.episode_length_s / self.sim.control_dt) < 1:
+            raise ValueError(
+                f"terminations.episode_length_s={self.terminations.episode_length_s:g} is less than a control step of"
+                f" {self.sim.control_dt:g} s"
+            )
         gait, period = self.robot.gait, self.sim.control_dt
         if gait is not None and gait.frequency * period > _MOST_STEPS:
             raise ValueError(

@@ -272,7 +272,7 @@ class OmniEnv(VecEnv):
         """Tell whether environments end, and why, each for the first reason that applies."""
         state, config = self.state, self.config.terminations
         never = torch.zeros_like(self.healthy)
-        reached = self.command.reached(state.kinematics)
+        reached = self.command.reached(state.kinematics, state.time_s)
         timed_out = self.episode_length_buf >= self.max_episode_length
         if self.ground is not None:
             timed_out |= self.ground.outside(state.kinematics.base_pos_w[:, :2])

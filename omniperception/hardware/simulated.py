@@ -314,9 +314,10 @@ class SimulatedRobot:
         kinematics = env.state.kinematics
         if self.up_since is not None:
             env.command.advance(CONTROL_STEPS * STEP_S, kinematics)
-            reached = env.command.reached(kinematics)
+            walking_s = self.time_s - self.up_since
+            reached = env.command.reached(kinematics, walking_s)
             if reached is not None and reached[0] and not self.outcome.reached:
-                self.outcome.reached, self.outcome.reached_s = True, self.time_s - self.up_since
+                self.outcome.reached, self.outcome.reached_s = True, walking_s
         if port is None:
             return
         words = " ".join(f"{value:.6f}" for value in env.command.value[0].tolist())

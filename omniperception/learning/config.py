@@ -129,8 +129,8 @@ class PPOConfig:
             CPU, on a GPU not.
         critic_warmup: iterations at the beginning in which only the critic learns, for a policy that starts from
             another run's weights (init=): advantages by a critic that knows nothing destroy it.
-        final_entropy_coef: entropy_coef at the last iteration, to which it changes evenly; None: it stays as it is.
-        final_desired_kl: desired_kl at the last iteration, likewise: smaller steps at the end.
+        final_entropy_coef: what entropy_coef changes to, linearly, until max_iterations; None: it stays as it is.
+        final_desired_kl: what desired_kl changes to, likewise: smaller steps at the end.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
         The others are rsl_rl's PPO arguments.
     """
@@ -173,9 +173,11 @@ class PPOConfig:
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be at least 1")
-        for name in ("num_learning_epochs", "critic_warmup"):
-            if getattr(self, name) < 0:
+        for name in ("num_learning_epochs", "critic_warmup", "value_loss_coef", "entropy_coef", "final_entropy_coef"):
+            if (getattr(self, name) or 0) < 0:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must not be negative")
+        if not self.hidden_dims or min(self.hidden_dims) < 1:
+            raise ValueError(f"ppo.hidden_dims={list(self.hidden_dims)} must be widths of hidden layers, one or more")
         for name in ("clip_param", "learning_rate", "max_grad_norm", "init_std", "desired_kl"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive")

@@ -80,6 +80,8 @@ class MazeLayout:
                 f"obstacles: a maze has 2 columns or more and an odd number of rows, not columns={self.columns}"
                 f" rows={self.rows}"
             )
+        if not self.cell > self.thickness[1]:
+            raise ValueError(f"obstacles: cell={self.cell} of a maze must be wider than its walls are thick")
         if any(not 0 <= lane < self.columns for lane in self.lanes):
             raise ValueError(f"obstacles: lanes={list(self.lanes)} of a maze must lie in 0 to {self.columns - 1}")
         _check_not_negative(self, "depth")

@@ -91,7 +91,7 @@ class TestGoal:
         n, device = len(positions), torch.device("cpu")
         command = config.build(n, device, EnvRandom(0, n, device))
         command.reset(torch.arange(len(positions)), kinematics)
-        return command.value, command.reached(kinematics)
+        return command.value, command.reached(kinematics, 0.0)
 
     def test_points_to_the_goal_in_the_base_frame(self):
         value, _ = self.command([[0.0, 0.0], [0.0, 0.0], [0.0, 11.0]], [0.0, math.pi / 2, 0.0])
@@ -148,11 +148,18 @@ class TestGoal:
         assert command.value[0].tolist() == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
         assert command.value[1, 2].item() == pytest.approx(0.6 * -1.0)  # 2 * 0.5 rad, at 0.6 of 1 m
         assert command.value[2].tolist() == pytest.approx([0.8, 0.0, 0.0], abs=1e-6)
-        for expected in (False, False, True):
-            command.advance(0.02, kinematics)
-            assert command.reached(kinematics).tolist() == [expected, False, False]
-        command.reset(torch.tensor([0]), kinematics)
-        assert not command.reached(kinematics).any()
+        for time_s, expected in ((0.02, False), (0.04, False), (0.06, True)):
+            assert command.reached(kinematics, torch.full((3,), time_s)).tolist() == [expected, False, False]
+
+    def test_a_place_is_held_for_as_many_steps_as_its_time_takes(self, make_env):
+        """1 s of steps of 0.02 s, in an episode that is as long."""
+        given = ("commands.goal_x=[0,0]", "commands.goal_y=[0,0]", "commands.radius=50", "commands.hold_s=1.0")
+        env = make_env("scenario=hold", *given, "terminations.episode_length_s=1.0", num_envs=2)
+        steps = 0
+        while not bool(env.done.any()):
+            env.step(torch.zeros(2, env.num_actions))
+            steps += 1
+        assert steps == 50 and bool(env.outcomes["goal"].all())
 
     @pytest.mark.parametrize(
         ("settings", "message"),

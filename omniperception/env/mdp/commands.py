@@ -149,14 +149,15 @@ class Command(Protocol):
 
     def advance(self, dt: float, kinematics: Kinematics) -> None: ...
 
-    def reached(self, kinematics: Kinematics) -> torch.Tensor | None:
-        """(num_envs,) bool whether the goal is reached, or None for commands without one."""
+    def reached(self, kinematics: Kinematics, time_s: torch.Tensor | float) -> torch.Tensor | None:
+        """(num_envs,) bool whether the goal is reached time_s (num_envs,) after an episode's begin; None without one."""
 
     def state_dict(self) -> dict: ...
 
     def load_state_dict(self, state: dict) -> None: ...
 
 
+_ROUNDING_S = 1e-3  # of times that are sums or products of control steps
 SETTLE_S = 0.5
 """Time (s) after a new command from which on a robot is held to it."""
 
@@ -191,7 +192,7 @@ class VelocityCommand:
         if len(expired):
             self._draw(expired)
 
-    def reached(self, kinematics: Kinematics) -> None:
+    def reached(self, kinematics: Kinematics, time_s: torch.Tensor | float) -> None:
         return None
 
     def state_dict(self) -> dict:
@@ -234,7 +235,6 @@ class GoalCommand:
         self.config = config
         self.value = torch.zeros(num_envs, 3, device=device)
         self.goal_w = torch.zeros(num_envs, 2, device=device)
-        self.elapsed = torch.zeros(num_envs, device=device)
         self.route_w: torch.Tensor | None = None
         self.along = torch.zeros(num_envs, 1, device=device)
         self.progress = torch.zeros(num_envs, device=device)
@@ -245,7 +245,6 @@ class GoalCommand:
 
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
         self.goal_w[env_ids] = self._low + self._random.uniform(env_ids, (2,)) * (self._high - self._low)
-        self.elapsed.index_fill_(0, env_ids, 0.0)
         self._steer(kinematics)
 
     def follow(self, env_ids: torch.Tensor, route: torch.Tensor, kinematics: Kinematics) -> None:
@@ -265,7 +264,6 @@ class GoalCommand:
         return self.along[:, -1] + self._distance(kinematics, self.route_w[:, 0])
 
     def advance(self, dt: float, kinematics: Kinematics) -> None:
-        self.elapsed += dt
         if self.route_w is not None:
             distance = (self.route_w - kinematics.base_pos_w[:, None, :2]).norm(dim=-1)
             on = self.along - self.progress[:, None]
@@ -294,24 +292,23 @@ class GoalCommand:
         if config.slow_within > 0:
             self.value *= (self._distance(kinematics, self.goal_w) / config.slow_within).clamp(max=1.0)[:, None]
 
-    def reached(self, kinematics: Kinematics) -> torch.Tensor:
+    def reached(self, kinematics: Kinematics, time_s: torch.Tensor | float) -> torch.Tensor:
         if self.config.radius is None:
             return kinematics.base_pos_w[:, 0] >= self.goal_w[:, 0]
         near = self._distance(kinematics, self.goal_w) <= self.config.radius
-        return near & (self.elapsed >= self.config.hold_s) if self.config.hold_s > 0 else near
+        return near & (time_s >= self.config.hold_s - _ROUNDING_S) if self.config.hold_s > 0 else near
 
     def _distance(self, kinematics: Kinematics, point_w: torch.Tensor) -> torch.Tensor:
         """(num_envs,) m, horizontal, from the bases to points (num_envs, 2)."""
         return (point_w - kinematics.base_pos_w[:, :2]).norm(dim=1)
 
     def state_dict(self) -> dict:
-        names = ("value", "goal_w", "elapsed", *(() if self.route_w is None else ("route_w", "progress")))
+        names = ("value", "goal_w", *(() if self.route_w is None else ("route_w", "progress")))
         return {name: getattr(self, name).clone() for name in names}
 
     def load_state_dict(self, state: dict) -> None:
         self.value.copy_(state["value"])
         self.goal_w.copy_(state["goal_w"])
-        self.elapsed.copy_(state["elapsed"])
         if "route_w" in state:
             self.route_w, self.progress = state["route_w"].clone(), state["progress"].clone()
             self.along = _along(self.route_w)

@@ -195,6 +195,8 @@ class RandomizationConfig:
             if len(value) != 2 or not -math.inf < value[0] <= value[1] < math.inf:
                 raise ValueError(f"randomization.{item.name}={list(value)} must be [low, high] or null")
             object.__setattr__(self, item.name, (float(value[0]), float(value[1])))
+        if len(self.payload_position) != 3:
+            raise ValueError(f"randomization.payload_position={list(self.payload_position)} must be [x, y, z]")
         for name in _NEVER_NEGATIVE:
             value = getattr(self, name)
             if value is not None and value[0] < 0:
