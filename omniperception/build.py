@@ -75,6 +75,18 @@ class RunConfig:
                 f"{given} is a beginning of a policy's learning, and ppo.num_learning_epochs=0 keeps it as it is; leave"
                 " one of them out"
             )
+        read_out = supervised_velocity(self.perception)
+        if self.env.observations.estimated is not None and self.ppo.num_learning_epochs > 0 and read_out is not None:
+            raise ValueError(
+                f"observations.estimated: estimates would be fitted to the command without the avoidance velocity that"
+                f" perception.{read_out} adds to it; set that to 0, or ppo.num_learning_epochs to 0"
+            )
+
+
+def supervised_velocity(perception: PerceptionConfig | None) -> str | None:
+    """The weight that makes a policy add an avoidance velocity to its command."""
+    names = ("avoidance_weight", "motion_weight")
+    return next((name for name in names if perception is not None and getattr(perception, name) > 0), None)
 
 
 _TASK = (

@@ -131,7 +131,9 @@ class OmniVectorEnv:
 
     def _seeds(self, seed: int | Sequence[int | None], env_ids: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Seeds (m,) of those of environments (n,) that get one, and which do (n,) bool."""
-        many = [seed + k for k in range(self.num_envs)] if isinstance(seed, Integral) else list(seed)
+        if isinstance(seed, Integral):
+            seed = int(seed)
+        many: list = [seed + k for k in range(self.num_envs)] if isinstance(seed, int) else list(seed)
         if len(many) != self.num_envs or not all(one is None or _is_seed(one) for one in many):
             raise ConfigError(
                 f"seed={seed} must be a whole number from 0 to {MOST_SEEDS - 1}, or {self.num_envs} of them or None"
@@ -281,7 +283,7 @@ def _box(values: torch.Tensor, most: int | None = None) -> gymnasium.spaces.Box:
 
 
 def _is_seed(value: object) -> bool:
-    return isinstance(value, Integral) and 0 <= value < MOST_SEEDS
+    return isinstance(value, Integral) and 0 <= int(value) < MOST_SEEDS
 
 
 def _first(observations: Observation) -> Observation:

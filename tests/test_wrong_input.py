@@ -78,6 +78,8 @@ LINES = [
     ("train +observations.groups.proprioception.terms.smell={}", "smell"),
     ("train +obstacles.groups.box={kind:cone,count:1,size:[[1,1]]}", "cone"),
     ("train seed.x=3", "seed.x=3"),
+    ("train experiment=quickstart observations=gait_without_velocity", "estimates would be fitted to the command"),
+    ("train experiment=avoid observations.groups.command.history=3", "observations.groups.command.history=3: an avoid"),
     # values of another type
     ("train seed=-1", "seed=-1 must lie in 0 to 4294967295"),
     ("train seed=20000000000000", "seed=20000000000000 must lie in 0 to 4294967295"),

@@ -137,8 +137,7 @@ def learn(
         if run.init:
             _check_motion(OmegaConf.create(run.composed), run.init[-1])
             given = [config.find_run(name, "init") for name in run.init]
-            others = run.env.observations.estimated is not None or runner.observes_more_than(given[-1])
-            observed = build.load_run(given[-1], trust=trust).env.observations if others else None
+            observed = build.load_run(given[-1], trust=trust).env.observations
             for source in runner.start_from(*given, observations=observed):
                 _report_other_inputs(OmegaConf.create(run.composed), source)
         report(f"run directory: {run_dir}")

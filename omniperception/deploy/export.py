@@ -41,6 +41,7 @@ from omniperception.env.mdp.commands import VelocityCommandConfig
 from omniperception.env.sensing import SensorConfig
 from omniperception.learning.checkpoint import load_checkpoint
 from omniperception.learning.config import PerceptionConfig
+from omniperception.learning.estimator import estimates_velocity
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.read_out import MotionReadOut
 from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler, StandingSampler
@@ -205,8 +206,7 @@ def _estimated(run: RunConfig) -> tuple[str, ...]:
     group = run.env.observations.estimated
     if group is None:
         return ()
-    terms = list(run.env.observations.groups[group].terms.values())
-    if terms != [observations.true_base_lin_vel] or run.env.observations.groups[group].history != 1:
+    if not estimates_velocity(run.env.observations):
         raise ConfigError(f"observations.estimated={group} cannot be exported: it must be true_base_lin_vel alone")
     return ("base_lin_vel",)
 

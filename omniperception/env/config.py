@@ -118,6 +118,12 @@ class EnvConfig:
                 "randomization.lidar_device needs a sensor whose maker states its noise, but lidar.device is null; name"
                 " the device, or use randomization=lidar"
             )
+        command = self.observations.groups.get("command")
+        if {AVOIDANCE_TARGET, MOTION_TARGET} & set(self.targets) and command is not None and command.history != 1:
+            raise ValueError(
+                f"observations.groups.command.history={command.history}: an avoidance velocity is added to the command"
+                " of the present; use 1, or perception.avoidance_weight=0 and motion_weight=0"
+            )
         self._check_measured_noise()
         if self.base_motion and self.lidar is not None and self.lidar.mount_body is not None:
             raise ValueError(

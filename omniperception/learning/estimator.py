@@ -10,6 +10,9 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP, HiddenState
 from tensordict import TensorDict
 
+from omniperception.env.mdp.observations import true_base_lin_vel
+from omniperception.env.mdp.terms import ObservationsConfig
+
 
 @dataclass(frozen=True)
 class EstimatorConfig:
@@ -22,6 +25,14 @@ class EstimatorConfig:
 
     group: str
     hidden_dims: Sequence[int] = (128, 64)
+
+
+def estimates_velocity(observations: ObservationsConfig) -> bool:
+    """Tell whether what a policy estimates is the base's linear velocity, alone and of the present."""
+    if observations.estimated is None:
+        return False
+    group = observations.groups[observations.estimated]
+    return list(group.terms.values()) == [true_base_lin_vel] and group.history == 1
 
 
 class EstimatingModel(MLPModel):

@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from tensordict import TensorDict
 
 from omniperception.common.errors import one_line
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.terms import ObservationsConfig
+from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
     CheckpointError,
@@ -31,9 +31,10 @@ from omniperception.learning.checkpoint import (
 )
 from omniperception.learning.config import LearningConfig
 from omniperception.learning.divergence import TrainingDiverged
+from omniperception.learning.estimator import estimates_velocity
 from omniperception.learning.logger import Logger
 from omniperception.learning.ppo import PerceptivePpo
-from omniperception.learning.warm_start import estimating, observes_more, observing_more, perceive_as, start_from
+from omniperception.learning.warm_start import estimating, observing_more, perceive_as, start_from
 
 
 class Runner:
@@ -69,7 +70,7 @@ class Runner:
         self.env, self.config, self.device = env, config, device
         self.alg = PerceptivePpo.build(env, config, device, distributed.multi_gpu())
         self.alg.use_mixed_precision = distributed.of_first(self.alg.use_mixed_precision)  # it may be a measurement
-        if config.estimator is not None:
+        if config.estimator is not None and estimates_velocity(env.config.observations):
             actor = self.alg.actor
             env.state.measure_velocity_by(lambda: actor.estimate)
         log_dir = Path(log_dir) if log_dir is not None and distributed.rank() == 0 else None
@@ -183,33 +184,39 @@ class Runner:
 
         Returns:
             The runs whose perception goes on here.
+
+        Raises:
+            CheckpointError: they do not fit: what they observe, perceive, estimate or move differs.
         """
         *seeing, run_dir = run_dirs
         for other in seeing:
             perceive_as(self.alg.actor, self._weights(other)["actor_state_dict"], str(other))
         state = self._weights(run_dir)
         weights = state["actor_state_dict"]
-        if observations is not None:
-            own = self.env.config.observations
-            inputs, given = self.env.actor_inputs(own), self.env.actor_inputs(observations)
-            if self.config.estimator is None:
-                weights = observing_more(weights, inputs, given)
-            elif observations.estimated is None:
+        own, theirs = self.env.config.observations, observations or self.env.config.observations
+        inputs, given = self.env.actor_inputs(own), self.env.actor_inputs(theirs)
+        if _meaning(inputs) != _meaning(given):
+            weights = observing_more(weights, inputs, given)
+            if self.config.estimator is not None and theirs.estimated is None:
                 truth = self.env.actor_inputs(replace(own, actor=[self.config.estimator.group]))
                 weights = estimating(self.alg.actor, weights, inputs, given, truth)
+            if weights is state["actor_state_dict"]:  # nothing has rearranged them
+                raise CheckpointError(
+                    f"init={run_dir} does not fit: {_first_difference(inputs, given)}; give both the same observations"
+                )
         if start_from(self.alg.actor, weights, str(run_dir)):
             seeing = [run_dir]
         if self.config.ppo.start_std is not None:
             with torch.no_grad():
                 self.alg.actor.distribution.std_param.fill_(self.config.ppo.start_std)
         self.alg.actor.reset()
-        with contextlib.suppress(CheckpointError):
-            start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
+        if _meaning(self._critic_inputs(own)) == _meaning(self._critic_inputs(theirs)):
+            with contextlib.suppress(CheckpointError):  # other hidden layers
+                start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
         return seeing
 
-    def observes_more_than(self, run_dir: Path) -> bool:
-        """Tell whether this actor observes more than another run's, whose observations `start_from` then needs."""
-        return observes_more(self.alg.actor, self._weights(run_dir)["actor_state_dict"])
+    def _critic_inputs(self, observations: ObservationsConfig) -> list[ActorInput]:
+        return self.env.actor_inputs(replace(observations, actor=observations.critic))
 
     def _weights(self, run_dir: str | Path) -> dict:
         return load_checkpoint(latest_checkpoint(run_dir), self.device)
@@ -318,6 +325,22 @@ class Runner:
             yield
         finally:
             signal.signal(signal.SIGINT, previous)
+
+
+def _meaning(inputs: Sequence[ActorInput]) -> list[tuple]:
+    """What they are, whatever their groups are called."""
+    return [(one.term, one.age, one.component) for one in inputs]
+
+
+def _named(one: ActorInput) -> str:
+    return f"{one.group}.{one.term}" + (f" of {one.age} steps before" if one.age else "")
+
+
+def _first_difference(own: Sequence[ActorInput], other: Sequence[ActorInput]) -> str:
+    differ = (k for k, (mine, theirs) in enumerate(zip(own, other, strict=False)) if mine[1:] != theirs[1:])
+    number = next(differ, min(len(own), len(other)))
+    mine, theirs = (_named(one[number]) if number < len(one) else "none" for one in (own, other))
+    return f"input {number} of this run's policy is {mine}, of that run's {theirs}"
 
 
 def _without_streams(state: dict) -> dict:

@@ -55,21 +55,26 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
         Whether the perception network was copied, too.
 
     Raises:
-        CheckpointError: observations, hidden layers or actions differ.
+        CheckpointError: observations, their normalization, hidden layers or actions differ; nothing was copied.
     """
-    state = model.state_dict()
+    alike = "observations (groups, history and what is estimated), ppo.hidden_dims and ppo.obs_normalization"
+    state, copies = model.state_dict(), []
     optional = {name for name in state if name.startswith(_OPTIONAL)}
     perceives_alike = all(name in weights and weights[name].shape == state[name].shape for name in optional)
+    embeds_besides = any(name.startswith("perception.") for name in weights) and not (optional and perceives_alike)
     for name in [name for name in state if perceives_alike or name not in optional]:
         own, other = state[name], weights.get(name)
-        if name == _FIRST_LAYER and other is not None and len(other) == len(own):
-            shared = own.shape[1] if perceives_alike else _blind_dim(model)
-            if other.shape[1] >= shared:
-                own[:, :shared] = other[:, :shared]
-                continue
+        if name == _FIRST_LAYER and other is not None and not (optional and perceives_alike):
+            own = own[:, : _blind_dim(model)]
+            other = other[:, : own.shape[1]] if embeds_besides else other
         if other is None or other.shape != own.shape:
-            alike = "observations (groups and history) and ppo.hidden_dims"
             raise _misfit(f"init={source} does not fit", name, own, other, alike)
+        copies.append((own, other))
+    if unknown := [name for name in weights if name not in state and not name.startswith(_OPTIONAL)]:
+        raise CheckpointError(
+            f"init={source} does not fit: nothing of this run takes that run's {unknown[0]}; give both the same {alike}"
+        )
+    for own, other in copies:
         own.copy_(other)
     return bool(optional) and perceives_alike
 
@@ -126,7 +131,8 @@ def observing_more(
 ) -> Mapping[str, torch.Tensor]:
     """The weights of an actor that observes less, for one that at first does not heed what it observes besides.
 
-    Actors that differ in anything else are left as they are.
+    What it observes besides is hardly normalized: its statistics are those of a mean of 0 and a deviation of 1, seen as
+    often as the rest. Actors that differ in anything else are left as they are.
 
     Args:
         weights: the state of the other actor.
@@ -144,11 +150,6 @@ def observing_more(
             wider[name] = weights[name].new_full((1, len(own)), unknown)
             wider[name][:, at] = weights[name]
     return wider
-
-
-def observes_more(model: MLPModel, weights: Mapping[str, torch.Tensor]) -> bool:
-    """Tell whether a model has more one-dimensional observations than another, whose state is given, has inputs."""
-    return _FIRST_LAYER in weights and weights[_FIRST_LAYER].shape[1] < _blind_dim(model)
 
 
 def _blind_dim(model: MLPModel) -> int:

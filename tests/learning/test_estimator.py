@@ -78,3 +78,23 @@ def test_a_run_learns_estimates_and_measures_by_them():
 def test_a_group_that_does_not_exist_is_refused():
     with pytest.raises(ConfigError, match=r"groups \['nothing'\] are used but not defined"):
         build.assemble(config.compose([*SMALL, "observations.estimated=nothing"]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_velocity"),
+    [
+        ((), True),
+        (("observations.groups.velocity.history=2",), False),
+        (("+observations.groups.extra={terms: {base_height: {}}}", "observations.estimated=extra"), False),
+    ],
+    ids=("velocity", "with the past", "height"),
+)
+def test_the_velocity_measured_is_an_estimate_of_it_alone(make_config, settings, is_velocity):
+    """Estimates with a bias of 7 are measured velocities, or change nothing in them."""
+    runner = build.build_runner(make_config(*SMALL, *settings), None)
+    with torch.no_grad():
+        list(runner.alg.actor.estimator.parameters())[-1].fill_(7.0)
+        runner.alg.actor(runner.env.get_observations())
+    runner.env.state.invalidate()
+    velocity = runner.env.state.measured.base_lin_vel_b
+    assert bool((velocity.abs() > 3.0).all()) == is_velocity

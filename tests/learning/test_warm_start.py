@@ -114,7 +114,6 @@ def test_what_is_observed_besides_is_not_heeded_at_first(make_config, walk):
     more = "+observations.groups.height={terms: {base_height: {}}}"
     actor = "observations.actor=[height,proprioception,command,action,clock]"
     runner = build_runner(make_config(*BLIND, more, actor, "seed=6"), None)
-    assert runner.observes_more_than(run_dir) and not blind.observes_more_than(run_dir)
     with pytest.raises(CheckpointError, match="give both the same observations"):
         runner.start_from(run_dir)
     runner.start_from(run_dir, observations=blind.env.config.observations)
@@ -153,6 +152,73 @@ def test_other_observations_are_refused(make_config, walk):
     runner = build_runner(make_config(*SEEING, *OTHERWISE), None)
     with pytest.raises(CheckpointError, match=r"init=.* does not fit: this run's .* give both the same observations"):
         runner.start_from(run_dir)
+
+
+PLAIN = ("ppo.obs_normalization=false",)
+
+
+@pytest.fixture(scope="module")
+def plain(make_config, tmp_path_factory):
+    """Run directory and observations of a policy whose observations are not normalized."""
+    folder = tmp_path_factory.mktemp("plain")
+    runner = build_runner(make_config(*BLIND, *PLAIN), None)
+    runner.save(checkpoint_path(folder, 1))
+    return folder, runner.env.config.observations
+
+
+class TestAsManyNumbersThatMeanOtherThings:
+    """Without normalization no shape tells them apart."""
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (("observations.actor=[action,proprioception,command,clock]",), "input 0 .* action.* proprioception"),
+            (("observations.groups.proprioception.terms.joint_vel=null",), "input [0-9]+ of this run's policy is"),
+            (("observations=gait_without_velocity", "observations.estimated=null"), "of that run's .*base_lin_vel"),
+        ],
+        ids=("order", "missing", "velocity"),
+    )
+    def test_are_refused(self, make_config, plain, change, message):
+        runner = build_runner(make_config(*BLIND, *PLAIN, *change), None)
+        before = {name: value.clone() for name, value in runner.alg.actor.state_dict().items()}
+        with pytest.raises(CheckpointError, match=rf"{message}.*; give both the same observations"):
+            runner.start_from(plain[0], observations=plain[1])
+        assert all(torch.equal(value, before[name]) for name, value in runner.alg.actor.state_dict().items())
+
+    def test_of_a_critic_stay_behind(self, make_config, plain):
+        order = "observations.critic=[clock,privileged,physics,command,action]"
+        runner = build_runner(make_config(*BLIND, *PLAIN, order), None)
+        before = runner.alg.critic.mlp[0].weight.clone()
+        runner.start_from(plain[0], observations=plain[1])
+        assert torch.equal(runner.alg.critic.mlp[0].weight, before)
+
+    def test_renamed_groups_are_the_same(self, make_config, plain):
+        actor = "observations.actor=[proprioception,command,doing,clock]"
+        renamed = "+observations.groups.doing={terms: {previous_action: {}}}"
+        runner = build_runner(make_config(*BLIND, *PLAIN, renamed, actor), None)
+        runner.start_from(plain[0], observations=plain[1])
+
+
+@pytest.mark.parametrize("normalized", [True, False])
+def test_normalization_is_both_runs_or_none(make_config, tmp_path, normalized):
+    mine, theirs = (f"ppo.obs_normalization={str(which).lower()}" for which in (not normalized, normalized))
+    build_runner(make_config(*BLIND, theirs), None).save(checkpoint_path(tmp_path, 1))
+    runner = build_runner(make_config(*BLIND, mine), None)
+    before = runner.alg.actor.mlp[0].weight.clone()
+    with pytest.raises(CheckpointError, match=r"does not fit: .*obs_normalizer.* and ppo\.obs_normalization"):
+        runner.start_from(tmp_path)
+    assert torch.equal(runner.alg.actor.mlp[0].weight, before)
+
+
+def test_what_estimates_does_not_start_what_does_not(make_config, tmp_path):
+    """Its policy reads the estimates; those columns would be lost."""
+    first = build_runner(make_config(*BLIND, "observations=gait_without_velocity"), None)
+    first.save(checkpoint_path(tmp_path, 1))
+    runner = build_runner(
+        make_config(*BLIND, "observations=gait_without_velocity", "observations.estimated=null"), None
+    )
+    with pytest.raises(CheckpointError, match=r"does not fit: .* and what is estimated\)"):
+        runner.start_from(tmp_path, observations=first.env.config.observations)
 
 
 @pytest.mark.slow

@@ -150,7 +150,7 @@ class Command(Protocol):
     def advance(self, dt: float, kinematics: Kinematics) -> None: ...
 
     def reached(self, kinematics: Kinematics, time_s: torch.Tensor | float) -> torch.Tensor | None:
-        """(num_envs,) bool whether the goal is reached time_s (num_envs,) after an episode's begin; None without one."""
+        """(num_envs,) bool whether the goal is reached, time_s (num_envs,) into the episodes; None without one."""
 
     def state_dict(self) -> dict: ...
 
