@@ -44,6 +44,10 @@ INTERRUPTED = 130  # as of a shell: 128 + SIGINT
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
+PICTURES = (".png", ".pdf", ".svg")
+RESULTS = (".json", ".json.gz")
+
+
 def argument(
     default: Any = dataclasses.MISSING,
     doc: str = "",
@@ -51,6 +55,7 @@ def argument(
     choices: Sequence[str] = (),
     least: float | None = None,
     positive: bool = False,
+    suffixes: Sequence[str] = (),
 ) -> Any:
     """An argument of a command: a field of a frozen dataclass with str, int, float, bool, Path, or a tuple of these.
 
@@ -60,8 +65,10 @@ def argument(
         choices: the only values allowed, of each item of a tuple.
         least: the least value allowed.
         positive: whether it must be above 0.
+        suffixes: one that a file that is written must end in; () where it is none or a folder.
     """
     metadata = {"doc": doc, "choices": tuple(choices), "least": least, "positive": positive}
+    metadata["suffixes"] = tuple(suffixes)
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -221,6 +228,8 @@ def _single(field: dataclasses.Field, kind: type, text: str, several: str = "") 
     limits = field.metadata
     if limits["choices"] and text not in limits["choices"]:
         raise ConfigError(f"{field.name}={text} must be one of {', '.join(limits['choices'])}")
+    if limits["suffixes"] and (not text.endswith(limits["suffixes"]) or Path(text).is_dir()):
+        raise ConfigError(f"{field.name}={text} must be a file that ends in {' or '.join(limits['suffixes'])}")
     if kind is bool:
         if text not in ("true", "false"):
             raise ConfigError(f"{field.name}={text} must be true or false")

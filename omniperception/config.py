@@ -362,7 +362,7 @@ def save_recipe(overrides: Sequence[str], run_dir: Path) -> None:
 def read_recipe(run_dir: Path) -> list[str]:
     """The overrides that a run was begun and went on with; none where it was begun before they were kept."""
     path = run_dir / RECIPE_FILE
-    return yaml.safe_load(path.read_text()) if path.is_file() else []
+    return (yaml.safe_load(path.read_text()) or []) if path.is_file() else []
 
 
 def recipe(run_dir: Path) -> str | None:
@@ -392,9 +392,12 @@ def read(run_dir: Path) -> DictConfig:
 
 
 def is_begun(run_dir: Path, composed: dict) -> bool:
-    """Tell whether `run_dir` holds a run of exactly this configuration; one of another is a ConfigError."""
+    """Tell whether `run_dir` holds a run of exactly this configuration; one of another is a ConfigError.
+
+    What has no checkpoint has not begun: a training that failed, or was stopped, before its first.
+    """
     path = run_dir / CONFIG_FILE
-    if not path.is_file():
+    if not path.is_file() or not has_checkpoint(run_dir):
         return False
     if yaml.safe_load(path.read_text()) != yaml.safe_load(yaml.safe_dump(composed)):
         raise ConfigError(
@@ -416,10 +419,15 @@ def find_run(name: str, key: str = "run") -> Path:
         if not path.is_dir():
             raise ConfigError(f"{key}={name} does not exist; give a run directory or {key}=latest")
         return path
-    runs = find_runs(OUTPUTS)
+    runs = [run for run in find_runs(OUTPUTS) if has_checkpoint(run)]
     if not runs:
-        raise ConfigError(f"{key}=latest finds no run under outputs/; train one first")
+        raise ConfigError(f"{key}=latest finds no run with a checkpoint under outputs/; train one first")
     return runs[-1]
+
+
+def has_checkpoint(run_dir: Path) -> bool:
+    """Tell whether a run has saved weights."""
+    return any(run_dir.glob("checkpoints/model_*.pt"))
 
 
 def find_runs(folder: Path) -> list[Path]:

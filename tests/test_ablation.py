@@ -27,7 +27,7 @@ def evaluated(ablation, trials=2, arm="own", **given):
     checkpoint = run_dir / "checkpoints" / "model_1.pt"
     checkpoint.parent.mkdir(exist_ok=True)
     checkpoint.write_bytes(b"weights")
-    outcome = torch.tensor([OUTCOMES.index("goal"), OUTCOMES.index("fall")])[:trials]
+    outcome, count = torch.tensor([OUTCOMES.index("goal"), OUTCOMES.index("fall")])[:trials], trials
     zeros = torch.zeros(trials, dtype=torch.float64)
     plain = dict.fromkeys(("length_s", "first_contact_s", "energy", "path", "velocity_error", "yaw_rate_error"), zeros)
     nothing = dict.fromkeys(("impulse", "clearance", "free_time_s", "free_velocity_error", "free_s"))
@@ -36,7 +36,7 @@ def evaluated(ablation, trials=2, arm="own", **given):
     named = {"policy": "run", "world": "corridor", "terrain": "own", "condition": "ideal", "split": "dev"}
     named |= {"weights": weights} | given
     record = Record(**named, condition_version=1, run=str(run_dir), seed=1, facts={}, episodes=trials)
-    path = "{split}-{condition}-{world}-{terrain}-{policy}.json".format(**named)
+    path = "{split}-{condition}-{world}-{terrain}-{policy}-{count}.json".format(**named, count=count)
     write(run_dir / "evaluation" / path, [record])
 
 
@@ -96,6 +96,19 @@ def test_results_of_other_evaluations_are_not_in_the_table(tmp_path, given):
 def test_a_study_that_cannot_be(given, message):
     with pytest.raises(ConfigError, match=message):
         replace(STUDY, **given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"conditions": ["paperr"]}, "conditions=paperr is unknown; did you mean paper"),
+        ({"scenarios": ["all", "static"]}, "scenarios=all has every scenario"),
+    ],
+    ids=("condition", "all"),
+)
+def test_what_would_fail_after_the_trainings_is_refused_before(given, message, tmp_path):
+    with pytest.raises(ConfigError, match=message):
+        Ablation(replace(STUDY, **given), tmp_path)
 
 
 def test_a_file_that_is_no_study_is_named(tmp_path):

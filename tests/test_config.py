@@ -113,11 +113,24 @@ class TestRunDirectories:
 
     def test_latest_is_the_newest(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        for age, name in ((50, "b"), (10, "a"), (90, "c")):
+        for age, name in ((50, "b"), (10, "a"), (90, "c"), (5, "failed")):
             config.save({"num_envs": 1}, tmp_path / "outputs" / name)
+            (tmp_path / "outputs" / name / "checkpoints").mkdir()
+            if name != "failed":
+                (tmp_path / "outputs" / name / "checkpoints" / "model_1.pt").touch()
             path = tmp_path / "outputs" / name / config.CONFIG_FILE
             os.utime(path, (path.stat().st_atime, path.stat().st_mtime - age))
         assert config.find_run("latest") == Path("outputs/a")
+
+
+def test_what_has_no_checkpoint_has_not_begun(tmp_path):
+    config.save({"num_envs": 1}, tmp_path)
+    assert not config.is_begun(tmp_path, {"num_envs": 2})
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "model_1.pt").touch()
+    assert config.is_begun(tmp_path, {"num_envs": 1})
+    with pytest.raises(ConfigError, match="holds a run of another configuration"):
+        config.is_begun(tmp_path, {"num_envs": 2})
 
 
 def test_what_comes_with_the_package_is_found_from_any_folder(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """A published run replays as the run that it was made from."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -74,6 +75,26 @@ def test_too_large_a_policy_is_refused(run, tmp_path, monkeypatch):
     monkeypatch.setattr(publish, "LIMIT", 1000)
     with pytest.raises(config.ConfigError, match=r"MB of weights, at most 0 MB are published"):
         publish.publish(run, tmp_path / "published")
+
+
+def test_a_training_is_not_published_over(run, tmp_path):
+    before = latest_checkpoint(run).read_bytes()
+    other = shutil.copytree(run, tmp_path / "other")
+    for folder in (run, tmp_path / ".." / tmp_path.name / "run", other):
+        with pytest.raises(config.ConfigError, match="holds a training, whose checkpoints would be lost"):
+            publish.publish(run, folder)
+    assert latest_checkpoint(run).read_bytes() == latest_checkpoint(other).read_bytes() == before
+
+
+def test_what_was_made_of_an_earlier_publication_goes(run, tmp_path):
+    published = tmp_path / "published"
+    publish.publish(run, published)
+    for name in ("exported", "evaluation"):
+        (published / name).mkdir()
+    save_checkpoint(checkpoint_path(run, 3), load_checkpoint(latest_checkpoint(run), "cpu") | {"iteration": 3})
+    publish.publish(run, published)
+    assert sorted(path.name for path in published.iterdir()) == ["checkpoints", "config.yaml", provenance.FILE]
+    assert [path.name for path in (published / "checkpoints").iterdir()] == ["model_3.pt"]
 
 
 def test_a_published_policy_is_not_published_again(run, tmp_path):

@@ -59,6 +59,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         study = _with_arms(study, arguments.arms)
     out = arguments.out or config.OUTPUTS / arguments.study
     ablation = Ablation(study, out, tuple(overrides), arguments.trust)
+    if arguments.stage == "all" and "exported" in study.policies:
+        raise config.ConfigError("policies=exported: no run is exported yet; train, export, then give stage=evaluate")
     if arguments.stage in ("train", "all"):
         train(ablation)
     if arguments.stage in ("evaluate", "all"):

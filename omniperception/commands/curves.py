@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import config
-from omniperception.cli import Command, argument
+from omniperception.cli import PICTURES, Command, argument
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.evaluation.curves import curves_of, draw_curves
 
@@ -26,7 +26,7 @@ class Arguments:
     runs: tuple[Path, ...] = argument((config.OUTPUTS,), "run directories, or folders that hold some, at any depth")
     tags: tuple[str, ...] = argument(TAGS, "scalars, a panel each")
     smooth: int = argument(20, "iterations of the running mean", least=1)
-    out: Path = argument(Path("outputs/curves.png"), "picture that is written")
+    out: Path = argument(Path("outputs/curves.png"), "picture that is written", suffixes=PICTURES)
 
 
 def main(arguments: Arguments) -> None:

@@ -47,14 +47,16 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     run_dir, path = config.SHIPPED_RUNS / RUN, Path(f"{file_stem('demo', overrides)}.mp4")
     num_envs = max(arguments.video.env_ids) + 1
     refuse_overrides(overrides, {"num_envs": num_envs})
-    if not any(override.startswith(("scenario=", "obstacles=")) for override in overrides):
+    if not any(override.startswith(("scenario=", "obstacles=", "commands=")) for override in overrides):
         overrides = [SCENARIO, *overrides]
     viewer = arguments.viewer or ("web" if has_display() and importlib.util.find_spec("viser") else "video")
     if viewer == "web":
         refuse_arguments(arguments, FILM, "viewer=web films nothing")
         options = PageOptions(arguments.host, arguments.port, arguments.stop_after_s, open_browser=has_display())
         return serve(Shown(run_dir, tuple(overrides)), options)
-    trained = build.load_policy(build.load_run(run_dir, [*overrides, f"num_envs={num_envs}"]), run_dir)
+    run = build.load_run(run_dir, [*overrides, f"num_envs={num_envs}"])
+    build.check_split(run, "film")
+    trained = build.load_policy(run, run_dir)
     with film(arguments, trained.env, trained.policy, path) as recorder, torch.no_grad():
         observations = trained.env.get_observations()
         while recorder.frames_left:

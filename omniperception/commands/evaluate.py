@@ -34,9 +34,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import config
-from omniperception.cli import Command, argument, refuse_arguments, trust
+from omniperception.cli import RESULTS, Command, argument, refuse_arguments, trust
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
+from omniperception.evaluation.baselines import DRIVEN
 from omniperception.evaluation.suite import (
     POLICIES,
     SPLITS,
@@ -74,7 +75,7 @@ class Arguments:
     walker: str | None = argument(None, "run directory of experiment=walk, whose gait stop, histogram and oracle drive")
     plots: bool = argument(False, "whether the worlds are drawn from above, with the ways")
     again: bool = argument(False, "whether to measure again what has been measured before")
-    out: Path | None = argument(None, "file (.json or .json.gz) that the results are added to, for tables")
+    out: Path | None = argument(None, "file that the results are added to, for tables", suffixes=RESULTS)
     log: Path | None = argument(None, "where split=test is noted; null: docs/lab/evaluations.jsonl of the checkout")
     viewer: str = argument("none", "web: look at the first policy in the first world", choices=("none", "web"))
     host: str = argument(
@@ -92,6 +93,10 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     if arguments.viewer == "web":
         refuse_arguments(arguments, MEASURED, "viewer=web measures nothing")
         return serve(_shown(arguments, runs[0], worlds[0], overrides), PageOptions(arguments.host, arguments.port))
+    if arguments.split != "test":
+        refuse_arguments(arguments, ("log",), "only split=test is noted")
+    if not set(DRIVEN) & set(arguments.policy):
+        refuse_arguments(arguments, ("walker",), f"none of policy={','.join(arguments.policy)} drives a gait")
     evaluate(
         Evaluation(
             runs=runs,

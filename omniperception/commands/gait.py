@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omniperception import build, config
-from omniperception.cli import Command, argument, refuse_arguments, refuse_overrides, trust
+from omniperception.cli import RESULTS, Command, argument, refuse_arguments, refuse_overrides, trust
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.common.tables import markdown
 from omniperception.evaluation import robustness
@@ -45,7 +45,7 @@ class Arguments:
     bearings: int = argument(16, "directions of the kicks, evenly around", least=1)
     repeats: int = argument(16, "kicks of each size and direction", least=1)
     condition: str | None = argument("robot", "preset of conf/condition for kicks (without its pushes) and feet")
-    out: Path | None = argument(None, "file (.json or .json.gz) that the trials of the ranges are added to")
+    out: Path | None = argument(None, "file that the trials of the ranges are added to", suffixes=RESULTS)
     trust: tuple[str, ...] = trust()
 
 
@@ -55,6 +55,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     refuse_arguments(arguments, others, f"it is not read for what={arguments.what}")
     if arguments.what == "kicks":
         refuse_overrides(overrides, {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S})
+    if arguments.what == "ranges":
+        refuse_overrides(overrides, {"num_envs": Evaluation.num_envs, "scenario": "walk"})
     if arguments.what == "feet":
         refuse_overrides(overrides, {"num_envs": len(COMMANDS)})
     run_dir = config.find_run(arguments.run)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omniperception.cli import Command, argument
+from omniperception.cli import PICTURES, Command, argument
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.deploy import DeployError, ExportedPolicy
 from omniperception.hardware.bags import Topics, events
@@ -36,7 +36,7 @@ class Arguments:
     imu: str | None = argument(None, "topic of the base's Imu; null: the only one")
     commands: str | None = argument(None, "topic of the commands; null: the only one")
     command: str | None = argument(None, "v_x,v_y,yaw_rate in place of the recorded ones")
-    out: Path | None = argument(None, "picture; null: the recording's name, ending in .png")
+    out: Path | None = argument(None, "picture; null: the recording's name, ending in .png", suffixes=PICTURES)
 
 
 def main(arguments: Arguments) -> None:

@@ -47,6 +47,10 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     if not arguments.table:
         faults = KNOWN_FAULTS if "all" in arguments.faults else arguments.faults
         folder = str(config.find_run(arguments.run))
+        known = config.presets("scenario", config.search_path(overrides, config.read(Path(folder))))
+        for scenario in arguments.scenario:
+            if scenario not in known:
+                raise config.ConfigError(f"scenario={scenario} is unknown; {config.suggest(scenario, known)}")
         run(
             TrialsConfig(
                 run=folder,

@@ -34,7 +34,6 @@ from omniperception.learning import (
     TrainingDiverged,
     distributed,
     latest_checkpoint,
-    list_checkpoints,
 )
 from omniperception.learning.log_writers import LoggerError
 from omniperception.plan import Plan, Watch
@@ -104,13 +103,25 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: 
     run = assemble(composed)
     distributed.connect(run.env.sim.torch_device)
     run_dir = distributed.of_first(run_dir)
-    begun = distributed.of_first(config.is_begun(run_dir, run.composed) and bool(list_checkpoints(run_dir)))
+    begun = distributed.of_first(config.is_begun(run_dir, run.composed))
+    if not begun:
+        _check_sources(run)
     if distributed.rank() == 0:
         config.save(run.composed, run_dir)
         if not begun:
             provenance.write(run_dir, provenance.provenance(run.env.sim.torch_device, seed=run.env.seed))
             config.save_recipe(overrides, run_dir)
     learn(run, run_dir, resume=begun, trust=trust)
+
+
+def _check_sources(run: build.RunConfig) -> None:
+    """Refuses runs to begin from that have no weights, or moved otherwise, before a directory is written."""
+    if run.init:
+        _check_motion(OmegaConf.create(run.composed), run.init[-1])
+    for name in run.init:
+        latest_checkpoint(config.find_run(name, "init"))
+    if run.distillation is not None:
+        latest_checkpoint(config.find_run(run.distillation.teacher, "distillation.teacher"))
 
 
 def learn(
@@ -135,7 +146,6 @@ def learn(
         report(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
     else:
         if run.init:
-            _check_motion(OmegaConf.create(run.composed), run.init[-1])
             given = [config.find_run(name, "init") for name in run.init]
             observed = build.load_run(given[-1], trust=trust).env.observations
             for source in runner.start_from(*given, observations=observed):

@@ -12,8 +12,8 @@ _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64
 _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
 _DRAWS_PER_EPISODE = 1 << 20
-MOST_SEEDS = 1 << 32
-"""Seeds are 0 to one less."""
+MOST_SEEDS = 1 << 43
+"""Seeds are 0 to one less: their streams, `_PER_SEED` apart, have numbers of 64 bits."""
 _PER_SEED = 1_000_003
 """Streams of a seed until the next one's begin."""
 

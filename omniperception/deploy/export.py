@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -92,6 +93,7 @@ def export(
         provenance={
             "run": run_dir.resolve().name,
             "checkpoint": trained.checkpoint.name,
+            "weights": hashlib.sha256(trained.checkpoint.read_bytes()).hexdigest(),
             "iteration": load_checkpoint(trained.checkpoint, "cpu")["iteration"],
             **provenance("cpu"),
         },

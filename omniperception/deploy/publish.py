@@ -10,7 +10,9 @@ from omegaconf import OmegaConf
 from omniperception import config
 from omniperception.common import provenance
 from omniperception.config import ConfigError
-from omniperception.learning import latest_checkpoint
+from omniperception.deploy.export import FOLDER as EXPORTED
+from omniperception.evaluation.records import FOLDER as RESULTS
+from omniperception.learning import latest_checkpoint, list_checkpoints
 from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 
 LIMIT = 4_000_000
@@ -25,19 +27,22 @@ def publish(run_dir: Path, folder: Path) -> dict:
 
     Args:
         run_dir: a run.
-        folder: becomes a run directory; what it held of another run is replaced.
+        folder: becomes a run directory; weights, evaluations and exported policies of an earlier publication go.
 
     Returns:
         What provenance.json holds.
 
     Raises:
-        ConfigError: the weights are larger than LIMIT, or the run is a published one.
+        ConfigError: the weights are larger than LIMIT, the run is a published one, or `folder` holds a training.
         CheckpointError: the run has no checkpoint.
     """
     newest = latest_checkpoint(run_dir)
     state = load_checkpoint(newest, "cpu")
     if "total_time" not in state:
         raise ConfigError(f"run={run_dir} was published already: it holds weights alone; give the run it came from")
+    theirs = list_checkpoints(folder)
+    if theirs and "total_time" in load_checkpoint(theirs[-1], "cpu"):
+        raise ConfigError(f"to={folder} holds a training, whose checkpoints would be lost; give another folder")
     weights = {name: state[name] for name in ("actor_state_dict", "critic_state_dict")}
     size = sum(tensor.numel() * tensor.element_size() for part in weights.values() for tensor in part.values())
     if size > LIMIT:
@@ -46,7 +51,8 @@ def publish(run_dir: Path, folder: Path) -> dict:
             " network"
         )
     composed = config.read(run_dir)
-    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+    for stale in (*(path.parent for path in theirs[:1]), folder / RESULTS, folder / EXPORTED):
+        shutil.rmtree(stale, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     composed.pop(config.SEARCH_PATH, None)  # a folder of this machine
     composed.sim.num_threads = 0  # and how many of its cores

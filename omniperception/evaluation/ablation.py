@@ -133,6 +133,11 @@ class Ablation:
             known = (*VARIANTS, *config.presets("perception", folders))
             if variant not in known:
                 raise ConfigError(f"variants={variant} is unknown; {config.suggest(variant, known)}")
+        for condition in self.study.conditions:
+            if condition not in (known := config.presets("condition", folders)):
+                raise ConfigError(f"conditions={condition} is unknown; {config.suggest(condition, known)}")
+        if "all" in self.study.scenarios and len(self.study.scenarios) > 1:
+            raise ConfigError("scenarios=all has every scenario of held_out; leave the others out")
         for scenario in self.study.scenarios:
             if scenario not in (known := (*config.presets("scenario", folders), "all")):
                 raise ConfigError(f"scenarios={scenario} is unknown; {config.suggest(scenario, known)}")

@@ -81,7 +81,11 @@ def table(records: Sequence[Record]) -> str:
     places = len({(record.world, record.terrain) for record in records})
     if places > 1:
         for (condition, policy), theirs in grouped(records, "condition", "policy").items():
-            where = [f"mean of {places}", *([""] if several else []), *([condition] if len(conditions) > 1 else [])]
+            where = [
+                f"mean of {len({(r.world, r.terrain) for r in theirs})}",
+                *([""] if several else []),
+                *([condition] if len(conditions) > 1 else []),
+            ]
             rows.append([*where, policy, *mean_figures(theirs)])
             reference = [one for one in records if (one.condition, one.policy) == (condition, REFERENCE)]
             if reference and policy != REFERENCE:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from omniperception.common.tables import markdown
+from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell
 
@@ -35,14 +36,16 @@ def study_table(records: Sequence[Record]) -> str:
     """A table for each world and condition. The folder of a run's seeds names its training: <arm>/<variant>/seed1.
 
     Raises:
-        ConfigError: see `check_apart`.
+        ConfigError: see `check_apart`; or a run is of no study.
     """
     check_apart(records)
     tables = []
     for (world, terrain, condition), here in grouped(records, "world", "terrain", "condition").items():
         by_row: dict[tuple[str, str, str], list[Record]] = {}
         for record in here:
-            arm, variant = Path(record.run).parts[-3:-1]
+            if len(parts := Path(record.run).parts[-3:-1]) < 2:
+                raise ConfigError(f"{record.run} is no run of a study, whose runs lie in <arm>/<variant>/seed<n>")
+            arm, variant = parts
             by_row.setdefault((arm, variant, record.policy), []).append(record)
         rows = [[*row, *_cells(seeds)] for row, seeds in by_row.items()]
         columns = ["arm", "variant", "policy", *(f"{label}, %" for label in RATES.values())]

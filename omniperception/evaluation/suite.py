@@ -218,12 +218,24 @@ class Task:
     @property
     def path(self) -> Path:
         """The file of the outcomes; that of the ways has another suffix."""
-        evaluation, world = self.evaluation, self.world
-        names = [evaluation.split, evaluation.condition or "own", world.name, world.terrain or "own", self.policy]
+        world = self.world
+        return self._file(world.name, world.terrain or "own", self.policy, f"{self.evaluation.trials}.json")
+
+    @property
+    def picture(self) -> Path:
+        """The file of the worlds from above."""
+        return self._file(self.policy, f"{self.evaluation.trials}.png")
+
+    def _file(self, *names: str) -> Path:
+        """A file of these settings alone; its last name has the suffix."""
+        evaluation = self.evaluation
         others = [*evaluation.overrides, *([] if self.walker == self.run_dir else [f"walker={shown(self.walker)}"])]
-        if others:
-            names.append(hashlib.sha256(" ".join(others).encode()).hexdigest()[:8])
-        return self.run_dir / FOLDER / f"{'-'.join(names)}.json"
+        changes = [hashlib.sha256(" ".join(others).encode()).hexdigest()[:8]] if others else []
+        return (
+            self.run_dir
+            / FOLDER
+            / "-".join([evaluation.split, evaluation.condition or "own", *names[:-1], *changes, names[-1]])
+        )
 
     def done(self, facts: dict) -> Record | None:
         """The record of an earlier measurement by the same code with the same settings; None without one.
@@ -235,7 +247,10 @@ class Task:
             return None
         if evaluation.again or not path.is_file() or (evaluation.plots and not path.with_suffix(".npz").is_file()):
             return None
-        (record,) = read(path)
+        try:
+            (record,) = read(path)
+        except ConfigError:  # half a file, or one of another format: measured again
+            return None
         now = self.settings() | {"commit": facts["commit"], "versions": facts["versions"]}
         before = record.plain()
         return record if all(before.get(name) == value for name, value in now.items()) else None
@@ -279,8 +294,7 @@ class Task:
             if self.policy in BASELINES:
                 policy = baseline(self.policy, env, policy, self._own.rewards.avoidance, self._limits())
             if self.policy == "exported":
-                exported = ExportedPolicy.load(self.run_dir / EXPORTED)
-                _check_exported(exported, checkpoint)
+                exported = _exported(self.run_dir, self.weights)
                 checkpoint, policy = self.run_dir / EXPORTED, ExportedPolicies(env, exported)
         except ValueError as error:
             raise ConfigError(f"policy={self.policy}: {error}") from None
@@ -301,11 +315,16 @@ class Task:
         return None if own else commanded_ranges(self.walker)
 
 
-def _check_exported(policy: ExportedPolicy, newest: Path) -> None:
-    """Refuses a policy that was exported from other weights than the record would name."""
-    of = policy.description.provenance.get("checkpoint")
-    if of != newest.name:
-        raise ValueError(f"it was exported from {of}, and the run's newest checkpoint is {newest.name}; export again")
+def _exported(run_dir: Path, weights: str) -> ExportedPolicy:
+    """A run's exported policy; refused if it was exported from other weights (SHA-256) than the record would name."""
+    policy = ExportedPolicy.load(run_dir / EXPORTED)
+    if policy.description.provenance.get("weights") != weights:
+        of = policy.description.provenance.get("checkpoint")
+        raise ValueError(
+            f"it was exported from another checkpoint ({of}) than the run's newest, {latest_checkpoint(run_dir).name};"
+            " export again"
+        )
+    return policy
 
 
 def weights_hash(run_dir: Path) -> str:
@@ -352,6 +371,7 @@ def measure_all(tasks: Sequence[Task]) -> list[Record]:
     for run_dir in {task.run_dir for task in tasks}:
         (run_dir / FOLDER).mkdir(exist_ok=True)
     facts = provenance(tasks[0].assembled().env.sim.torch_device)
+    _check_tasks(tasks)
     records = {k: record for k, task in enumerate(tasks) if (record := task.done(facts)) is not None}
     if records:
         print(f"{len(records)} of {len(tasks)} measured before and kept; again=true measures them again", flush=True)
@@ -361,6 +381,25 @@ def measure_all(tasks: Sequence[Task]) -> list[Record]:
         if tasks[k].evaluation.split == "test":
             note(log_file(tasks[k].evaluation), record)
     return [records[k] for k in range(len(tasks))]
+
+
+def _check_tasks(tasks: Sequence[Task]) -> None:
+    """Refuses before anything is measured what would fail after hours."""
+    seen = set()
+    for task in tasks:
+        key = task.path.resolve()
+        if key in seen:
+            raise ConfigError(f"run={task.run_dir} policy={task.policy} world={task.world.name} is given twice")
+        seen.add(key)
+        weights = task.weights
+        if task.policy == "exported":
+            try:
+                _exported(task.run_dir, weights)
+            except ValueError as error:
+                raise ConfigError(f"policy=exported: {error}") from None
+    out = tasks[0].evaluation.out
+    if out is not None and out.exists():
+        read(out)
 
 
 def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Record]]:
@@ -433,10 +472,9 @@ def _draw(tasks: Sequence[Task], records: Sequence[Record]) -> None:
     """A picture of each policy of each run: all worlds from above, each on the first of its terrains."""
     panels: dict[Path, dict[str, Record]] = {}
     for task, record in zip(tasks, records, strict=True):
-        path = task.run_dir / FOLDER / f"{record.split}-{record.condition}-{record.policy}.png"
-        if record.world not in panels.setdefault(path, {}):
+        if record.world not in panels.setdefault(task.picture, {}):
             tracks = Tracks.load(task.path.with_suffix(".npz"))
-            panels[path][record.world] = replace(record, episodes=replace(record.episodes, tracks=tracks))
+            panels[task.picture][record.world] = replace(record, episodes=replace(record.episodes, tracks=tracks))
     for path, worlds in panels.items():
         draw_worlds(path, list(worlds.values()))
         print(f"wrote {path}")

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from omniperception.common.tables import markdown
+from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, without_constants
@@ -155,5 +156,5 @@ def figures(parts: Sequence[Part]) -> list[str]:
 def _walking(record: Record) -> dict[str, torch.Tensor]:
     walking = record.episodes.walking
     if walking is None:
-        raise ValueError(f"{record.world}: no figures of a gait; evaluate suite=walking")
+        raise ConfigError(f"{record.world}: no figures of a gait; evaluate suite=walking")
     return walking

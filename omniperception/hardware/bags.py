@@ -102,6 +102,7 @@ def messages(path: Path) -> Iterator[Message]:
 
 
 def _of_mcap(path: Path) -> Iterator[Message]:
+    import zstandard
     from mcap.exceptions import EndOfFile, McapError
     from mcap.reader import NonSeekingReader
     from mcap_ros2.decoder import DecoderFactory
@@ -120,7 +121,7 @@ def _of_mcap(path: Path) -> Iterator[Message]:
                     yield Message(channel.topic, schema.name, message.log_time, data, decode)
         except (EndOfFile, struct.error):
             print(f"{path} is cut off, as a killed process leaves it; read up to there", file=sys.stderr)
-        except McapError as error:
+        except (McapError, zstandard.ZstdError, RuntimeError) as error:  # RuntimeError: lz4's
             raise DeployError(f"{path} is not a readable MCAP file: {error}") from None
 
 

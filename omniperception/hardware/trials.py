@@ -92,7 +92,7 @@ def run(config: TrialsConfig) -> None:
     config.out.mkdir(parents=True, exist_ok=True)
     made_with = config.made_with
     for path in _files(config.out):
-        theirs = json.loads(path.read_text()).get("made_with", {})
+        theirs = _result(path).get("made_with", {})
         differs = [name for name, value in made_with.items() if theirs.get(name) != value]
         if differs:
             name = differs[0]
@@ -109,7 +109,9 @@ def run(config: TrialsConfig) -> None:
                 if path.exists():
                     continue
                 result = _trial(config, scenario, fault, trial, _FIRST_DOMAIN + number % _DOMAINS)
-                path.write_text(json.dumps({"made_with": made_with, **result}))
+                whole = path.with_suffix(".part")
+                whole.write_text(json.dumps({"made_with": made_with, **result}))
+                whole.replace(path)
                 print(f"{path.name}: {_told(result)}", flush=True)
 
 
@@ -259,12 +261,19 @@ def results(folder: Path) -> list[dict]:
     """Of all trials in a folder.
 
     Raises:
-        DeployError: there is none.
+        DeployError: there is none, or one cannot be read.
     """
-    found = [json.loads(path.read_text()) for path in _files(folder)]
+    found = [_result(path) for path in _files(folder)]
     if not found:
         raise DeployError(f"{folder} holds no results of trials")
     return found
+
+
+def _result(path: Path) -> dict:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (ValueError, TypeError):
+        raise DeployError(f"{path} is no result of a trial; delete it, and the same command makes it again") from None
 
 
 def _files(folder: Path) -> list[Path]:

@@ -47,6 +47,8 @@ def save_progress(run_dir: Path, iterations: int, total: int, rates: Mapping[str
 
 
 def load_progress(run_dir: Path) -> dict | None:
-    """What `save_progress` wrote; None where there is nothing."""
-    path = run_dir / PROGRESS_FILE
-    return json.loads(path.read_text()) if path.is_file() else None
+    """What `save_progress` wrote; None where there is nothing, or nothing readable."""
+    try:
+        return dict(json.loads((run_dir / PROGRESS_FILE).read_text()))
+    except (OSError, ValueError, TypeError):
+        return None

@@ -20,6 +20,7 @@ from omniperception.evaluation import suite
 from omniperception.evaluation.baselines import baseline
 from omniperception.evaluation.records import read
 from omniperception.evaluation.suite import Evaluation, Task, World, evaluate, reported_seed, suite_worlds
+from omniperception.learning import CheckpointError
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1")
@@ -87,7 +88,7 @@ def test_files_hold_what_was_measured_and_by_what(walker, tmp_path, capsys):
     folder = walker / "evaluation"
     assert [(r.world, r.policy) for r in records] == [(w, p) for w in ("static", "corridor") for p in ("run", "oracle")]
     for record in records:
-        (path,) = folder.glob(f"dev-ideal-{record.world}-own-{record.policy}-????????.json")  # overrides have a name
+        (path,) = folder.glob(f"dev-ideal-{record.world}-own-{record.policy}-????????-4.json")  # overrides have a name
         (written,) = read(path)
         assert written.plain() == record.plain()
         facts = written.facts
@@ -97,9 +98,50 @@ def test_files_hold_what_was_measured_and_by_what(walker, tmp_path, capsys):
     assert [record.key for record in read(tmp_path / "all.json.gz")] == [record.key for record in records]
     printed = capsys.readouterr().out
     for policy in ("run", "oracle"):
-        (picture,) = folder.glob(f"dev-*-{policy}.png")
+        (picture,) = folder.glob(f"dev-ideal-{policy}-????????-4.png")
         assert picture.read_bytes()[:4] == b"\x89PNG" and str(picture) in printed
     assert printed.count("| static") == 2 and "mean of 2" in printed
+
+
+def test_other_trials_and_overrides_leave_files_where_they_are(walker):
+    first = evaluation(walker, "rod", trials=3)
+    (task,) = first.tasks()
+    others = (
+        evaluation(walker, "rod", trials=2),
+        evaluation(walker, "rod", trials=3, overrides=("sim.cone=elliptic",)),
+    )
+    for name in ("path", "picture"):
+        assert len({getattr(task, name), *(getattr(other.tasks()[0], name) for other in others)}) == 3
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"runs": "twice"}, "policy=run world=rod is given twice"),
+        ({"runs": "empty"}, "no checkpoint in"),
+        ({"policies": ("run", "exported")}, "policy=exported: "),
+        ({"out": "other.json"}, "other.json holds no results of evaluate"),
+    ],
+    ids=lambda given: next(iter(given)) if isinstance(given, dict) else "",
+)
+def test_what_would_fail_after_the_trials_is_refused_before(walker, tmp_path, monkeypatch, given, message):
+    (tmp_path / "other.json").write_text("{}")
+    shutil.copytree(walker, tmp_path / "empty", ignore=shutil.ignore_patterns("checkpoints", "evaluation"))
+    runs = {"twice": [walker, walker / ".." / walker.name], "empty": [walker, tmp_path / "empty"]}
+    given = given | ({"runs": runs[given["runs"]]} if "runs" in given else {})
+    given = given | ({"out": tmp_path / given["out"]} if "out" in given else {})
+    monkeypatch.setattr(suite, "run_episodes", lambda *_, **__: pytest.fail("it was measured"))
+    with pytest.raises((ConfigError, CheckpointError), match=message):
+        evaluate(replace(evaluation(walker, "rod"), **given))
+
+
+def test_half_a_file_is_measured_again(walker, monkeypatch):
+    by(monkeypatch, "half")
+    given = evaluation(walker, "rod", trials=2)
+    records = evaluate(given)
+    path = given.tasks()[0].path
+    path.write_text(path.read_text()[:100])
+    assert outcomes(evaluate(given)) == outcomes(records) and read(path)[0].plain() == evaluate(given)[0].plain()
 
 
 def test_the_same_command_goes_on_where_it_was(walker, monkeypatch, capsys):

@@ -126,6 +126,14 @@ def test_results_of_something_else_are_not_taken_for_ones_own(tmp_path):
         run(a_config(tmp_path, scenarios=("corridor",)))
 
 
+def test_half_a_result_is_named(tmp_path):
+    path = tmp_path / "moving-none-000.json"
+    for text in ("", '{"made_with": {"run": "r1"', "3"):
+        path.write_text(text)
+        with pytest.raises(DeployError, match=r"moving-none-000\.json is no result of a trial; delete it"):
+            results(tmp_path)
+
+
 def test_packages_that_the_run_may_name_reach_the_simulation(tmp_path, monkeypatch):
     started = []
     monkeypatch.setattr(trials, "_Simulation", lambda words: started.append(words) or 1 / 0)

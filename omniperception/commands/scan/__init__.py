@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from omniperception import build, config
-from omniperception.cli import Command, argument
+from omniperception.cli import Command, argument, refuse_arguments
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
 from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene, demo_scene, mesh_scene
 from omniperception.common.figures import PlotsUnavailable
@@ -123,6 +123,7 @@ def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConf
 
 def _surroundings(arguments: Arguments, robot: RobotConfig, walkers: int = 0) -> DemoScene:
     if arguments.mesh is None:
+        refuse_arguments(arguments, ("at", "scale"), "without mesh= there is no mesh to stand in")
         return demo_scene(robot, walkers=walkers)
     if len(arguments.at) != 3:
         raise config.ConfigError(f"at={','.join(map(str, arguments.at))} must be three numbers, x,y,z in metres")
