@@ -12,7 +12,8 @@ import yaml
 from omniperception import build, config
 from omniperception.commands import main
 from omniperception.common import provenance
-from omniperception.learning import distributed, load_checkpoint
+from omniperception.learning import Runner, distributed, load_checkpoint
+from omniperception.learning.checkpoint import checkpoint_path
 from omniperception.learning.ppo import PerceptivePpo
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -126,6 +127,33 @@ def test_what_a_run_goes_on_with_is_written_down(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["train", "run=here", "ppo.hidden_dims=[8]"])
     assert config.load(tmp_path / "here") == saved
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [("randomization=none",), ("randomization=robot", "num_envs=3"), ("obstacles.curriculum=null",)],
+    ids=("nothing random", "more robots", "all obstacles"),
+)
+def test_a_run_that_goes_on_in_another_task_begins_new_episodes(tmp_path, monkeypatch, capsys, changes):
+    """Of the task before nothing stays: no drawn friction, no number of robots; but levels of curricula that go on."""
+    monkeypatch.chdir(tmp_path)
+    given = ["experiment=quickstart", *SMALL, *SMALL_CLOUD, "num_envs=2", "randomization=paper"]
+    run = build.assemble(config.compose([*given, "randomization.curriculum=null"]))
+    config.save(run.composed, Path("here"))
+    first = build.build_runner(run, None)
+    first.env.obstacles.level = 0.7
+    first.save(checkpoint_path("here", 1))
+    seen = []
+    monkeypatch.setattr(Runner, "learn", lambda self, *_, **__: seen.append(self))
+    main(["train", "run=here", "ppo.learning_rate=1e-5"])
+    assert torch.equal(seen[0].env.sim.qpos, first.env.sim.qpos) and "another now" not in capsys.readouterr().out
+    main(["train", "run=here", *changes])
+    assert "its task is another now: new episodes begin" in capsys.readouterr().out
+    env, fresh = seen[1].env, build.build_runner(build.load_run(Path("here")), None).env
+    assert env.num_envs == fresh.num_envs and bool((env.episode_length_buf == 0).all())
+    assert env.obstacles.level == (1.0 if changes == ("obstacles.curriculum=null",) else 0.7)
+    mass, nominal = (one.sim.model_field("body_mass") for one in (env, fresh))
+    assert torch.equal(mass, nominal) == (changes[0] == "randomization=none")
 
 
 def test_processes_that_go_on_draw_from_streams_of_their_own(tmp_path, monkeypatch):

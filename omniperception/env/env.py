@@ -458,6 +458,16 @@ class OmniEnv(VecEnv):
         self._frame_heights = state["frame_heights"]
         self.observations = self._collect(dict(state["observations"]))
 
+    def begin_at_levels_of(self, state: dict) -> None:
+        """Begins new episodes at the levels that the curricula have in the `state_dict` of another task, of those that
+        there are here."""
+        command = state.get("command", {}) if isinstance(self.command, VelocityCommand) else {}
+        saved = {"randomization": state["difficulty"], "obstacle": state.get("obstacles", {}), "command": command}
+        for name, part in self._curricula().items():
+            if part.rises and "level" in saved[name]:
+                part.level = saved[name]["level"]
+        self.reset()
+
     def _managers(self) -> dict[str, RewardManager | ObservationManager]:
         """The managers, by name."""
         return {"rewards": self.rewards, **{f"observations.{name}": group for name, group in self._groups.items()}}

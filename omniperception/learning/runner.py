@@ -153,14 +153,22 @@ class Runner:
         }
         save_checkpoint(path, state)
 
-    def load(self, path: str | Path) -> None:
-        """Go on where :meth:`save` wrote a checkpoint."""
+    def load(self, path: str | Path, same_task: bool = True) -> None:
+        """Go on where :meth:`save` wrote a checkpoint.
+
+        Args:
+            path: of the checkpoint.
+            same_task: whether the environments are configured as there; otherwise new episodes begin, at the levels
+                of the curricula.
+        """
         state = self._load(path)
         self.current_learning_iteration, self.total_time = state["iteration"], state["total_time"]
         self.logger.load_state_dict(state["logger"])
         if self.config.ppo.mixed_precision is None:
             self.alg.use_mixed_precision = state["use_mixed_precision"]
-        if distributed.rank() == 0:
+        if not same_task:
+            self.env.begin_at_levels_of(state["env"])
+        elif distributed.rank() == 0:
             self.env.load_state_dict(state["env"])
             set_rng_state(state["rng"])
         else:  # the others go on in ways of their own

@@ -263,6 +263,11 @@ class ObstacleField:
         if len(env_ids):
             self._start_approach(env_ids, gone[env_ids], robot_xy[env_ids], command_w[env_ids].to(self._dtype))
 
+    @property
+    def rises(self) -> bool:
+        """Whether there is a curriculum."""
+        return self.config.curriculum is not None
+
     def follow(self, velocity_error: float, seconds: float) -> None:
         """Raises the curriculum's level while the robot walks well (`velocity_error` in m/s)."""
         curriculum = self.config.curriculum

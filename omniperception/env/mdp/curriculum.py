@@ -39,6 +39,11 @@ class Curriculum:
         self._config = config
         self.level = 1.0 if config is None else config.start
 
+    @property
+    def rises(self) -> bool:
+        """Whether there is a curriculum."""
+        return self._config is not None
+
     def follow(self, velocity_error: float, seconds: float) -> None:
         """Takes in how robots have walked for `seconds`: with this error (m/s)."""
         config = self._config
