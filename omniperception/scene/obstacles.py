@@ -87,7 +87,8 @@ class ObstaclesConfig:
             around the environment's origin, with 'wrap' around the robot.
         boundary: 'bounce': obstacles turn back at the area's edge; 'wrap': one that leaves the area enters it again
             at the opposite edge, so that a robot can walk for ever among them.
-        clearance: free distance (m) kept at a reset between the robot's centre and an obstacle's edge.
+        clearance: free distance (m) kept at a reset between the robot's centre and an obstacle's edge; what finds no
+            place in its area that keeps it is not there in that episode.
         curriculum: None: everything is there from the first step.
         spacing: free distance (m) kept at a reset between the edges of any two standing obstacles, so that a robot fits
             through; 0 lets them overlap.

@@ -68,8 +68,10 @@ class Placement:
         """
         config = self._config
         if not self._searches:
-            xy, bounds = self._in_area(u, robot), None if self.follows else self.bounds
-            return push_off(xy, robot, config.clearance + radius, bounds), torch.ones_like(in_the_way)
+            xy, found = push_off(
+                self._in_area(u, robot), robot, config.clearance + radius, self.bounds, around_robot=self.follows
+            )
+            return xy, found | placed
         u = self._random.uniform(env_ids, (_CANDIDATES * 2, radius.shape[1])).to(radius.dtype)
         places = torch.stack([self._in_area(pair, robot) for pair in u.split(2, 1)], 2)  # (n, O, C, 2)
         fits = (places - robot[:, None, None]).norm(dim=-1) - radius[..., None] >= config.clearance
@@ -87,30 +89,37 @@ class Placement:
 
 
 def push_off(
-    xy: torch.Tensor, robot: torch.Tensor, keep: torch.Tensor, bounds: tuple[torch.Tensor, torch.Tensor] | None
-) -> torch.Tensor:
+    xy: torch.Tensor,
+    robot: torch.Tensor,
+    keep: torch.Tensor,
+    bounds: tuple[torch.Tensor, torch.Tensor],
+    around_robot: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Moves obstacles that would stand on the robot radially away from it.
 
     Args:
         xy: (n, O, 2) m, where they would stand.
         robot: (n, 2) m.
         keep: (n, O) m, the least distance of their centres from the robot.
-        bounds: low and high (O, 2) m of where they may go; None: anywhere.
+        bounds: low and high (O, 2) m of where they may go.
+        around_robot: whether the bounds are the robot's; what were beyond them would enter on the other side.
 
     Returns:
-        (n, O, 2) m.
+        (n, O, 2) m, and who has found a place (n, O) bool: an area may be too small for one.
     """
     offset = xy - robot[:, None]
     bearing = torch.atan2(offset[..., 1], offset[..., 0])
     turns = torch.arange(_PUSH_OFF_TURNS, dtype=xy.dtype, device=xy.device)[:, None, None]
     outside = robot[:, None] + unit(bearing + turns * _GOLDEN_ANGLE) * (keep + 1e-6)[..., None]
     places = torch.cat((xy[None], outside))  # where it is, then other directions, for robots close to an edge
-    if bounds is not None:
+    if not around_robot:
         places[1:] = places[1:].clamp(*bounds)
-    clear = (places - robot[:, None]).norm(dim=-1) >= keep
-    clear[-1] = True
+    apart = places - robot[:, None]
+    clear = apart.norm(dim=-1) >= keep
+    if around_robot:
+        clear[1:] &= ((apart[1:] >= bounds[0]) & (apart[1:] <= bounds[1])).all(-1)
     first = clear.int().argmax(0)
-    return places.gather(0, first[None, ..., None].expand(1, -1, -1, 2))[0]
+    return places.gather(0, first[None, ..., None].expand(1, -1, -1, 2))[0], clear.any(0)
 
 
 def choose_apart(

@@ -31,6 +31,26 @@ def reset(field, robot_xy):
     return (field.pos_w[..., :2] - robot_xy[:, None]).norm(dim=-1) - field.radius
 
 
+@pytest.mark.parametrize(
+    ("boundary", "area", "some"),
+    [
+        ("wrap", (-5.0, 5.0, -1.0, 1.0), True),  # beyond an edge it would enter on the other side
+        ("wrap", (-0.4, 0.4, -0.4, 0.4), False),
+        ("bounce", (-0.4, 0.4, -0.4, 0.4), False),
+    ],
+)
+def test_what_finds_no_place_that_keeps_the_clearance_is_not_there(boundary, area, some):
+    field = field_of(64, area=area, boundary=boundary, clearance=0.8)
+    robot = torch.zeros(64, 2)
+    field.reset(torch.arange(64), robot)
+    assert bool(field.root_active.any()) == some
+    for _ in range(2):
+        edge = field.root_pos_w[..., :2].norm(dim=-1) - field.root_radius
+        assert bool((edge >= 0.8 - 1e-6)[field.root_active].all())
+        field.root_velocity_w.zero_()
+        field.advance(0.02, robot)
+
+
 @pytest.mark.parametrize("boundary", ["bounce", "wrap"])
 @pytest.mark.parametrize("where", ["centre", "anywhere", "corner"])
 @pytest.mark.parametrize("seed", range(3))
