@@ -100,6 +100,8 @@ def export(
     )
     folder = run_dir / FOLDER if folder is None else folder
     folder.mkdir(parents=True, exist_ok=True)
+    for name in FORMATS.keys() - described.files.keys():  # of an earlier export
+        (folder / FORMATS[name]).unlink(missing_ok=True)
     for name, file in described.files.items():
         check(network, *_WRITERS[name](network, folder / file))
     if "onnx" in described.files:

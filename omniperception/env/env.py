@@ -110,6 +110,9 @@ class OmniEnv(VecEnv):
         self._all_envs = torch.arange(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.outcomes = dict.fromkeys(OUTCOMES, self.done)
+        self.velocity_error = self.yaw_rate_error = torch.zeros(self.num_envs, device=self.device)
+        self.contacts = self.done
+        self.no_obstacle_near: torch.Tensor | None = None
         self._reset(self._all_envs)
         self.healthy = ~self.sim.failed
         self._sense()

@@ -90,7 +90,8 @@ class EpisodeMetrics:
         log = {f"Reward/{name}": value for name, value in zip(self._names, rewards, strict=True)}
         log["Metrics/velocity_error"] = errors[0] / healthy_steps
         log["Metrics/yaw_rate_error"] = errors[1] / healthy_steps
-        log["Metrics/calm_velocity_error"] = errors[2] / max(errors[3], 1e-6)
+        if errors[3] > 0:
+            log["Metrics/calm_velocity_error"] = errors[2] / errors[3]
         log["Metrics/contact_share"] = errors[4] / steps
         episodes = outcomes[-1]
         if episodes:
