@@ -226,6 +226,7 @@ LINES = [
     ("ablate conditions=paperr", "conditions=paperr is unknown; did you mean paper"),
     ("ablate policies=exported", "policies=exported: no run is exported yet"),
     ("demo viewer=video obstacles.split=test", "no film may see it"),
+    ("robot-sim run=RUN obstacles.split=test", "no trial on the wire may see it"),
     ("train init=RUN", "no checkpoint in"),
     ("scan lidar=none", "lidar=none has nothing to view"),
     ("scan lidar=sonar", "lidar=sonar"),

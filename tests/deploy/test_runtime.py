@@ -17,12 +17,13 @@ import yaml
 
 from omniperception import build, config
 from omniperception.build import build_runner, load_policy
+from omniperception.config import ConfigError
 from omniperception.deploy import export as export_module
 from omniperception.deploy.export import describe, export
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.learning import CheckpointError
-from omniperception.learning.checkpoint import checkpoint_path
+from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 
 pytest.importorskip("onnxruntime", reason="extra deploy")
 pytest.importorskip("onnx", reason="extra export")
@@ -32,6 +33,7 @@ from omniperception.deploy.deploy_yaml import deploy_yaml
 from omniperception.deploy.description import Term
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
 from omniperception.evaluation.exported import ExportedPolicies, raw_points, record, robot_states
+from omniperception.evaluation.suite import Evaluation, World, evaluate
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from own_robots import BIPED, BIPED_PRESET, write_preset
@@ -255,6 +257,22 @@ def test_the_evaluation_result_is_that_of_torch(exported_run):
         assert torch.equal(getattr(got, name), getattr(expected, name)), name
     for name in ("clearance", "path", "velocity_error", "yaw_rate_error", "free_s"):
         torch.testing.assert_close(getattr(got, name), getattr(expected, name), atol=1e-5, rtol=1e-5)
+
+
+def test_other_weights_of_the_same_name_are_not_evaluated_as_exported(exported_run, tmp_path):
+    run_dir = shutil.copytree(exported_run("none"), tmp_path / "run")
+    path = checkpoint_path(run_dir, 7)
+    state = load_checkpoint(path, "cpu")
+    state["actor_state_dict"]["mlp.0.bias"] += 1.0
+    save_checkpoint(path, state)
+    with pytest.raises(ConfigError, match=r"exported from another checkpoint \(model_7.pt\) .* export again"):
+        evaluate(Evaluation([run_dir], [World("walk")], policies=("exported",), trials=1, num_envs=1, jobs=1))
+
+
+def test_an_export_leaves_no_file_of_an_earlier_one(exported_run, tmp_path):
+    for formats in (("torchscript", "onnx"), ("onnx",)):
+        export(exported_run("none"), tmp_path, formats=formats)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["deploy.yaml", "policy.json", "policy.onnx"]
 
 
 @pytest.mark.slow
