@@ -18,7 +18,7 @@ RAYS, HISTORY = 40, 4
 def ppo_config(**changes):
     values = {name: 1 for name in PPOConfig.__dataclass_fields__}
     values |= {"num_steps_per_env": 8, "num_mini_batches": 2, "max_minutes": None, "schedule": "adaptive"}
-    values["activation"] = "elu"
+    values |= {"activation": "elu", "hidden_dims": (1,)}
     return PPOConfig(**{**values, **changes})
 
 
