@@ -129,6 +129,15 @@ def test_what_a_run_goes_on_with_is_written_down(tmp_path, monkeypatch, capsys):
     assert config.load(tmp_path / "here") == saved
 
 
+def test_what_cannot_be_trained_leaves_no_directory(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    given = ("experiment=walk", "num_envs=1", "ppo.num_steps_per_env=2", "ppo.num_mini_batches=4")
+    for wrong, message in ((given, "ppo.num_mini_batches=4"), (("init=nowhere",), "init=nowhere does not exist")):
+        with pytest.raises(SystemExit, match="2"):
+            main(["train", *wrong, "hydra.run.dir=here"])
+        assert message in capsys.readouterr().err and not (tmp_path / "here").exists()
+
+
 @pytest.mark.parametrize(
     "changes",
     [("randomization=none",), ("randomization=robot", "num_envs=3"), ("obstacles.curriculum=null",)],

@@ -37,6 +37,7 @@ from omniperception.learning import (
     latest_checkpoint,
 )
 from omniperception.learning.log_writers import LoggerError
+from omniperception.learning.ppo import check_rollout
 from omniperception.plan import Plan, Watch
 
 ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
@@ -107,6 +108,8 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: 
     begun = distributed.of_first(config.is_begun(run_dir, run.composed))
     if not begun:
         _check_sources(run)
+        ppo = run.ppo
+        check_rollout(run.env.num_envs, ppo.num_steps_per_env, ppo.num_mini_batches, run.perception is not None)
     if distributed.rank() == 0:
         config.save(run.composed, run_dir)
         if not begun:

@@ -25,6 +25,26 @@ ESTIMATOR_LEARNING_RATE = 1.0e-3
 """Of the estimator's own optimiser, which passes over each rollout once."""
 
 
+def check_rollout(num_envs: int, num_steps: int, num_mini_batches: int, has_frames: bool) -> None:
+    """Refuses rollouts that leave a mini-batch without content; those with frames are of whole environments.
+
+    Raises:
+        RolloutTooSmall: one line says what to change.
+    """
+    available = num_envs if has_frames else num_envs * num_steps
+    if available < num_mini_batches:
+        what = "environments" if has_frames else f"steps ({num_envs} environments x {num_steps})"
+        raise RolloutTooSmall(
+            f"ppo.num_mini_batches={num_mini_batches} must not exceed the {available} {what} of a rollout;"
+            " lower it or raise num_envs"
+        )
+    if num_envs * num_steps < 2:
+        raise RolloutTooSmall(
+            f"num_envs={num_envs} and ppo.num_steps_per_env={num_steps} make rollouts of one step, whose advantages"
+            " have no spread to be divided by; raise one of them"
+        )
+
+
 class RolloutTooSmall(ValueError):
     """There is too little in a rollout to learn from it."""
 
@@ -350,21 +370,9 @@ class PerceptivePpo(PPO):
         return True
 
     def check_rollout(self) -> None:
-        """Refuse rollouts that leave a mini-batch without content; those with frames are of whole environments."""
-        num_envs, num_steps = self.storage.num_envs, self.storage.num_transitions_per_env
-        available = num_envs if self.storage.has_frames else num_envs * num_steps
-        if available < self.num_mini_batches:
-            steps = f"steps ({num_envs} environments x {num_steps})"
-            what = "environments" if self.storage.has_frames else steps
-            raise RolloutTooSmall(
-                f"ppo.num_mini_batches={self.num_mini_batches} must not exceed the {available} {what} of a rollout;"
-                " lower it or raise num_envs"
-            )
-        if num_envs * num_steps < 2:
-            raise RolloutTooSmall(
-                f"num_envs={num_envs} and ppo.num_steps_per_env={num_steps} make rollouts of one step, whose advantages"
-                " have no spread to be divided by; raise one of them"
-            )
+        """Refuse rollouts that leave a mini-batch without content."""
+        storage = self.storage
+        check_rollout(storage.num_envs, storage.num_transitions_per_env, self.num_mini_batches, storage.has_frames)
 
     def _act_without_value(self, obs: TensorDict) -> torch.Tensor:
         """As rsl_rl's `act`, for a policy that does not learn: nothing is valued."""
