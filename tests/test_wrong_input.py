@@ -267,7 +267,8 @@ def one_line(monkeypatch, tmp_path, run_dir, capfd):
         (tmp_path / "EMPTY").mkdir()
         words = [word.replace("=RUN", f"={run_dir}") for word in text.split()]
         if words[0] in ("train", "plan") and "run=" not in text:
-            words.append("num_envs=2") if "num_envs" not in text else None
+            small = [one for one in ("num_envs=2", "ppo.num_mini_batches=1") if one.split("=")[0] not in text]
+            words += small if words[0] == "train" else small[:1]
         with pytest.raises(SystemExit) as stopped:
             main(words)
         error = capfd.readouterr().err
