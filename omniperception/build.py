@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from omniperception import config as configs
-from omniperception.avoidance.velocity import AVOIDANCE_TARGET
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET
 from omniperception.common.errors import DoesNotFit
 from omniperception.common.provenance import made_at
 from omniperception.config import ConfigError, is_composed, one_line
@@ -75,18 +75,12 @@ class RunConfig:
                 f"{given} is a beginning of a policy's learning, and ppo.num_learning_epochs=0 keeps it as it is; leave"
                 " one of them out"
             )
-        read_out = supervised_velocity(self.perception)
-        if self.env.observations.estimated is not None and self.ppo.num_learning_epochs > 0 and read_out is not None:
+        adds = self.perception is not None and {AVOIDANCE_TARGET, MOTION_TARGET} & set(self.perception.supervision)
+        if adds and self.env.observations.estimated is not None and self.ppo.num_learning_epochs > 0:
             raise ValueError(
-                f"observations.estimated: estimates would be fitted to the command without the avoidance velocity that"
-                f" perception.{read_out} adds to it; set that to 0, or ppo.num_learning_epochs to 0"
+                "observations.estimated: estimates would be fitted to the command without the avoidance velocity that"
+                " is added to it; set perception.avoidance_weight and motion_weight, or ppo.num_learning_epochs, to 0"
             )
-
-
-def supervised_velocity(perception: PerceptionConfig | None) -> str | None:
-    """The weight that makes a policy add an avoidance velocity to its command."""
-    names = ("avoidance_weight", "motion_weight")
-    return next((name for name in names if perception is not None and getattr(perception, name) > 0), None)
 
 
 _TASK = (

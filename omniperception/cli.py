@@ -45,7 +45,9 @@ _KINDS = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
 PICTURES = (".png", ".pdf", ".svg")
+"""Suffixes of pictures."""
 RESULTS = (".json", ".json.gz")
+"""Suffixes of files of results."""
 
 
 def argument(
@@ -67,9 +69,8 @@ def argument(
         positive: whether it must be above 0.
         suffixes: one that a file that is written must end in; () where it is none or a folder.
     """
-    metadata = {"doc": doc, "choices": tuple(choices), "least": least, "positive": positive}
-    metadata["suffixes"] = tuple(suffixes)
-    return dataclasses.field(default=default, metadata=metadata)
+    limits = {"choices": tuple(choices), "least": least, "positive": positive, "suffixes": tuple(suffixes)}
+    return dataclasses.field(default=default, metadata={"doc": doc, **limits})
 
 
 def trust() -> Any:

@@ -20,6 +20,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from omniperception.common.checkpoints import list_checkpoints
 from omniperception.common.errors import ConfigError, UnknownKey, one_line, suggest
 
 _SHIPPED = Path(__file__).resolve().parent / "conf"
@@ -397,7 +398,7 @@ def is_begun(run_dir: Path, composed: dict) -> bool:
     What has no checkpoint has not begun: a training that failed, or was stopped, before its first.
     """
     path = run_dir / CONFIG_FILE
-    if not path.is_file() or not has_checkpoint(run_dir):
+    if not path.is_file() or not list_checkpoints(run_dir):
         return False
     if yaml.safe_load(path.read_text()) != yaml.safe_load(yaml.safe_dump(composed)):
         raise ConfigError(
@@ -419,15 +420,10 @@ def find_run(name: str, key: str = "run") -> Path:
         if not path.is_dir():
             raise ConfigError(f"{key}={name} does not exist; give a run directory or {key}=latest")
         return path
-    runs = [run for run in find_runs(OUTPUTS) if has_checkpoint(run)]
+    runs = [run for run in find_runs(OUTPUTS) if list_checkpoints(run)]
     if not runs:
         raise ConfigError(f"{key}=latest finds no run with a checkpoint under outputs/; train one first")
     return runs[-1]
-
-
-def has_checkpoint(run_dir: Path) -> bool:
-    """Tell whether a run has saved weights."""
-    return any(run_dir.glob("checkpoints/model_*.pt"))
 
 
 def find_runs(folder: Path) -> list[Path]:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.cli import Command, argument, trust
+from omniperception.common.errors import check_known
 from omniperception.evaluation.ablation import Ablation, Study, evaluate_all, load_study, train, write_tables
 from omniperception.evaluation.suite import POLICIES, SPLITS
 from omniperception.learning import CheckpointError
@@ -71,9 +72,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
 
 def _with_arms(study: Study, names: tuple[str, ...]) -> Study:
     """The study with some of its arms, in its order."""
-    for name in names:
-        if name not in study.arms:
-            raise config.ConfigError(f"arms={name} is unknown; {config.suggest(name, tuple(study.arms))}")
+    check_known("arms", names, tuple(study.arms))
     return replace(study, arms={name: arm for name, arm in study.arms.items() if name in names})
 
 

@@ -53,12 +53,12 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     """Measures, prints a table and draws a picture."""
     others = {"ranges": (*KICKS, "condition"), "kicks": RANGES, "feet": (*RANGES, *KICKS)}[arguments.what]
     refuse_arguments(arguments, others, f"it is not read for what={arguments.what}")
-    if arguments.what == "kicks":
-        refuse_overrides(overrides, {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S})
-    if arguments.what == "ranges":
-        refuse_overrides(overrides, {"num_envs": Evaluation.num_envs, "scenario": "walk"})
-    if arguments.what == "feet":
-        refuse_overrides(overrides, {"num_envs": len(COMMANDS)})
+    own: dict[str, dict[str, object]] = {
+        "ranges": {"num_envs": Evaluation.num_envs, "scenario": "walk"},
+        "kicks": {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S},
+        "feet": {"num_envs": len(COMMANDS)},
+    }
+    refuse_overrides(overrides, own[arguments.what])
     run_dir = config.find_run(arguments.run)
     picture = run_dir / FOLDER / f"gait-{arguments.what}.png"
     picture.parent.mkdir(exist_ok=True)

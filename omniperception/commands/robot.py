@@ -45,7 +45,7 @@ class Arguments:
         "check", "the robot's own controller: refuse while it runs, end it, or do not ask", choices=CHOICES
     )
     record: Path | None = argument(None, "file ending in .mcap, of state, clouds and what the policy did; null: none")
-    report: Path | None = argument(None, "file, of what was measured; null: none", suffixes=(".json",))
+    report: Path | None = argument(None, "file of what was measured; null: none", suffixes=(".json",))
     seconds: float | None = argument(None, "how long; null: until it is interrupted", positive=True)
 
 

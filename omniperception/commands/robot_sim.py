@@ -43,7 +43,7 @@ class Arguments:
     sport_mode: str | None = argument(None, "name of a controller of its own, which runs until it is released")
     fault: str | None = argument(None, "fault of the wire a second after it has begun to walk", choices=tuple(FAULTS))
     fault_s: float = argument(2.0, "how long the fault lasts", positive=True)
-    report: Path | None = argument(None, "file, of what became of the robot; null: none", suffixes=(".json",))
+    report: Path | None = argument(None, "file of what became of the robot; null: none", suffixes=(".json",))
     seconds: float | None = argument(None, "simulated time; null: until the goal or an interrupt", positive=True)
     trust: tuple[str, ...] = trust()
 

@@ -23,6 +23,7 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.cli import Command, argument, trust
+from omniperception.common.errors import check_known
 from omniperception.deploy.description import DeployError
 from omniperception.hardware.trials import KNOWN_FAULTS, NO_FAULT, TrialsConfig, results, run, table
 
@@ -48,9 +49,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         faults = KNOWN_FAULTS if "all" in arguments.faults else arguments.faults
         folder = str(config.find_run(arguments.run))
         known = config.presets("scenario", config.search_path(overrides, config.read(Path(folder))))
-        for scenario in arguments.scenario:
-            if scenario not in known:
-                raise config.ConfigError(f"scenario={scenario} is unknown; {config.suggest(scenario, known)}")
+        check_known("scenario", arguments.scenario, known)
         run(
             TrialsConfig(
                 run=folder,

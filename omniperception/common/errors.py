@@ -38,6 +38,17 @@ def suggest(name: str, known: Sequence[str], before: str = "", and_all: bool = F
     return " ".join(hints)
 
 
+def check_known(key: str, names: Iterable[str], known: Sequence[str]) -> None:
+    """Refuses names that are none of those that are known, with what they are given by.
+
+    Raises:
+        ConfigError: one is unknown.
+    """
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{key}={name} is unknown; {suggest(name, known)}")
+
+
 def one_line(error: BaseException) -> str:
     """The message of an error without line breaks."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]

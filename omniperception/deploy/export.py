@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -93,7 +92,7 @@ def export(
         provenance={
             "run": run_dir.resolve().name,
             "checkpoint": trained.checkpoint.name,
-            "weights": hashlib.sha256(trained.checkpoint.read_bytes()).hexdigest(),
+            "weights": checksum(trained.checkpoint),
             "iteration": load_checkpoint(trained.checkpoint, "cpu")["iteration"],
             **provenance("cpu"),
         },

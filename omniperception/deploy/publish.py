@@ -51,8 +51,8 @@ def publish(run_dir: Path, folder: Path) -> dict:
             " network"
         )
     composed = config.read(run_dir)
-    for stale in (*(path.parent for path in theirs[:1]), folder / RESULTS, folder / EXPORTED):
-        shutil.rmtree(stale, ignore_errors=True)
+    for stale in ("checkpoints", RESULTS, EXPORTED):
+        shutil.rmtree(folder / stale, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     composed.pop(config.SEARCH_PATH, None)  # a folder of this machine
     composed.sim.num_threads = 0  # and how many of its cores

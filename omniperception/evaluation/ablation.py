@@ -11,6 +11,7 @@ from pathlib import Path
 import yaml
 
 from omniperception import config
+from omniperception.common.errors import check_known
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record, read, write
 from omniperception.evaluation.study_report import study_table
@@ -91,10 +92,8 @@ class Study:
             if arm.after is not None and arm.after not in before:
                 raise ConfigError(f"arms.{name}.after={arm.after} must be an arm before it, one of {sorted(before)}")
             before.add(name)
-        for key, values, known in (("split", [self.split], SPLITS), ("policies", self.policies, POLICIES)):
-            for value in values:
-                if value not in known:
-                    raise ConfigError(f"{key}={value} is unknown; {config.suggest(value, tuple(known))}")
+        check_known("split", [self.split], tuple(SPLITS))
+        check_known("policies", self.policies, tuple(POLICIES))
 
 
 def load_study(name: str, folders: Sequence[Path] = ()) -> Study:
@@ -129,18 +128,11 @@ class Ablation:
 
     def __post_init__(self) -> None:
         folders = config.search_path(self.overrides)
-        for variant in self.study.variants:
-            known = (*VARIANTS, *config.presets("perception", folders))
-            if variant not in known:
-                raise ConfigError(f"variants={variant} is unknown; {config.suggest(variant, known)}")
-        for condition in self.study.conditions:
-            if condition not in (known := config.presets("condition", folders)):
-                raise ConfigError(f"conditions={condition} is unknown; {config.suggest(condition, known)}")
+        check_known("variants", self.study.variants, (*VARIANTS, *config.presets("perception", folders)))
+        check_known("conditions", self.study.conditions, config.presets("condition", folders))
         if "all" in self.study.scenarios and len(self.study.scenarios) > 1:
             raise ConfigError("scenarios=all has every scenario of held_out; leave the others out")
-        for scenario in self.study.scenarios:
-            if scenario not in (known := (*config.presets("scenario", folders), "all")):
-                raise ConfigError(f"scenarios={scenario} is unknown; {config.suggest(scenario, known)}")
+        check_known("scenarios", self.study.scenarios, (*config.presets("scenario", folders), "all"))
         if self.study.suite is not None:
             suite_worlds(self.study.suite, folders)
         for override in config.parse(self.overrides):

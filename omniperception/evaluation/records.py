@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from omniperception.common.files import write_whole
 from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes
 
@@ -88,9 +89,7 @@ def write(path: Path, records: Iterable[Record]) -> None:
     lines = ",\n".join(json.dumps(record.plain(), separators=(",", ":")) for record in records)
     text = f'{{"format": {FORMAT}, "records": [\n{lines}\n]}}\n'.encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(gzip.compress(text, mtime=0) if path.suffix == ".gz" else text)
-    temporary.replace(path)
+    write_whole(path, gzip.compress(text, mtime=0) if path.suffix == ".gz" else text)
 
 
 def read(path: Path) -> list[Record]:

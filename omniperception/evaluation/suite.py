@@ -17,11 +17,13 @@ from omegaconf import OmegaConf
 
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
+from omniperception.common.errors import check_known
 from omniperception.common.figures import new_figure
 from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.description import FILE as DESCRIPTION
+from omniperception.deploy.description import checksum
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.config import EnvConfig
 from omniperception.evaluation.baselines import BASELINES, DRIVEN, Limits, baseline, commanded_ranges, prepared
@@ -104,9 +106,13 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         folders = config.search_path(self.overrides, config.read(self.runs[0]))
-        _check("scenario", [world.name for world in self.worlds], folders)
-        _check("terrain", [world.terrain for world in self.worlds if world.terrain is not None], folders)
-        _check("condition", [self.condition] if self.condition is not None else [], folders)
+        named = {
+            "scenario": [world.name for world in self.worlds],
+            "terrain": [world.terrain for world in self.worlds if world.terrain is not None],
+            "condition": [self.condition] if self.condition is not None else [],
+        }
+        for group, names in named.items():
+            check_known(group, names, config.presets(group, folders))
         for override in config.parse(self.overrides):
             given, name = override.input_line, override.key_or_group
             if name in ("scenario", "num_envs", "condition", "obstacles.split"):
@@ -122,13 +128,6 @@ class Evaluation:
             for policy in self.policies
             for run_dir in self.runs
         ]
-
-
-def _check(group: str, names: Sequence[str], folders: Sequence[Path]) -> None:
-    known = config.presets(group, folders)
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"{group}={name} is unknown; {config.suggest(name, known)}")
 
 
 def suite_worlds(name: str, folders: Sequence[Path] = ()) -> list[World]:
@@ -329,7 +328,7 @@ def _exported(run_dir: Path, weights: str) -> ExportedPolicy:
 
 def weights_hash(run_dir: Path) -> str:
     """SHA-256 of a run's newest checkpoint."""
-    return hashlib.sha256(latest_checkpoint(run_dir).read_bytes()).hexdigest()
+    return checksum(latest_checkpoint(run_dir))
 
 
 def reported_seed(weights: str, world: str) -> int:
@@ -391,12 +390,12 @@ def _check_tasks(tasks: Sequence[Task]) -> None:
         if key in seen:
             raise ConfigError(f"run={task.run_dir} policy={task.policy} world={task.world.name} is given twice")
         seen.add(key)
-        weights = task.weights
-        if task.policy == "exported":
-            try:
-                _exported(task.run_dir, weights)
-            except ValueError as error:
-                raise ConfigError(f"policy=exported: {error}") from None
+    weights = {run_dir: weights_hash(run_dir) for run_dir in dict.fromkeys(task.run_dir for task in tasks)}
+    for run_dir in dict.fromkeys(task.run_dir for task in tasks if task.policy == "exported"):
+        try:
+            _exported(run_dir, weights[run_dir])
+        except ValueError as error:
+            raise ConfigError(f"policy=exported: {error}") from None
     out = tasks[0].evaluation.out
     if out is not None and out.exists():
         read(out)

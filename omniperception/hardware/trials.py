@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from omniperception.common.files import write_whole
 from omniperception.deploy.description import FILE, DeployError, checksum
 from omniperception.evaluation.statistics import wilson
 from omniperception.hardware.faults import FAULTS, SENSORS
@@ -109,9 +110,7 @@ def run(config: TrialsConfig) -> None:
                 if path.exists():
                     continue
                 result = _trial(config, scenario, fault, trial, _FIRST_DOMAIN + number % _DOMAINS)
-                whole = path.with_suffix(".part")
-                whole.write_text(json.dumps({"made_with": made_with, **result}))
-                whole.replace(path)
+                write_whole(path, json.dumps({"made_with": made_with, **result}).encode())
                 print(f"{path.name}: {_told(result)}", flush=True)
 
 

@@ -12,27 +12,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from omniperception.common.checkpoints import checkpoint_path, list_checkpoints
+
 FORMAT = "omniperception-checkpoint"
 VERSION = 1
 
-_NAME = re.compile(r"model_(\d+)\.pt")
 _LAYER = re.compile(r"mlp\.(\d+)\.weight")
 
 
 class CheckpointError(RuntimeError):
     """A checkpoint is missing, damaged, foreign or does not fit what it is loaded into."""
-
-
-def checkpoint_path(run_dir: str | os.PathLike, iteration: int) -> Path:
-    """``run_dir/checkpoints/model_<iteration>.pt``; ``iteration`` is the number of completed iterations."""
-    return Path(run_dir) / "checkpoints" / f"model_{iteration}.pt"
-
-
-def list_checkpoints(run_dir: str | os.PathLike) -> list[Path]:
-    """Complete checkpoints of a run, oldest first; half-written temporary files are not among them."""
-    folder = Path(run_dir) / "checkpoints"
-    found = [(int(match[1]), path) for path in folder.glob("model_*.pt") if (match := _NAME.fullmatch(path.name))]
-    return [path for _, path in sorted(found)]
 
 
 def latest_checkpoint(run_dir: str | os.PathLike) -> Path:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+
+from omniperception.common.files import write_whole
 
 PROGRESS_FILE = "progress.json"
 """In the run directory: completed iterations, those at which training ends, and the newest rates."""
@@ -41,9 +42,8 @@ class ProgressLine:
 
 def save_progress(run_dir: Path, iterations: int, total: int, rates: Mapping[str, float]) -> None:
     """Writes PROGRESS_FILE; whoever reads it meanwhile sees the old one or the new one."""
-    half = run_dir / f".{PROGRESS_FILE}.tmp"
-    half.write_text(json.dumps({"iterations": iterations, "total": total, "rates": rates}) + "\n")
-    os.replace(half, run_dir / PROGRESS_FILE)
+    line = json.dumps({"iterations": iterations, "total": total, "rates": rates}) + "\n"
+    write_whole(run_dir / PROGRESS_FILE, line.encode())
 
 
 def load_progress(run_dir: Path) -> dict | None:

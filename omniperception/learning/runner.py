@@ -337,7 +337,7 @@ class Runner:
 
 def _meaning(inputs: Sequence[ActorInput]) -> list[tuple]:
     """What they are, whatever their groups are called."""
-    return [(one.term, one.age, one.component) for one in inputs]
+    return [one[1:] for one in inputs]
 
 
 def _named(one: ActorInput) -> str:
@@ -345,8 +345,8 @@ def _named(one: ActorInput) -> str:
 
 
 def _first_difference(own: Sequence[ActorInput], other: Sequence[ActorInput]) -> str:
-    differ = (k for k, (mine, theirs) in enumerate(zip(own, other, strict=False)) if mine[1:] != theirs[1:])
-    number = next(differ, min(len(own), len(other)))
+    pairs = zip(_meaning(own), _meaning(other), strict=False)
+    number = next((k for k, (mine, theirs) in enumerate(pairs) if mine != theirs), min(len(own), len(other)))
     mine, theirs = (_named(one[number]) if number < len(one) else "none" for one in (own, other))
     return f"input {number} of this run's policy is {mine}, of that run's {theirs}"
 

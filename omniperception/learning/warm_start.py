@@ -60,13 +60,13 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
     alike = "observations (groups, history and what is estimated), ppo.hidden_dims and ppo.obs_normalization"
     state, copies = model.state_dict(), []
     optional = {name for name in state if name.startswith(_OPTIONAL)}
-    perceives_alike = all(name in weights and weights[name].shape == state[name].shape for name in optional)
-    embeds_besides = any(name.startswith("perception.") for name in weights) and not (optional and perceives_alike)
-    for name in [name for name in state if perceives_alike or name not in optional]:
+    fits = bool(optional) and all(name in weights and weights[name].shape == state[name].shape for name in optional)
+    for name in [name for name in state if fits or name not in optional]:
         own, other = state[name], weights.get(name)
-        if name == _FIRST_LAYER and other is not None and not (optional and perceives_alike):
+        if name == _FIRST_LAYER and other is not None and not fits:
             own = own[:, : _blind_dim(model)]
-            other = other[:, : own.shape[1]] if embeds_besides else other
+            if any(name.startswith("perception.") for name in weights):  # its embedding stays behind
+                other = other[:, : own.shape[1]]
         if other is None or other.shape != own.shape:
             raise _misfit(f"init={source} does not fit", name, own, other, alike)
         copies.append((own, other))
@@ -76,7 +76,7 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
         )
     for own, other in copies:
         own.copy_(other)
-    return bool(optional) and perceives_alike
+    return fits
 
 
 def estimating(
@@ -131,8 +131,8 @@ def observing_more(
 ) -> Mapping[str, torch.Tensor]:
     """The weights of an actor that observes less, for one that at first does not heed what it observes besides.
 
-    What it observes besides is hardly normalized: its statistics are those of a mean of 0 and a deviation of 1, seen as
-    often as the rest. Actors that differ in anything else are left as they are.
+    What it observes besides has a running mean of 0 and a standard deviation of 1 at first, at the same count as the
+    rest, so that they hardly change. Actors that differ in anything else are left as they are.
 
     Args:
         weights: the state of the other actor.
