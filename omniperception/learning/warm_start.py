@@ -131,8 +131,8 @@ def observing_more(
 ) -> Mapping[str, torch.Tensor]:
     """The weights of an actor that observes less, for one that at first does not heed what it observes besides.
 
-    What it observes besides has a running mean of 0 and a standard deviation of 1 at first, at the same count as the
-    rest, so that they hardly change. Actors that differ in anything else are left as they are.
+    The running mean and standard deviation of the inputs it adds start at 0 and 1 with the sample count of the others,
+    so new samples move them slowly. The weights of an actor that differs in anything else are returned unchanged.
 
     Args:
         weights: the state of the other actor.
