@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from omniperception import config as configs
-from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET
 from omniperception.common.errors import DoesNotFit
 from omniperception.common.provenance import made_at
 from omniperception.config import ConfigError, is_composed, one_line
@@ -75,7 +75,7 @@ class RunConfig:
                 f"{given} is a beginning of a policy's learning, and ppo.num_learning_epochs=0 keeps it as it is; leave"
                 " one of them out"
             )
-        adds = self.perception is not None and {AVOIDANCE_TARGET, MOTION_TARGET} & set(self.perception.supervision)
+        adds = self.perception is not None and self.perception.adds_velocity
         if adds and self.env.observations.estimated is not None and self.ppo.num_learning_epochs > 0:
             raise ValueError(
                 "observations.estimated: estimates would be fitted to the command without the avoidance velocity that"
@@ -312,13 +312,15 @@ def steps_per_frame(run: RunConfig) -> int:
 
 def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
     """The runner that trains in the environment of a run."""
+    avoidance = run.env.rewards.avoidance
     return LearningConfig(
         run.ppo,
         run.perception,
         run.env.observations.actor,
         run.env.observations.critic,
         steps_per_frame(run) if run.perception is not None else 1,
-        run.env.rewards.avoidance.risk,
+        avoidance.risk,
+        None if avoidance.max_acceleration is None else avoidance.max_acceleration * env.control_dt,
         Mirror(env) if run.ppo.symmetry else None,
         estimator=EstimatorConfig(run.env.observations.estimated) if run.env.observations.estimated else None,
         distillation=run.distillation,

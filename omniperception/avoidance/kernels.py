@@ -93,6 +93,7 @@ def worst_sectors(
     candidates: wp.array(dtype=wp.vec2),
     times: wp.array(dtype=wp.float32),
     robot_radius: float,
+    robot_half_length: float,
     decay: float,
     time_constant: float,
     out_of_reach: float,
@@ -122,7 +123,9 @@ def worst_sectors(
             nearest = float(wp.inf)
             at = wp.int32(0)
             for j in range(present):
-                squared = wp.length_sq(points[env, j] - goal)
+                apart = points[env, j] - goal
+                along = wp.max(wp.abs(apart[0]) - robot_half_length, 0.0)
+                squared = along * along + apart[1] * apart[1]
                 if squared < nearest:
                     nearest = squared
                     at = j

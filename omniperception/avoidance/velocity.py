@@ -13,6 +13,9 @@ SECTOR_TARGET, AVOIDANCE_TARGET, MOTION_TARGET = "sector_target", "avoidance_tar
 """Supervision of a network: 1 - d / NEARNESS_RANGE by sector of what the LiDAR hits; the avoidance velocity; nearness
 and velocity of the true obstacles by sector."""
 
+LAST_ASKED = "last_asked"
+"""Observations (n, 2) of the velocity (m/s) that a policy asked its gait for in the step that ended."""
+
 
 @dataclass(frozen=True)
 class AvoidanceConfig:
@@ -23,6 +26,9 @@ class AvoidanceConfig:
         threshold: sectors with an obstacle nearer than this (m) push.
         alpha: decay (1/m) of the push with distance.
         max_speed: bound (m/s) of the sum's magnitude; None leaves it as the paper has it.
+        max_acceleration: at most as fast (m/s^2) changes V_cmd + V_avoid where a policy adds V_avoid to the command, as
+            gaits are trained with commands that do not jump (`observations.command_acceleration`); None: it jumps. The
+            reward's V_avoid has no such limit.
         risk: None: V_avoid is the paper's sum; otherwise it follows from the risk of velocities, and the sectors only
             tell whether an obstacle is near.
     """
@@ -31,14 +37,16 @@ class AvoidanceConfig:
     threshold: float
     alpha: float
     max_speed: float | None = None
+    max_acceleration: float | None = None
     risk: VelocityRisk | None = None
 
     def __post_init__(self) -> None:
         for key in ("num_sectors", "threshold", "alpha"):
             if getattr(self, key) <= 0:
                 raise ValueError(f"rewards.avoidance.{key}={getattr(self, key)} must be positive")
-        if self.max_speed is not None and self.max_speed <= 0:
-            raise ValueError(f"rewards.avoidance.max_speed={self.max_speed} must be positive or null")
+        for key in ("max_speed", "max_acceleration"):
+            if getattr(self, key) is not None and getattr(self, key) <= 0:
+                raise ValueError(f"rewards.avoidance.{key}={getattr(self, key)} must be positive or null")
 
 
 def avoidance_velocity(distance: torch.Tensor, config: AvoidanceConfig) -> torch.Tensor:

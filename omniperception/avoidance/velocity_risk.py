@@ -37,10 +37,11 @@ class VelocityRisk:
 
     The candidates lie on rings around standing still, in the yaw-aligned frame. The risk of one, 0 to 1, is the largest
     of exp(-gap / decay - t / time_constant) over all obstacles and `times` t, where gap (m) lies between the
-    obstacle's outline and a disc of `robot_radius` if both keep their velocities until then: a velocity obstacle
-    (Fiorini and Shiller, 1998) with soft edges. The choice is the mean of the candidates under the weights
-    softmax(-(along^2 + sideways * across^2 + weight * risk) / temperature), where along and across (m/s) are how much a
-    candidate deviates from the command in its direction and beside it.
+    obstacle's outline and the robot's, seen from above, if both keep their velocities until then: a velocity obstacle
+    (Fiorini and Shiller, 1998) with soft edges. The robot's outline is what lies within `robot_radius` of a line from
+    `robot_half_length` behind to as much before the base's origin. The choice is the mean of the candidates under the
+    weights softmax(-(along^2 + sideways * across^2 + weight * risk) / temperature), where along and across (m/s) are
+    how much a candidate deviates from the command in its direction and beside it.
 
     Beyond the paper, whose V_avoid sees distances alone; see docs/lab/learning.md for what it brings.
 
@@ -49,7 +50,7 @@ class VelocityRisk:
         num_rings: equally spaced speeds.
         num_directions: candidates on each ring.
         times: when the gap is looked at (s).
-        robot_radius: (m).
+        robot_radius, robot_half_length: of the robot's outline (m); a disc where the latter is 0.
         decay: (m).
         time_constant: (s).
         weight: of a risk of 1 against a squared deviation from the command ((m/s)^2).
@@ -68,14 +69,16 @@ class VelocityRisk:
     weight: float
     temperature: float
     sideways: float = 1.0
+    robot_half_length: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", tuple(float(time) for time in self.times))
         for name in _POSITIVE:
             if getattr(self, name) <= 0:
                 raise ValueError(f"rewards.avoidance.risk.{name}={getattr(self, name)} must be positive")
-        if self.robot_radius < 0:
-            raise ValueError(f"rewards.avoidance.risk.robot_radius={self.robot_radius} must not be negative")
+        for name in ("robot_radius", "robot_half_length"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"rewards.avoidance.risk.{name}={getattr(self, name)} must not be negative")
         if not self.times or min(self.times) < 0:
             raise ValueError(f"rewards.avoidance.risk.times={list(self.times)} must be times (s) of at least 0")
 
@@ -114,7 +117,7 @@ class VelocityRisk:
                 sector, time = self._worst_by_kernel(place, velocity, candidates)
         sector = sector[..., None].expand(-1, -1, 2)
         meeting = place.gather(1, sector) + time[..., None] * (velocity.gather(1, sector) - candidates)
-        distance = meeting.square().sum(-1).clamp(min=_SMALLEST).sqrt()
+        distance = self._squared(meeting).clamp(min=_SMALLEST).sqrt()
         return (-self._exponent(distance, time)).exp()
 
     def _worst_by_kernel(
@@ -138,6 +141,7 @@ class VelocityRisk:
             view(candidates, wp.vec2),
             view(times, wp.float32),
             self.robot_radius,
+            self.robot_half_length,
             self.decay,
             self.time_constant,
             _OUT_OF_REACH,
@@ -155,10 +159,10 @@ class VelocityRisk:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(n, K) which sector's obstacle makes each candidate's risk, and when (s)."""
         worst: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
-        for time in self.times:  # the squared distance is |p|^2 - 2 p.c t + |c t|^2, the middle term a matrix product
-            point, goal = place + time * velocity, time * candidates
-            squared, nearest = (point.square().sum(-1, keepdim=True) - 2.0 * point @ goal.T).min(1)
-            distance = (squared + goal.square().sum(-1)).clamp(min=0.0).sqrt()
+        for time in self.times:
+            apart = (place + time * velocity)[:, :, None] - time * candidates  # (n, S, K, 2)
+            squared, nearest = self._squared(apart).min(1)
+            distance = squared.sqrt()
             now = 0.0 * distance + time  # not full_like, which an exporter takes for a constant
             exponent = self._exponent(distance, now)
             if worst is None:
@@ -170,6 +174,11 @@ class VelocityRisk:
             worst = least, sector, torch.where(worse, now, when)
         assert worst is not None  # there is a time
         return worst[1:]
+
+    def _squared(self, apart: torch.Tensor) -> torch.Tensor:
+        """Squared distances (...) (m^2) of places (..., 2) from the line in the robot's middle."""
+        along, across = apart.unbind(-1)
+        return (along.abs() - self.robot_half_length).clamp(min=0.0).square() + across.square()
 
     def _exponent(self, distance: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
         """Minus the logarithm of the risk of passing an obstacle at a distance (m) after a time (s)."""

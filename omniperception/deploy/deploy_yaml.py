@@ -110,6 +110,8 @@ def _caveats(description: Description) -> list[str]:
     lines.append(f"Actions, and last_action, are clipped to +-{description.joints.action_limit:g} before their scale.")
     if description.estimated:
         lines.append(f"The network's second output, 'estimate', is its {', '.join(description.estimated)}.")
+    if description.max_acceleration is not None:
+        lines.append("Its last output, 'asked', goes into its input 'last_asked' at the next step, 0 at the first.")
     if description.stepping is not None:
         lines.append("NOT TO BE USED AS IT IS: targets lack the stepping motion of policy.json, which this form has no")
         lines.append("place for.")

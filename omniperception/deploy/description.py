@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 FORMAT = "omniperception-policy"
-VERSION = 6
+VERSION = 7
 FILE = "policy.json"
 FINGERPRINT = "omniperception-description"
 """Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
@@ -174,6 +174,8 @@ class Description:
         perception: what is made of its frames; None for a blind policy.
         estimated: quantities of the robot's state that the network gives in the output `estimate` and nobody measures:
             base_lin_vel (m/s, base frame), or none.
+        max_acceleration: at most as fast (m/s^2) changes the velocity that the network gives in its last output `asked`
+            and reads in its last input `last_asked` at the next step, 0 at the first; None: it has neither.
         files: name of the network's file by kind, "onnx" or "torchscript".
         checksums: SHA-256 of each of these files.
         provenance: run, checkpoint, iteration, date and versions.
@@ -188,6 +190,7 @@ class Description:
     lidar: Lidar | None = None
     perception: Perception | None = None
     estimated: Sequence[str] = ()
+    max_acceleration: float | None = None
     files: Mapping[str, str] = field(default_factory=dict)
     checksums: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping = field(default_factory=dict)
@@ -204,6 +207,8 @@ class Description:
         if self.perception is not None:
             shapes["frames"] = (self.perception.history, self.perception.num_points, 3)
             shapes["frame_count"] = (1,)
+        if self.max_acceleration is not None:
+            shapes["last_asked"] = (2,)
         return shapes
 
     @property
@@ -218,6 +223,8 @@ class Description:
         outputs = {"actions": ["batch", len(self.joints.names)]}
         if self.estimated:
             outputs["estimate"] = ["batch", 3]
+        if self.max_acceleration is not None:
+            outputs["asked"] = ["batch", 2]
         network = {"inputs": shapes, "outputs": outputs}
         content = {"format": FORMAT, "version": VERSION, "network": network, **asdict(self)}
         (folder / FILE).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -18,8 +18,10 @@ from rsl_rl.models import MLPModel
 from torch import nn
 
 from omniperception import build
+from omniperception.avoidance.velocity import LAST_ASKED
 from omniperception.build import RunConfig
 from omniperception.common.provenance import provenance
+from omniperception.common.vectors import moved_towards
 from omniperception.config import ConfigError
 from omniperception.deploy.deploy_yaml import FILE as DEPLOY_YAML
 from omniperception.deploy.deploy_yaml import deploy_yaml
@@ -147,6 +149,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         lidar=_lidar(run.env.lidar, robot) if run.perception is not None and run.env.lidar is not None else None,
         perception=_perception(run.perception) if run.perception is not None else None,
         estimated=_estimated(run),
+        max_acceleration=_max_acceleration(run),
     )
 
 
@@ -212,6 +215,11 @@ def _estimated(run: RunConfig) -> tuple[str, ...]:
     if not estimates_velocity(run.env.observations):
         raise ConfigError(f"observations.estimated={group} cannot be exported: it must be true_base_lin_vel alone")
     return ("base_lin_vel",)
+
+
+def _max_acceleration(run: RunConfig) -> float | None:
+    adds = run.perception is not None and run.perception.adds_velocity
+    return run.env.rewards.avoidance.max_acceleration if adds else None
 
 
 def _lidar(sensor: SensorConfig, robot: RobotConfig) -> Lidar:
@@ -285,7 +293,7 @@ def _cells(sampler: ProximitySampler | StandingSampler) -> dict:
 
 
 Outputs = torch.Tensor | tuple[torch.Tensor, ...]
-"""Actions, or actions and estimates."""
+"""Actions, or actions and what `output_names` says besides."""
 
 
 class BlindNetwork(nn.Module):
@@ -324,27 +332,42 @@ class BlindNetwork(nn.Module):
 
 
 class PerceptiveNetwork(BlindNetwork):
-    """Flat observations and a history of sampled frames -> actions."""
+    """Flat observations and a history of sampled frames -> actions; with a limit of the change of V_cmd + V_avoid the
+    one of the step before goes in last, too, and the new one comes out last."""
 
-    input_names = ("observations", "frames", "frame_count")
+    input_names: Sequence[str] = ("observations", "frames", "frame_count")
 
     def __init__(self, actor: PerceptionActor, command_start: int) -> None:
         """Args: actor: copied, on the CPU; command_start: where (v_x, v_y) begin in the observations."""
         super().__init__(actor)
         self.command_start = command_start
+        if actor.max_change is not None:
+            self.input_names = (*self.input_names, LAST_ASKED)
+            self.output_names = (*self.output_names, "asked")
 
     def forward(  # type: ignore[override]
-        self, observations: torch.Tensor, frames: torch.Tensor, frame_count: torch.Tensor
+        self,
+        observations: torch.Tensor,
+        frames: torch.Tensor,
+        frame_count: torch.Tensor,
+        last_asked: torch.Tensor | None = None,
     ) -> Outputs:
-        """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames -> as `BlindNetwork`."""
+        """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames, (B, 2) m/s -> as
+        `BlindNetwork`, and (B, 2) m/s."""
         features = self.actor.perception(frames, frame_count)[:, 0]
+        asked = None
         if self.actor.read_out is not None:
             start, stop = self.command_start, self.command_start + 2
             command = observations[:, start:stop]
             command = command + self.actor.read_out.velocity(features, command) * (frame_count > 0)
+            if last_asked is not None and self.actor.max_change is not None:
+                command = asked = moved_towards(last_asked, command, self.actor.max_change)
             observations = torch.cat((observations[:, :start], command, observations[:, stop:]), 1)
         latent = self.latent(observations)
-        return self.outputs(latent, torch.cat((latent, features), 1))
+        outputs = self.outputs(latent, torch.cat((latent, features), 1))
+        if asked is None:
+            return outputs
+        return (*outputs, asked) if isinstance(outputs, tuple) else (outputs, asked)
 
     def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
         """Random inputs, with every number of valid frames in turn."""
@@ -354,7 +377,8 @@ class PerceptiveNetwork(BlindNetwork):
         nearness = (-nearness).exp()  # a place in the plane and its proximity, as rows of a grid are
         rows = torch.stack((nearness * bearing.cos(), nearness * bearing.sin(), nearness), -1)
         rows[:, :, -1] *= 0.1  # motion from frame to frame is small
-        return *super().examples(batch), rows, count
+        asked = () if self.actor.max_change is None else (torch.randn(batch, 2),)
+        return *super().examples(batch), rows, count, *asked
 
 
 def network_of(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:

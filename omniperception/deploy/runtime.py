@@ -139,6 +139,7 @@ class ExportedPolicy:
             history.clear()
         self.frame_count = self._steps = self._steps_stood = 0
         self._reference = np.zeros(3, np.float32)
+        self._asked = np.zeros(2, np.float32)
         self.base_lin_vel: np.ndarray | None = None
         if self.safety is not None:
             self.safety.reset()
@@ -257,9 +258,13 @@ class ExportedPolicy:
             blind = self.safety is not None and self.safety.sight is Sight.STOPPED
             feed |= {"frames": self.frames[None], "frame_count": np.array([[0 if blind else self.frame_count]])}
         joints = self.description.joints
-        actions, *estimates = (output[0] for output in self._session.run(None, feed))
-        if estimates:
-            self.base_lin_vel = estimates[0]
+        if self.description.max_acceleration is not None:
+            feed["last_asked"] = self._asked[None]
+        actions, *others = (output[0] for output in self._session.run(None, feed))
+        if self.description.max_acceleration is not None:
+            self._asked = others.pop()
+        if others:
+            self.base_lin_vel = others.pop()
         self._steps += 1
         self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
         self.pose = self._default_pos + self._stepping_offset(command)

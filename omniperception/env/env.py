@@ -9,6 +9,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from omniperception.avoidance.velocity import LAST_ASKED
 from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
@@ -372,6 +373,8 @@ class OmniEnv(VecEnv):
             groups[HEIGHT_TARGET] = self.state.heights if self._frame_heights is None else self._frame_heights
         if self.avoidance is not None:
             groups |= self.avoidance.targets(self.config.targets)
+        if self.config.rewards.avoidance.max_acceleration is not None:
+            groups[LAST_ASKED] = self.state.last_asked
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:

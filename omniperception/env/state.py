@@ -12,6 +12,7 @@ import torch
 
 from omniperception.common.lazy import lazy
 from omniperception.common.rotations import rotate, rotate_yaw
+from omniperception.common.vectors import moved_towards
 from omniperception.env.heights import flat_heights
 from omniperception.env.kinematics import Kinematics
 from omniperception.env.mdp.curriculum import FULL, Curriculum
@@ -107,6 +108,8 @@ class EnvState:
         default_base_height: m, of the default pose.
         drawn_physics: (num_envs, W) what randomization drew; see `Randomizer.drawn`.
         stand_s: (num_envs,) s for which the command has been to stand.
+        last_asked: (num_envs, 2) m/s: what the policy asked its gait for in the step that ended; 0 after a reset, and
+            where no policy says so.
     """
 
     def __init__(
@@ -145,6 +148,7 @@ class EnvState:
         steps = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
         self._episode_steps = steps if episode_steps is None else episode_steps
         self._velocity_source: Callable[[], torch.Tensor | None] | None = None
+        self._asked_source: Callable[[], torch.Tensor | None] | None = None
         self._sim, self._command, self._obstacles, self._height_lookup = sim, command, obstacles, height_lookup
         self.num_envs, self.device, self.control_dt = sim.num_envs, sim.device, control_dt
         self._avoidance, self._sensing = avoidance, sensing
@@ -165,6 +169,7 @@ class EnvState:
         self._foot_times: ContactTimes | None = None
         self.before = self.kinematics
         self.stand_s = torch.zeros(self.num_envs, device=self.device)
+        self.last_asked = torch.zeros(self.num_envs, 2, device=self.device)
         self._command_acceleration, self._difficulty = command_acceleration, difficulty
         self._reference = torch.zeros(self.num_envs, 3, device=self.device)
         self.pose = self.default_joint_pos.expand(self.num_envs, -1)
@@ -179,6 +184,8 @@ class EnvState:
         if self._stepping is not None:
             self.pose = self.default_joint_pos + self._stepping(self)
         self.targets = (self.pose + self.action_scale * actions, self.targets[0])
+        asked = self._asked_source() if self._asked_source is not None else None
+        self.last_asked = self.last_asked if asked is None else asked
 
     def end_step(self) -> None:
         """Takes in the physics steps of the control step."""
@@ -186,7 +193,7 @@ class EnvState:
         self.stand_s = torch.where((self.command == 0).all(1), self.stand_s + self.control_dt, 0.0)
         if self._command_acceleration is not None:
             most = [rate * self.control_dt / max(self._difficulty.level, 1e-3) for rate in self._command_acceleration]
-            self._reference = moved_towards(self._reference, self.command, *most)
+            self._reference = _ramped(self._reference, self.command, *most)
         if self._history is not None:
             self._history.record()
         if self._errors is not None:
@@ -202,6 +209,7 @@ class EnvState:
         last, before = (torch.where(fresh, self.default_joint_pos, targets) for targets in self.targets)
         self.targets = (last, before)
         self.stand_s = self.stand_s.index_fill(0, env_ids, 0.0)
+        self.last_asked = self.last_asked.index_fill(0, env_ids, 0.0)
         self._reference = self._reference.index_fill(0, env_ids, 0.0)
         if self._history is not None:
             self._history.reset(env_ids)
@@ -220,6 +228,10 @@ class EnvState:
         None until there is one."""
         self._velocity_source = source
 
+    def ask_by(self, source: Callable[[], torch.Tensor | None]) -> None:
+        """Takes `last_asked` from a policy from now on; None until it has acted."""
+        self._asked_source = source
+
     def has_computed(self, name: str) -> bool:
         """Tell whether a quantity has been read since the last `invalidate`."""
         return name in self.__dict__
@@ -230,6 +242,7 @@ class EnvState:
             "actions": list(self.actions),
             "targets": list(self.targets),
             "stand_s": self.stand_s,
+            "last_asked": self.last_asked,
             "reference": self._reference,
             "history": self._history and self._history.state_dict(),
             "errors": self._errors and self._errors.state_dict(),
@@ -241,6 +254,7 @@ class EnvState:
         self.actions = tuple(state["actions"])
         self.targets = (state["targets"][0], state["targets"][1])
         self.stand_s, self._reference = state["stand_s"].clone(), state["reference"].clone()
+        self.last_asked = state.get("last_asked", self.last_asked).clone()  # older checkpoints have none
         if self._history is not None:
             self._history.load_state_dict(state["history"])
         if self._errors is not None:
@@ -437,11 +451,10 @@ class Stepping:
         return offsets * ~rests(state, self._rest_s)[:, None]
 
 
-def moved_towards(now: torch.Tensor, there: torch.Tensor, linear: float, angular: float) -> torch.Tensor:
+def _ramped(now: torch.Tensor, there: torch.Tensor, linear: float, angular: float) -> torch.Tensor:
     """Velocities (n, 3) `now`, moved towards `there` by at most `linear` (m/s) and `angular` (rad/s)."""
-    change = there - now
-    share = linear / change[:, :2].norm(dim=1, keepdim=True).clamp(min=linear)
-    return now + torch.cat((change[:, :2] * share, change[:, 2:].clamp(-angular, angular)), 1)
+    turn = (there - now)[:, 2:].clamp(-angular, angular)
+    return torch.cat((moved_towards(now[:, :2], there[:, :2], linear), now[:, 2:] + turn), 1)
 
 
 _CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance(value, lazy))

@@ -98,6 +98,11 @@ class PerceptionConfig:
             raise ValueError(f"perception.network does not fit the sampler, which gives {sizes}: {error}") from None
 
     @property
+    def adds_velocity(self) -> bool:
+        """Whether the policy adds an avoidance velocity to its command."""
+        return self.avoidance_weight > 0 or self.motion_weight > 0
+
+    @property
     def supervision(self) -> dict[str, float]:
         """Weight of each supervised target, by observation group."""
         weights = {
@@ -243,6 +248,8 @@ class LearningConfig:
         critic_groups: observation groups of the critic.
         steps_per_frame: control steps between two LiDAR frames.
         velocity_risk: the controller of a policy that is supervised with obstacles' motion, else None.
+        max_change: most (m/s) by which V_cmd + V_avoid of a policy that adds V_avoid changes from step to step; None:
+            no limit.
         mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
         command_group: the group that begins with the commanded velocity (v_x, v_y).
         estimator: of what the actor does not observe; None: it estimates nothing.
@@ -257,6 +264,7 @@ class LearningConfig:
     critic_groups: Sequence[str]
     steps_per_frame: int = 1
     velocity_risk: VelocityRisk | None = None
+    max_change: float | None = None
     mirror: Callable | None = None
     command_group: str = "command"
     estimator: EstimatorConfig | None = None

@@ -10,8 +10,9 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 
-from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, LAST_ASKED, MOTION_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
+from omniperception.common.vectors import moved_towards
 from omniperception.learning.estimator import EstimatingModel
 from omniperception.learning.read_out import MotionReadOut, VelocityReadOut
 from omniperception.learning.storage import WindowedObservations
@@ -33,11 +34,15 @@ class PerceptionActor(EstimatingModel):
     With supervision of ``avoidance_target`` or ``motion_target`` an avoidance velocity is read out of the embedding and
     added to the commanded one before the MLP sees it, because that sum is what the reward wants tracked (paper,
     r_vel_avoid): a gait that follows commands then avoids as soon as the read-out is right. Without a frame it is 0.
+    With `max_change` the sum moves no further than that from the one of the step before, which is observed.
 
     Attributes:
         perception: the network.
         supervision: weight of the regression on each privileged observation group.
         read_out: gives the avoidance velocity, or None.
+        max_change: most (m/s) by which the sum changes from step to step; None: no limit, or nothing is added.
+        asked: (N, 2) m/s, the sum that the newest actions were computed from; None before the first, and without a
+            limit.
     """
 
     def __init__(
@@ -51,6 +56,7 @@ class PerceptionActor(EstimatingModel):
         velocity_risk: VelocityRisk | None = None,
         command_group: str = "command",
         end_to_end: bool = True,
+        max_change: float | None = None,
         **mlp_options,
     ) -> None:
         """Build the actor.
@@ -66,6 +72,7 @@ class PerceptionActor(EstimatingModel):
             command_group: the group that begins with the commanded velocity (v_x, v_y).
             end_to_end: whether the loss of an update reaches the perception network; otherwise it is trained by
                 supervision alone (:meth:`PerceptivePpo.train_perception`).
+            max_change: of the commanded velocity with the avoidance velocity added (m/s).
             mlp_options: ``estimator``, and ``hidden_dims``, ``activation``, ``obs_normalization`` (of the
                 one-dimensional groups) and ``distribution_cfg`` of rsl_rl's ``MLPModel``.
         """
@@ -86,6 +93,8 @@ class PerceptionActor(EstimatingModel):
             part, num_values = perception.supervised.get(MOTION_TARGET), obs[MOTION_TARGET].shape[-1]
             self.read_out_target = MOTION_TARGET
             self.read_out = MotionReadOut(self._feature_dim, num_values, part, velocity_risk)
+        self.max_change = None if self.read_out is None else max_change
+        self.asked: torch.Tensor | None = None
         self._check_supervision(obs)
         self._newest: tuple[int, torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # tick, frames, embeddings
         self._losses: dict[str, list[torch.Tensor]] = {target: [] for target in self.supervision}
@@ -187,8 +196,12 @@ class PerceptionActor(EstimatingModel):
             return groups
         groups = groups.clone(recurse=False)
         command = groups[self.command_group]
-        velocity = self.read_out.velocity(features, command[:, :2]) * has_frame[:, None]
-        groups[self.command_group] = command + functional.pad(velocity, (0, command.shape[-1] - 2))
+        asked = command[:, :2] + self.read_out.velocity(features, command[:, :2]) * has_frame[:, None]
+        if self.max_change is not None:
+            asked = moved_towards(groups[LAST_ASKED], asked, self.max_change)
+            if not torch.is_grad_enabled():
+                self.asked = asked
+        groups[self.command_group] = torch.cat((asked, command[:, 2:]), 1)
         return groups
 
     def _check_supervision(self, obs: TensorDict) -> None:
@@ -215,6 +228,11 @@ class PerceptionActor(EstimatingModel):
             raise ValueError(
                 f"perception.avoidance_weight and motion_weight need the actor to observe '{self.command_group}', it"
                 f" observes {self.obs_groups}; add it to observations.actor or set both to 0"
+            )
+        if self.max_change is not None and LAST_ASKED not in obs:
+            raise ValueError(
+                f"a limit of the change of V_cmd + V_avoid needs observations '{LAST_ASKED}', which the environment"
+                " does not give; set rewards.avoidance.max_acceleration of both"
             )
 
 

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 
-from omniperception.avoidance.velocity import AVOIDANCE_TARGET
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, LAST_ASKED
 from omniperception.learning.config import LearningConfig
 from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.distributed import average_gradients
@@ -138,6 +138,7 @@ class PerceptivePpo(PPO):
                 perception.supervision,
                 config.velocity_risk,
                 config.command_group,
+                max_change=config.max_change,
                 end_to_end=perception.supervised_epochs == 0,
                 estimator=config.estimator,
                 distribution_cfg=distribution,
@@ -146,6 +147,8 @@ class PerceptivePpo(PPO):
         actor = actor.to(device)
         critic = MLPModel(obs, groups, "critic", 1, **ppo.mlp).to(device)
         stored = {*config.actor_groups, *config.critic_groups, *(perception.supervision if perception else ())}
+        if isinstance(actor, PerceptionActor) and actor.max_change is not None:
+            stored.add(LAST_ASKED)
         if config.estimator is not None:
             stored.add(config.estimator.group)
         if config.distillation is not None:

@@ -253,6 +253,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
     edges = [np.abs(body.bounds(body.geoms(foot.link))).max(0)[:2] for foot in draft.feet]
     gait = _gait(draft, height)
     low, high = body.bounds(body.touchable)
+    length, width = (high - low)[:2]
     pairs = self_collisions(body, draft.pose) if draft.wishes.self_collision else []
     mounts, by_mount = _mounts(draft)
     preset: dict[str, object] = {
@@ -266,7 +267,8 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
         "footing": round(float(np.linalg.norm(np.max(edges, 0))) + 0.05, 2),
         "outline": [round(_SWING + float(reach), 2) for reach in (-low[0], high[0], max(-low[1], high[1]))],
         "height": round(height + float(high[2]) + _SWAY, 2),
-        "radius": round(0.5 * float((high - low)[:2].max()), 2),
+        "radius": round(0.5 * float(width), 2),
+        "half_length": round(0.5 * max(float(length - width), 0.0), 2),
         "foot_geoms": feet,
         "gait": gait,
         "penalized_geoms": others,
@@ -285,7 +287,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
         Finding("footprint, footing", LIKELY, "where the feet are"),
         Finding("outline", GUESSED, f"what collides, in the default pose, and {_SWING:g} m"),
         Finding("height", GUESSED, f"likewise, and {_SWAY:g} m"),
-        Finding("radius", GUESSED, "half of its length or width"),
+        Finding("radius, half_length", GUESSED, "half of its width; half of what it is longer than wide"),
         Finding(
             "gait",
             GUESSED,

@@ -132,7 +132,8 @@ class RobotConfig:
         outline: how far (m) the robot reaches behind, before and beside the base's origin while it walks: what a LiDAR
             sees within is taken for the robot itself.
         height: (m) above the ground from which on a thing hangs too high to be in the robot's way.
-        radius: (m) of the disc that avoidance takes the robot for.
+        radius, half_length: (m) of what avoidance takes the robot for: all within `radius` of a line from `half_length`
+            behind to as much before the base's origin.
         min_base_height: height (m) of the base origin above the ground below which the robot has fallen.
         frictionloss: dry friction (N m) of the actuated joints; None: as in the file.
         armature: rotor inertia (kg m^2) of the actuated joints, seen from the joint; None: as in the file.
@@ -171,6 +172,7 @@ class RobotConfig:
     mounts: Mapping[str, Mount] = field(default_factory=dict)
     locked: Mapping[str, float] = field(default_factory=dict)
     gait: Gait | None = None
+    half_length: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "penalized_geoms", tuple(self.penalized_geoms))
@@ -194,10 +196,10 @@ class RobotConfig:
             raise ValueError(
                 f"robot.outline={list(self.outline)} must be three positive lengths (m): behind, before, beside"
             )
-        if self.min_base_height < 0 or min(self.footprint) < 0:
+        if self.min_base_height < 0 or self.half_length < 0 or min(self.footprint) < 0:
             raise ValueError(
-                f"robot.min_base_height={self.min_base_height} and robot.footprint={list(self.footprint)} must not be"
-                " negative"
+                f"robot.min_base_height={self.min_base_height}, robot.half_length={self.half_length} and"
+                f" robot.footprint={list(self.footprint)} must not be negative"
             )
         if len(set(self.joints)) != len(self.joints):
             twice = sorted({name for name in self.joints if self.joints.count(name) > 1})

@@ -87,6 +87,7 @@ def test_goes_round_something_wide_instead_of_standing_before_it():
     [
         ({"temperature": 0.0}, r"risk\.temperature=0\.0 must be positive"),
         ({"robot_radius": -0.1}, r"robot_radius=-0\.1 must not be negative"),
+        ({"robot_half_length": -0.1}, r"robot_half_length=-0\.1 must not be negative"),
         ({"times": []}, r"times=\[\] must be times"),
         ({"times": [-1.0]}, r"times=\[-1\.0\] must be times"),
     ],
@@ -105,7 +106,8 @@ class TestRisk:
             for time in controller.times:
                 x = distance * math.cos(bearing) + (vx - candidate[0]) * time
                 y = distance * math.sin(bearing) + (vy - candidate[1]) * time
-                gap = max(math.hypot(x, y) - controller.robot_radius, 0.0)
+                along = x - min(max(x, -controller.robot_half_length), controller.robot_half_length)
+                gap = max(math.hypot(along, y) - controller.robot_radius, 0.0)
                 worst = max(worst, math.exp(-gap / controller.decay - time / controller.time_constant))
         return worst
 
@@ -115,9 +117,9 @@ class TestRisk:
         distance[torch.rand(n, num_sectors, 1, generator=generator) < 0.5] = torch.inf
         return torch.cat((distance, torch.randn(n, num_sectors, 2, generator=generator)), -1)
 
-    @pytest.mark.parametrize("seed", [0, 1])
-    def test_is_that_of_the_definition(self, seed):
-        controller = VelocityRisk(**GIVEN)
+    @pytest.mark.parametrize(("seed", "half_length"), [(0, 0.0), (1, 0.0), (2, 0.35)])
+    def test_is_that_of_the_definition(self, seed, half_length):
+        controller = VelocityRisk(**GIVEN, robot_half_length=half_length)
         sectors, candidates = self.scene(seed), controller.candidates()
         sectors[2, :, 0] = torch.inf
         risk = controller.risk(sectors, candidates)
@@ -128,8 +130,9 @@ class TestRisk:
                 assert risk[n, k].item() == pytest.approx(expected, abs=1e-5)
         assert not risk[2].any() and risk.max() > 0.5
 
-    def test_the_kernel_finds_what_the_exported_operations_find(self):
-        controller = VelocityRisk(**GIVEN)
+    @pytest.mark.parametrize("half_length", [0.0, 0.35])
+    def test_the_kernel_finds_what_the_exported_operations_find(self, half_length):
+        controller = VelocityRisk(**GIVEN, robot_half_length=half_length)
         sectors, candidates = self.scene(3, n=40), controller.candidates()
         risk = controller.risk(sectors, candidates)
         bearing = -math.pi + (torch.arange(12) + 0.5) * math.pi / 6
@@ -137,11 +140,28 @@ class TestRisk:
         sector, when = controller._worst(place, sectors[..., 1:], candidates)
         index = sector[..., None].expand(-1, -1, 2)
         offset = place.gather(1, index) + when[..., None] * (sectors[..., 1:].gather(1, index) - candidates)
-        gap = (offset.norm(dim=-1) - controller.robot_radius).clamp(min=0.0)
+        along = offset[..., 0] - offset[..., 0].clamp(-half_length, half_length)
+        gap = (torch.hypot(along, offset[..., 1]) - controller.robot_radius).clamp(min=0.0)
         assert torch.allclose((-gap / controller.decay - when / controller.time_constant).exp(), risk, atol=1e-5)
 
+    def test_a_long_robot_passes_beside_what_it_would_not_pass_before(self):
+        """A post beside it and one ahead, as far from its middle."""
+        risks = {}
+        for half_length in (0.0, 0.3):
+            controller = VelocityRisk(**GIVEN | {"times": (0.0,)}, robot_half_length=half_length)
+            for s in (2, 8):  # of 12 sectors: to the right and to the left are 2.5 and 8.5
+                sectors = torch.zeros(1, 12, 3)
+                sectors[..., 0] = torch.inf
+                sectors[0, s, 0] = 0.8
+                risks[half_length, s] = controller.risk(sectors, controller.candidates())[0, 0].item()
+            sectors[0, :, 0] = torch.inf
+            sectors[0, 6, 0] = 0.8
+            risks[half_length, 6] = controller.risk(sectors, controller.candidates())[0, 0].item()
+        assert risks[0.0, 2] == pytest.approx(risks[0.0, 8]) == pytest.approx(risks[0.0, 6])
+        assert risks[0.3, 6] > 3 * risks[0.3, 8] and risks[0.3, 8] < 1.5 * risks[0.0, 8]
+
     def test_gradient_is_that_of_differences(self):
-        controller = VelocityRisk(**GIVEN)
+        controller = VelocityRisk(**GIVEN, robot_half_length=0.2)
         sectors = self.scene(5, n=3)
         sectors[..., 0].clamp_(max=3.0)
         sectors.requires_grad_()

@@ -16,6 +16,7 @@ import torch
 import yaml
 
 from omniperception import build, config
+from omniperception.avoidance.velocity import LAST_ASKED
 from omniperception.build import build_runner, load_policy
 from omniperception.config import ConfigError
 from omniperception.deploy import export as export_module
@@ -49,7 +50,7 @@ RECIPES = {
     "proximity_gru": ("perception=proximity_gru", "randomization=paper"),
     "pd_risknet_no_distal": overrides_of("pd_risknet_no_distal"),
     "proximity_gru_no_proximal": overrides_of("proximity_gru_no_proximal"),
-    "polar_rings": ("experiment=avoid", "init=unread"),
+    "polar_rings": ("experiment=avoid", "init=unread", "rewards.avoidance.max_acceleration=2.0"),
     "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
     "clock": (
         *("experiment=walk", "observations=gait", "commands.standing=0.5", "commands.resample_s=[0.1,0.3]"),
@@ -132,7 +133,7 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
     torch_side = trained(run_dir, "num_envs=2", "terminations.episode_length_s=0.5", *given)
     env, policies = torch_side.env, ExportedPolicies(torch_side.env, plain(run_dir))
     scripted = torch.jit.load(str(run_dir / "exported" / "policy.pt"))
-    ends, frames, lost, without_frames = 0, 0, 0, 0.0
+    ends, frames, lost, limited, without_frames = 0, 0, 0, 0, 0.0
     with torch.no_grad():
         for step in range(45):
             expected = torch_side.policy(env.get_observations())
@@ -150,9 +151,15 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
                 lost += int((~env.sensing.fresh & (env.sensing.frame_count[:, 0] > 1)).sum())
                 frames += policies.robots[0].frame_count
                 inputs.append(torch.from_numpy(np.stack([robot.frames for robot in policies.robots])))
-                blind = actions_of(scripted(*inputs, torch.zeros(2, 1, dtype=torch.int64)))
+                asked = []
+                if LAST_ASKED in env.get_observations():
+                    asked.append(env.get_observations()[LAST_ASKED])
+                    ours = torch.from_numpy(np.stack([robot._asked for robot in policies.robots]))
+                    torch.testing.assert_close(ours, torch_side.policy.asked, atol=1e-5, rtol=0.0)
+                    limited += int(((ours - asked[0]).norm(dim=1) > 2.0 * env.control_dt - 1e-5).sum())
+                blind = actions_of(scripted(*inputs, torch.zeros(2, 1, dtype=torch.int64), *asked))
                 without_frames = max(without_frames, float((blind - expected).abs().max()))
-                inputs.append(env.sensing.frame_count)
+                inputs += [env.sensing.frame_count, *asked]
             torch.testing.assert_close(actions_of(scripted(*inputs)), expected, atol=1e-5, rtol=0.0)
             if torch_side.policy.estimate is not None:
                 estimates = torch.from_numpy(np.stack([robot.base_lin_vel for robot in policies.robots]))
@@ -161,6 +168,7 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
                 env.sim.qpos[1, 2] = 0.05
             ends += int(env.step(expected)[2].sum())
     assert ends == 3
+    assert limited > 0 or recipe != "polar_rings"
     assert recipe in ("none", "clock", "estimated") or (
         frames > 30 and lost > 0 and without_frames > 1e-2
     )  # what it sees matters
@@ -395,7 +403,7 @@ def test_wrong_points_are_named(exported_run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 99}, "format version 99, this program reads 6"),
+        ({"version": 99}, "format version 99, this program reads 7"),
         ({"format": "something"}, "describes no exported policy"),
         ({"joints": None}, "is incomplete"),
         ({"control_period_s": 0.03}, "policy.onnx and policy.json are not from the same export"),

@@ -227,6 +227,30 @@ def test_avoidance_velocity_of_an_update_equals_that_of_the_rollout_and_is_learn
     assert losses[-1] < 0.2 * losses[0]
 
 
+def test_what_is_asked_for_changes_no_faster_than_the_limit():
+    """From what was asked for last; shorter changes are not touched, and without a frame the limit holds, too."""
+    env = ToyEnv(4)
+    advance(env, 7)
+    env.frame_count[2] = 0
+    obs = env.get_observations()
+    actor = avoiding_actor(env)
+    with torch.no_grad():
+        wanted = actor.get_latent(obs)[:, :2]
+    assert actor.asked is None
+    last = wanted + torch.tensor([[3.0, 4.0], [0.03, -0.04], [-0.6, 0.8], [0.0, 0.0]])
+    obs["last_asked"] = last
+    actor.max_change = 0.1
+    with torch.no_grad():
+        asked = actor.get_latent(obs)[:, :2]
+    moved = torch.tensor([[-0.06, -0.08], [-0.03, 0.04], [0.06, -0.08], [0.0, 0.0]])
+    assert torch.allclose(asked, last + moved, atol=1e-5) and torch.equal(actor.asked, asked)
+
+
+def test_a_limit_needs_to_observe_what_was_asked_for():
+    with pytest.raises(ValueError, match="needs observations 'last_asked', which the environment does not give"):
+        avoiding_actor(ToyEnv(3), max_change=0.1)
+
+
 def test_avoidance_needs_an_observed_command():
     with pytest.raises(ValueError, match="need the actor to observe 'command', it observes \\['policy'\\]"):
         actor_for(ToyEnv(3), supervision={"avoidance_target": 1.0})

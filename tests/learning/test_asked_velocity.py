@@ -1,0 +1,90 @@
+"""The velocity that a policy asks its gait for: observed, limited, stored, resumed."""
+
+import pytest
+import torch
+
+from omniperception import build
+from omniperception.config import ConfigError
+
+SMALL = (
+    *("experiment=avoid", "init=unread", "num_envs=6", "seed=4", "ppo.hidden_dims=[16]", "sim.num_threads=1"),
+    *("lidar.num_rays=200", "obstacles=static", "obstacles.curriculum=null", "rewards.avoidance.max_acceleration=3.0"),
+    *(
+        "ppo.num_learning_epochs=1",
+        "ppo.num_steps_per_env=12",
+        "ppo.num_mini_batches=2",
+        "perception.supervised_epochs=1",
+    ),
+    "terminations.episode_length_s=0.4",
+)
+
+
+@pytest.fixture
+def make_runner(make_config):
+    def make(*settings):
+        torch.manual_seed(0)
+        runner = build.build_runner(make_config(*SMALL, *settings), None)
+        with torch.no_grad():  # a read-out that sees things everywhere
+            for part in (runner.alg.actor.read_out, runner.alg.actor.perception):
+                for parameter in part.parameters():
+                    parameter.add_(0.3 * torch.randn_like(parameter))
+        return runner
+
+    return make
+
+
+def test_it_is_observed_at_the_next_step_and_changes_no_faster_than_the_limit(make_runner):
+    runner = make_runner()
+    env, actor, obs = runner.env, runner.alg.actor, runner.env.get_observations()
+    most, longest, began = 3.0 * env.control_dt, 0.0, 0
+    assert not obs["last_asked"].any()
+    with torch.inference_mode():
+        for _ in range(30):
+            before = obs["last_asked"].clone()
+            obs, _, done, _ = env.step(actor(obs))
+            longest = max(longest, float((actor.asked - before).norm(dim=1).max()))
+            going = done == 0
+            assert torch.equal(obs["last_asked"][going], actor.asked[going]) and not obs["last_asked"][~going].any()
+            began += int((~going).sum())
+    assert began > 0 and longest == pytest.approx(most, rel=1e-4)
+    assert (actor.asked - env.state.reference[:, :2]).norm(dim=1).max() > 0.05  # it avoids something
+
+
+def test_an_update_sees_what_the_policy_acted_on(make_runner):
+    """PPO's first ratio is 1: the stored velocities limit the update's as they limited the rollout's."""
+    runner = make_runner()
+    obs = runner.env.get_observations()
+    with torch.inference_mode():
+        for _ in range(12):
+            obs = runner.step(obs)
+    alg = runner.alg
+    with torch.no_grad():
+        [batch] = alg.storage.mini_batch_generator(1, 1)
+        alg.actor(batch.observations, stochastic_output=True)
+        got = alg.actor.get_output_log_prob(batch.actions)
+    torch.testing.assert_close(got, batch.old_actions_log_prob.squeeze(-1), atol=1e-4, rtol=1e-4)
+    assert batch.observations["last_asked"].any()
+
+
+def test_a_state_goes_on_with_it(make_runner):
+    one, other = make_runner(), make_runner()
+    with torch.inference_mode():
+        obs = one.env.get_observations()
+        for _ in range(7):
+            obs = one.env.step(one.alg.actor(obs))[0]
+        other.env.load_state_dict(one.env.state_dict())
+        again = other.env.get_observations()
+        assert obs["last_asked"].any() and torch.equal(again["last_asked"], obs["last_asked"])
+        for _ in range(5):
+            obs, again = (run.env.step(run.alg.actor(seen))[0] for run, seen in ((one, obs), (other, again)))
+    assert torch.equal(again["last_asked"], obs["last_asked"])
+
+
+def test_without_a_limit_nothing_is_observed(make_runner):
+    runner = make_runner("rewards.avoidance.max_acceleration=null")
+    assert runner.alg.actor.max_change is None and "last_asked" not in runner.env.get_observations()
+
+
+def test_a_limit_is_positive(make_config):
+    with pytest.raises(ConfigError, match=r"rewards\.avoidance\.max_acceleration=0\.0 must be positive or null"):
+        make_config(*SMALL, "rewards.avoidance.max_acceleration=0.0")
