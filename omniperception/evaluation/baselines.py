@@ -278,7 +278,8 @@ def _avoiding(env: OmniEnv, avoidance: AvoidanceConfig, motion: Steering) -> Ste
 def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | None) -> Policy:
     """The policy with another velocity in place of V_cmd.
 
-    A policy that sees, too, must never be shown a frame, so that it adds no avoidance of its own.
+    A policy that sees, too, must never be shown a frame, so that it adds no avoidance of its own. One that limits how
+    fast what it asks of its gait changes limits this velocity, too.
 
     Args:
         env: where it walks.
