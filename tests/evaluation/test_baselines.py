@@ -41,7 +41,7 @@ class TestBlind:
             assert not felt["frame_count"].any() and not felt["frames"].any()
             assert (seen["frame_count"] > 0).all() and seen["frames"].any()
             before = seen.clone()
-            for group in ("proprioception", "command", "action", "clock"):
+            for group in ("proprioception", "command", "action", "clock", "last_asked"):
                 before[group] = felt[group]
             before["frame_tick"] += 1  # the policy embeds each frame once
             assert not torch.allclose(policy(felt), seeing.policy(before))
