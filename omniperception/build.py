@@ -75,12 +75,21 @@ class RunConfig:
                 f"{given} is a beginning of a policy's learning, and ppo.num_learning_epochs=0 keeps it as it is; leave"
                 " one of them out"
             )
-        adds = self.perception is not None and self.perception.adds_velocity
-        if adds and self.env.observations.estimated is not None and self.ppo.num_learning_epochs > 0:
+        if self.adds_velocity and self.env.observations.estimated is not None and self.ppo.num_learning_epochs > 0:
             raise ValueError(
                 "observations.estimated: estimates would be fitted to the command without the avoidance velocity that"
                 " is added to it; set perception.avoidance_weight and motion_weight, or ppo.num_learning_epochs, to 0"
             )
+
+    @property
+    def adds_velocity(self) -> bool:
+        """Whether the policy adds an avoidance velocity to its command."""
+        return self.perception is not None and (self.perception.avoidance_weight or self.perception.motion_weight) > 0
+
+    @property
+    def max_acceleration(self) -> float | None:
+        """Limit (m/s^2) of V_cmd + V_avoid; None without one, and where V_avoid is not added."""
+        return self.env.rewards.avoidance.max_acceleration if self.adds_velocity else None
 
 
 _TASK = (
@@ -312,15 +321,14 @@ def steps_per_frame(run: RunConfig) -> int:
 
 def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
     """The runner that trains in the environment of a run."""
-    avoidance = run.env.rewards.avoidance
     return LearningConfig(
         run.ppo,
         run.perception,
         run.env.observations.actor,
         run.env.observations.critic,
         steps_per_frame(run) if run.perception is not None else 1,
-        avoidance.risk,
-        None if avoidance.max_acceleration is None else avoidance.max_acceleration * env.control_dt,
+        run.env.rewards.avoidance.risk,
+        None if run.max_acceleration is None else run.max_acceleration * env.control_dt,
         Mirror(env) if run.ppo.symmetry else None,
         estimator=EstimatorConfig(run.env.observations.estimated) if run.env.observations.estimated else None,
         distillation=run.distillation,

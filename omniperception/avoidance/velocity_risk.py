@@ -38,10 +38,10 @@ class VelocityRisk:
     The candidates lie on rings around standing still, in the yaw-aligned frame. The risk of one, 0 to 1, is the largest
     of exp(-gap / decay - t / time_constant) over all obstacles and `times` t, where gap (m) lies between the
     obstacle's outline and the robot's, seen from above, if both keep their velocities until then: a velocity obstacle
-    (Fiorini and Shiller, 1998) with soft edges. The robot's outline is what lies within `robot_radius` of a line from
-    `robot_half_length` behind to as much before the base's origin. The choice is the mean of the candidates under the
-    weights softmax(-(along^2 + sideways * across^2 + weight * risk) / temperature), where along and across (m/s) are
-    how much a candidate deviates from the command in its direction and beside it.
+    (Fiorini and Shiller, 1998) with soft edges. The robot's outline is a capsule: what lies within `robot_radius` of a
+    line from `robot_half_length` behind to as much before the base's origin. The choice is the mean of the candidates
+    under the weights softmax(-(along^2 + sideways * across^2 + weight * risk) / temperature), where along and across
+    (m/s) are how much a candidate deviates from the command in its direction and beside it.
 
     Beyond the paper, whose V_avoid sees distances alone; see docs/lab/learning.md for what it brings.
 
@@ -117,7 +117,7 @@ class VelocityRisk:
                 sector, time = self._worst_by_kernel(place, velocity, candidates)
         sector = sector[..., None].expand(-1, -1, 2)
         meeting = place.gather(1, sector) + time[..., None] * (velocity.gather(1, sector) - candidates)
-        distance = self._squared(meeting).clamp(min=_SMALLEST).sqrt()
+        distance = self._squared(*meeting.unbind(-1)).clamp(min=_SMALLEST).sqrt()
         return (-self._exponent(distance, time)).exp()
 
     def _worst_by_kernel(
@@ -158,26 +158,16 @@ class VelocityRisk:
         self, place: torch.Tensor, velocity: torch.Tensor, candidates: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(n, K) which sector's obstacle makes each candidate's risk, and when (s)."""
-        worst: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
-        for time in self.times:
-            apart = (place + time * velocity)[:, :, None] - time * candidates  # (n, S, K, 2)
-            squared, nearest = self._squared(apart).min(1)
-            distance = squared.sqrt()
-            now = 0.0 * distance + time  # not full_like, which an exporter takes for a constant
-            exponent = self._exponent(distance, now)
-            if worst is None:
-                worst = exponent, nearest, now
-                continue
-            least, sector, when = worst
-            worse = exponent < least
-            least, sector = torch.where(worse, exponent, least), torch.where(worse, nearest, sector)
-            worst = least, sector, torch.where(worse, now, when)
-        assert worst is not None  # there is a time
-        return worst[1:]
+        times = place.new_tensor(self.times)[:, None]  # (T, 1)
+        points = place[:, None] + times[..., None] * velocity[:, None]  # (n, T, S, 2)
+        goals = times[..., None] * candidates  # (T, K, 2)
+        along, across = (points[..., None, axis] - goals[:, None, :, axis] for axis in (0, 1))  # (n, T, S, K)
+        squared, nearest = self._squared(along, across).min(2)
+        soonest = self._exponent(squared.sqrt(), times).argmin(1, keepdim=True)
+        return nearest.gather(1, soonest)[:, 0], times[soonest[:, 0], 0]
 
-    def _squared(self, apart: torch.Tensor) -> torch.Tensor:
-        """Squared distances (...) (m^2) of places (..., 2) from the line in the robot's middle."""
-        along, across = apart.unbind(-1)
+    def _squared(self, along: torch.Tensor, across: torch.Tensor) -> torch.Tensor:
+        """Squared distances (m^2) from the line in the robot's middle, of places along and across it (m)."""
         return (along.abs() - self.robot_half_length).clamp(min=0.0).square() + across.square()
 
     def _exponent(self, distance: torch.Tensor, time: torch.Tensor) -> torch.Tensor:

@@ -149,7 +149,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         lidar=_lidar(run.env.lidar, robot) if run.perception is not None and run.env.lidar is not None else None,
         perception=_perception(run.perception) if run.perception is not None else None,
         estimated=_estimated(run),
-        max_acceleration=_max_acceleration(run),
+        max_acceleration=run.max_acceleration,
     )
 
 
@@ -215,11 +215,6 @@ def _estimated(run: RunConfig) -> tuple[str, ...]:
     if not estimates_velocity(run.env.observations):
         raise ConfigError(f"observations.estimated={group} cannot be exported: it must be true_base_lin_vel alone")
     return ("base_lin_vel",)
-
-
-def _max_acceleration(run: RunConfig) -> float | None:
-    adds = run.perception is not None and run.perception.adds_velocity
-    return run.env.rewards.avoidance.max_acceleration if adds else None
 
 
 def _lidar(sensor: SensorConfig, robot: RobotConfig) -> Lidar:
@@ -321,10 +316,12 @@ class BlindNetwork(nn.Module):
         estimator = self.actor.estimator
         return latent if estimator is None else torch.cat((latent, estimator(latent)), 1)
 
-    def outputs(self, latent: torch.Tensor, inputs: torch.Tensor) -> Outputs:
-        """Actions from the first layer's inputs (B, ...), which begin with `latent` (B, D), and the estimates in it."""
+    def outputs(self, latent: torch.Tensor, inputs: torch.Tensor, *others: torch.Tensor) -> Outputs:
+        """Actions from the first layer's inputs (B, ...), which begin with `latent` (B, D), the estimates in it, and
+        others."""
         actions = self.output(self.actor.mlp(inputs))
-        return actions if self.actor.estimator is None else (actions, latent[:, self.observation_size :])
+        estimates = () if self.actor.estimator is None else (latent[:, self.observation_size :],)
+        return (actions, *estimates, *others) if estimates or others else actions
 
     def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
         """Random inputs."""
@@ -355,19 +352,17 @@ class PerceptiveNetwork(BlindNetwork):
         """(B, observation_size), (B, H, P, 3) newest last, (B, 1) int64 newest valid frames, (B, 2) m/s -> as
         `BlindNetwork`, and (B, 2) m/s."""
         features = self.actor.perception(frames, frame_count)[:, 0]
-        asked = None
+        asked: tuple[torch.Tensor, ...] = ()
         if self.actor.read_out is not None:
             start, stop = self.command_start, self.command_start + 2
             command = observations[:, start:stop]
             command = command + self.actor.read_out.velocity(features, command) * (frame_count > 0)
-            if last_asked is not None and self.actor.max_change is not None:
-                command = asked = moved_towards(last_asked, command, self.actor.max_change)
+            if last_asked is not None:
+                command = moved_towards(last_asked, command, self.actor.max_change)
+                asked = (command,)
             observations = torch.cat((observations[:, :start], command, observations[:, stop:]), 1)
         latent = self.latent(observations)
-        outputs = self.outputs(latent, torch.cat((latent, features), 1))
-        if asked is None:
-            return outputs
-        return (*outputs, asked) if isinstance(outputs, tuple) else (outputs, asked)
+        return self.outputs(latent, torch.cat((latent, features), 1), *asked)
 
     def examples(self, batch: int) -> tuple[torch.Tensor, ...]:
         """Random inputs, with every number of valid frames in turn."""

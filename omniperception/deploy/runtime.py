@@ -76,6 +76,7 @@ class ExportedPolicy:
     ) -> None:
         """Args: description: of the policy; session: its network; safety: limits, None for none."""
         self.description, self._session = description, session
+        self._outputs = [output.name for output in session.get_outputs()]
         self.safety = Safety(description, safety) if safety is not None else None
         joints, perception = description.joints, description.perception
         self._default_pos = np.asarray(joints.default_pos, np.float32)
@@ -260,13 +261,10 @@ class ExportedPolicy:
         joints = self.description.joints
         if self.description.max_acceleration is not None:
             feed["last_asked"] = self._asked[None]
-        actions, *others = (output[0] for output in self._session.run(None, feed))
-        if self.description.max_acceleration is not None:
-            self._asked = others.pop()
-        if others:
-            self.base_lin_vel = others.pop()
+        outputs = {name: output[0] for name, output in zip(self._outputs, self._session.run(None, feed), strict=True)}
+        self.base_lin_vel, self._asked = outputs.get("estimate"), outputs.get("asked", self._asked)
         self._steps += 1
-        self.action = np.clip(actions, -joints.action_limit, joints.action_limit)
+        self.action = np.clip(outputs["actions"], -joints.action_limit, joints.action_limit)
         self.pose = self._default_pos + self._stepping_offset(command)
         self._steps_stood = 0 if np.any(command) else self._steps_stood + 1
         targets = self.pose + np.asarray(joints.action_scale, np.float32) * self.action

@@ -98,11 +98,6 @@ class PerceptionConfig:
             raise ValueError(f"perception.network does not fit the sampler, which gives {sizes}: {error}") from None
 
     @property
-    def adds_velocity(self) -> bool:
-        """Whether the policy adds an avoidance velocity to its command."""
-        return self.avoidance_weight > 0 or self.motion_weight > 0
-
-    @property
     def supervision(self) -> dict[str, float]:
         """Weight of each supervised target, by observation group."""
         weights = {

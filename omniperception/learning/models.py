@@ -40,7 +40,7 @@ class PerceptionActor(EstimatingModel):
         perception: the network.
         supervision: weight of the regression on each privileged observation group.
         read_out: gives the avoidance velocity, or None.
-        max_change: most (m/s) by which the sum changes from step to step; None: no limit, or nothing is added.
+        max_change: most (m/s) by which the sum changes from step to step; None: no limit.
         asked: (N, 2) m/s, the sum that the newest actions were computed from; None before the first, and without a
             limit.
     """
@@ -93,7 +93,7 @@ class PerceptionActor(EstimatingModel):
             part, num_values = perception.supervised.get(MOTION_TARGET), obs[MOTION_TARGET].shape[-1]
             self.read_out_target = MOTION_TARGET
             self.read_out = MotionReadOut(self._feature_dim, num_values, part, velocity_risk)
-        self.max_change = None if self.read_out is None else max_change
+        self.max_change = max_change
         self.asked: torch.Tensor | None = None
         self._check_supervision(obs)
         self._newest: tuple[int, torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # tick, frames, embeddings

@@ -147,7 +147,7 @@ class PerceptivePpo(PPO):
         actor = actor.to(device)
         critic = MLPModel(obs, groups, "critic", 1, **ppo.mlp).to(device)
         stored = {*config.actor_groups, *config.critic_groups, *(perception.supervision if perception else ())}
-        if isinstance(actor, PerceptionActor) and actor.max_change is not None:
+        if config.max_change is not None:
             stored.add(LAST_ASKED)
         if config.estimator is not None:
             stored.add(config.estimator.group)

@@ -33,7 +33,6 @@ from omniperception.learning.config import LearningConfig
 from omniperception.learning.divergence import TrainingDiverged
 from omniperception.learning.estimator import estimates_velocity
 from omniperception.learning.logger import Logger
-from omniperception.learning.models import PerceptionActor
 from omniperception.learning.ppo import PerceptivePpo
 from omniperception.learning.warm_start import estimating, observing_more, perceive_as, start_from
 
@@ -71,12 +70,11 @@ class Runner:
         self.env, self.config, self.device = env, config, device
         self.alg = PerceptivePpo.build(env, config, device, distributed.multi_gpu())
         self.alg.use_mixed_precision = distributed.of_first(self.alg.use_mixed_precision)  # it may be a measurement
+        actor = self.alg.actor
         if config.estimator is not None and estimates_velocity(env.config.observations):
-            actor = self.alg.actor
             env.state.measure_velocity_by(lambda: actor.estimate)
-        if isinstance(self.alg.actor, PerceptionActor) and self.alg.actor.max_change is not None:
-            seeing = self.alg.actor
-            env.state.ask_by(lambda: seeing.asked)
+        if config.max_change is not None:
+            env.state.ask_by(lambda: actor.asked)
         log_dir = Path(log_dir) if log_dir is not None and distributed.rank() == 0 else None
         self.logger = Logger(log_dir, env.num_envs, device, config.logger, config.settings)
         self.step_hooks: list[Callable[[], None]] = []

@@ -132,8 +132,8 @@ class RobotConfig:
         outline: how far (m) the robot reaches behind, before and beside the base's origin while it walks: what a LiDAR
             sees within is taken for the robot itself.
         height: (m) above the ground from which on a thing hangs too high to be in the robot's way.
-        radius, half_length: (m) of what avoidance takes the robot for: all within `radius` of a line from `half_length`
-            behind to as much before the base's origin.
+        radius, half_length: (m) of the capsule that avoidance takes the robot for: all within `radius` of a line from
+            `half_length` behind to as much before the base's origin.
         min_base_height: height (m) of the base origin above the ground below which the robot has fallen.
         frictionloss: dry friction (N m) of the actuated joints; None: as in the file.
         armature: rotor inertia (kg m^2) of the actuated joints, seen from the joint; None: as in the file.
