@@ -212,6 +212,16 @@ class Description:
         return shapes
 
     @property
+    def outputs(self) -> dict[str, int]:
+        """Numbers of each output of the network, in their order."""
+        sizes = {"actions": len(self.joints.names)}
+        if self.estimated:
+            sizes["estimate"] = 3
+        if self.max_acceleration is not None:
+            sizes["asked"] = 2
+        return sizes
+
+    @property
     def fingerprint(self) -> str:
         """SHA-256 of everything that the network depends on: all but its files and where it comes from."""
         content = {key: value for key, value in asdict(self).items() if key not in ("files", "checksums", "provenance")}
@@ -220,11 +230,7 @@ class Description:
     def write(self, folder: Path) -> None:
         """Write policy.json."""
         shapes = {name: ["batch", *shape] for name, shape in self.inputs.items()}
-        outputs = {"actions": ["batch", len(self.joints.names)]}
-        if self.estimated:
-            outputs["estimate"] = ["batch", 3]
-        if self.max_acceleration is not None:
-            outputs["asked"] = ["batch", 2]
+        outputs = {name: ["batch", size] for name, size in self.outputs.items()}
         network = {"inputs": shapes, "outputs": outputs}
         content = {"format": FORMAT, "version": VERSION, "network": network, **asdict(self)}
         (folder / FILE).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")

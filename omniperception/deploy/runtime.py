@@ -76,7 +76,6 @@ class ExportedPolicy:
     ) -> None:
         """Args: description: of the policy; session: its network; safety: limits, None for none."""
         self.description, self._session = description, session
-        self._outputs = [output.name for output in session.get_outputs()]
         self.safety = Safety(description, safety) if safety is not None else None
         joints, perception = description.joints, description.perception
         self._default_pos = np.asarray(joints.default_pos, np.float32)
@@ -261,7 +260,8 @@ class ExportedPolicy:
         joints = self.description.joints
         if self.description.max_acceleration is not None:
             feed["last_asked"] = self._asked[None]
-        outputs = {name: output[0] for name, output in zip(self._outputs, self._session.run(None, feed), strict=True)}
+        found = self._session.run(None, feed)
+        outputs = {name: output[0] for name, output in zip(self.description.outputs, found, strict=True)}
         self.base_lin_vel, self._asked = outputs.get("estimate"), outputs.get("asked", self._asked)
         self._steps += 1
         self.action = np.clip(outputs["actions"], -joints.action_limit, joints.action_limit)
