@@ -47,7 +47,7 @@ MIN_CHUNK_WORK = 65536
 
 @contextlib.contextmanager
 def compiling_is_said(kernel: wp.Kernel) -> Iterator[None]:
-    """Says what takes so long where a kernel is compiled, which Warp does once and keeps on the disk.
+    """Says what takes so long where a kernel is compiled, which Warp does once for each form and keeps on the disk.
 
     Args:
         kernel: that is launched; nothing is said of one that has been launched before.
@@ -57,7 +57,8 @@ def compiling_is_said(kernel: wp.Kernel) -> Iterator[None]:
         _launched.add(module)
         yield
         return
-    line = f"compiling {kernel.key.rpartition('__')[2]} for {SAY_AFTER_S:g} s and more, once on this machine ..."
+    name = kernel.key.rpartition("__")[2]
+    line = f"compiling {name} for {SAY_AFTER_S:g} s and more, once on this machine for such a scene ..."
     said = threading.Timer(SAY_AFTER_S, print, (line,), {"file": sys.stderr, "flush": True})
     said.daemon = True
     said.start()
