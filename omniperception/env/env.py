@@ -368,7 +368,7 @@ class OmniEnv(VecEnv):
         if self.sensing is not None and self.sensing.frames is not None:
             groups["frames"] = self.sensing.frames
             groups["frame_count"] = self.sensing.frame_count.clone()
-            groups["frame_tick"] = self.sensing.frame_tick.clone()
+            groups["frame_tick"] = self.sensing.frame_tick
         if HEIGHT_TARGET in self.config.targets:
             groups[HEIGHT_TARGET] = self.state.heights if self._frame_heights is None else self._frame_heights
         if self.avoidance is not None:

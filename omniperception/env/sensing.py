@@ -281,9 +281,12 @@ class LidarSensing:
                     self._sectors[index]()
         next(slices, None)  # the frame has been cast
         self.tick, self._is_cast = self.tick + 1, True
-        self.frame_tick.fill_(self.tick)
+        self._note_tick()
         if self._shown:
             self._append_newest()
+
+    def _note_tick(self) -> None:
+        self.frame_tick = torch.full_like(self.frame_tick, self.tick)  # observations keep the tensor of before
 
     def _attitude(self, base_quat: torch.Tensor) -> torch.Tensor:
         """(num_envs, 4) attitude of the body that carries the sensor, by the base's as measured and the joints."""
@@ -367,7 +370,7 @@ class LidarSensing:
         self._is_cast = bool(clouds)
         for name, values in clouds.items():
             getattr(self.lidar.frame, name).copy_(values)
-        self.frame_tick.fill_(self.tick)
+        self._note_tick()
         self.lidar.load_state_dict(state["lidar"])
         self.frame_count.copy_(state["frame_count"])
         if self.frames is not None:

@@ -66,7 +66,7 @@ def test_features_once_per_tick_until_the_actor_is_reset():
         for _ in range(3):
             actor(env.get_observations())
             assert len(calls) == 2 * first
-            env.frame_count[2], env.frames[2] = 0, 0.0  # a reset alone embeds nothing
+            env._reset(torch.tensor([2]))  # alone embeds nothing
     with torch.no_grad():
         next(actor.perception.parameters()).add_(0.1)
     with torch.inference_mode():

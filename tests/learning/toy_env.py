@@ -32,7 +32,7 @@ class ToyEnv(VecEnv):
         self.position = torch.tensor(self.rng.normal(size=(num_envs, 2)), dtype=torch.float32)
         self.episode_length_buf = torch.arange(num_envs) * 3 % episode
         self.frames = torch.zeros(num_envs, history, POINTS, 3)
-        self.frame_count = torch.zeros(num_envs, 1, dtype=torch.long)
+        self.frame_count, self.frame_tick = torch.zeros(2, num_envs, 1, dtype=torch.long).unbind(0)
 
     curriculum_levels = (1.0,)
 
@@ -48,7 +48,7 @@ class ToyEnv(VecEnv):
         if self.has_frames:
             groups["frames"] = self.frames
             groups["frame_count"] = self.frame_count.clone()
-            groups["frame_tick"] = torch.full((self.num_envs, 1), self.tick)
+            groups["frame_tick"] = self.frame_tick
         return TensorDict(groups, batch_size=[self.num_envs])
 
     def step(self, actions):
@@ -70,11 +70,13 @@ class ToyEnv(VecEnv):
         noise = torch.randn(self.num_envs, POINTS, 1) * 0.01  # torch's global generator
         self.frames[:, -1] = torch.cat([self.position, torch.ones(self.num_envs, 1)], -1).unsqueeze(1) * 0.1 + noise
         self.frame_count = (self.frame_count + 1).clamp(max=self.frames.shape[1])
+        self.frame_tick = torch.full_like(self.frame_tick, self.tick)
 
     def _reset(self, ids):
         self.position[ids] = torch.tensor(self.rng.normal(size=(len(ids), 2)), dtype=torch.float32)
         self.episode_length_buf[ids] = 0
         self.frame_count[ids] = 0
+        self.frames = self.frames.index_fill(0, ids, 0.0)
 
     def state_dict(self):
         return {"rng": self.rng.bit_generator.state, "array": np.arange(3), **{n: getattr(self, n) for n in STATE}}
@@ -84,6 +86,7 @@ class ToyEnv(VecEnv):
         self.rng.bit_generator.state = state["rng"]
         for name in STATE:
             setattr(self, name, state[name])
+        self.frame_tick = torch.full_like(self.frame_tick, self.tick)
 
 
 def config(frames=True, supervised=False, **ppo):
