@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -91,12 +92,26 @@ class RunConfig:
         """Limit (m/s^2) of V_cmd + V_avoid; None without one, and where V_avoid is not added."""
         return self.env.rewards.avoidance.max_acceleration if self.adds_velocity else None
 
+    @property
+    def task(self) -> dict:
+        """What the configuration says of the environments."""
+        task = copy.deepcopy(self.composed)
+        for key in _BESIDE_THE_TASK:
+            group, _, name = key.rpartition(".")
+            (task.get(group) or {} if group else task).pop(name, None)
+        return task
+
 
 _TASK = (
     *("num_envs", "seed", "robot", "terrain", "obstacles", "commands", "observations", "rewards", "terminations"),
     *("randomization", "sim"),
 )
 """Keys of a configuration that are fields of EnvConfig as they stand."""
+_BESIDE_THE_TASK = (
+    *("ppo", "logger", "init", "seed", "sim.num_threads", configs.SEARCH_PATH),
+    *("perception.learning_rate", "perception.final_learning_rate", "perception.supervised_epochs"),
+)
+"""Keys of a configuration that change nothing in the environments."""
 
 
 def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
@@ -113,7 +128,7 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     if config.get("perception") and not config.get("lidar"):
         raise ConfigError("perception needs a LiDAR, but lidar=none; use lidar=mid360 or perception=none")
     composed = _resolved(config)
-    for key in {*_TASK, "lidar", "perception", "ppo"} - composed.keys():
+    for key in {*_TASK, "lidar", "perception", "ppo", "logger"} - composed.keys():
         raise DoesNotFit(f"the configuration has no {key}")
     hints = types_of(EnvConfig)
     task = {key: make(hints[key], composed[key], key, trusted) for key in _TASK}
@@ -334,6 +349,7 @@ def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
         distillation=run.distillation,
         logger=run.logger,
         settings=run.composed,
+        task=run.task,
     )
 
 

@@ -22,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from omniperception.common.checkpoints import list_checkpoints
 from omniperception.common.errors import ConfigError, UnknownKey, one_line, suggest
+from omniperception.common.files import write_whole
 
 _SHIPPED = Path(__file__).resolve().parent / "conf"
 CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"
@@ -352,12 +353,12 @@ def listed(folder: str, name: str, folders: Sequence[Path] = ()) -> Path:
 def save(composed: dict, run_dir: Path) -> None:
     """Writes the resolved configuration into the run directory."""
     run_dir.mkdir(parents=True, exist_ok=True)
-    (run_dir / CONFIG_FILE).write_text(as_yaml(composed))
+    write_whole(run_dir / CONFIG_FILE, as_yaml(composed).encode())
 
 
 def save_recipe(overrides: Sequence[str], run_dir: Path) -> None:
     """Writes the overrides that a run was begun with beside its configuration."""
-    (run_dir / RECIPE_FILE).write_text(yaml.safe_dump(list(overrides)))
+    write_whole(run_dir / RECIPE_FILE, yaml.safe_dump(list(overrides)).encode())
 
 
 def read_recipe(run_dir: Path) -> list[str]:

@@ -163,6 +163,8 @@ def test_a_run_that_goes_on_in_another_task_begins_new_episodes(tmp_path, monkey
     assert env.obstacles.level == (1.0 if changes == ("obstacles.curriculum=null",) else 0.7)
     mass, nominal = (one.sim.model_field("body_mass") for one in (env, fresh))
     assert torch.equal(mass, nominal) == (changes[0] == "randomization=none")
+    main(["train", "run=here"])  # stopped before it has saved anything of its task
+    assert "its task is another now: new episodes begin" in capsys.readouterr().out
 
 
 def test_processes_that_go_on_draw_from_streams_of_their_own(tmp_path, monkeypatch):

@@ -11,7 +11,6 @@ of values with commas, on a cluster with hydra/launcher=submitit_slurm. `--cfg j
 
 from __future__ import annotations
 
-import copy
 import os
 import sys
 from collections.abc import Sequence
@@ -118,22 +117,6 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: 
     learn(run, run_dir, resume=begun, trust=trust)
 
 
-_BESIDE_THE_TASK = (
-    *("ppo", "logger", "init", "seed", "sim.num_threads", config.SEARCH_PATH),
-    *("perception.learning_rate", "perception.final_learning_rate", "perception.supervised_epochs"),
-)
-"""Keys of a configuration that change nothing in the environments."""
-
-
-def _task_of(run: build.RunConfig) -> dict:
-    """What a configuration says of the environments."""
-    task = copy.deepcopy(run.composed)
-    for key in _BESIDE_THE_TASK:
-        group, _, name = key.rpartition(".")
-        (task.get(group) or {} if group else task).pop(name, None)
-    return task
-
-
 def _check_sources(run: build.RunConfig) -> None:
     """Refuses runs to begin from that have no weights, or moved otherwise, before a directory is written."""
     if run.init:
@@ -159,9 +142,7 @@ def learn(
     torch.set_flush_denormal(True)  # gradients of faint activations are, and one convolution took 40 times as long
     runner = build.build_runner(run, run_dir)
     if resume:
-        same_task = not changes or _task_of(run) == _task_of(build.load_run(run_dir, trust=trust))
-        runner.load(str(latest_checkpoint(run_dir)), same_task)
-        if not same_task:
+        if not runner.load(latest_checkpoint(run_dir)):
             report("its task is another now: new episodes begin")
         if changes and distributed.rank() == 0:  # the weights fit
             config.save(run.composed, run_dir)

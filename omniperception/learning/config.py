@@ -251,6 +251,7 @@ class LearningConfig:
         distillation: of a teacher, which :meth:`PerceptivePpo.learn_from` gives; None: there is none.
         logger: where scalars go; None: nowhere.
         settings: the run's composed configuration, for what is logged.
+        task: the part of it that says what the environments are; a checkpoint of another task begins new episodes.
     """
 
     ppo: PPOConfig
@@ -266,3 +267,4 @@ class LearningConfig:
     distillation: DistillationConfig | None = None
     logger: LoggerConfig | None = field(default_factory=LoggerConfig)
     settings: Mapping[str, Any] = field(default_factory=dict)
+    task: Mapping[str, Any] = field(default_factory=dict)

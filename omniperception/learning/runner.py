@@ -152,18 +152,19 @@ class Runner:
             "logger": self.logger.state_dict(),
             "rng": rng_state(),
             "env": self.env.state_dict(),
+            "task": self.config.task,
         }
         save_checkpoint(path, state)
 
-    def load(self, path: str | Path, same_task: bool = True) -> None:
+    def load(self, path: str | Path) -> bool:
         """Go on where :meth:`save` wrote a checkpoint.
 
-        Args:
-            path: of the checkpoint.
-            same_task: whether the environments are configured as there; otherwise new episodes begin, at the levels
-                of the curricula.
+        Returns:
+            Whether the environments are configured as there; otherwise new episodes begin, at the levels of the
+            curricula.
         """
         state = self._load(path)
+        same_task = state.get("task") == self.config.task
         self.current_learning_iteration, self.total_time = state["iteration"], state["total_time"]
         self.logger.load_state_dict(state["logger"])
         if self.config.ppo.mixed_precision is None:
@@ -176,6 +177,7 @@ class Runner:
         else:  # the others go on in ways of their own
             self.env.load_state_dict(_without_streams(state["env"]))
         self._last_saved = Path(path)
+        return same_task
 
     def load_policy(self, path: str | Path) -> None:
         """Load the actor's weights alone, to replay it."""
