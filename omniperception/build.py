@@ -22,6 +22,7 @@ from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import Condition
+from omniperception.env.mdp.terms import first_difference
 from omniperception.env.mirror import Mirror
 from omniperception.learning import CheckpointError, Runner, distributed, latest_checkpoint, load_checkpoint
 from omniperception.learning.checkpoint import difference
@@ -224,10 +225,12 @@ def _logger(composed: dict, trust: Sequence[str] | None) -> LoggerConfig | None:
 
 
 def _names(value: object) -> tuple[str, ...]:
-    """Run directories of `init`: none, one or several."""
+    """Run directories of `init`: none, one, or one that perceives and one that moves."""
     names = [] if value is None else value if isinstance(value, list) else [value]
     if not all(isinstance(name, str) for name in names):
         raise ConfigError(f"init={value} must be a run directory, a list of them, or null")
+    if len(names) > 2:
+        raise ConfigError(f"init={value}: give two at most, a run that perceives and one that moves")
     return tuple(names)
 
 
@@ -306,6 +309,11 @@ def load_teacher(run_dir: Path, env: OmniEnv, trust: Sequence[str] = ()) -> Teac
         raise ConfigError(
             f"distillation.teacher={run_dir} reads the observations {', '.join(missing)}, which this run has not; give"
             " both the same preset of observations"
+        )
+    own = replace(env.config.observations, actor=list(groups))
+    if reason := first_difference(env.actor_inputs(own), env.actor_inputs(run.env.observations)):
+        raise CheckpointError(
+            f"distillation.teacher={run_dir} does not fit: {reason}; give both the same preset of observations"
         )
     estimated = run.env.observations.estimated
     actor = EstimatingModel(

@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from omegaconf import OmegaConf
 
 from omniperception import build, config
 from omniperception.commands import main
 from omniperception.common import provenance
-from omniperception.learning import Runner, distributed, load_checkpoint
+from omniperception.learning import CheckpointError, Runner, distributed, load_checkpoint
 from omniperception.learning.checkpoint import checkpoint_path
 from omniperception.learning.ppo import PerceptivePpo
 
@@ -104,6 +105,19 @@ def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
     assert "init=end" not in capsys.readouterr().out
     main(["train", *seen, "perception.sampler.split_deg=10", "hydra.run.dir=other"])
     assert "learned from another sampler (split_deg 20.0 -> 10)" in capsys.readouterr().out
+
+    timed = ("init=gait", "ppo.max_iterations=1", "observations.groups.clock.terms.gait_phase.frequency=4.0")
+    main(["train", *(one for one in student if not one.startswith("init=")), *timed, taught, "hydra.run.dir=timed"])
+    said = capsys.readouterr().out
+    for name in ("init", "distillation.teacher"):
+        assert f"{name}=gait: what it observes as gait_phase is made otherwise here (frequency 2.5 -> 4.0)" in said
+
+    made = config.read(tmp_path / "gait")
+    terms = made.observations.groups.proprioception.terms
+    made.observations.groups.proprioception.terms = {"joint_vel": terms.pop("joint_vel"), **terms}
+    (tmp_path / "gait" / "config.yaml").write_text(OmegaConf.to_yaml(made))
+    with pytest.raises(CheckpointError, match="teacher=.*gait does not fit: input 0 .* proprioception.joint_pos_off"):
+        build.load_teacher(tmp_path / "gait", env)
 
 
 def test_what_a_run_goes_on_with_is_written_down(tmp_path, monkeypatch, capsys):

@@ -153,11 +153,13 @@ def learn(
             given = [config.find_run(name, "init") for name in run.init]
             observed = build.load_run(given[-1], trust=trust).env.observations
             for source in runner.start_from(*given, observations=observed):
-                _report_other_inputs(OmegaConf.create(run.composed), source)
+                _report_other_sampler(OmegaConf.create(run.composed), source)
+            _report_other_terms(run, given[-1], "init")
         report(f"run directory: {run_dir}")
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
         name = run.distillation.teacher
         _check_motion(OmegaConf.create(run.composed), name, "distillation.teacher")
+        _report_other_terms(run, config.find_run(name, "distillation.teacher"), "distillation.teacher")
         runner.alg.learn_from(build.load_teacher(config.find_run(name, "distillation.teacher"), runner.env, trust))
 
     def save(plan: Plan) -> None:
@@ -197,14 +199,32 @@ def _check_motion(composed: DictConfig, source: str, name: str = "init") -> None
         report(f"{name}={source}: it was learned by the robot of {robots[1]}, this one is that of {robots[0]}")
 
 
-def _report_other_inputs(composed: DictConfig, source: Path) -> None:
+def _report_other_sampler(composed: DictConfig, source: Path) -> None:
     """Says where a perception network goes on with inputs that are made otherwise; nothing in its weights shows it."""
-    own, given = (one.perception.sampler for one in (composed, config.read(source)))
-    if own == given:
-        return
-    keys = [key for key in dict.fromkeys((*given, *own)) if given.get(key) != own.get(key)]
-    changes = ", ".join(f"{key} {given.get(key)} -> {own.get(key)}" for key in keys)
-    report(f"init={source}: its perception was learned from another sampler ({changes}) and goes on from there")
+    changes = _changes(*(one.perception.sampler for one in (config.read(source), composed)))
+    if changes:
+        report(f"init={source}: its perception was learned from another sampler ({changes}) and goes on from there")
+
+
+def _report_other_terms(run: build.RunConfig, source: Path, name: str) -> None:
+    """Says where what a policy observes has other parameters, such as a scale, than in the run that it comes from."""
+    own, given = (_terms(one) for one in (OmegaConf.create(run.composed), config.read(source)))
+    for term, parameters in own.items():
+        if term in given and (changes := _changes(given[term], parameters)):
+            report(f"{name}={source}: what it observes as {term} is made otherwise here ({changes})")
+
+
+def _terms(composed: DictConfig) -> dict[str, DictConfig]:
+    """Parameters of the terms that the actor observes."""
+    groups = [composed.observations.groups[name] for name in composed.observations.actor]
+    return {
+        str(term): parameters for group in groups for term, parameters in group.terms.items() if parameters is not None
+    }
+
+
+def _changes(before: DictConfig, now: DictConfig) -> str:
+    keys = [key for key in dict.fromkeys((*before, *now)) if before.get(key) != now.get(key)]
+    return ", ".join(f"{key} {before.get(key)} -> {now.get(key)}" for key in keys)
 
 
 def report(text: str) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from tensordict import TensorDict
 
 from omniperception.common.errors import one_line
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
+from omniperception.env.mdp.terms import ActorInput, ObservationsConfig, first_difference
 from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
     CheckpointError,
@@ -186,11 +186,11 @@ class Runner:
     def start_from(self, *run_dirs: Path, observations: ObservationsConfig | None = None) -> list[Path]:
         """Begin with the newest weights of other runs.
 
-        The last one gives the actor's, and the critic's where it observes the same; those before give what they
-        perceive with.
+        The last one gives the actor's, and the critic's where it observes the same; one before it gives what it
+        perceives with, otherwise the last one does where that fits.
 
         Args:
-            run_dirs: of these runs.
+            run_dirs: of these runs, one or two.
             observations: of the last one, which may observe what this one estimates, or less than this one; None: the
                 same as here.
 
@@ -207,22 +207,20 @@ class Runner:
         weights = state["actor_state_dict"]
         own, theirs = self.env.config.observations, observations or self.env.config.observations
         inputs, given = self.env.actor_inputs(own), self.env.actor_inputs(theirs)
-        if _meaning(inputs) != _meaning(given):
+        if reason := first_difference(inputs, given):
             weights = observing_more(weights, inputs, given)
             if self.config.estimator is not None and theirs.estimated is None:
                 truth = self.env.actor_inputs(replace(own, actor=[self.config.estimator.group]))
                 weights = estimating(self.alg.actor, weights, inputs, given, truth)
             if weights is state["actor_state_dict"]:  # nothing has rearranged them
-                raise CheckpointError(
-                    f"init={run_dir} does not fit: {_first_difference(inputs, given)}; give both the same observations"
-                )
-        if start_from(self.alg.actor, weights, str(run_dir)):
+                raise CheckpointError(f"init={run_dir} does not fit: {reason}; give both the same observations")
+        if start_from(self.alg.actor, weights, str(run_dir), with_perception=not seeing):
             seeing = [run_dir]
         if self.config.ppo.start_std is not None:
             with torch.no_grad():
                 self.alg.actor.distribution.std_param.fill_(self.config.ppo.start_std)
         self.alg.actor.reset()
-        if _meaning(self._critic_inputs(own)) == _meaning(self._critic_inputs(theirs)):
+        if first_difference(self._critic_inputs(own), self._critic_inputs(theirs)) is None:
             with contextlib.suppress(CheckpointError):  # other hidden layers
                 start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
         return seeing
@@ -337,22 +335,6 @@ class Runner:
             yield
         finally:
             signal.signal(signal.SIGINT, previous)
-
-
-def _meaning(inputs: Sequence[ActorInput]) -> list[tuple]:
-    """What they are, whatever their groups are called."""
-    return [one[1:] for one in inputs]
-
-
-def _named(one: ActorInput) -> str:
-    return f"{one.group}.{one.term}" + (f" of {one.age} steps before" if one.age else "")
-
-
-def _first_difference(own: Sequence[ActorInput], other: Sequence[ActorInput]) -> str:
-    pairs = zip(_meaning(own), _meaning(other), strict=False)
-    number = next((k for k, (mine, theirs) in enumerate(pairs) if mine != theirs), min(len(own), len(other)))
-    mine, theirs = (_named(one[number]) if number < len(one) else "none" for one in (own, other))
-    return f"input {number} of this run's policy is {mine}, of that run's {theirs}"
 
 
 def _without_streams(state: dict) -> dict:

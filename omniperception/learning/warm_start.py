@@ -40,7 +40,7 @@ def perceive_as(model: MLPModel, weights: Mapping[str, torch.Tensor], source: st
         state[name].copy_(weights[name])
 
 
-def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> bool:
+def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str, with_perception: bool = True) -> bool:
     """Copies the actor's weights of another run into a model with the same one-dimensional observations.
 
     The first layer reads these observations before an embedding, so a policy that walked blind starts to walk with
@@ -50,6 +50,7 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
         model: whose weights are replaced in place.
         weights: the state of the other.
         source: names the other run in an error.
+        with_perception: whether its perception network is copied where it fits.
 
     Returns:
         Whether the perception network was copied, too.
@@ -60,7 +61,8 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
     alike = "observations (groups, history and what is estimated), ppo.hidden_dims and ppo.obs_normalization"
     state, copies = model.state_dict(), []
     optional = {name for name in state if name.startswith(_OPTIONAL)}
-    fits = bool(optional) and all(name in weights and weights[name].shape == state[name].shape for name in optional)
+    fits = with_perception and bool(optional)
+    fits = fits and all(name in weights and weights[name].shape == state[name].shape for name in optional)
     for name in [name for name in state if fits or name not in optional]:
         own, other = state[name], weights.get(name)
         if name == _FIRST_LAYER and other is not None and not fits:

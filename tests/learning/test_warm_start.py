@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from omniperception.build import build_runner
+from omniperception.config import ConfigError
 from omniperception.learning import CheckpointError
 from omniperception.learning.checkpoint import checkpoint_path
 
@@ -66,6 +67,20 @@ def test_a_gait_and_perception_are_joined(make_config, walk, seeing):
     mine, theirs = joined.alg.actor.state_dict(), seeing.alg.actor.state_dict()
     perceived = [name for name in theirs if name.startswith("perception.")]
     assert perceived and all(torch.equal(mine[name], theirs[name]) for name in perceived)
+
+
+def test_the_first_of_two_that_perceive_alike_gives_perception(make_config, seeing, tmp_path):
+    seeing_dir, first = seeing
+    second = build_runner(make_config(*SEEING, *OTHERWISE, "seed=11"), None)
+    torch.nn.init.normal_(second.alg.actor.mlp[0].weight)
+    second.save(checkpoint_path(tmp_path, 1))
+    joined = build_runner(make_config(*SEEING, *OTHERWISE, "seed=10"), None)
+    assert joined.start_from(seeing_dir, tmp_path) == [seeing_dir]
+    mine, theirs, moves = (one.alg.actor.state_dict() for one in (joined, first, second))
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs if name.startswith("perception."))
+    blind_dim = joined.alg.actor.blind_dim
+    assert torch.equal(mine["mlp.0.weight"][:, :blind_dim], moves["mlp.0.weight"][:, :blind_dim])
+    assert bool((mine["mlp.0.weight"][:, blind_dim:] == 0).all())  # the second's weighed another embedding
 
 
 def test_what_does_not_perceive_alike_is_not_joined(make_config, walk, seeing):
@@ -263,3 +278,5 @@ def losses_on_the_rollout(runner):
 def test_init_is_a_run_or_several(make_config):
     assert make_config(*BLIND).init == ()
     assert make_config(*BLIND, "init=[a,b]").init == ("a", "b")
+    with pytest.raises(ConfigError, match=r"init=.*: give two at most"):
+        make_config(*BLIND, "init=[a,b,c]")

@@ -139,6 +139,23 @@ class ActorInput(NamedTuple):
     age: int
     component: int
 
+    def __str__(self) -> str:
+        return f"{self.group}.{self.term}" + (f" of {self.age} steps before" if self.age else "")
+
+
+def first_difference(own: Sequence[ActorInput], other: Sequence[ActorInput]) -> str | None:
+    """Where the inputs of an actor first are something else than another's, in words; None: nowhere.
+
+    What their groups are called does not count.
+    """
+    mine, theirs = ([one[1:] for one in inputs] for inputs in (own, other))
+    if mine == theirs:
+        return None
+    pairs = zip(mine, theirs, strict=False)
+    number = next((k for k, (one, another) in enumerate(pairs) if one != another), min(len(own), len(other)))
+    here, there = (str(one[number]) if number < len(one) else "none" for one in (own, other))
+    return f"input {number} of this run's policy is {here}, of that run's {there}"
+
 
 @dataclass(frozen=True)
 class ObservationsConfig:
