@@ -333,7 +333,7 @@ def load_teacher(run_dir: Path, env: OmniEnv, trust: Sequence[str] = ()) -> Teac
             " history"
         )
     actor.load_state_dict(weights)
-    return Teacher(actor, "command")
+    return Teacher(actor)
 
 
 def steps_per_frame(run: RunConfig) -> int:

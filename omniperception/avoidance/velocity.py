@@ -13,6 +13,8 @@ SECTOR_TARGET, AVOIDANCE_TARGET, MOTION_TARGET = "sector_target", "avoidance_tar
 """Supervision of a network: 1 - d / NEARNESS_RANGE by sector of what the LiDAR hits; the avoidance velocity; nearness
 and velocity of the true obstacles by sector."""
 
+COMMAND = "command"
+"""Group of observations that begins with the commanded velocity (v_x, v_y), m/s."""
 LAST_ASKED = "last_asked"
 """Observations (n, 2) of the velocity (m/s) that a policy asked its gait for in the step that ended."""
 

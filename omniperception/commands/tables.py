@@ -7,9 +7,9 @@ A table stands in a page between <!-- table: NAME view=... key=value ... --> and
 written by evaluate out=, or several with commas. Views: all (every figure), policies (a row for each world, a column
 for each policy), worlds (a row for each world, a column for each condition), conditions (a row for each policy),
 trained (a row for each run, a column for each policy), trainings (a row for each world, a column for each training, its
-seeds together), walking (figures of a gait: a row for each ground), runs (the same, a row for each run). The keys
-policy, world, terrain, condition, split and run choose what is shown. Percentages and intervals are computed from the
-outcomes of trials.
+seeds together), study (a row for each training and policy), walking (figures of a gait: a row for each ground), levels
+(the same, all kinds of ground together), runs (the same, a row for each run). The keys policy, world, terrain,
+condition, split and run choose what is shown. Percentages and intervals are computed from the outcomes of trials.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
 def go_on(run_dir: Path, overrides: Sequence[str], trust: Sequence[str]) -> None:
     """Goes on with a run; what overrides change is written into its directory, for whoever reads it next."""
     for override in config.parse(overrides):
-        if override.key_or_group in ("seed", "init"):
+        if override.key_or_group in ("seed", "init", "ppo.critic_warmup"):  # all are of a beginning
             raise config.ConfigError(
                 f"{override.input_line}: {run_dir} has begun already and goes on from its newest checkpoint; leave it"
                 " out, or train a run of its own"

@@ -18,7 +18,7 @@ from rsl_rl.models import MLPModel
 from torch import nn
 
 from omniperception import build
-from omniperception.avoidance.velocity import LAST_ASKED
+from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
 from omniperception.build import RunConfig
 from omniperception.common.provenance import provenance
 from omniperception.common.vectors import moved_towards
@@ -387,7 +387,7 @@ def network_of(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
         return BlindNetwork(actor)
     names, command_start = list(group_sizes), 0
     if actor.read_out is not None:
-        command_start = sum(group_sizes[name] for name in names[: names.index(actor.command_group)])
+        command_start = sum(group_sizes[name] for name in names[: names.index(COMMAND)])
     return PerceptiveNetwork(actor, command_start)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, MOTION_TARGET, SECTOR_TARGET
 from omniperception.common.random import MOST_SEEDS
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.env.mdp.randomization import RandomizationConfig
@@ -118,7 +118,7 @@ class EnvConfig:
                 "randomization.lidar_device needs a sensor whose maker states its noise, but lidar.device is null; name"
                 " the device, or use randomization=lidar"
             )
-        command = self.observations.groups.get("command")
+        command = self.observations.groups.get(COMMAND)
         if {AVOIDANCE_TARGET, MOTION_TARGET} & set(self.targets) and command is not None and command.history != 1:
             raise ValueError(
                 f"observations.groups.command.history={command.history}: an avoidance velocity is added to the command"

@@ -254,7 +254,7 @@ class EnvState:
         self.actions = tuple(state["actions"])
         self.targets = (state["targets"][0], state["targets"][1])
         self.stand_s, self._reference = state["stand_s"].clone(), state["reference"].clone()
-        self.last_asked = state.get("last_asked", self.last_asked).clone()  # older checkpoints have none
+        self.last_asked = state["last_asked"].clone()
         if self._history is not None:
             self._history.load_state_dict(state["history"])
         if self._errors is not None:

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from omniperception.avoidance.sector_tracks import SectorTracks, TracksConfig
 from omniperception.avoidance.true_sectors import TrueSectors
-from omniperception.avoidance.velocity import AvoidanceConfig, avoidance_velocity
+from omniperception.avoidance.velocity import COMMAND, AvoidanceConfig, avoidance_velocity
 from omniperception.config import read
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
@@ -37,9 +37,6 @@ BASELINES = {
 
 DRIVEN = ("stop", "histogram", "oracle")
 """Those that drive a gait by its command."""
-
-COMMAND_GROUP = "command"
-"""The observation group that begins with the commanded velocity (v_x, v_y)."""
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
 """Ranges of v_x and v_y (m/s)."""
@@ -287,10 +284,10 @@ def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | N
         steering: the velocity, asked for once at each control step.
         limits: ranges to which it is clipped: what the policy has learned to follow; None for no limits.
     """
-    shape = env.get_observations()[COMMAND_GROUP].shape if COMMAND_GROUP in env.get_observations() else None
+    shape = env.get_observations()[COMMAND].shape if COMMAND in env.get_observations() else None
     if shape is None or shape[1] != env.command.value.shape[1]:
         raise ValueError(
-            f"it drives a policy by its command and needs observations with a group '{COMMAND_GROUP}' that holds the"
+            f"it drives a policy by its command and needs observations with a group '{COMMAND}' that holds the"
             " command alone, without history; name another gait: walker=<run directory of experiment=walk>"
         )
 
@@ -302,7 +299,7 @@ def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | N
             low, high = velocity.new_tensor(limits).unbind(1)
             velocity = velocity.clamp(low, high)
         observations = observations.clone(recurse=False)
-        observations[COMMAND_GROUP] = torch.cat((velocity, env.state.reference[:, 2:]), 1)
+        observations[COMMAND] = torch.cat((velocity, env.state.reference[:, 2:]), 1)
         return policy(observations)
 
     return drive

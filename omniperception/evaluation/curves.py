@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +17,8 @@ from omniperception import config
 from omniperception.common.errors import ConfigError
 from omniperception.common.figures import new_figure
 
-SAME_IN_NOTHING = ("seed", "logger", config.SEARCH_PATH)
-"""Keys of a configuration in which runs of one curve may differ."""
+MAY_DIFFER = ("seed", "logger", config.SEARCH_PATH)
+"""Keys of a configuration in which runs of one curve may differ; `init` may in the seed of a study's run."""
 UNITS = {
     "velocity_error": "m/s",
     "calm_velocity_error": "m/s",
@@ -55,7 +56,8 @@ def by_recipe(runs: Sequence[Path]) -> dict[str, list[Path]]:
     for run in runs:
         made = OmegaConf.to_container(config.read(run))
         assert isinstance(made, dict)
-        kept = {key: value for key, value in made.items() if key not in SAME_IN_NOTHING}
+        kept = {key: value for key, value in made.items() if key not in MAY_DIFFER}
+        kept["init"] = re.sub(r"/seed\d+(?=\W|$)", "", str(made.get("init")))
         groups.setdefault(json.dumps(kept, sort_keys=True), []).append(run)
     named: dict[str, list[Path]] = {}
     for same in groups.values():

@@ -29,8 +29,9 @@ def run_episodes(
     """Runs trials 0 to num_trials - 1: an environment whose trial has ended takes the next one.
 
     The scene of a trial depends on its number alone (`TrialRandom`), and every trial that has begun is run to its end.
-    So neither the number of environments nor the length of other trials decides what is measured; an environment that
-    finds no trial left goes on unobserved until the last one has ended.
+    So neither the number of environments nor the length of other trials decides which scenes are measured; what a
+    policy that sees meets there is decided by them as well: frames come in time with all environments, and the LiDAR's
+    noise belongs to an environment. One that finds no trial left goes on unobserved until the last one has ended.
 
     Args:
         env: freshly built with `EnvConfig.trials`: every environment at the start of its first trial.

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from omniperception.avoidance.velocity import COMMAND
 from omniperception.common.figures import new_figure
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.commands import VelocityCommand
@@ -68,7 +69,7 @@ def watch(env: OmniEnv, policy: Policy) -> Footfall:
         for step in range(round((SETTLES_S + SHOWN_S) / env.control_dt)):
             env.command.value.copy_(wanted)
             env.command.time_left.fill_(torch.inf)  # none is drawn, so that what follows from the command stays, too
-            env.observations["command"].copy_(wanted)
+            env.observations[COMMAND].copy_(wanted)
             env.step(policy(env.get_observations()))
             if step * env.control_dt >= SETTLES_S:
                 k = env.state.kinematics

@@ -56,13 +56,11 @@ class KickResults:
 
     Attributes:
         speed: size of the kick (m/s).
-        bearing: direction (rad) of the change of velocity, 0 ahead, positive to the left.
         kicked: bool: was still walking when the kick was due.
         survived: bool: was kicked and did not fall within WATCHED_S.
     """
 
     speed: torch.Tensor
-    bearing: torch.Tensor
     kicked: torch.Tensor
     survived: torch.Tensor
 
@@ -102,7 +100,7 @@ def kick(env: OmniEnv, policy: Policy, speeds: Sequence[float], num_bearings: in
     env.pushes = Kicks(env, change)  # type: ignore[assignment]  # stands in for them
     episodes = run_episodes(env, policy, len(speed))
     kicked = episodes.length_s >= AFTER_S
-    return KickResults(speed, bearing, kicked, kicked & episodes.ended("time_out"))
+    return KickResults(speed, kicked, kicked & episodes.ended("time_out"))
 
 
 def draw_kicks(results: KickResults, speeds: Sequence[float], num_bearings: int, path: Path) -> None:

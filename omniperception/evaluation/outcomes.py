@@ -100,17 +100,6 @@ class Episodes:
         """(num_trials,) bool: success without a touch; a fall ends a trial, so that there is none in a success."""
         return self.success & ~self.collided
 
-    @property
-    def verdict(self) -> list[str]:
-        """For each trial: success, success touched, time out, fall, collision end or diverged, in words."""
-        words = []
-        for succeeded, touched, outcome in zip(self.success, self.collided, self.outcome, strict=True):
-            if succeeded:
-                words.append("success, touched" if touched else "success")
-            else:
-                words.append(OUTCOMES[outcome].replace("_", " "))
-        return words
-
     def happened(self) -> dict[str, torch.Tensor]:
         """(num_trials,) bool each: what rates are given of; the first decides."""
         rates = {"untouched": self.clean, "success": self.success, "collision": self.collided}

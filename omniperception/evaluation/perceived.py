@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.nn import functional
 
-from omniperception.avoidance.sector_motion import NEARNESS_RANGE, decode
+from omniperception.avoidance.sector_motion import FAINT, NEARNESS_RANGE, decode
 from omniperception.avoidance.velocity import SECTOR_TARGET
 from omniperception.env.config import HEIGHT_TARGET
 from omniperception.env.env import OmniEnv
@@ -58,8 +59,8 @@ def perceived(actor: nn.Module, observations: TensorDict, command: torch.Tensor,
         risk = features[0, actor.perception.feature_dim :]
     elif SECTOR_TARGET in actor.supervision:
         nearness = embedding[0, parts[SECTOR_TARGET]].clamp(max=1.0)
-        distance = torch.where(nearness > 0.05, NEARNESS_RANGE * (1.0 - nearness), torch.inf)
-        sectors = torch.cat((distance[:, None], torch.zeros(len(distance), 2)), 1)
+        distance = torch.where(nearness < FAINT, torch.inf, NEARNESS_RANGE * (1.0 - nearness))
+        sectors = functional.pad(distance[:, None], (0, 2))  # nothing moves
     if actor.read_out is not None:
         velocity = actor.read_out.velocity(features, command[env_id, None, :2])[0]
     return Perceived(_array(sectors), _array(risk), _array(velocity), _array(heights))

@@ -128,7 +128,8 @@ class PPOConfig:
         mixed_precision: whether updates multiply matrices in bfloat16; None where that is measured to be faster on a
             CPU, on a GPU not.
         critic_warmup: iterations at the beginning in which only the critic learns, for a policy that starts from
-            another run's weights (init=): advantages by a critic that knows nothing destroy it.
+            another run's weights (init=): advantages by a critic that knows nothing destroy it. Those in which a
+            teacher teaches (`distillation`) are among them: there the critic learns as well.
         final_entropy_coef: what entropy_coef changes to, linearly, until max_iterations; None: it stays as it is.
         final_desired_kl: what desired_kl changes to, likewise: smaller steps at the end.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
@@ -246,7 +247,6 @@ class LearningConfig:
         max_change: most (m/s) by which V_cmd + V_avoid of a policy that adds V_avoid changes from step to step; None:
             no limit.
         mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
-        command_group: the group that begins with the commanded velocity (v_x, v_y).
         estimator: of what the actor does not observe; None: it estimates nothing.
         distillation: of a teacher, which :meth:`PerceptivePpo.learn_from` gives; None: there is none.
         logger: where scalars go; None: nowhere.
@@ -262,7 +262,6 @@ class LearningConfig:
     velocity_risk: VelocityRisk | None = None
     max_change: float | None = None
     mirror: Callable | None = None
-    command_group: str = "command"
     estimator: EstimatorConfig | None = None
     distillation: DistillationConfig | None = None
     logger: LoggerConfig | None = field(default_factory=LoggerConfig)

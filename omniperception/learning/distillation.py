@@ -9,7 +9,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch.nn import functional
 
-from omniperception.avoidance.velocity import AVOIDANCE_TARGET
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,18 @@ class Teacher:
         groups: observation groups that it reads, the target among them.
     """
 
-    def __init__(self, actor: MLPModel, command_group: str) -> None:
+    def __init__(self, actor: MLPModel) -> None:
         """
         Args:
-            actor: reads one-dimensional groups, one of them `command_group`, which begins with (v_x, v_y).
+            actor: reads one-dimensional groups, the command among them.
         """
-        self._actor, self._command = actor.eval().requires_grad_(False), command_group
+        self._actor = actor.eval().requires_grad_(False)
         self.groups = (*actor.obs_groups, AVOIDANCE_TARGET)
 
     @torch.no_grad()
     def actions(self, groups: TensorDict) -> torch.Tensor:
         """(B, num_actions) actions without noise for observation groups of batch size B."""
         groups = groups.clone(recurse=False)
-        command, avoidance = groups[self._command], groups[AVOIDANCE_TARGET]
-        groups[self._command] = command + functional.pad(avoidance, (0, command.shape[-1] - avoidance.shape[-1]))
+        command, avoidance = groups[COMMAND], groups[AVOIDANCE_TARGET]
+        groups[COMMAND] = command + functional.pad(avoidance, (0, command.shape[-1] - avoidance.shape[-1]))
         return self._actor(groups)

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 
-from omniperception.avoidance.velocity import AVOIDANCE_TARGET, LAST_ASKED, MOTION_TARGET
+from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, LAST_ASKED, MOTION_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.common.vectors import moved_towards
 from omniperception.learning.estimator import EstimatingModel
@@ -54,7 +54,6 @@ class PerceptionActor(EstimatingModel):
         perception: PerceptionNetwork,
         supervision: Mapping[str, float] | None = None,
         velocity_risk: VelocityRisk | None = None,
-        command_group: str = "command",
         end_to_end: bool = True,
         max_change: float | None = None,
         **mlp_options,
@@ -69,7 +68,6 @@ class PerceptionActor(EstimatingModel):
             perception: the network.
             supervision: positive weight of the regression on each privileged observation group.
             velocity_risk: the controller, needed for supervision of ``motion_target``.
-            command_group: the group that begins with the commanded velocity (v_x, v_y).
             end_to_end: whether the loss of an update reaches the perception network; otherwise it is trained by
                 supervision alone (:meth:`PerceptivePpo.train_perception`).
             max_change: of the commanded velocity with the avoidance velocity added (m/s).
@@ -82,7 +80,7 @@ class PerceptionActor(EstimatingModel):
         with torch.no_grad():  # an untrained embedding is noise to the gait; it enters as its weights learn
             self.mlp[0].weight[:, self.blind_dim :] = 0.0
         self.supervision = dict(supervision or {})
-        self.command_group, self.end_to_end = command_group, end_to_end
+        self.end_to_end = end_to_end
         self.read_out: VelocityReadOut | MotionReadOut | None = None
         self.read_out_target = None
         if AVOIDANCE_TARGET in self.supervision:
@@ -111,11 +109,11 @@ class PerceptionActor(EstimatingModel):
                 features, has_frame = self.embed(obs), obs.step_count > 0
                 if self.supervision and obs.has_frames and torch.is_grad_enabled():
                     features = _AddLoss.apply(features, self.supervised_loss(features, obs))
-                groups = self._avoiding(obs.groups, features, has_frame)
+                groups = self._avoiding(obs.groups, features, has_frame, acts=False)
         else:
             with torch.no_grad():
                 features, has_frame = self.embed_newest(obs), obs["frame_count"].squeeze(-1) > 0
-                groups = self._avoiding(obs, features, has_frame)
+                groups = self._avoiding(obs, features, has_frame, acts=True)
         latent = super().get_latent(groups, masks, hidden_state)
         return torch.cat([latent, features[:, : self._feature_dim]], dim=-1)
 
@@ -189,18 +187,18 @@ class PerceptionActor(EstimatingModel):
     def _extend(self, embedding: torch.Tensor) -> torch.Tensor:
         return embedding if self.read_out is None else self.read_out.extend(embedding)
 
-    def _avoiding(self, groups: TensorDict, features: torch.Tensor, has_frame: torch.Tensor) -> TensorDict:
+    def _avoiding(self, groups: TensorDict, features: torch.Tensor, has_frame: torch.Tensor, acts: bool) -> TensorDict:
         """The observations with the avoidance velocity, 0 without a frame, added to the commanded one."""
         if self.read_out is None:
             return groups
         groups = groups.clone(recurse=False)
-        command = groups[self.command_group]
+        command = groups[COMMAND]
         asked = command[:, :2] + self.read_out.velocity(features, command[:, :2]) * has_frame[:, None]
         if self.max_change is not None:
             asked = moved_towards(groups[LAST_ASKED], asked, self.max_change)
-            if not torch.is_grad_enabled():
+            if acts:
                 self.asked = asked
-        groups[self.command_group] = torch.cat((asked, command[:, 2:]), 1)
+        groups[COMMAND] = torch.cat((asked, command[:, 2:]), 1)
         return groups
 
     def _check_supervision(self, obs: TensorDict) -> None:
@@ -223,9 +221,9 @@ class PerceptionActor(EstimatingModel):
                 )
         if self.read_out is None:
             return
-        if self.command_group not in self.obs_groups or obs[self.command_group].shape[-1] < 2:
+        if COMMAND not in self.obs_groups or obs[COMMAND].shape[-1] < 2:
             raise ValueError(
-                f"perception.avoidance_weight and motion_weight need the actor to observe '{self.command_group}', it"
+                f"perception.avoidance_weight and motion_weight need the actor to observe '{COMMAND}', it"
                 f" observes {self.obs_groups}; add it to observations.actor or set both to 0"
             )
         if self.max_change is not None and LAST_ASKED not in obs:

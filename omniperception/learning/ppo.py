@@ -137,7 +137,6 @@ class PerceptivePpo(PPO):
                 perception.build_network(),
                 perception.supervision,
                 config.velocity_risk,
-                config.command_group,
                 max_change=config.max_change,
                 end_to_end=perception.supervised_epochs == 0,
                 estimator=config.estimator,
@@ -295,7 +294,8 @@ class PerceptivePpo(PPO):
     def train_perception(self) -> None:
         """Fit the supervised targets on the frames of a rollout; one without a frame teaches nothing.
 
-        Each frame is compared with the targets of the first control step that sees it, when they were measured.
+        Each frame is compared with the targets of the first control step of the rollout that sees it: of those when it
+        was cast, or, for the frame that a rollout begins with, of up to a frame's period later.
         """
         optimizer = self.perception_optimizer
         if optimizer is None:  # PPO trains it, or there is none
@@ -313,8 +313,8 @@ class PerceptivePpo(PPO):
                     loss = self.actor.supervised_loss(self.actor.embed(obs), obs)
                 optimizer.zero_grad()
                 loss.backward()
-                nn.utils.clip_grad_norm_(self._perception_parameters, self.max_grad_norm)
                 average_gradients(self._perception_parameters)
+                nn.utils.clip_grad_norm_(self._perception_parameters, self.max_grad_norm)
                 self.guard.check_gradients("perception network", self._perception_parameters)
                 optimizer.step()
 

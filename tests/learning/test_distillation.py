@@ -15,33 +15,33 @@ from omniperception.learning.distillation import DistillationConfig, Teacher
 def teacher(env, seed=1):
     torch.manual_seed(seed)
     distribution = {"class_name": "GaussianDistribution", "init_std": 0.5}
-    groups = {"actor": ["policy"]}
+    groups = {"actor": ["command"]}
     return MLPModel(env.get_observations(), groups, "actor", env.num_actions, [8], "elu", distribution_cfg=distribution)
 
 
 def algorithm(env, frames, **distillation):
     torch.manual_seed(0)
     wanted = DistillationConfig("somewhere", **{"iterations": 20, "learning_rate": 1e-2, **distillation})
-    settings = replace(config(frames, num_learning_epochs=4), distillation=wanted, command_group="policy")
+    settings = replace(config(frames, num_learning_epochs=4), distillation=wanted)
     return PerceptivePpo.build(env, settings, "cpu")
 
 
 def test_a_teacher_follows_command_and_avoidance_together():
     env = ToyEnv(5)
     actor, obs = teacher(env), env.get_observations()
-    moved = obs["policy"].clone()
+    moved = obs["command"].clone()
     moved[:, :2] += obs["avoidance_target"]
-    expected = actor(TensorDict({"policy": moved}, [5]))
-    kept = obs["policy"].clone()
-    assert torch.equal(Teacher(actor, "policy").actions(obs), expected)
-    assert torch.equal(obs["policy"], kept) and not torch.equal(actor(obs), expected)
+    expected = actor(TensorDict({"command": moved}, [5]))
+    kept = obs["command"].clone()
+    assert torch.equal(Teacher(actor).actions(obs), expected)
+    assert torch.equal(obs["command"], kept) and not torch.equal(actor(obs), expected)
 
 
 @pytest.mark.parametrize("frames", [True, False])
 def test_the_student_comes_to_do_what_the_teacher_does(frames):
     env = ToyEnv(32, frames=frames)
     alg, actor = algorithm(env, frames), teacher(ToyEnv(5))
-    alg.learn_from(Teacher(actor, "policy"))
+    alg.learn_from(Teacher(actor))
     before = {name: p.clone() for name, p in actor.named_parameters()}
     critic = [p.clone() for p in alg.critic.parameters()]
     imitation = []
@@ -57,7 +57,7 @@ def test_the_student_comes_to_do_what_the_teacher_does(frames):
     batch = next(iter(alg.storage.mini_batch_generator(1, 1))).observations
     groups = batch.groups if isinstance(batch, WindowedObservations) else batch
     with torch.no_grad():
-        error = (alg.actor(batch) - Teacher(actor, "policy").actions(groups)).square().mean()
+        error = (alg.actor(batch) - Teacher(actor).actions(groups)).square().mean()
     assert error < 0.2 * imitation[0]
     losses = alg.update()
     assert "surrogate" in losses and "imitation" not in losses  # PPO's turn
@@ -69,7 +69,7 @@ def test_what_does_not_fit_is_refused():
     collect(alg, env, 8)
     with pytest.raises(RuntimeError, match="needs a teacher"):
         alg.update()
-    stranger = Teacher(teacher(env), "policy")
+    stranger = Teacher(teacher(env))
     stranger.groups = (*stranger.groups, "clock")
     with pytest.raises(ValueError, match="distillation.teacher reads the observations clock"):
         alg.learn_from(stranger)

@@ -18,7 +18,7 @@ NETWORKS = {
 
 def actor_for(env, network="pd", **options):
     torch.manual_seed(1)
-    groups = {"actor": ["policy"]}
+    groups = {"actor": ["command"]}
     options = {"hidden_dims": [8], "distribution_cfg": {"class_name": "GaussianDistribution"}, **options}
     return PerceptionActor(env.get_observations(), groups, "actor", 2, perception=NETWORKS[network](), **options)
 
@@ -46,7 +46,7 @@ def test_update_equals_rollout(network, normalize):
     advance(env, 13)
     actor = actor_for(env, network, obs_normalization=normalize)
     torch.nn.init.normal_(actor.mlp[0].weight)  # an untrained actor ignores its features
-    storage = PerceptiveStorage(5, 12, env.get_observations(), ["policy"], 2, frames=True, steps_per_frame=5)
+    storage = PerceptiveStorage(5, 12, env.get_observations(), ["command"], 2, frames=True, steps_per_frame=5)
     seen = rollout(env, storage, 12)
     if normalize:
         actor.update_normalization(storage.observations.flatten(0, 1))
@@ -126,7 +126,7 @@ def height_case(weight):
     env = ToyEnv(5, episode=11)
     advance(env, 7)
     actor = actor_for(env, supervision={"height_target": weight} if weight else None)
-    storage = PerceptiveStorage(5, 9, env.get_observations(), ["policy", "height_target"], 2, frames=True)
+    storage = PerceptiveStorage(5, 9, env.get_observations(), ["command", "height_target"], 2, frames=True)
     rollout(env, storage, 9)
     torch.manual_seed(6)
     [batch] = storage.mini_batch_generator(1, 1)
@@ -168,12 +168,12 @@ def test_height_supervision_needs_a_predictor_and_a_fitting_target():
     obs["height_target"] = torch.zeros(3, 7)
     with pytest.raises(ValueError, match="of 5 values within the embedding's 8, the environment gives 7"):
         PerceptionActor(
-            obs, {"actor": ["policy"]}, "actor", 2, NETWORKS["pd"](), {"height_target": 1.0}, hidden_dims=[8]
+            obs, {"actor": ["command"]}, "actor", 2, NETWORKS["pd"](), {"height_target": 1.0}, hidden_dims=[8]
         )
 
 
 def avoiding_actor(env, network="mlp", **options):
-    actor = actor_for(env, network, supervision={"avoidance_target": 1.0}, command_group="policy", **options)
+    actor = actor_for(env, network, supervision={"avoidance_target": 1.0}, **options)
     with torch.no_grad():
         actor.read_out.layers[-1].weight.normal_()
         actor.read_out.layers[-1].bias.normal_()
@@ -194,7 +194,7 @@ def test_avoidance_velocity_shifts_the_command(normalize):
         velocity = actor.read_out.layers(actor.perception(obs["frames"], obs["frame_count"])[:, 0])
         velocity[2] = 0.0
         seen = actor.get_latent(obs)[:, :3]
-        command = obs["policy"] + torch.cat([velocity, torch.zeros(4, 1)], 1)
+        command = obs["command"] + torch.cat([velocity, torch.zeros(4, 1)], 1)
         expected = (command - actor.obs_normalizer.mean) / (actor.obs_normalizer.std + 1e-2) if normalize else command
     assert velocity[[0, 1, 3]].abs().min() > 1e-3
     assert torch.allclose(seen, expected, atol=1e-6)
@@ -203,9 +203,9 @@ def test_avoidance_velocity_shifts_the_command(normalize):
 def test_an_untrained_actor_follows_the_command_alone():
     env = ToyEnv(4)
     advance(env, 7)
-    actor = actor_for(env, supervision={"avoidance_target": 1.0}, command_group="policy")
+    actor = actor_for(env, supervision={"avoidance_target": 1.0})
     with torch.no_grad():
-        assert torch.equal(actor.get_latent(env.get_observations())[:, :3], env.get_observations()["policy"])
+        assert torch.equal(actor.get_latent(env.get_observations())[:, :3], env.get_observations()["command"])
 
 
 def test_avoidance_velocity_of_an_update_equals_that_of_the_rollout_and_is_learnt():
@@ -213,7 +213,7 @@ def test_avoidance_velocity_of_an_update_equals_that_of_the_rollout_and_is_learn
     env = ToyEnv(5, episode=11)
     advance(env, 7)
     actor = avoiding_actor(env)
-    storage = PerceptiveStorage(5, 9, env.get_observations(), ["policy", "avoidance_target"], 2, frames=True)
+    storage = PerceptiveStorage(5, 9, env.get_observations(), ["command", "avoidance_target"], 2, frames=True)
     seen = rollout(env, storage, 9)
     [batch] = storage.mini_batch_generator(1, 1)
     assert_update_equals_rollout(actor, storage, seen, 1)
@@ -252,5 +252,8 @@ def test_a_limit_needs_to_observe_what_was_asked_for():
 
 
 def test_avoidance_needs_an_observed_command():
-    with pytest.raises(ValueError, match="need the actor to observe 'command', it observes \\['policy'\\]"):
-        actor_for(ToyEnv(3), supervision={"avoidance_target": 1.0})
+    obs = ToyEnv(3).get_observations()
+    with pytest.raises(ValueError, match="need the actor to observe 'command', it observes \\['height_target'\\]"):
+        PerceptionActor(
+            obs, {"actor": ["height_target"]}, "actor", 2, NETWORKS["pd"](), {"avoidance_target": 1.0}, hidden_dims=[8]
+        )

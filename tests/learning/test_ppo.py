@@ -69,8 +69,8 @@ def test_first_ratio_is_one():
 
 
 def test_storage_holds_only_what_is_read():
-    assert set(algorithm(ToyEnv(4)).storage.observations.keys()) == {"policy", "height_target"}
-    assert set(algorithm(ToyEnv(4, frames=False), frames=False).storage.observations.keys()) == {"policy"}
+    assert set(algorithm(ToyEnv(4)).storage.observations.keys()) == {"command", "height_target"}
+    assert set(algorithm(ToyEnv(4, frames=False), frames=False).storage.observations.keys()) == {"command"}
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

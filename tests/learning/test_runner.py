@@ -269,7 +269,7 @@ class TestLearn:
         assert latest_checkpoint(tmp_path).name == "model_2.pt"
         assert signal.getsignal(signal.SIGINT) is handler
 
-    @pytest.mark.parametrize("what", ["rewards", "policy"])
+    @pytest.mark.parametrize("what", ["rewards", "command"])
     def test_non_finite_environment_output_stops(self, tmp_path, what):
         runner = runner_for(tmp_path)
         step = runner.env.step

@@ -60,8 +60,8 @@ def test_a_likelihood_ratio_that_overflows_is_the_cause():
 
 def test_an_observation_whose_square_overflows_is_the_cause():
     alg = collected(frames=False)
-    alg.storage.observations["policy"][3, 2, 0] = 1e30
-    assert "observation 'policy' reach 1e+30, whose square overflows" in stopped_by(alg)
+    alg.storage.observations["command"][3, 2, 0] = 1e30
+    assert "observation 'command' reach 1e+30, whose square overflows" in stopped_by(alg)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from omniperception.learning.storage import max_windows
 
 def storage_for(env, num_steps, steps_per_frame=PERIOD):
     given = {"frames": env.has_frames, "steps_per_frame": steps_per_frame}
-    return PerceptiveStorage(env.num_envs, num_steps, env.get_observations(), ["policy"], 2, **given)
+    return PerceptiveStorage(env.num_envs, num_steps, env.get_observations(), ["command"], 2, **given)
 
 
 @pytest.mark.parametrize(("num_envs", "num_batches"), [(1, 1), (5, 2), (7, 3), (6, 6)])
@@ -35,12 +35,12 @@ def test_every_step_finds_its_own_window(num_envs, num_batches):
                 [env_id] = [e for e in range(num_envs) if torch.equal(storage.actions[step, e], batch.actions[row])]
                 visited.append((step, env_id))
                 truth = seen[step][env_id]
-                assert torch.equal(obs["policy"][row], truth["policy"])
+                assert torch.equal(obs["command"][row], truth["command"])
                 count = int(truth["frame_count"])
                 assert obs.step_count[row] == count
                 emptied += count == 0
                 e, w = divmod(int(obs.step_window[row]), obs.window_count.shape[1])
-                assert torch.equal(obs.frames[e, w : w + HISTORY], truth["frames"])
+                assert torch.equal(obs.frames[e, w + HISTORY - count : w + HISTORY], truth["frames"][HISTORY - count :])
                 assert count in (0, int(obs.window_count[e, w]))
         assert sorted(visited) == [(s, e) for s in range(num_steps) for e in range(num_envs)]
         storage.clear()
@@ -74,7 +74,7 @@ def test_too_many_frames_and_missing_calls_are_reported():
     with pytest.raises(RuntimeError, match="once before each"):
         storage.record_frames(env.get_observations(), env.tick)
     with pytest.raises(ValueError, match="no observations"):
-        PerceptiveStorage(2, 4, ToyEnv(2, frames=False).get_observations(), ["policy"], 2, frames=True)
+        PerceptiveStorage(2, 4, ToyEnv(2, frames=False).get_observations(), ["command"], 2, frames=True)
 
 
 @pytest.mark.parametrize(("steps", "period", "expected"), [(24, 5, 6), (1, 5, 1), (5, 5, 2), (6, 5, 2), (7, 1, 7)])
@@ -87,7 +87,7 @@ def test_bytes_are_a_tenth_of_storing_windows():
     env = ToyEnv(8)
     obs = env.get_observations()
     obs["frames"] = torch.zeros(8, 10, 48, 3)
-    storage = PerceptiveStorage(8, 24, obs, ["policy"], 2, frames=True, steps_per_frame=5)
+    storage = PerceptiveStorage(8, 24, obs, ["command"], 2, frames=True, steps_per_frame=5)
     buffers = [v for v in vars(storage).values() if isinstance(v, torch.Tensor)] + list(storage.observations.values())
     clouds = sum(b.untyped_storage().nbytes() for b in buffers if b.shape[-2:] == (48, 3))
     assert clouds == 8 * 15 * 48 * 3 * 4 <= 8 * 24 * 10 * 48 * 3 * 4 / 10

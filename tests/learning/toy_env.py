@@ -41,7 +41,7 @@ class ToyEnv(VecEnv):
 
     def get_observations(self):
         groups = {
-            "policy": torch.cat([self.position, self.episode_length_buf.unsqueeze(1) / 10.0], -1),
+            "command": torch.cat([self.position, self.episode_length_buf.unsqueeze(1) / 10.0], -1),
             "avoidance_target": -0.3 * self.position,
             "height_target": (self.position[:, :1] * torch.linspace(0.1, 0.5, 5)).clamp(-1, 1),
         }
@@ -123,7 +123,7 @@ def config(frames=True, supervised=False, **ppo):
         supervised_epochs=2 if supervised else 0,
         learning_rate=1e-2,
     )
-    groups = ("policy",)
+    groups = ("command",)
     return LearningConfig(PPOConfig(**defaults | ppo), perception if frames else None, groups, groups, PERIOD)
 
 
