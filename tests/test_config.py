@@ -80,6 +80,7 @@ class TestRunDirectories:
             ),
             (lambda saved: saved.update(sensors={}), r"sensors is unknown"),
             (lambda saved: saved.pop("terrain"), r"the configuration has no terrain"),
+            (lambda saved: saved.pop("logger"), r"the configuration has no logger"),
         ],
     )
     def test_a_run_of_another_version_is_said_to_be_one(self, run_dir, change, named, capsys):

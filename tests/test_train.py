@@ -124,9 +124,10 @@ def test_what_a_run_goes_on_with_is_written_down(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     quick = ("experiment=walk", "num_envs=2", "ppo.num_steps_per_env=4", *SMALL[3:])
     main(["train", *quick, "ppo.max_iterations=1", "hydra.run.dir=here"])
-    with pytest.raises(SystemExit, match="2"):
-        main(["train", "run=here", "seed=9"])
-    assert "seed=9: here has begun already" in capsys.readouterr().err
+    for of_a_beginning in ("seed=9", "ppo.critic_warmup=9"):
+        with pytest.raises(SystemExit, match="2"):
+            main(["train", "run=here", of_a_beginning])
+        assert f"{of_a_beginning}: here has begun already" in capsys.readouterr().err
     changed = [
         "ppo.max_iterations=2",
         "rewards.terms.velocity_tracking.weight=3.0",

@@ -43,7 +43,7 @@ def test_a_reset_clears_that_environments_frames_only(make_env):
     env = make_env("obstacles=static", "rewards=paper")
     for _ in range(6):
         env.step(still(env))
-    before = env.sensing.frames.clone()
+    before, tick = env.sensing.frames.clone(), env.get_observations()["frame_tick"]
     sectors = env.avoidance.sector_distance.clone()
     env.sim.qpos[1, 2] = 0.05
     observations, _, done, _ = env.step(still(env))
@@ -51,12 +51,14 @@ def test_a_reset_clears_that_environments_frames_only(make_env):
     assert observations["frame_count"].flatten().tolist() == [2, 0, 2, 2]
     assert (observations["frames"][1] == 0).all()
     assert torch.equal(observations["frames"][OTHERS], before[OTHERS])
+    assert observations["frame_tick"] is tick  # by which an actor knows that it has embedded the others' frames
     assert torch.equal(env.avoidance.sector_distance[OTHERS], sectors[OTHERS])
     assert (env.avoidance.sector_distance[1] == 6.0).all()
     assert env.sensing.mean_distal_range(6.0)[1] == 6.0  # the last episode's distances are forgotten, too
     for _ in range(3):
         observations = env.step(still(env))[0]
     assert observations["frame_count"].flatten().tolist() == [3, 1, 3, 3]
+    assert tick.flatten().tolist() == [2] * 4 and observations["frame_tick"].flatten().tolist() == [3] * 4
     assert (observations["frames"][1, :-1] == 0).all() and (observations["frames"][1, -1] != 0).any()
     assert env.sensing.mean_distal_range(6.0)[1] < 6.0
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from torch.utils.tensorboard import SummaryWriter
 
 from omniperception import config
@@ -19,6 +20,13 @@ def make_run(folder, seed, values, num_envs=4, first=0, logger="tensorboard"):
         writer.add_scalar(TAG, value, first + step)
     writer.close()
     return folder
+
+
+def test_runs_after_runs_that_differ_by_their_seed_are_one_curve(tmp_path):
+    runs = [make_run(tmp_path / arm / f"seed{n}", n, [1.0]) for arm in ("after", "else") for n in (1, 2)]
+    for run, lesson in zip(runs, ("a/lesson/seed1", "a/lesson/seed2", "a/seed1x", "a/seed2x"), strict=True):
+        config.save({**OmegaConf.to_container(config.read(run)), "init": [lesson]}, run)
+    assert list(by_recipe(runs).values()) == [runs[:2], [runs[2]], [runs[3]]]
 
 
 def test_runs_that_differ_by_their_seed_are_one_curve(tmp_path):
