@@ -129,6 +129,7 @@ def forget(package):
     [
         ("rewards=mine",),
         ("lidar=os0_32", "lidar.mount=back"),
+        ("lidar=mine", "condition=robot"),
         ("terrain=mine",),
         ("obstacles=mine",),
         ("scenario=mine",),
