@@ -99,7 +99,7 @@ class FrameCutter:
         self._held: list[Points] = []
 
     def add(self, given: Points) -> list[Frame]:
-        """Frames that are complete, oldest first; a period without any point gives none."""
+        """Frames that are complete, oldest first; a period without any point gives none, however many there are."""
         if not len(given.times_ns):
             return []
         first, last = int(given.times_ns.min()), int(given.times_ns.max())
@@ -121,6 +121,10 @@ class FrameCutter:
         times = np.concatenate([held.times_ns for held in self._held])
         start, end = self._start, self._start + self._period
         now, rest = (times >= start) & (times < end), times >= end
+        if not now.any():
+            end += (
+                (int(times[rest].min()) - end) // self._period * self._period
+            )  # empty periods are passed over at once
         self._start, self._held = end, [Points(points[rest], times[rest])]
         if not now.any():
             return []
@@ -156,6 +160,8 @@ class _Cdr:
 
 
 _TIME_FIELDS = ("timestamp", "offset_time", "time", "t")
+_LATEST = 2.0**62
+"""ns; no clock of a sensor is there, and sums of two such times fit int64."""
 _CUSTOM_POINT = np.dtype(
     {
         "names": ["offset_time", "xyz", "tag"],
@@ -174,7 +180,7 @@ def read_point_cloud2(data: bytes) -> Points:
     seconds, after the header's stamp.
 
     Raises:
-        DeployError: the message is cut off, big-endian, or lacks x, y, z or a time.
+        DeployError: the message is cut off, big-endian, lacks x, y, z or a time, or has a time that is none.
     """
     try:
         return _point_cloud2(data)
@@ -217,6 +223,10 @@ def _point_cloud2(data: bytes) -> Points:
     points = np.stack([rows[axis].astype(np.float32) for axis in "xyz"], 1)
     points[~np.isfinite(points).all(axis=1)] = 0.0
     times = rows[time_field]
+    if times.dtype.kind == "f":
+        is_none = ~(abs(times.astype(np.float64)) < _LATEST * (1.0 if time_field == "timestamp" else 1e-9))
+        if is_none.any():
+            raise DeployError(f"PointCloud2: finite numbers were expected in {time_field}, {times[is_none][0]!r} given")
     if time_field == "timestamp":
         if times.dtype.kind == "f" and (times != np.floor(times)).any():
             raise DeployError(
@@ -243,8 +253,7 @@ def read_custom_msg(data: bytes) -> Points:
         if len(part) < 20 * count - 1:
             raise DeployError("CustomMsg: cut off")
         rows = np.frombuffer(part.ljust(20 * count, b"\0"), _CUSTOM_POINT, count)
-    except (struct.error, ValueError) as error:
+        times_ns = base + rows["offset_time"].astype(np.int64)
+    except (struct.error, ValueError, OverflowError) as error:
         raise DeployError(f"CustomMsg: {error}") from None
-    return Points(
-        without_noise(rows["xyz"].astype(np.float32), rows["tag"]), base + rows["offset_time"].astype(np.int64)
-    )
+    return Points(without_noise(rows["xyz"].astype(np.float32), rows["tag"]), times_ns)

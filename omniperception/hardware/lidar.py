@@ -123,6 +123,14 @@ class _Packets:
         self._mid360.close()
 
 
+def _in_one_time(message: Points) -> Points:
+    """The message, whose points were measured within a second of each other; a DeployError otherwise."""
+    span_s = 1e-9 * float(np.ptp(message.times_ns)) if len(message.times_ns) else 0.0
+    if span_s > 1.0:
+        raise DeployError(f"a message's points span {span_s:.3g} s, at most 1 s was expected; a point's time is none")
+    return message
+
+
 class _Topic:
     """A driver's messages."""
 
@@ -136,7 +144,7 @@ class _Topic:
         read = []
         for data in self._reader.take():
             try:
-                read.append(self._decode(data))
+                read.append(_in_one_time(self._decode(data)))
             except DeployError as error:
                 self._refused += 1
                 if self._refused == 1:  # the robot stands without frames; this is why

@@ -1,5 +1,6 @@
 """Frames by the points' times, and drivers' messages as bytes laid out by hand."""
 
+import re
 import struct
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from messages_by_hand import LIVOX, XYZ, point_cloud2, text
 
 from omniperception.deploy import DeployError
+from omniperception.hardware import lidar
 from omniperception.hardware.clouds import (
     Extrinsic,
     FrameCutter,
@@ -15,6 +17,7 @@ from omniperception.hardware.clouds import (
     read_point_cloud2,
     without_noise,
 )
+from omniperception.hardware.lidar import LidarSource
 
 MS = 10**6
 
@@ -59,6 +62,14 @@ class TestFrames:
         cutter.add(at(10000, 10050))
         assert cutter.add(at(10000 + jump)) == [] and cutter.jumps == 1
         assert [f.start_ns // MS for f in cutter.add(at(10102 + jump))] == [10000 + jump]
+
+    def test_a_time_that_is_far_from_the_others_holds_nothing_up(self):
+        """1.7e10 periods are passed over at once, and the grid of periods stays."""
+        cutter = FrameCutter(0.1)
+        (frame,) = cutter.add(Points(np.ones((2, 3), np.float32), np.array([0, 17 * 10**17 + 150 * MS])))
+        assert frame.start_ns == 0
+        (frame,) = cutter.add(Points(np.ones((1, 3), np.float32), np.array([17 * 10**17 + 202 * MS])))
+        assert frame.start_ns == 17 * 10**17 + 100 * MS
 
     def test_a_message_of_several_periods(self):
         frames = FrameCutter(0.1).add(at(*range(0, 320, 10)))
@@ -118,6 +129,54 @@ def test_times_in_seconds_and_points_that_are_no_numbers_are_refused():
         read_point_cloud2(point_cloud2([*XYZ, ("timestamp", 12, 8)], rows, 1))
     with pytest.raises(DeployError, match="numbers were expected in x, y, z, t"):
         read_point_cloud2(point_cloud2([*XYZ, ("t", 12, 99)], struct.pack("<fffI", 1.0, 2.0, 3.0, 4), 1))
+
+
+@pytest.mark.parametrize("time", [np.nan, np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize("field", ["timestamp", "time"])
+def test_times_that_are_none_are_refused(field, time):
+    rows = struct.pack("<fffd", 1.0, 2.0, 3.0, 5.0) + struct.pack("<fffd", 1.0, 2.0, 3.0, time)
+    with pytest.raises(
+        DeployError, match=rf"finite numbers were expected in {field}, .*{re.escape(str(time))}.* given"
+    ):
+        read_point_cloud2(point_cloud2([*XYZ, (field, 12, 8)], rows, 2))
+
+
+def a_custom_msg(base, *offsets_ns):
+    """Of one point 1 m ahead for each offset."""
+    points = b"".join(struct.pack("<IfffBBBx", offset, 1.0, 0.0, 0.0, 9, 0, 1) for offset in offsets_ns)
+    head = struct.pack("<iI", 12, 7) + text("livox_frame") + bytes(4)
+    return b"\0\1\0\0" + head[:24] + struct.pack("<QIB3xI", base, len(offsets_ns), 0, len(offsets_ns)) + points
+
+
+def test_a_base_of_times_that_is_none_is_refused():
+    with pytest.raises(DeployError, match="CustomMsg: "):
+        read_custom_msg(a_custom_msg(2**63, 0))
+
+
+class Topics:
+    """Stands in for `dds.Network`: a topic on which these messages have come."""
+
+    def __init__(self, *messages):
+        self.messages = list(messages)
+
+    def reader(self, topic, kind, depth):
+        return self
+
+    def take(self):
+        return self.messages
+
+
+def test_a_message_whose_times_are_far_from_each_other_is_refused_and_the_next_one_read(capsys):
+    """As where one point's time was never set."""
+    far = struct.pack("<fffd", 1.0, 2.0, 3.0, 0.0) + struct.pack("<fffd", 1.0, 2.0, 3.0, 1.7e18)
+    near = struct.pack("<fffd", 1.0, 2.0, 3.0, 1.7e18)
+    clouds = [point_cloud2([*XYZ, ("timestamp", 12, 8)], rows, len(rows) // 20) for rows in (far, near)]
+    topic = lidar._Topic(LidarSource(kind="PointCloud2"), Topics(*clouds))
+    assert [len(points.times_ns) for points in topic.read()] == [1] and topic.counts() == {"messages refused": 1}
+    assert "refused: a message's points span 1.7e+09 s, at most 1 s was expected" in capsys.readouterr().err
+    customs = Topics(a_custom_msg(5, 0, 10**9 + 1), a_custom_msg(5, 0, 10**9))
+    topic = lidar._Topic(LidarSource(kind="CustomMsg"), customs)
+    assert [len(points.times_ns) for points in topic.read()] == [2] and topic.counts() == {"messages refused": 1}
 
 
 def test_a_cloud_without_times_or_cut_off_is_refused():
