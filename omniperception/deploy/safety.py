@@ -77,7 +77,7 @@ class Safety:
         self._lower, self._upper = _or(joints.lower, -math.inf), _or(joints.upper, math.inf)
         self._torque_limits = np.asarray(joints.torque_limits, np.float32)
         ranges = np.array([description.command[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")], np.float32)
-        self._command_low, self._command_high = ranges.T
+        self._command_low, self._command_high = np.minimum(ranges[:, 0], 0.0), np.maximum(ranges[:, 1], 0.0)
         self._min_cos = math.cos(math.radians(config.max_tilt_deg))
         self._sees = lidar is not None and description.perception is not None
         self._min_hits = config.min_hits * lidar.num_rays if lidar is not None else 0.0
@@ -110,7 +110,10 @@ class Safety:
         return False
 
     def limit_command(self, command: np.ndarray) -> np.ndarray:
-        """(3,) the command within the ranges of training, slowed down while no good frame comes; once per step."""
+        """(3,) the command within training's ranges and 0, slowed down while no good frame comes; once per step.
+
+        To stand is always allowed, also where training's ranges leave 0 out.
+        """
         limited = np.clip(command, self._command_low, self._command_high)
         if (limited != command).any():
             self._count(

@@ -86,6 +86,19 @@ def test_a_command_stays_within_the_ranges_of_training(caplog):
     assert len(caplog.records) == 1 and "is beyond training's" in caplog.text
 
 
+def test_to_stand_is_allowed_where_training_always_walked():
+    """A range of 0.3 to 1 m/s: 0 stays 0, and so does what is slower than training's."""
+    ranges = {"lin_vel_x": [0.3, 1.0], "lin_vel_y": [-0.5, -0.2], "ang_vel_z": [0.0, 0.0]}
+    robot = policy(command=ranges)
+    for given, expected in (
+        ([0.0] * 3, [0.0] * 3),
+        ([-0.1, 0.1, 0.1], [0.0] * 3),
+        ([2.0, -2.0, 0.0], [1.0, -0.5, 0.0]),
+    ):
+        robot.step(state(), given, CLOUD)
+        assert fed_command(robot) == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("bad", [None, np.zeros((100, 3)), CLOUD[:4], np.full((100, 3), np.nan), CLOUD * 10])
 def test_without_good_frames_the_robot_slows_down_and_stands_blind(bad, caplog):
     """No frame, misses, 4 of 100 hits, nan, and hits beyond the range: after 0.35 s the command falls within 0.3 s."""
