@@ -155,7 +155,7 @@ def test_the_simulated_world_is_an_evaluations():
 
 @pytest.mark.slow
 def test_three_processes_in_real_time(tmp_path):
-    """The robot stands up and walks; when its policy is killed, it lies down; another description is refused.
+    """The robot stands up and walks; when its policy is killed, it is damped and lies; another description is refused.
 
     How well it walks depends on the machine's other work and is not asserted.
     """

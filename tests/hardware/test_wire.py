@@ -74,7 +74,7 @@ def is_lying(robot):
     return z < 0.15 and robot.machine.mode in (Mode.DAMPING, Mode.STOPPED)
 
 
-def test_it_stands_up_and_walks_and_lies_down_when_the_policy_dies(lockstep, exported, tmp_path):
+def test_it_stands_up_and_walks_and_is_damped_when_the_policy_dies(lockstep, exported, tmp_path):
     """And what was recorded meanwhile gives the same targets again."""
     record = tmp_path / "run.mcap" if importlib.util.find_spec("mcap_ros2") else None
     robot = walking(lockstep("scenario=static", record=record), 1.5)
