@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -274,7 +276,8 @@ class Control:
             targets = self.policy.step(state, command, points)
         except SafetyStop as stop:
             if self._mode in DRIVEN or str(stop) != self._stopped:
-                print(f"stop: {stop}", file=sys.stderr, flush=True)
+                with contextlib.suppress(OSError):  # without a terminal it damps all the same
+                    print(f"stop: {stop}", file=sys.stderr, flush=True)
             self._stopped = str(stop)
             if self._mode in DRIVEN:
                 self._link.ask(Request.DAMP)
@@ -331,11 +334,11 @@ def down(quat: np.ndarray) -> np.ndarray:
 
 
 def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> Report:
-    """Runs a policy on a robot until `should_end`, an interrupt, or the guard's end."""
+    """Runs a policy on a robot until `should_end`, an interrupt, SIGTERM, SIGHUP, or the guard's end."""
     policy = ExportedPolicy.load(config.policy)
     description = policy.description
     machine = machine_config(description)
-    with contextlib.ExitStack() as closing:  # whatever ends it, the terminal is left as it was found
+    with interruptible(), contextlib.ExitStack() as closing:  # whatever ends it, the terminal is left as it was found
         operator = make_operator(config.steer, description.command)
         closing.callback(operator.close)
         network = Network(config.interface, config.domain)
@@ -354,13 +357,7 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
         closing.callback(link.close)
         control = Control(policy, states, frames, operator, link, recorder)
-        try:
-            begins, times, skipped = _loop(control, link, description.control_period_s, config.seconds, should_end)
-        finally:
-            if link.mode in (Mode.STANDING, Mode.STANDING_UP, *DRIVEN):
-                link.ask(Request.LIE)
-            if link.mode in DRIVEN:  # it slows the robot down before the guard lays it down
-                _loop(control, link, description.control_period_s, 2.0, lambda: link.mode not in DRIVEN)
+        begins, times, skipped = drive(control, link, description.control_period_s, config.seconds, should_end)
         if link.is_closed:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 guard.wait(1.0)
@@ -375,6 +372,50 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         if config.report is not None:
             report.write(config.report)
     return report
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """SIGTERM and SIGHUP interrupt as Ctrl-C does, the first of them; as before where others set no handlers.
+
+    Those that follow are ignored, as service managers send both: what the first has begun is brought to its end.
+    """
+    if threading.current_thread() is not threading.main_thread():  # Python lets no other set handlers
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    heard: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        heard.append(number)
+        if len(heard) == 1:
+            raise KeyboardInterrupt
+
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def drive(
+    control: Control,
+    link: Link,
+    period_s: float,
+    seconds: float | None = None,
+    should_end: Callable[[], bool] = lambda: False,
+) -> tuple[list[float], list[float], int]:
+    """Steps in real time, and then lies down; what `_loop` gives."""
+    try:
+        return _loop(control, link, period_s, seconds, should_end)
+    finally:
+        if link.mode in (Mode.STANDING, Mode.STANDING_UP, *DRIVEN):
+            link.ask(Request.LIE)
+        if link.mode in DRIVEN:  # it slows the robot down before the guard lays it down
+            _loop(control, link, period_s, 2.0, lambda: link.mode not in DRIVEN)
 
 
 def _loop(
@@ -396,5 +437,6 @@ def _loop(
             due, skipped = due + missed * period_s, skipped + missed
             time.sleep(max(0.0, due - time.monotonic()))
     except KeyboardInterrupt:
-        print("ended: the guard lays the robot down", file=sys.stderr)
+        with contextlib.suppress(OSError):  # the terminal may be what has gone
+            print("ended: the guard lays the robot down", file=sys.stderr, flush=True)
     return begins, times, skipped

@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import os
 import pty
+import signal
 import socket
 import struct
 import subprocess
@@ -24,7 +25,7 @@ from messages_by_hand import LIVOX, point_cloud2
 from omniperception.commands import main
 from omniperception.deploy import DeployError, Description, ExportedPolicy
 from omniperception.deploy.export import export
-from omniperception.hardware import guard, lidar
+from omniperception.hardware import control, guard, lidar
 from omniperception.hardware.bags import Topics, events
 from omniperception.hardware.control import machine_config, motor_order
 from omniperception.hardware.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, Network
@@ -105,6 +106,57 @@ def replayed_is_recorded(record, exported):
     )
     seen = {sight for sight, step in zip(blind.sight, blind.steps, strict=True) if step.mode.startswith("policy")}
     assert seen == {"stopped"}  # a policy that has never had a frame does not begin to walk
+
+
+class SteppedClock:
+    """In place of `time`: sleeping steps the robot and its guard on; signals (s, name) come in their order."""
+
+    def __init__(self, robot, signals):
+        self._robot, self._signals = robot, [(robot.time_s + at, name) for at, name in signals]
+
+    def monotonic(self):
+        return 1000.0 + self._robot.time_s
+
+    def sleep(self, seconds):
+        self._robot.run(seconds)
+        if self._signals and self._robot.time_s >= self._signals[0][0]:
+            os.kill(os.getpid(), signal.Signals[self._signals.pop(0)[1]])
+
+
+@pytest.mark.parametrize("signals", [[(0.3, "SIGINT")], [(0.3, "SIGTERM"), (0.7, "SIGHUP")]])
+def test_a_signal_while_it_walks_slows_it_down_and_lays_it_down(lockstep, monkeypatch, signals):
+    """And a second one changes nothing, as a service manager sends it."""
+    robot = walking(lockstep("scenario=static"), 1.0)
+    robot.policy_lives, modes, enter = False, [], robot.machine._enter  # `drive` steps it
+    monkeypatch.setattr(robot.machine, "_enter", lambda now, mode, why: (modes.append(mode), enter(now, mode, why)))
+    clock = SteppedClock(robot, signals)
+    monkeypatch.setattr(control, "time", clock)
+    with control.interruptible():
+        begins, _, _ = control.drive(robot.control, robot.link, 0.02)
+    assert 14 <= len(begins) <= 17 and modes == [Mode.SLOWING, Mode.LYING_DOWN] and not clock._signals
+    assert speed(robot) < 0.3
+    robot.link.close()
+    robot.run(3.0)
+    assert modes == [Mode.SLOWING, Mode.LYING_DOWN, Mode.DAMPING] and "lay down" in robot.machine.reason
+    assert is_lying(robot) and not robot.robot.outcome.fell and robot.robot.outcome.largest_tilt_deg < 30
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_signals_interrupt_once_and_mean_afterwards_what_they_did(name):
+    """One that was ignored, as under nohup, stays so."""
+    number, before = signal.Signals[name], [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)]
+    with control.interruptible():
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+        os.kill(os.getpid(), number)
+    assert [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)] == before
+    signal.signal(number, signal.SIG_IGN)
+    try:
+        with control.interruptible():
+            os.kill(os.getpid(), number)
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, before[number == signal.SIGHUP])
 
 
 def unplugged(robot):
