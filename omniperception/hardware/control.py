@@ -346,7 +346,8 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         lidar = description.lidar if description.perception is not None else None
         if lidar is not None and config.lidar is None:
             raise DeployError("this policy sees: points=none is for a blind one")
-        ensure_released(network, config.sport_mode)
+        if config.sport_mode != "release":  # a refusal leaves nothing behind
+            ensure_released(network, config.sport_mode)
         frames = None
         if lidar is not None and config.lidar is not None:  # it listens from here on; what waits for long is lost
             frames = Frames(config.lidar, lidar, network)
@@ -354,6 +355,8 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         recorder = None if config.record is None else Recorder(config.record, description)
         if recorder is not None:
             closing.callback(recorder.close)
+        if config.sport_mode == "release":  # after all that may fail: nothing moves the robot from here to the guard
+            ensure_released(network, config.sport_mode)
         link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
         closing.callback(link.close)
         control = Control(policy, states, frames, operator, link, recorder)

@@ -356,6 +356,37 @@ def test_joints_without_limits_are_named(exported):
         machine_config(described)
 
 
+@pytest.mark.parametrize("choice", ["check", "ignore", "release"])
+def test_the_robots_own_controller_is_ended_after_all_that_may_fail(exported, monkeypatch, tmp_path, choice):
+    """Whether it runs is asked first, so that a refusal leaves no empty recording."""
+    did = []
+
+    def failing(what):
+        def fail(*_):
+            did.append(what)
+            raise DeployError(f"no {what}")
+
+        return fail
+
+    monkeypatch.setattr(control, "Network", lambda *_: Memory())
+    monkeypatch.setattr(control, "ensure_released", lambda network, asked: did.append(asked))
+    monkeypatch.setattr(control, "start", failing("guard"))
+    config = control.RobotConfig(exported, lidar=LidarSource(), steer="0,0,0", sport_mode=choice)
+    for name in ("Frames", "Recorder"):
+        with monkeypatch.context() as one:
+            one.setattr(control, "Frames", lambda *_: type("F", (), {"close": lambda self: None})())
+            one.setattr(control, name, failing(name))
+            with pytest.raises(DeployError, match=f"no {name}"):
+                control.run(replace(config, record=tmp_path / "a.mcap"))
+    before = [] if choice == "release" else [choice]
+    assert did == [*before, "Frames", *before, "Recorder"]
+    did.clear()
+    monkeypatch.setattr(control, "Frames", lambda *_: type("F", (), {"close": lambda self: None})())
+    with pytest.raises(DeployError, match="no guard"):
+        control.run(config)
+    assert did == [choice, "guard"]
+
+
 def test_the_machine_has_the_motors_order(exported):
     described = Description.read(exported)
     assert motor_order(described).tolist() == [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
