@@ -15,12 +15,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from omniperception.cli import Command, argument
+from omniperception.cli import Command, argument, refuse_arguments
 from omniperception.deploy.description import DeployError
 from omniperception.hardware.clouds import Extrinsic
 from omniperception.hardware.control import RobotConfig, run
 from omniperception.hardware.lidar import KINDS, LidarSource
 from omniperception.hardware.switcher import CHOICES
+
+_OF_PACKETS, _OF_TOPICS = ("host", "point_port"), ("topic", "extrinsic")
+_UNREAD = {"none": (*_OF_PACKETS, *_OF_TOPICS), "mid360": _OF_TOPICS, "packets": _OF_TOPICS}
+"""Arguments that say nothing for these `points`; for a topic, those of packets."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,10 +39,10 @@ class Arguments:
         "where points come from: the sensor's packets after a search, or without one, or a driver's topic",
         choices=(*KINDS, "none"),
     )
-    host: str = argument("192.168.1.50", "this machine's address in the sensor's network")
-    point_port: int = argument(56301, "UDP port that points come to", least=1)
+    host: str = argument("192.168.1.50", "this machine's address in the sensor's network, of mid360 and packets")
+    point_port: int = argument(56301, "UDP port that points come to, likewise", least=1)
     topic: str = argument("rt/livox/lidar", "topic of PointCloud2 or CustomMsg")
-    extrinsic: str | None = argument(None, "x,y,z,qw,qx,qy,qz that the driver has applied to the points; undone")
+    extrinsic: str | None = argument(None, "x,y,z,qw,qx,qy,qz that a topic's driver has applied to the points; undone")
     steer: str = argument("remote", "remote, keyboard, udp:PORT, goal:X,Y[,SPEED] in odometry, or v_x,v_y,yaw_rate")
     crc: bool = argument(True, "whether states with a wrong checksum are refused; simulators that fill none need false")
     sport_mode: str = argument(
@@ -51,6 +55,8 @@ class Arguments:
 
 def main(arguments: Arguments) -> None:
     """Runs, and prints what was measured."""
+    unread = _UNREAD.get(arguments.points, _OF_PACKETS)
+    refuse_arguments(arguments, unread, f"it is not read for points={arguments.points}")
     source = LidarSource(
         kind=arguments.points,
         topic=arguments.topic,

@@ -346,6 +346,29 @@ def test_a_bag_of_ros_2_is_replayed_and_drawn(exported, tmp_path, capsys):
     assert (tmp_path / "bag.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.parametrize(
+    ("points", "unread"),
+    [
+        ("none", ["host=192.168.1.5", "point_port=56302", "topic=rt/cloud", "extrinsic=0,0,0,1,0,0,0"]),
+        ("mid360", ["topic=rt/cloud", "extrinsic=0,0,0,1,0,0,0"]),
+        ("packets", ["topic=rt/cloud", "extrinsic=0,0,0,1,0,0,0"]),
+        ("PointCloud2", ["host=192.168.1.5", "point_port=56302"]),
+        ("CustomMsg", ["host=192.168.1.5", "point_port=56302"]),
+    ],
+)
+def test_arguments_that_say_nothing_of_these_points_are_refused(points, unread, monkeypatch, capsys):
+    monkeypatch.setattr("omniperception.commands.robot.run", lambda config: config)
+    given = {"host=192.168.1.5", "point_port=56302", "topic=rt/cloud", "extrinsic=0,0,0,1,0,0,0"}
+    for word in sorted(given):
+        if word not in unread:
+            main(["robot", f"points={points}", word])
+            continue
+        with pytest.raises(SystemExit, match="2"):
+            main(["robot", f"points={points}", word])
+        said = f"{word.partition('=')[0]}= would mean nothing: it is not read for points={points}; leave it out"
+        assert said in capsys.readouterr().err
+
+
 def test_joints_without_limits_are_named(exported):
     described = Description.read(exported)
     lower, upper = list(described.joints.lower), list(described.joints.upper)
