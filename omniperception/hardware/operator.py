@@ -150,7 +150,10 @@ class Datagrams:
 
 
 class Keyboard:
-    """w s ahead, a d aside, q e turn, by a fifth each; space stops; 1 stand, 2 walk, 3 lie, 0 damp, Escape e-stop."""
+    """w s ahead, a d aside, q e turn, by a fifth each; space stops; 1 stand, 2 walk, 3 lie, 0 damp, Escape e-stop.
+
+    When its terminal is gone it commands 0 and asks once to lie down.
+    """
 
     _STEPS = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "q": (2, 1), "e": (2, -1)}
     _REQUESTS = {
@@ -167,16 +170,17 @@ class Keyboard:
         import termios
         import tty
 
-        self._ranges, self._shares = ranges, np.zeros(3)
+        self._ranges, self._shares, self._is_gone = ranges, np.zeros(3), False
         self._before = termios.tcgetattr(sys.stdin)
         tty.setcbreak(sys.stdin)
 
     def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         asked = []
-        while select.select([sys.stdin], [], [], 0.0)[0]:
-            typed = os.read(sys.stdin.fileno(), 64).decode("ascii", "replace")
-            if not typed:  # the terminal is gone
-                break
+        while not self._is_gone and select.select([sys.stdin], [], [], 0.0)[0]:
+            typed = _typed()
+            if not typed:
+                self._is_gone, self._shares = True, np.zeros(3)
+                asked.append(Request.LIE)
             for key in _SEQUENCE.sub("", typed):
                 if key in self._REQUESTS:
                     asked.append(self._REQUESTS[key])
@@ -190,4 +194,13 @@ class Keyboard:
     def close(self) -> None:
         import termios
 
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
+        with contextlib.suppress(termios.error):  # the terminal may be gone
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
+
+
+def _typed() -> str:
+    """What waits at the terminal; empty: it is gone."""
+    try:
+        return os.read(sys.stdin.fileno(), 64).decode("ascii", "replace")
+    except OSError:
+        return ""

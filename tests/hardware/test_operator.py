@@ -42,7 +42,7 @@ def test_datagrams_hold_for_half_a_second():
     operator.close()
 
 
-def test_arrows_are_no_e_stop_and_a_terminal_that_is_gone_ends_nothing(monkeypatch):
+def test_arrows_are_no_e_stop(monkeypatch):
     """An arrow begins as the Escape key does."""
     terminal, typed = pty.openpty()
     with open(typed, closefd=False) as stdin:
@@ -52,11 +52,28 @@ def test_arrows_are_no_e_stop_and_a_terminal_that_is_gone_ends_nothing(monkeypat
             os.write(terminal, keys)
             command, got = keyboard.poll(0.0, CENTRED, START)
             assert command[0] == pytest.approx(share) and got == asked
-        monkeypatch.setattr("os.read", lambda *_: b"")
-        monkeypatch.setattr("select.select", lambda *_: ([0], [], []))
-        assert keyboard.poll(0.0, CENTRED, START)[1] == []
         keyboard.close()
     os.close(terminal), os.close(typed)
+
+
+@pytest.mark.parametrize("is_an_error", [False, True])
+def test_a_robot_whose_terminal_is_gone_stops_and_lies_down(monkeypatch, is_an_error):
+    """As by a connection that drops: asked for once, so that the remote may ask for something else."""
+    terminal, typed = pty.openpty()
+    with open(typed, closefd=False) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        keyboard = make_operator("keyboard", RANGES)
+        os.write(terminal, b"wwq")
+        assert keyboard.poll(0.0, CENTRED, START)[0].tolist() == pytest.approx([0.4, 0.0, 0.3])
+        os.close(terminal)
+        if is_an_error:
+            monkeypatch.setattr("os.read", lambda *_: os.close(-1))
+        command, asked = keyboard.poll(0.02, CENTRED, START)
+        assert command.tolist() == [0.0, 0.0, 0.0] and asked == [Request.LIE]
+        command, asked = keyboard.poll(0.04, CENTRED, START)
+        assert command.tolist() == [0.0, 0.0, 0.0] and asked == []
+        keyboard.close()
+    os.close(typed)
 
 
 def test_one_command_for_good_and_wrong_words():
