@@ -204,7 +204,9 @@ class Machine:
             self._held = self._targets[1]
             return Drive(self._held, self.config.kp, self.config.kd)
         if self.mode in (Mode.DAMPING, Mode.STOPPED):
-            position = self._stand if self._sensed is None else self._sensed.joint_pos
+            position = self._stand  # with a kp of 0 it moves nothing
+            if self._sensed is not None and np.isfinite(self._sensed.joint_pos).all():
+                position = self._sensed.joint_pos
             return Drive(position, 0.0, self.config.damping_kd)
         self._held = self._pose(now - self._since)
         return Drive(self._held, self.config.stand_kp, self.config.stand_kd)

@@ -189,7 +189,9 @@ def test_watchdogs_damp(fault, reason):
     robot = walking()
     for name, value in fault.items():
         setattr(robot, name, value)
-    assert is_damped(robot.run(0.046)) and robot.mode is Mode.DAMPING and reason in robot.machine.reason
+    command = robot.run(0.046)
+    assert is_damped(command) and robot.mode is Mode.DAMPING and reason in robot.machine.reason
+    assert np.isfinite(command.joint_pos).all()
 
 
 @pytest.mark.parametrize("to", [Request.STAND, Request.LIE])
