@@ -122,7 +122,7 @@ class Lidar:
         period_s: seconds between two frames.
         mount_pos: of the sensor in the frame of the link that carries it, m.
         mount_quat: of the sensor in that frame, (w, x, y, z).
-        min_range: nearest distance that it measures, m.
+        min_range: nearest distance that it measures, m; nearer points are misses.
         max_range: points beyond are misses, m.
         num_rays: rays of a frame that training used.
         points_per_frame: points that the device measures in a frame.

@@ -53,7 +53,7 @@ class ExportedPolicy:
     Call :meth:`step` once per `description.control_period_s`, with the points of a LiDAR frame whenever one is
     complete, once per `description.lidar.period_s`; where one is lost, call :meth:`miss`. Points are in the sensor
     frame, in metres, in the order of their measurement, without a correction for the robot's motion. Rows that are not
-    finite or zero are misses.
+    finite or zero are misses, and so are points nearer or farther than training's sensor measures.
 
     Unless `safety` is None, commands are limited to the ranges of training and targets to the limits and a rate of the
     joints;
@@ -188,6 +188,7 @@ class ExportedPolicy:
         points = np.asarray(points, np.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
+        points = _without_nearer(points, lidar.min_range)
         if self.safety is not None and not self.safety.frame_is_good(points):
             return self.miss()
         attitude = Attitude(self._carrier_quat(lidar, base_quat, joint_pos), lidar.mount_pos, lidar.mount_quat)
@@ -385,6 +386,12 @@ def _rays_of_points(lidar: Lidar) -> np.ndarray:
     rays = np.full(lidar.points_per_frame, -1)
     rays[kept] = count
     return rays
+
+
+def _without_nearer(points: np.ndarray, min_range: float) -> np.ndarray:
+    """(n, 3) m with points nearer than training's sensor measures made misses, as they are there."""
+    nearest = np.float32((min_range * (1.0 - 1e-6)) ** 2)  # what training keeps is not lost by rounding
+    return np.where((np.einsum("ij,ij->i", points, points) < nearest)[:, None], np.float32(0.0), points)
 
 
 Quantity = Callable[[ExportedPolicy, RobotState, ArrayLike], np.ndarray]

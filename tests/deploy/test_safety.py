@@ -122,6 +122,18 @@ def test_without_good_frames_the_robot_slows_down_and_stands_blind(bad, caplog):
     assert fed_command(robot)[0] == pytest.approx(1.0) and robot.safety.sight is Sight.FRESH
 
 
+def test_points_nearer_than_the_sensor_of_training_measures_are_misses():
+    """Its least is 0.1 m: 0.1 m stays, 0.0999 m is a miss; a frame of such points alone is none."""
+    robot = policy()
+    cloud = CLOUD.copy()
+    cloud[:2] = [[0.1, 0.0, 0.0], [0.0999, 0.0, 0.0]]
+    cloud[2] = np.nan
+    robot.see(cloud, UPRIGHT)
+    assert robot.frames[-1, :4] * 6.0 == pytest.approx(np.array([[0.1, 0, 0], [0, 0, 0], [0, 0, 0], CLOUD[3]]))
+    robot.see(CLOUD * 0.04, UPRIGHT)
+    assert robot.safety.counts["frames refused"] == 1
+
+
 def test_a_robot_that_never_sees_anything_stands():
     robot = policy()
     for _ in range(50):
