@@ -6,7 +6,6 @@ cyclonedds brings the network and the description of the types; what is in a sam
 
 from __future__ import annotations
 
-from contextlib import suppress
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -94,7 +93,7 @@ class Writer:
     """Samples to a topic.
 
     Attributes:
-        unsent: samples that DDS did not take, because a reader is behind or the network is gone.
+        unsent: samples so far that DDS did not take, because a reader is behind or the network is gone.
     """
 
     def __init__(self, network: Network, topic: str, kind: Struct | str) -> None:
@@ -103,7 +102,7 @@ class Writer:
         from cyclonedds.topic import Topic
         from cyclonedds.util import duration
 
-        self._network, self._type = network, _type(kind)
+        self._network, self._type, self.unsent = network, _type(kind), 0
         participant = network.participant
         qos = Qos(Policy.Reliability.Reliable(duration(milliseconds=1)), Policy.History.KeepLast(1))
         self._writer = DataWriter(participant, Topic(participant, topic, self._type), qos=qos)
@@ -114,8 +113,10 @@ class Writer:
 
         sample: Any = object.__new__(self._type)
         sample.cdr = cdr
-        with suppress(DDSException):
+        try:
             self._writer.write(sample)
+        except DDSException:
+            self.unsent += 1
 
 
 @cache

@@ -214,7 +214,7 @@ class Guard:
         self._held: set[Request] = set()
         self._gone_since: float | None = None
         self._is_asked_to_leave = False
-        self._said = b""
+        self._said, self._has_said_unsent = b"", False
 
     def _refuse_others(self, network: Network) -> None:
         """Listens from the first state on: before it, nobody may have been found on the network yet."""
@@ -286,15 +286,16 @@ class Guard:
                 self.machine.ask(now, REQUESTS[data[0]])
 
     def _report(self) -> None:
-        """Says its mode when it has changed."""
+        """Says its mode when it has changed, and once that commands do not reach the network."""
+        if self._writer.unsent and not self._has_said_unsent:
+            self._has_said_unsent = True
+            _say(f"guard: {LOW_CMD_TOPIC}: the network has not taken a command: a reader is behind, or it is gone")
         said = bytes([MODES.index(self.machine.mode)]) + self.machine.reason.encode()[:200]
         if said != self._said:
             self._said = said
             _say(f"guard: {self.machine.mode}: {self.machine.reason}")
-            try:
+            with contextlib.suppress(OSError):  # nobody listens any more
                 self._link.send(said)
-            except OSError:
-                self._said = said  # nobody listens any more
 
     def _is_over(self, now: float) -> bool:
         if self._gone_since is None:

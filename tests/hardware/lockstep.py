@@ -46,6 +46,8 @@ class Memory:
         network = self
 
         class Writer:
+            unsent = 0
+
             def write(self, cdr):
                 for part in network.damage.get(topic, lambda data: [data])(cdr):
                     for queue in network._queues[topic]:

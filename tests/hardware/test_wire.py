@@ -450,6 +450,18 @@ def test_a_guard_that_fails_inside_stops_the_robot(exported):
         assert not command["motor_cmd"]["kp"].any() and command["motor_cmd"]["kd"][0] == 3.0
 
 
+def test_a_guard_whose_commands_are_not_sent_says_so_once(exported, capfd):
+    network, (_, theirs) = Memory(), socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    settings = guard.GuardConfig(machine_config(Description.read(exported)), listen_s=1e-9)
+    unheard, said = guard.Guard(settings, theirs, network), "guard: rt/lowcmd: the network has not taken a command"
+    unheard.tick(0.0)
+    assert said not in capfd.readouterr().err
+    for unsent in (1, 2, 3):
+        unheard._writer.unsent = unsent
+        unheard.tick(0.002 * unsent)
+    assert capfd.readouterr().err.count(said) == 1
+
+
 class TestDds:
     """Over CycloneDDS on the loopback."""
 
@@ -473,6 +485,20 @@ class TestDds:
         assert LOW_STATE.from_cdr(came[-1])["tick"] == 123
         read = LOW_CMD.from_cdr(asked[-1])
         assert read["motor_cmd"]["q"][3] == 1.5 and crc(read) == read["crc"]
+
+    def test_samples_that_dds_does_not_take_are_counted(self, monkeypatch):
+        from cyclonedds.core import DDSException
+
+        writer = Network(domain=80).writer(LOW_CMD_TOPIC, LOW_CMD)
+        writer.write(LOW_CMD.to_cdr(low_cmd()))
+        assert writer.unsent == 0
+
+        def refuse(sample):
+            raise DDSException(DDSException.DDS_RETCODE_TIMEOUT)
+
+        monkeypatch.setattr(writer._writer, "write", refuse)
+        writer.write(LOW_CMD.to_cdr(low_cmd()))
+        assert writer.unsent == 1
 
     @pytest.mark.parametrize("kind", ["CustomMsg", "PointCloud2"])
     def test_a_drivers_cloud_goes_over_the_loopback(self, kind, capsys, monkeypatch):
