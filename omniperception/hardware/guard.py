@@ -86,8 +86,8 @@ class StateReader:
     """
 
     def __init__(self, reader: Reader, check_crc: bool) -> None:
-        """Args: reader: of rt/lowstate; check_crc: whether checksums and the states' own clock matter: simulators that
-        fill neither need false."""
+        """Args: reader: of rt/lowstate; check_crc: whether checksums matter: simulators that fill none need false, and
+        their states may be without a clock, too, which is then 0 in all of them."""
         self._reader, self._check_crc = reader, check_crc
         self.refused = self.repeated = 0
         self._tick: int | None = None
@@ -103,16 +103,17 @@ class StateReader:
                 continue
             if self._check_crc and crc(state) != state["crc"]:
                 self.refused += 1
-            elif self._check_crc and not self._is_newer(int(state["tick"])):
+            elif not self._is_newer(int(state["tick"])):
                 self.repeated += 1
             else:
                 newest = state
         return newest
 
     def _is_newer(self, tick: int) -> bool:
-        """Whether a state's clock (ms) has gone on, or began again."""
+        """Whether a state's clock (ms) has gone on, or began again; always where simulators fill none."""
         before = self._tick
-        if before is None or not -_RESTART_MS < (tick - before + 2**31) % 2**32 - 2**31 <= 0:
+        has_none = not self._check_crc and tick == 0 and not before
+        if before is None or has_none or not -_RESTART_MS < (tick - before + 2**31) % 2**32 - 2**31 <= 0:
             self._tick = tick
             return True
         return False

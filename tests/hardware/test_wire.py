@@ -280,25 +280,41 @@ def test_a_robot_whose_joints_have_the_names_of_a_go2s_and_go_farther_is_refused
         motor_order(described)
 
 
-def test_a_state_that_is_not_newer_is_none():
-    """By its own clock; one that is far behind has begun again, as after a restart."""
+def reads_ticks(check_crc):
+    """A reader of states, and what it says of states with these ticks: the newest one's, None without a newer one."""
     network = Memory()
-    reader = guard.StateReader(network.reader(LOW_STATE_TOPIC, LOW_STATE, 4), check_crc=True)
+    reader = guard.StateReader(network.reader(LOW_STATE_TOPIC, LOW_STATE, 4), check_crc)
     writer = network.writer(LOW_STATE_TOPIC, LOW_STATE)
 
     def newest(*ticks):
         for tick in ticks:
             state = LOW_STATE.zeros()
             state["tick"] = tick
-            writer.write(LOW_STATE.to_cdr(sealed(state)))
+            writer.write(LOW_STATE.to_cdr(sealed(state) if check_crc else state))
         found = reader.newest()
         return None if found is None else int(found["tick"])
 
+    return reader, newest
+
+
+@pytest.mark.parametrize("check_crc", [True, False])
+def test_a_state_that_is_not_newer_is_none(check_crc):
+    """By its own clock; one that is far behind has begun again, as after a restart."""
+    reader, newest = reads_ticks(check_crc)
     assert newest(4000) == 4000 and newest(4000) is None and newest(4002, 4000) == 4002
     assert newest(3500) is None and newest(10) == 10  # half a second ago, and a restart
     assert newest(2**32 - 2) is None and reader.repeated == 4
     reader._tick = 2**32 - 2
     assert newest(4) == 4  # the clock's end
+
+
+def test_states_of_a_simulator_without_a_clock_are_all_new():
+    """Once one has a clock, it must go on."""
+    reader, newest = reads_ticks(check_crc=False)
+    assert [newest(0), newest(0, 0), newest(0)] == [0, 0, 0] and reader.repeated == 0
+    assert [newest(2), newest(2), newest(0), newest(4)] == [2, None, None, 4]
+    _, newest = reads_ticks(check_crc=True)
+    assert [newest(0), newest(0)] == [0, None]
 
 
 def test_requests_are_sent_again_where_the_guard_is_behind():
