@@ -148,7 +148,8 @@ def events(path: Path, wanted: Topics) -> Iterator[Event]:
     """What a robot has heard, in order of the recording.
 
     Raises:
-        DeployError: the recording lacks joints, or a topic has to be named.
+        DeployError: the recording lacks joints, their positions or velocities, or the base's orientation; or a topic
+            has to be named.
     """
     kinds = {message.topic: message.kind for message in messages(path)}
     inputs = {topic: kind for topic, kind in kinds.items() if not topic.startswith(OUTPUTS)}
@@ -172,7 +173,7 @@ def events(path: Path, wanted: Topics) -> Iterator[Event]:
         if topic == low:
             yield Event(now, state=LOW_STATE.from_cdr(message.data))
         elif topic == imu:
-            _take_imu(assembled, message.decode())
+            _take_imu(path, assembled, message.decode())
             has_imu = True
         elif topic == joints:
             _take_joints(path, assembled, message.decode())
@@ -199,7 +200,12 @@ def _chosen(path: Path, topics: dict[str, str], kinds: tuple[str, ...], name: st
     raise DeployError(f"{path}: {name or 'several'} given, of type {' or '.join(kinds)} are {', '.join(found)}; {mend}")
 
 
-def _take_imu(state: np.ndarray, message: Any) -> None:
+def _take_imu(path: Path, state: np.ndarray, message: Any) -> None:
+    if message.orientation_covariance[0] == -1:
+        raise DeployError(
+            f"{path}: the base's orientation was expected, an {_IMU} with an orientation_covariance of -1 says that it"
+            " has none; name another with imu="
+        )
     imu, quat = state["imu_state"], message.orientation
     imu["quaternion"] = (quat.w, quat.x, quat.y, quat.z)
     for name, vector in (("gyroscope", message.angular_velocity), ("accelerometer", message.linear_acceleration)):
@@ -213,7 +219,7 @@ def _take_joints(path: Path, state: np.ndarray, message: Any) -> None:
 
 
 def _in_motors_order(path: Path, message: Any, field: str) -> np.ndarray:
-    """(12,) of a JointState; zeros where it gives none."""
+    """(12,) of a JointState; zeros where it gives no effort."""
     values = np.asarray(getattr(message, field), float)
     names = list(message.name)
     lacking = sorted(set(MOTORS) - set(names))
@@ -221,10 +227,12 @@ def _in_motors_order(path: Path, message: Any, field: str) -> np.ndarray:
         raise DeployError(
             f"{path}: joints of a Go2 were expected, {', '.join(lacking[:3])} are not among {names[:3]} ..."
         )
-    if not len(values):
+    if not len(values) and field == "effort":
         return np.zeros(len(MOTORS))
     if len(values) != len(names):
-        raise DeployError(f"{path}: {len(names)} joints are named, and {field} has {len(values)} numbers")
+        raise DeployError(
+            f"{path}: {len(names)} joints are named, and {field} has {len(values)} numbers; as many are needed"
+        )
     return values[[names.index(name) for name in MOTORS]]
 
 

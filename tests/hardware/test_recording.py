@@ -124,8 +124,8 @@ def test_points_in_the_levelled_base():
     assert near[18] == pytest.approx(np.hypot(1.0, 0.01)) and near[17] == np.inf and np.isfinite(near).sum() == 1
 
 
-def a_ros_bag(folder, names=MOTORS, imus=("/imu",)):
-    """Written by rosbags' own serializer: 100 Hz, a cloud, a Twist, joints in another order."""
+def a_ros_bag(folder, names=MOTORS, imus=("/imu",), positions=12, velocities=12, orientation_covariance=0.0):
+    """Written by rosbags' own serializer: 100 Hz, a cloud, a Twist, joints in another order, without efforts."""
     pytest.importorskip("rosbags", reason="extra clouds")
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -141,13 +141,14 @@ def a_ros_bag(folder, names=MOTORS, imus=("/imu",)):
     imu = t["Imu"](
         header,
         t["Quaternion"](0.0, 0.0, 0.0, 1.0),
-        nothing,
+        np.array([orientation_covariance, *nothing[1:]]),
         vector(0.1, 0.2, 0.3),
         nothing,
         vector(0, 0, 9.81),
         nothing,
     )
-    joints = t["JointState"](header, list(names)[::-1], np.arange(12.0)[::-1].copy(), np.zeros(12), np.zeros(0))
+    angles = np.arange(12.0)[::-1][:positions].copy()
+    joints = t["JointState"](header, list(names)[::-1], angles, np.zeros(velocities), np.zeros(0))
     twist = t["Twist"](vector(0.5, 0.0, 0.0), vector(0.0, 0.0, 0.2))
     rows = np.zeros(2, [("xyz", "<f4", 3), ("timestamp", "<f8")])
     rows["xyz"], rows["timestamp"] = [[1, 2, 3], [4, 5, 6]], [9e9, 9e9 + 5000]
@@ -193,6 +194,17 @@ def test_bags_that_do_not_say_enough(tmp_path):
     a_ros_bag(tmp_path / "other", names=[f"leg_{k}" for k in range(12)])
     with pytest.raises(DeployError, match="joints of a Go2 were expected, FL_calf_joint"):
         list(events(tmp_path / "other", Topics()))
+    for k, (lack, said) in enumerate(
+        [
+            ({"positions": 0}, "12 joints are named, and position has 0 numbers"),
+            ({"velocities": 0}, "12 joints are named, and velocity has 0 numbers"),
+            ({"velocities": 11}, "12 joints are named, and velocity has 11 numbers"),
+            ({"orientation_covariance": -1.0}, "orientation_covariance of -1 says that it has none; name another"),
+        ]
+    ):
+        a_ros_bag(tmp_path / f"lacks{k}", **lack)
+        with pytest.raises(DeployError, match=said):
+            list(events(tmp_path / f"lacks{k}", Topics()))
     with pytest.raises(DeployError, match="does not exist"):
         list(bags.messages(tmp_path / "none.mcap"))
     (tmp_path / "none.mcap").write_bytes(b"nothing of the kind, at some length")
