@@ -59,11 +59,12 @@ class Packet:
 
 
 def read_points(data: bytes) -> Packet | None:
-    """A packet of points; None for what is none of Cartesian points, or is cut off."""
+    """A packet of points; None for what is none of Cartesian points, is cut off, or is from a time of 2^62 ns or more,
+    146 years, which no clock shows."""
     if len(data) < _POINTS.size:
         return None
     _, length, interval, count, number, _, kind, _, _, _, time_ns = _POINTS.unpack_from(data)
-    if kind not in _KINDS:
+    if kind not in _KINDS or time_ns >= 2**62:
         return None
     dtype, metres = _KINDS[kind]
     if length != len(data) or len(data) != _POINTS.size + count * dtype.itemsize or not count:

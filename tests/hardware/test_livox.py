@@ -61,7 +61,13 @@ def test_centimetres_and_tags():
     assert read.tags.tolist() == [5]
 
 
-@pytest.mark.parametrize("data", [b"", bytes(36), packet(np.ones((3, 3)))[:-1], packet(np.ones((3, 3))) + b"x"])
+ONES = np.ones((3, 3))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", bytes(36), packet(ONES)[:-1], packet(ONES) + b"x", packet(ONES, 2**64 - 1), packet(ONES, 2**63 - 1)],
+)
 def test_what_is_no_packet_of_points_is_none(data):
     assert livox.read_points(data) is None
 
