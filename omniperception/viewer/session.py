@@ -285,7 +285,6 @@ class Session:
             seed=env.config.seed,
             outputs=CLOUD_OUTPUTS,
         )
-        self._lidar.frame_count.copy_(env.sensing.lidar.frame_count)
         self._tick = env.sensing.tick
 
     def _follow_lidar(self) -> None:
@@ -301,6 +300,7 @@ class Session:
         assert sensor is not None
         if env.sensing.tick != self._tick:
             self._tick, self.frames = env.sensing.tick, self.frames + 1
+            torch.sub(env.sensing.lidar.frame_count, 1, out=lidar.frame_count)  # the task's, from before its cast
             self.cloud = lidar.cast(env.step_count * env.control_dt)
         elif sensor.motion_segments and self._ends_segment(sensor.motion_segments):
             lidar.record_poses()

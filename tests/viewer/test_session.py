@@ -18,6 +18,7 @@ from omniperception.viewer.session import DRAG_SPEED, Session, spare_kinds
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
 OVERRIDES = ("terrain=flat", "obstacles=none", "condition=ideal", "lidar.num_rays=2000", "sim.num_threads=1")
+NOISY = ("terrain=flat", "obstacles=none", "randomization=device", "lidar.num_rays=2000", "sim.num_threads=1")
 
 
 @pytest.fixture(scope="module")
@@ -43,22 +44,50 @@ def test_a_person_commands_and_gives_the_task_its_commands_back(session):
     assert not torch.equal(session.env.command.value, expected) and own.shape == (1, 3)
 
 
-def test_points_are_those_that_the_policy_is_given(session):
+def step_to_a_frame(session, before=0):
+    """Until the task's LiDAR has just cast, or will after `before` steps more."""
     session.step()
-    while session.env.step_count % session.env.sensing.period_steps:
+    while (session.env.step_count + before) % session.env.sensing.period_steps:
         session.step()
+
+
+def shown_is_given(session):
+    """Points shown are the noisy ranges that the task has cast: their distances from the sensor, whatever the
+    directions."""
     given, shown = session.env.sensing.frame, session.cloud
     assert torch.equal(shown.valid, given.ranges.isfinite())
     sensor = session.env.config.lidar
     sensing = session.env.sensing
     place = sensing.scene.body_pos[0, sensing.carrier].numpy()
     hit = shown.valid[0]
-    # a mount turned about and moved off the base: distances from it are the ranges, whatever the directions
+    # a mount turned about and moved off the base
     quat = sensing.scene.body_quat[0, sensing.carrier].double()
     w, v, pos = quat[0], quat[1:], torch.tensor(sensor.mount_pos, dtype=torch.float64)
     mount = place + (pos + 2 * torch.linalg.cross(v, torch.linalg.cross(v, pos) + w * pos)).numpy()
     distance = np.linalg.norm(shown.points_w[0, hit].numpy() - mount, axis=1)
     assert distance == pytest.approx(given.ranges[0, hit].numpy(), abs=2e-5)
+
+
+def test_points_are_those_that_the_policy_is_given(session):
+    step_to_a_frame(session)
+    shown_is_given(session)
+
+
+def test_noisy_points_are_those_that_the_policy_is_given_in_every_trial():
+    """Also after trials whose last step ended with a frame, which is not shown, and after another choice of rays."""
+    session = Session(Shown(PRETRAINED / "avoider", NOISY))
+    assert session.env.config.lidar_noise
+    for trial in range(3):
+        step_to_a_frame(session)
+        shown_is_given(session)
+        step_to_a_frame(session, before=1)
+        casts = int(session.env.sensing.lidar.frame_count)
+        session.reset()
+        assert int(session.env.sensing.lidar.frame_count) == casts + 1 and session.cloud is None
+        if trial == 1:
+            session.show_cloud(500)
+            step_to_a_frame(session)
+            session.show_cloud(None)
 
 
 def test_trials_end_anywhere_within_a_frame_of_several_segments():
