@@ -110,7 +110,9 @@ def export(
     described = replace(described, checksums={name: checksum(folder / file) for name, file in described.files.items()})
     described.write(folder)
     text = deploy_yaml(described)
-    if text is not None:
+    if text is None:
+        (folder / DEPLOY_YAML).unlink(missing_ok=True)
+    else:
         (folder / DEPLOY_YAML).write_text(text)
     return described
 

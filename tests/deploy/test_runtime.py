@@ -277,10 +277,13 @@ def test_other_weights_of_the_same_name_are_not_evaluated_as_exported(exported_r
         evaluate(Evaluation([run_dir], [World("walk")], policies=("exported",), trials=1, num_envs=1, jobs=1))
 
 
-def test_an_export_leaves_no_file_of_an_earlier_one(exported_run, tmp_path):
+def test_an_export_leaves_no_file_of_an_earlier_one(exported_run, tmp_path, monkeypatch):
     for formats in (("torchscript", "onnx"), ("onnx",)):
         export(exported_run("none"), tmp_path, formats=formats)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["deploy.yaml", "policy.json", "policy.onnx"]
+    monkeypatch.setattr("omniperception.deploy.export.deploy_yaml", lambda described: None)  # as of another robot
+    export(exported_run("none"), tmp_path, formats=("onnx",))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.json", "policy.onnx"]
 
 
 @pytest.mark.slow
