@@ -10,7 +10,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from omniperception.deploy.description import DeployError
-from omniperception.hardware.messages import LOW_CMD, LOW_STATE, Struct
+from omniperception.hardware.messages import Struct
 
 if TYPE_CHECKING:
     from cyclonedds.domain import DomainParticipant
@@ -214,9 +214,7 @@ def _variable() -> dict[str, Any]:
 
 __all__ = [
     "CUSTOM_MSG",
-    "LOW_CMD",
     "LOW_CMD_TOPIC",
-    "LOW_STATE",
     "LOW_STATE_TOPIC",
     "POINT_CLOUD2",
     "REQUEST",

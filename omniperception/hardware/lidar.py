@@ -19,7 +19,7 @@ from omniperception.hardware.clouds import (
     without_noise,
 )
 from omniperception.hardware.dds import CUSTOM_MSG, POINT_CLOUD2, Network, Reader
-from omniperception.hardware.livox import DETECTION_PORT, HOST_POINT_PORT, Mid360
+from omniperception.hardware.livox import HOST_POINT_PORT, Mid360
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,6 @@ class LidarSource:
             pointed here), 'PointCloud2' or 'CustomMsg' (a topic over DDS).
         topic: of DDS.
         host: this machine's address in the sensor's network, of 'mid360' and 'packets'.
-        broadcast: where a Mid-360 is searched.
-        detection_port: the same.
         point_port: of this machine, where packets come to.
         extrinsic: what a driver has applied to the points.
     """
@@ -40,8 +38,6 @@ class LidarSource:
     kind: str = "mid360"
     topic: str = "rt/livox/lidar"
     host: str = "192.168.1.50"
-    broadcast: str = "255.255.255.255"
-    detection_port: int = DETECTION_PORT
     point_port: int = HOST_POINT_PORT
     extrinsic: Extrinsic = field(default_factory=Extrinsic)
 
@@ -110,7 +106,7 @@ class _Packets:
     def __init__(self, source: LidarSource) -> None:
         self._mid360 = Mid360(source.host, source.point_port)
         if source.kind == "mid360":
-            self._mid360.find(source.broadcast, source.detection_port)
+            self._mid360.find()
 
     def read(self) -> list[Points]:
         return [Points(without_noise(p.points, p.tags), p.times_ns) for p in self._mid360.packets()]

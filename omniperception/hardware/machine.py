@@ -256,12 +256,12 @@ class Machine:
             return _along(
                 since, (0.0, config.fold_s, config.fold_s + config.rise_s), (self._from, self._crouch, self._stand)
             )
-        quarter = config.settle_s / 2
+        reached_s = config.settle_s / 2
         if self.mode is Mode.STANDING:
-            return _along(since, (0.0, quarter), (self._from, self._stand))
+            return _along(since, (0.0, reached_s), (self._from, self._stand))
         if not self._settle_s:
             return _along(since, (0.0, config.fold_down_s), (self._from, self._crouch))
-        times = (0.0, quarter, config.settle_s, config.settle_s + config.fold_down_s)
+        times = (0.0, reached_s, config.settle_s, config.settle_s + config.fold_down_s)
         return _along(since, times, (self._from, self._stand, self._stand, self._crouch))
 
     def _is_silent(self, now: float) -> bool:

@@ -35,6 +35,8 @@ SCAN_STEPS = 5
 _CROUCH = (0.0, 1.36, -2.65)
 _LYING_HEIGHT, _UP_HEIGHT = 0.12, 0.2
 _TEMPERATURE = 30
+_AFTER_FAULT_S = 6.0
+"""From a fault's beginning to the end of the simulation."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,6 @@ class SimulatedConfig:
         sport_mode: name of a controller of its own, for which it ignores commands until it is released; empty: none.
         fault: of faults.FAULTS, one second after it has begun to walk; empty: none.
         fault_s: how long the fault lasts.
-        after_s: simulated time from the fault's beginning to the end.
         report: .json file of the outcome, for `robot-trials`; None: none is written.
         seconds: simulated time; None: until it is ended.
     """
@@ -69,7 +70,6 @@ class SimulatedConfig:
     sport_mode: str = ""
     fault: str = ""
     fault_s: float = 2.0
-    after_s: float = 6.0
     report: Path | None = None
     seconds: float | None = None
 
@@ -330,7 +330,7 @@ class SimulatedRobot:
     def is_over(self) -> bool:
         """Whether a fault has been looked at for long enough."""
         began = self.faults.begun_s
-        return began is not None and self.time_s >= began + self._config.after_s
+        return began is not None and self.time_s >= began + _AFTER_FAULT_S
 
     @property
     def has_walked(self) -> bool:
