@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from omniperception.deploy.description import FILE, FINGERPRINT, DeployError, Description, Group, Lidar, checksum
 from omniperception.deploy.odometry import Odometry
 from omniperception.deploy.safety import Safety, SafetyConfig, SafetyStop, Sight
-from omniperception.deploy.sampling import Attitude, CloudSampler, make_sampler
+from omniperception.deploy.sampling import Attitude, CloudSampler, down, make_sampler
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -430,8 +430,7 @@ def _joint_pos_offset(policy: ExportedPolicy, state: RobotState, command: ArrayL
 
 def _projected_gravity(policy: ExportedPolicy, state: RobotState, command: ArrayLike) -> np.ndarray:
     """Unit vector of gravity in the base frame."""
-    w, x, y, z = _quaternion(state.base_quat)
-    return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], np.float32)
+    return down(_quaternion(state.base_quat)).astype(np.float32)
 
 
 def _quaternion(given: ArrayLike) -> np.ndarray:

@@ -321,6 +321,12 @@ def rotation_matrix(quat: ArrayLike) -> np.ndarray:
     )
 
 
+def down(quat: np.ndarray) -> np.ndarray:
+    """(3,) unit vector of gravity in a frame of orientation quat (w, x, y, z), which is of length 1."""
+    w, x, y, z = quat
+    return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1])
+
+
 def _levelled(base: np.ndarray) -> np.ndarray:
     """The base's rotation without its heading."""
     yaw = math.atan2(base[1, 0], base[0, 0])

@@ -21,6 +21,7 @@ from omniperception.deploy import DeployError, ExportedPolicy, RobotState, Safet
 from omniperception.deploy.description import FILE, Description
 from omniperception.deploy.go2 import MOTORS, RANGES
 from omniperception.deploy.odometry import Odometry
+from omniperception.deploy.sampling import down
 from omniperception.hardware.clouds import Frame, Points
 from omniperception.hardware.dds import LOW_STATE_TOPIC, Network
 from omniperception.hardware.guard import GuardConfig, Link, StateReader, start
@@ -325,12 +326,6 @@ class Control:
         velocity = self._leg_velocity(state) if self._needs_velocity else None
         order = self._motors
         return RobotState(motors["q"][order], motors["dq"][order], quat, gyro, velocity, motors["tau_est"][order])
-
-
-def down(quat: np.ndarray) -> np.ndarray:
-    """(3,) unit vector of gravity in the base of orientation (w, x, y, z)."""
-    w, x, y, z = quat
-    return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1])
 
 
 def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> Report:

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from omniperception.deploy.description import DeployError, Description
+from omniperception.deploy.geometry import sector_of
 from omniperception.deploy.go2 import MOTORS
 from omniperception.deploy.sampling import rotation_matrix
 from omniperception.hardware.clouds import Points
@@ -141,11 +142,11 @@ def nearest_by_sector(
         mount_pos: of the sensor in the base, m.
         mount_quat: likewise.
     """
-    x, y, z = levelled(points[points.any(axis=1)], base_quat, mount_pos, mount_quat).T
+    places = levelled(points[points.any(axis=1)], base_quat, mount_pos, mount_quat)
+    x, y, z = places.T
     inside = (z > HEIGHTS[0]) & (z < HEIGHTS[1]) & ((abs(x) > OWN[0]) | (abs(y) > OWN[1]))
-    sectors = ((np.arctan2(y, x)[inside] + math.pi) * (SECTORS / (2 * math.pi))).astype(int) % SECTORS
     nearest = np.full(SECTORS, np.inf)
-    np.minimum.at(nearest, sectors, np.hypot(x, y)[inside])
+    np.minimum.at(nearest, sector_of(places[inside, :2], SECTORS), np.hypot(x, y)[inside])
     return nearest
 
 
