@@ -181,16 +181,16 @@ class OmniEnv(VecEnv):
             Observations.
         """
         env_ids = self._all_envs if env_ids is None else env_ids
+        everybody = len(env_ids) == self.num_envs
         if seeds is not None:
             self.random.seed(env_ids, seeds)
-            if len(env_ids) == self.num_envs:
-                self.step_count = 0
-                if self.sensing is not None:
-                    self.sensing.lidar.reset()
+            self.step_count = 0 if everybody else self.step_count
+        time_begins = everybody and self.step_count == 0
+        if time_begins and self.sensing is not None:
+            self.sensing.lidar.reset()
         self._reset(env_ids, seeds, interrupted=True)
         self.healthy = ~self.sim.failed
-        everybody = len(env_ids) == self.num_envs
-        if everybody and self.step_count == 0:
+        if time_begins:
             self._sense()
         self.observations = self._observe(env_ids) if everybody else self._begun(env_ids)
         return self.observations

@@ -230,6 +230,18 @@ def test_time_begins_anew_within_a_frame_of_several_segments(make_env):
     assert torch.equal(env.sensing.frame.true_ranges, fresh.sensing.frame.true_ranges)
 
 
+def test_everybody_may_begin_again_before_the_first_step(make_env):
+    """Moments within a frame are missed then, and are not asked for; so does another task's state begin."""
+    given = ("obstacles=static", "lidar.motion_segments=5", "perception=none")
+    env = make_env(*given, num_envs=2)
+    env.reset()
+    env.reset()
+    env.begin_at_levels_of(env.state_dict())
+    for action in random_actions(env, 5):
+        env.step(action)
+    assert env.sensing.tick == 5  # a frame at each beginning, and one after five steps
+
+
 class TestSlices:
     """Clouds of some environments after those of others give what all at once give."""
 
