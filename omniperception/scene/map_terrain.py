@@ -65,7 +65,7 @@ class MapTerrainConfig:
         cell: distance (m) of grid points.
         start: where robots start.
         friction: sliding friction coefficient of the ground; it holds for every contact with the ground.
-        restitution: coefficient of restitution e in [0, 1].
+        restitution: the ground's coefficient of restitution in [0, 1]; a contact has half of it, see `ground_solrefs`.
     """
 
     file: str

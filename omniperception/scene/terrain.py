@@ -18,7 +18,7 @@ class TerrainConfig:
 
     Attributes:
         friction: sliding friction coefficient of the ground; it holds for every contact with the ground.
-        restitution: coefficient of restitution e in [0, 1].
+        restitution: the ground's coefficient of restitution in [0, 1]; a contact has half of it, see `ground_solrefs`.
     """
 
     friction: float = 0.8
@@ -45,24 +45,29 @@ def set_contact(geom: mujoco.MjsGeom, friction: float, restitution: float) -> No
     """Makes a geom the ground, whose contact parameters take priority over the robot's."""
     geom.contype, geom.conaffinity, geom.condim, geom.priority = 1, 0, 3, 1
     geom.friction = [friction, 0.005, 0.0001]
-    geom.solref[:2] = contact_solref(restitution)
+    geom.solref[:2] = ground_solrefs(torch.tensor(restitution, dtype=torch.float64, device="cpu")).tolist()
 
 
 _CONTACT_FREQUENCY = 50.0
 """Natural frequency (rad/s) of the ground contact: MuJoCo's default, slow enough for a 5 ms physics step."""
 
 
-def contact_solref(restitution: float) -> tuple[float, float]:
-    """MuJoCo's (-stiffness, -damping) of a ground contact with a coefficient of restitution.
+def ground_solrefs(restitution: torch.Tensor) -> torch.Tensor:
+    """(..., 2) `geom_solref` of grounds with coefficients of restitution (...).
+
+    A contact has the mean of the ground's coefficient and the robot's own, which is 0, as PhysX has by default (and so
+    the paper's simulator). Contacts with coefficients beyond a half would have no friction left: with MuJoCo's
+    pyramidal cones what damps the rebound is also what slows down a sliding foot.
+    """
+    return contact_solrefs(0.5 * restitution)
+
+
+def contact_solrefs(restitution: torch.Tensor) -> torch.Tensor:
+    """(..., 2) MuJoCo's (-stiffness, -damping) of ground contacts with coefficients of restitution (...).
 
     The stiffness is the same for every restitution: in MuJoCo's other format, (time constant, damping ratio),
     it grows as the damping ratio falls, and a lively contact then gains energy at usual step sizes.
     """
-    return tuple(contact_solrefs(torch.tensor(restitution, dtype=torch.float64, device="cpu")).tolist())
-
-
-def contact_solrefs(restitution: torch.Tensor) -> torch.Tensor:
-    """(..., 2) `contact_solref` of coefficients (...)."""
     damping = -2.0 * damping_ratio(restitution) * _CONTACT_FREQUENCY
     return torch.stack((torch.full_like(damping, -(_CONTACT_FREQUENCY**2)), damping), -1)
 

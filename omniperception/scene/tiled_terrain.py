@@ -61,7 +61,7 @@ class TiledTerrainConfig:
         difficulty: of the lowest and of the highest level, 0 to 1.
         curriculum: None: every episode starts on any level.
         friction: sliding friction coefficient of the ground; it holds for every contact with the ground.
-        restitution: coefficient of restitution e in [0, 1].
+        restitution: the ground's coefficient of restitution in [0, 1]; a contact has half of it, see `ground_solrefs`.
     """
 
     tiles: Mapping[str, Tile]

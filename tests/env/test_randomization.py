@@ -6,9 +6,10 @@ import mujoco
 import pytest
 import torch
 
-from omniperception.env.mdp.randomization import RandomizationConfig, ground_solrefs
+from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mirror import Mirror
 from omniperception.lidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
+from omniperception.scene.terrain import ground_solrefs
 
 N = 300
 PAPER = {

@@ -10,7 +10,7 @@ import torch
 
 import omniperception.scene
 from omniperception.scene import TerrainConfig, build_world
-from omniperception.scene.terrain import contact_solref, damping_ratio
+from omniperception.scene.terrain import GROUND, contact_solrefs, damping_ratio
 from omniperception.sim import SimConfig
 from omniperception.sim.mujoco import apply_options
 
@@ -134,10 +134,16 @@ def test_damping_ratio(restitution, ratio):
     assert damping_ratio(torch.tensor(restitution)).item() == pytest.approx(ratio, abs=1e-6)
 
 
-def rebound(restitution, timestep, speed=1.0, gap=1e-4):
-    """Rebound speed over impact speed of a ball without weight."""
+def solref(restitution):
+    return contact_solrefs(torch.tensor(restitution, dtype=torch.float64)).tolist()
+
+
+def rebound(restitution, timestep, speed=1.0, gap=1e-4, ground=None):
+    """Rebound speed over impact speed of a ball without weight, of a contact or, where it is given, on a ground."""
     spec = mujoco.MjSpec()
-    TerrainConfig(restitution=restitution).add_to(spec)
+    (ground or TerrainConfig()).add_to(spec)
+    if ground is None:
+        spec.geom(GROUND).solref[:2] = solref(restitution)
     ball = spec.worldbody.add_body(pos=[0, 0, 0.1 + gap])
     ball.add_freejoint()
     ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], mass=1.0, contype=0, conaffinity=1)
@@ -165,7 +171,26 @@ def test_no_contact_gains_energy(restitution):
 
 def test_without_restitution_the_contact_is_the_default_one():
     """solref (0.02, 1) in MuJoCo's other format: stiffness 1 / 0.02^2, damping 2 / 0.02."""
-    assert contact_solref(0.0) == (-2500.0, -100.0)
+    assert solref(0.0) == [-2500.0, -100.0]
+
+
+def test_a_ground_that_rebounds_wholly_rebounds_by_half_and_keeps_its_friction():
+    """The robot's own coefficient is 0 and a contact has the mean; Coulomb stops 1 m/s after 0.13 s and 0.064 m."""
+    ground = TerrainConfig(friction=0.8, restitution=1.0)
+    assert rebound(None, 0.001, ground=ground) == pytest.approx(0.5, abs=0.1)
+    spec = mujoco.MjSpec()
+    ground.add_to(spec)
+    block = spec.worldbody.add_body(pos=[0, 0, 0.1])
+    block.add_freejoint()
+    block.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1], mass=4.0, contype=0, conaffinity=1)
+    spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, nstep=400)
+    data.qvel[0] = 1.0
+    start = data.qpos[0]
+    mujoco.mj_step(model, data, nstep=40)
+    assert abs(data.qvel[0]) < 0.1 and 0.05 < data.qpos[0] - start < 0.12
 
 
 def test_the_ground_decides_the_friction(mixed):

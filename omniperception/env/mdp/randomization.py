@@ -12,7 +12,7 @@ import torch
 from omniperception.common.random import EnvRandom
 from omniperception.env.mdp.curriculum import FULL, Curriculum, CurriculumConfig
 from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
-from omniperception.scene.terrain import contact_solrefs
+from omniperception.scene.terrain import ground_solrefs
 from omniperception.sim import Simulator
 
 Range = Sequence[float] | None
@@ -132,7 +132,7 @@ class RandomizationConfig:
         payload_mass: mass (kg) carried at `payload_position`.
         com_x, com_y, com_z: displacement (m) of the base's centre of mass.
         ground_friction: sliding friction coefficient.
-        ground_restitution: coefficient of restitution of the ground; see `ground_solrefs`.
+        ground_restitution: coefficient of restitution of the ground; see `scene.terrain.ground_solrefs`.
         motor_strength: factor on the PD torque; the torque limit stays.
         joint_offset: calibration error (rad) of every joint, added to the joint targets.
         gravity_offset: acceleration (m/s^2) added to each axis of gravity.
@@ -218,16 +218,6 @@ class RandomizationConfig:
         """The LiDAR noise models, but for those of the device."""
         models = (getattr(self, item.name) for item in fields(self) if item.name.startswith("lidar_"))
         return tuple(model for model in models if not isinstance(model, bool | None))
-
-
-def ground_solrefs(restitution: torch.Tensor) -> torch.Tensor:
-    """(..., 2) `geom_solref` of grounds with coefficients of restitution (...).
-
-    A contact has the mean of the ground's coefficient and the robot's own, which is 0, as PhysX has by default (and so
-    the paper's simulator). Contacts with coefficients beyond a half would have no friction left: with MuJoCo's
-    pyramidal cones what damps the rebound is also what slows down a sliding foot.
-    """
-    return contact_solrefs(0.5 * restitution)
 
 
 class Randomizer:
@@ -338,7 +328,7 @@ class Randomizer:
         """(1,) float64: what a parameter is without randomization."""
         terrain_friction = float(self._model.geom_friction[self._ground, 0])
         neutral = {"motor_strength": 1.0, "ground_friction": terrain_friction}
-        neutral["ground_restitution"] = 2 * self._sim.world.terrain.restitution  # a contact has half of what is drawn
+        neutral["ground_restitution"] = self._sim.world.terrain.restitution
         value = neutral.get(name, 0.0)
         return torch.tensor([value], dtype=torch.float64, device=self._sim.device)
 
