@@ -63,7 +63,7 @@ class OmniEnv(VecEnv):
         self.num_envs, self.num_actions = config.num_envs, config.robot.num_joints
         self.control_dt = config.sim.control_dt
         self.max_episode_length = round(config.terminations.episode_length_s / self.control_dt)
-        self.timer, self.step_count = StageTimer(), 0
+        self.timer, self.step_count, self._has_stepped = StageTimer(), 0, False
         self.step_hooks: list[Callable[[], None]] = []
         sensors = config.requirements() & CONTACT_SENSORS
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
@@ -141,6 +141,7 @@ class OmniEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """One control step with actions (num_envs, num_actions); see rsl_rl.env.VecEnv."""
         self.step_count += 1
+        self._has_stepped = True
         self.episode_length_buf += 1
         self._advance_physics(self._clipped(actions))
         with self.timer.stage("state"):
@@ -348,7 +349,7 @@ class OmniEnv(VecEnv):
 
     def _completed(self, env_ids: torch.Tensor, interrupted: bool) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now commanded no more; None before the first ones."""
-        if self.step_count == 0:
+        if not self._has_stepped:
             return None
         return (self.outcomes["time_out"] | self.outcomes["goal"])[env_ids] | interrupted
 
@@ -459,7 +460,7 @@ class OmniEnv(VecEnv):
         if self.obstacles is not None:
             self._resize(self.obstacles, torch.arange(self.num_envs, device=self.device))
         self.random.load_state_dict(state["random"])
-        self.step_count = state["step_count"]
+        self.step_count, self._has_stepped = state["step_count"], True
         self.episode_length_buf.copy_(state["episode_length"])
         self._frame_heights = state["frame_heights"]
         self.observations = self._collect(dict(state["observations"]))

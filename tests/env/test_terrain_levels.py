@@ -112,3 +112,14 @@ def test_levels_are_logged(make_env):
     assert extras["log"]["Metrics/terrain_level"] == 30 / 8
     assert extras["log"]["Terrain/level_stairs_up"] == 1.5  # columns 0 and 1
     assert extras["log"]["Terrain/level_stairs_down"] == 6.0
+
+
+def test_levels_outlast_resets_of_all_with_seeds(make_env):
+    """Time begins anew; the curriculum goes on from where it was, and a step of standing takes at most one level."""
+    env = make_env("terrain=stairs", "terrain.curriculum.start_level=0", num_envs=8, blind=True)
+    levels = torch.tensor([1, 2, 3, 4, 5, 6, 7, 8])
+    env.ground.move(torch.arange(8), levels)
+    env.step(torch.zeros(8, 12))
+    for _ in range(2):
+        env.reset(seeds=torch.arange(8))
+        assert env.step_count == 0 and ((env.ground.level - levels).abs() <= 1).all()
