@@ -68,7 +68,8 @@ class Articulation:
         self.scale[env_ids] = scale
         self.lift[env_ids] = torch.where(self._is_whole, half_height, 0.0)
         self.cycle[env_ids] = cycle
-        self.seconds[env_ids], self.metres[env_ids] = 0.0, 0.0
+        self.seconds.index_fill_(0, env_ids, 0.0)
+        self.metres.index_fill_(0, env_ids, 0.0)
 
     def advance(self, dt: float, speed: torch.Tensor) -> None:
         """Lets `dt` (s) pass, in which obstacles move at `speed` (num_envs, O) m/s."""

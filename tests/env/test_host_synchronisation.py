@@ -42,10 +42,12 @@ class Synchronisations(TorchDispatchMode):
         (("experiment=walk", "randomization=paper"), 2),
         (("experiment=avoid", "terrain=mixed", "lidar.num_rays=100", "randomization=paper"), 3),
         (("experiment=avoid", "terrain=flat", "lidar.num_rays=100", "randomization=robot"), 3),
+        (("experiment=avoid", "scenario=people", "lidar.num_rays=100"), 2),
     ],
 )
 def test_a_step_counts_environments_and_nothing_else(make_env, overrides, times):
-    """Those that end, those whose command is drawn again, and those with an approaching obstacle that has passed."""
+    """Those that end, those whose command is drawn again, and those where an approaching obstacle has passed or a
+    wandering one chooses again."""
     env = make_env(*overrides, *ON_WARP)
     if env.obstacles is not None:
         env.obstacles.level = 1.0
