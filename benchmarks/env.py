@@ -74,7 +74,7 @@ class Timed:
 def environment(run: RunConfig) -> OmniEnv:
     """A task with all obstacles, so that the LiDAR is awake, whose stages no report drains meanwhile."""
     seed_everything(run.env.seed)
-    return OmniEnv(replace(run.env, log_interval=10**9, initial_level=1.0))
+    return OmniEnv(replace(run.env, log_interval=10**9, full_level=True))
 
 
 def step_of(run: RunConfig) -> Timed:
@@ -224,7 +224,7 @@ def latency(run_dir: Path, steps: int) -> Table:
     run = build.assemble(config.load(run_dir, ["num_envs=1"]))
 
     def readings(whole_frames: bool):
-        return record(OmniEnv(replace(run.env, initial_level=1.0)), policy, RECORDED, whole_frames)
+        return record(OmniEnv(replace(run.env, full_level=True)), policy, RECORDED, whole_frames)
 
     cases = {"as trained": (policy, readings(False))}
     if policy.description.perception is not None:

@@ -124,7 +124,7 @@ def _clouds_at_once(env: OmniEnv, num_envs: int) -> int:
 
 
 def _build(run: RunConfig, num_envs: int) -> Runner:
-    return build_runner(replace(run, env=replace(run.env, num_envs=num_envs, initial_level=1.0)), None)
+    return build_runner(replace(run, env=replace(run.env, num_envs=num_envs, full_level=True)), None)
 
 
 def _update_bytes(run: RunConfig) -> int:

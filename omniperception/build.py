@@ -289,7 +289,7 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
         CheckpointError: there is none, or it does not fit.
     """
     checkpoint = latest_checkpoint(run_dir)
-    runner = build_runner(replace(run, env=replace(run.env, initial_level=1.0, trials=True)), None)
+    runner = build_runner(replace(run, env=replace(run.env, full_level=True, trials=True)), None)
     runner.load_policy(checkpoint)
     return TrainedPolicy(runner.env, runner.policy, checkpoint)
 

@@ -76,7 +76,7 @@ def world(run_dir: Path, overrides: list[str], trust: Sequence[str] = ()) -> Omn
     refuse_overrides(overrides, WIRE)
     run = build.load_run(run_dir, [*overrides, *(f"{key}={value}" for key, value in WIRE.items())], trust)
     build.check_split(run, "trial on the wire")
-    return OmniEnv(replace(run.env, initial_level=1.0, trials=True))
+    return OmniEnv(replace(run.env, full_level=True, trials=True))
 
 
 command = Command(main, Arguments, __doc__, overrides="of the run's configuration", errors=(DeployError,))

@@ -55,7 +55,8 @@ class EnvConfig:
         shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
         read_besides: requirements of who acts in the task, beside those of its terms; see `state.requires`.
         log_interval: control steps between two reports of the metrics.
-        initial_level: where curricula of obstacles and commands start, 0 to 1; None: as they say. Evaluation uses 1.
+        full_level: whether everything that curricula of obstacles, commands and randomization let in is there from the
+            first step on, and stays, as in evaluations; the terrain's has `trials`.
         trials: whether episodes are trials of an evaluation: the k-th to begin is the same scene whatever the number of
             environments, on a tile that it draws; see `TrialRandom`.
     """
@@ -80,7 +81,7 @@ class EnvConfig:
     shows_frames: bool = True
     read_besides: Sequence[str] = ()
     log_interval: int = 24
-    initial_level: float | None = None
+    full_level: bool = False
     trials: bool = False
 
     def __post_init__(self) -> None:

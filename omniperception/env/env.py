@@ -97,8 +97,8 @@ class OmniEnv(VecEnv):
             self.difficulty,
             config.stepping,
         )
-        if config.initial_level is not None:
-            self.curriculum_levels = (config.initial_level,) * len(self._curricula())
+        if config.full_level:
+            self.curriculum_levels = (1.0,) * len(self._curricula())
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self._spawn = self._spawn_bounds()
         self._sized = self._find_sized()
@@ -381,7 +381,7 @@ class OmniEnv(VecEnv):
     def _report(self) -> dict[str, float]:
         """Metrics at the end of a log interval."""
         config = self.config
-        if config.initial_level is None:
+        if not config.full_level:
             seconds, error = config.log_interval * self.control_dt, self.metrics.calm_velocity_error()
             for curriculum in self._curricula().values():
                 curriculum.follow(error, seconds)

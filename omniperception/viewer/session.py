@@ -330,6 +330,6 @@ def _watched(task: EnvConfig, policy: str) -> EnvConfig:
         obstacles=with_spares(task.obstacles),
         read_besides=tuple(dict.fromkeys(besides)),
         shows_frames=task.shows_frames and policy not in BASELINES,
-        initial_level=1.0,
+        full_level=True,
         trials=True,
     )

@@ -60,7 +60,7 @@ def test_memory_is_predicted_from_few_environments(make_config):
 def test_memory_of_clouds_that_are_cast_in_parts(make_config):
     """24 environments whose clouds exist 8 at a time; the samplers' memory goes with them."""
     run = make_config("obstacles=static", "num_envs=24", "lidar.num_rays=500", "lidar.cloud_mb=0.13", *TINY[1:])
-    runner = build_runner(replace(run, env=replace(run.env, initial_level=1.0)), None)
+    runner = build_runner(replace(run, env=replace(run.env, full_level=True)), None)
     assert len(runner.env.sensing.lidar.env_slices) == 3
     predicted = {part.name: part.total(24) for part in memory.predict(run)}
     assert predicted["rays"] == pytest.approx(memory.held_bytes(runner)["rays"], rel=0.01)

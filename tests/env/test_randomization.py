@@ -1,11 +1,12 @@
 """The paper's thirteen rows: what each changes, within which range, and that nothing else is changed."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import mujoco
 import pytest
 import torch
 
+from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mirror import Mirror
 from omniperception.lidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
@@ -377,6 +378,12 @@ class TestCurriculum:
         ground = env.world.model.geom("ground").id
         drawn, nominal = env.sim.model_field("geom_solref")[:, ground], env.world.model.geom_solref[ground]
         torch.testing.assert_close(drawn, torch.tensor(nominal).expand(4, -1), atol=1e-4, rtol=1e-6)
+
+    def test_at_full_level_it_is_over_from_the_first_step_on(self, make_env):
+        rising = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=2).config
+        env = OmniEnv(replace(rising, full_level=True, log_interval=1))
+        logs = [env.step(torch.zeros(2, 12))[3]["log"] for _ in range(3)]
+        assert all(log["Metrics/randomization_level"] == log["Metrics/command_level"] == 1.0 for log in logs)
 
     def test_it_rises_while_robots_walk_well_and_lasts_in_a_checkpoint(self, make_env):
         env = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=2)

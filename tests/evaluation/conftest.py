@@ -17,6 +17,6 @@ def make_env() -> MakeEnv:
 
     def make(*overrides: str, trials: bool = True, read_besides: tuple[str, ...] = ()) -> OmniEnv:
         run = build.assemble(config.compose(["rewards=default", "perception=none", *overrides]))
-        return OmniEnv(replace(run.env, initial_level=1.0, trials=trials, read_besides=read_besides))
+        return OmniEnv(replace(run.env, full_level=True, trials=trials, read_besides=read_besides))
 
     return make
