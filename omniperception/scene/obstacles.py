@@ -90,9 +90,9 @@ class ObstaclesConfig:
         clearance: free distance (m) kept at a reset between the robot's centre and an obstacle's edge; what finds no
             place in its area that keeps it is not there in that episode.
         curriculum: None: everything is there from the first step.
-        spacing: free distance (m) kept at a reset between the edges of any two standing obstacles, so that a robot fits
-            through; 0 lets them overlap.
-        free_path: a way to the goal that standing obstacles keep free; None for none.
+        spacing: free distance (m) kept at a reset between the edges of any two standing obstacles that are placed, so
+            that a robot fits through; 0 lets them overlap. Those with poses are not placed, and keep none.
+        free_path: a way to the goal that standing obstacles that are placed keep free; None for none.
         headroom: spacing and free path do not count obstacles that hang at least this high (m).
         split: 'dev' or 'test': the scenes for choosing anything, and those for reports, which no training may see.
             `build.assemble` turns those of 'test' into `held_out` ones; here it chooses the worlds of layouts.
