@@ -14,6 +14,7 @@ from omniperception.env.mdp.terminations import TerminationsConfig
 from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
 from omniperception.lidar import DEVICES, Noise
+from omniperception.lidar.noise import NAMES as NOISE_NAMES
 from omniperception.scene import (
     MapTerrainConfig,
     ObstaclesConfig,
@@ -126,6 +127,7 @@ class EnvConfig:
                 " of the present; use 1, or perception.avoidance_weight=0 and motion_weight=0"
             )
         self._check_measured_noise()
+        self._check_one_noise_of_a_kind()
         if self.base_motion and self.lidar is not None and self.lidar.mount_body is not None:
             raise ValueError(
                 "perception.base_motion=true says how the base moves, but the LiDAR is carried by"
@@ -161,6 +163,17 @@ class EnvConfig:
                 f" is {self.lidar.device or 'null'}; use randomization=device"
             )
 
+    def _check_one_noise_of_a_kind(self) -> None:
+        source = "lidar_measured" if self.randomization.lidar_measured else "lidar_device"
+        of_device = {type(model) for model in self._device_noise}
+        for model in self.randomization.noise:
+            if type(model) in of_device:
+                row = f"lidar_{NOISE_NAMES[type(model)]}"
+                raise ValueError(
+                    f"randomization.{source} and {row} are two models of one kind ({type(model).__name__}); set"
+                    f" {source} to false or {row} to null"
+                )
+
     def requirements(self) -> frozenset[str]:
         """Sensors that must exist before the world is compiled, see `state.requires`."""
         needed = {*self.rewards.requirements(), *self.observations.requirements(), *self.read_besides}
@@ -179,12 +192,16 @@ class EnvConfig:
     @property
     def lidar_noise(self) -> tuple[Noise, ...]:
         """The device's noise, stated or measured, where asked for, and the randomization's."""
-        own: tuple[Noise, ...] = ()
-        if self.lidar is not None and self.lidar.device is not None:
-            device = DEVICES[self.lidar.device]
-            own = device.noise() if self.randomization.lidar_device else own
-            own = device.measured if self.randomization.lidar_measured else own
-        return (*own, *self.randomization.noise)
+        return (*self._device_noise, *self.randomization.noise)
+
+    @property
+    def _device_noise(self) -> tuple[Noise, ...]:
+        if self.lidar is None or self.lidar.device is None:
+            return ()
+        device = DEVICES[self.lidar.device]
+        if self.randomization.lidar_measured:
+            return device.measured
+        return device.noise() if self.randomization.lidar_device else ()
 
     @property
     def casts_frames(self) -> bool:

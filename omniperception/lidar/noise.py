@@ -35,7 +35,7 @@ class MaskNoise:
     def __post_init__(self) -> None:
         _require_share("mask.ratio", self.ratio)
         if not 0.0 <= self.low <= self.high < math.inf:
-            raise ValueError(f"lidar.noise.mask.low={self.low} and high={self.high} must be 0 <= low <= high")
+            raise ValueError(f"noise.mask.low={self.low} and high={self.high} must be 0 <= low <= high")
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class AngularJitter:
     def __post_init__(self) -> None:
         _require_amount("jitter.sigma_deg", self.sigma_deg)
         if self.sigma_deg > 10.0:
-            raise ValueError(f"lidar.noise.jitter.sigma_deg={self.sigma_deg} must be at most 10 degrees")
+            raise ValueError(f"noise.jitter.sigma_deg={self.sigma_deg} must be at most 10 degrees")
 
 
 @dataclass(frozen=True)
@@ -132,11 +132,11 @@ class TabulatedNoise:
         n = len(self.edges) - 1
         if not 1 <= n <= TABLE_BINS or len(self.sigma) != n or len(self.dropout) != n:
             raise ValueError(
-                f"lidar.noise.table has {len(self.edges)} edges, {len(self.sigma)} sigma and {len(self.dropout)}"
+                f"noise.table has {len(self.edges)} edges, {len(self.sigma)} sigma and {len(self.dropout)}"
                 f" dropout; for n ranges (at most {TABLE_BINS}) they must be n + 1, n and n"
             )
         if not self.edges[0] >= 0.0 or any(a >= b for a, b in pairwise(self.edges)) or self.edges[-1] == math.inf:
-            raise ValueError(f"lidar.noise.table.edges={self.edges} must ascend from 0 or more, and be finite")
+            raise ValueError(f"noise.table.edges={self.edges} must ascend from 0 or more, and be finite")
         for sigma in (*self.sigma, self.sigma_elsewhere):
             _require_amount("table.sigma", sigma)
         for share in self.dropout:
@@ -171,10 +171,10 @@ class MixedPixels:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.divergence_deg <= 10.0:
-            raise ValueError(f"lidar.noise.mixed.divergence_deg={self.divergence_deg} must be in 0..10 degrees")
+            raise ValueError(f"noise.mixed.divergence_deg={self.divergence_deg} must be in 0..10 degrees")
         if not 0.0 <= self.min_gap <= self.max_gap < math.inf:
             raise ValueError(
-                f"lidar.noise.mixed.min_gap={self.min_gap} and max_gap={self.max_gap} must be 0 <= min_gap <= max_gap"
+                f"noise.mixed.min_gap={self.min_gap} and max_gap={self.max_gap} must be 0 <= min_gap <= max_gap"
             )
         _require_share("mixed.foreground", self.foreground)
 
@@ -198,10 +198,10 @@ def noise_by_name(noise: Sequence[Noise]) -> dict[str, Noise]:
     for model in noise:
         if type(model) not in NAMES:
             known = ", ".join(kind.__name__ for kind in NAMES)
-            raise ValueError(f"lidar.noise={model!r} must be one of {known}")
+            raise ValueError(f"noise={model!r} must be one of {known}")
         name = NAMES[type(model)]
         if name in named:
-            raise ValueError(f"lidar.noise holds more than one {type(model).__name__}; give at most one of each kind")
+            raise ValueError(f"noise holds more than one {type(model).__name__}; give at most one of each kind")
         named[name] = model
     return named
 
@@ -219,9 +219,9 @@ def max_deviation(noise: Sequence[Noise]) -> float:
 
 def _require_share(name: str, value: float) -> None:
     if not 0.0 <= value <= 1.0:
-        raise ValueError(f"lidar.noise.{name}={value} must be in 0..1")
+        raise ValueError(f"noise.{name}={value} must be in 0..1")
 
 
 def _require_amount(name: str, value: float) -> None:
     if not 0.0 <= value < math.inf:
-        raise ValueError(f"lidar.noise.{name}={value} must be >= 0 and finite")
+        raise ValueError(f"noise.{name}={value} must be >= 0 and finite")

@@ -304,6 +304,18 @@ def test_measured_noise_needs_a_recording(make_config, overrides, message):
         make_config("randomization=lidar_measured", *overrides)
 
 
+@pytest.mark.parametrize(
+    ("row", "model"),
+    [("lidar_gaussian={sigma: 0.05}", "GaussianNoise"), ("lidar_jitter={sigma_deg: 0.1}", "AngularJitter")],
+)
+def test_two_noises_of_one_kind_are_refused_by_their_rows(make_config, row, model):
+    name = row.split("=")[0]
+    with pytest.raises(
+        ValueError, match=rf"randomization\.lidar_device and {name} are two .* \({model}\); set lidar_dev"
+    ):
+        make_config("randomization=device", "lidar=mid360", f"randomization.{row}")
+
+
 def test_the_critic_sees_what_was_drawn(make_env):
     """As the model that the physics has now tells, and mirrored as bodies are."""
     env = make_env("experiment=gait", "terrain=flat", "randomization=paper", num_envs=6)

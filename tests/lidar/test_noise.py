@@ -263,8 +263,8 @@ def test_without_noise_there_is_neither_kernel_nor_copy(pattern):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: make(mid360(), MaskNoise(), MaskNoise()), "more than one MaskNoise"),
-        (lambda: MaskNoise(1.5), "mask.ratio=1.5"),
+        (lambda: make(mid360(), MaskNoise(), MaskNoise()), "^noise holds more than one MaskNoise"),
+        (lambda: MaskNoise(1.5), r"^noise\.mask\.ratio=1\.5"),
         (lambda: MaskNoise(0.1, 0.3, 0.2), "low <= high"),
         (lambda: DistanceNoise(-0.1), "distance.ratio=-0.1"),
         (lambda: GaussianNoise(-0.1), "gaussian.sigma=-0.1"),
