@@ -197,24 +197,18 @@ def test_gravity_offset(one_row):
 class TestLatency:
     def test_the_actor_sees_the_state_of_that_many_physics_steps_ago(self, one_row):
         env = one_row("latency_s", 0.005, 0.045, num_envs=64)
-        history = [env.sim.qpos.float()]
-        physics_step = env.sim.step
-
-        def recorded(target, num_steps, *kinematic):
-            for _ in range(num_steps):
-                physics_step(target)
-                history.append(env.sim.qpos.float())
-            env.sim._records["qpos"] = torch.stack(history[-num_steps:], 1).double().numpy()
-            env.sim._records["qvel"] = env.sim.qvel[:, None].repeat(1, num_steps, 1).numpy()
-
-        env.sim.step = recorded
         generator = torch.Generator().manual_seed(0)
+        positions, velocities = [], []
         for _ in range(6):
             env.step(torch.randn(64, 12, generator=generator))
             assert (env.episode_length_buf > 0).all()
+            qpos, qvel = env.sim.recorded_states()  # after each physics step: tests/sim/test_simulators.py
+            positions += qpos.float().unbind(1)
+            velocities += qvel.float().unbind(1)
         assert set(env.randomizer.delay.tolist()) == set(range(1, 10))
         for i, delay in enumerate(env.randomizer.delay.tolist()):
-            assert torch.equal(env.state.measured.joint_pos[i], history[-1 - delay][i, 7:])
+            assert torch.equal(env.state.measured.joint_pos[i], positions[-1 - delay][i, 7:])
+            assert torch.equal(env.state.measured.joint_vel[i], velocities[-1 - delay][i, 6:])
             assert not torch.equal(env.state.measured.joint_pos[i], env.state.kinematics.joint_pos[i])
 
     @pytest.mark.parametrize("latency", [0.0025, 0.0075, 0.0125, 0.0175])

@@ -5,10 +5,10 @@ import torch
 from omniperception.scene import build_world
 
 
-def simulator(run, engine, num_envs=4):
+def simulator(run, engine, num_envs=4, **options):
     sensors = ("foot_force", "obstacle_contact", "obstacle_force")
     world = build_world(run.env.robot, run.env.terrain, run.env.obstacles, sensors)
-    return engine.build(world, num_envs)
+    return engine.build(world, num_envs, **options)
 
 
 def default_joints(sim):

@@ -51,6 +51,22 @@ def test_a_state_that_was_read_stays_as_it_was(sim):
     assert not torch.equal(sim.robot_state()[1], before[1])
 
 
+def test_recorded_states_are_those_after_each_physics_step(run, engine):
+    """A call of four steps against four calls of one, positions and velocities; twice, so that nothing old is left."""
+    at_once, one_by_one = simulator(run, engine, record_states=True), simulator(run, engine)
+    for each in (at_once, one_by_one):
+        stand(each)
+    for target in targets(at_once, 7, 2):
+        at_once.step(target, 4)
+        states = []
+        for _ in range(4):
+            one_by_one.step(target, 1)
+            states.append(one_by_one.robot_state())
+        for recorded, expected in zip(at_once.recorded_states(), zip(*states, strict=True), strict=True):
+            assert torch.equal(recorded.float(), torch.stack(expected, 1))
+            assert not torch.equal(recorded[:, 2], recorded[:, 3])
+
+
 def test_impulses_of_obstacles_are_those_of_the_contacts(sim, engine):
     """Against mj_contactForce, of a pillar that overlaps one robot and is far from the others."""
     model, steps = sim.world.model, 4
