@@ -109,7 +109,7 @@ class Caster:
         self.rays = RayScene(ray_shapes(scene, triangles), scene.num_envs, len(scene.kinds) + 1, num_threads=1)
         self.lidar = Lidar(self.config, bench.pattern, self.rays, mount_body=len(scene.kinds), outputs=outputs)
         frame, base = self.lidar.frame, len(scene.kinds)
-        place = (self.rays.body_quat, base, self.config.mount_pos, self.config.quat)
+        place = (self.rays.body_pos, self.rays.body_quat, base, self.config.mount_pos, self.config.quat)
         rays = (frame.true_ranges, frame.directions_s, frame.class_id)
         self.sectors = SectorDistances(*rays, *place, OBSTACLE, NEAR, bench.num_sectors, num_threads=1)
         self._poses: dict[float, tuple[torch.Tensor, torch.Tensor]] = {}

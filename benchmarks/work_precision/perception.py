@@ -128,7 +128,7 @@ class Recorder:
         outputs = ("true_ranges", "directions_s", "class_id")
         dense = Lidar(config, pattern, sensing.scene, base, housing, outputs=outputs)
         rays = (dense.frame.true_ranges, dense.frame.directions_s, dense.frame.class_id)
-        place = (sensing.scene.body_quat, base, config.mount_pos, config.quat)
+        place = (sensing.scene.body_pos, sensing.scene.body_quat, base, config.mount_pos, config.quat)
         return dense, SectorDistances(*rays, *place, int(HitClass.OBSTACLE), config.max_range, num_threads=1)
 
     def frames(self, count: int) -> list[Cloud]:

@@ -417,6 +417,7 @@ class LidarSensing:
                 frame.true_ranges,
                 frame.directions_s,
                 frame.class_id,
+                self.scene.body_pos[envs],
                 self.scene.body_quat[envs],
                 self.base,
                 sensor.mount_pos,
@@ -426,7 +427,6 @@ class LidarSensing:
                 num_sectors=out.shape[1],
                 num_threads=num_threads,
                 out=out[envs],
-                body_pos=self.scene.body_pos[envs],
                 carrier=self.carrier,
             )
             launches.append(launch)

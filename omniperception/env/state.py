@@ -296,11 +296,6 @@ class EnvState:
         return self.command if self._command_acceleration is None else self._reference
 
     @lazy
-    def base_lin_acc_b(self) -> torch.Tensor:
-        """(num_envs, 3) m/s^2: change of the linear velocity in the base frame over the control step."""
-        return (self.kinematics.base_lin_vel_b - self.before.base_lin_vel_b) / self.control_dt
-
-    @lazy
     def joint_acc(self) -> torch.Tensor:
         """(num_envs, num_joints) rad/s^2: change of the joint velocity over the control step."""
         return (self.kinematics.joint_vel - self.before.joint_vel) / self.control_dt

@@ -40,7 +40,6 @@ from .patterns import (
     os1,
     os2,
     ouster,
-    select_rows,
     spinning,
     tele15,
     unitree_l1,
@@ -60,7 +59,7 @@ if TYPE_CHECKING:
     from .mujoco import GeomShapes, MujocoScene, geom_shapes
     from .rotations import quat_from_rpy
     from .scene import RayHits, RayScene
-    from .sectors import SectorDistances, sector_distances
+    from .sectors import SectorDistances
     from .sensor import Lidar, LidarConfig, env_slices, ray_bytes
     from .shapes import Shape, ShapeKind
 
@@ -73,7 +72,7 @@ _LOADED_WHEN_USED = {
     "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
     "rotations": ("quat_from_rpy",),
     "scene": ("RayHits", "RayScene"),
-    "sectors": ("SectorDistances", "sector_distances"),
+    "sectors": ("SectorDistances",),
     "sensor": ("Lidar", "LidarConfig", "env_slices", "ray_bytes"),
     "shapes": ("Shape", "ShapeKind"),
 }
@@ -132,8 +131,6 @@ __all__ = [
     "ray_bytes",
     "read_points",
     "read_scans",
-    "sector_distances",
-    "select_rows",
     "spinning",
     "tele15",
     "unitree_l1",

@@ -69,11 +69,6 @@ class DeviceSpec:
     measured: tuple[Noise, ...] = ()
 
     @property
-    def vertical_fov_deg(self) -> float:
-        """Height of the field of view."""
-        return self.elevation_deg[1] - self.elevation_deg[0]
-
-    @property
     def period_s(self) -> float:
         """Time between frames at the usual rate, seconds."""
         return 1.0 / self.frame_hz

@@ -25,6 +25,7 @@ class SectorDistances:
         true_ranges: torch.Tensor,
         directions_s: torch.Tensor,
         class_id: torch.Tensor,
+        body_pos: torch.Tensor,
         body_quat: torch.Tensor,
         base: int,
         mount_pos: tuple[float, float, float],
@@ -34,7 +35,6 @@ class SectorDistances:
         num_sectors: int = 36,
         num_threads: int | None = None,
         out: torch.Tensor | None = None,
-        body_pos: torch.Tensor | None = None,
         carrier: int | None = None,
     ) -> None:
         """Records the launch.
@@ -43,7 +43,8 @@ class SectorDistances:
             true_ranges: Noise-free distances, metres, ``inf`` for a miss, (num_envs, N).
             directions_s: Ray directions in the sensor frame, (num_envs, N, 3).
             class_id: Class that each ray hit, -1 for a miss, (num_envs, N) int32.
-            body_quat: Orientations of bodies in the world, (w, x, y, z), (num_envs, num_bodies, 4) float32.
+            body_pos: Positions of bodies in the world, metres, (num_envs, num_bodies, 3) float32.
+            body_quat: Their orientations, (w, x, y, z), (num_envs, num_bodies, 4) float32.
             base: Which body is the base.
             mount_pos: Sensor position in the frame of the body that carries it, metres.
             mount_quat: Sensor orientation likewise, (w, x, y, z).
@@ -52,7 +53,6 @@ class SectorDistances:
             num_sectors: n, the number of sectors.
             num_threads: CPU threads; None for all cores.
             out: Memory for ``distances``; None allocates it.
-            body_pos: Positions of bodies, metres, (num_envs, num_bodies, 3) float32; needed for a ``carrier``.
             carrier: Which body carries the sensor; None for the base.
         """
         num_envs, num_rays = true_ranges.shape
@@ -70,8 +70,8 @@ class SectorDistances:
             raise ValueError(
                 f"body_quat must be ({num_envs}, bodies, 4) with bodies > base={base}, got {tuple(body_quat.shape)}"
             )
-        if carrier is not None and (body_pos is None or body_pos.shape[:2] != body_quat.shape[:2]):
-            raise ValueError(f"carrier={carrier} needs body_pos of the same bodies as body_quat")
+        if body_pos.shape != (*body_quat.shape[:2], 3):
+            raise ValueError(f"body_pos must be {(*body_quat.shape[:2], 3)}, got {tuple(body_pos.shape)}")
         if out is not None and out.shape != (num_envs, num_sectors):
             raise ValueError(f"out must be ({num_envs}, {num_sectors}), got {tuple(out.shape)}")
         out = torch.empty(num_envs, num_sectors, device=true_ranges.device) if out is None else out
@@ -82,7 +82,7 @@ class SectorDistances:
             wp.from_torch(true_ranges),
             wp.from_torch(directions_s, dtype=wp.vec3),
             wp.from_torch(class_id),
-            wp.from_torch(body_quat[..., 1:].contiguous() if body_pos is None else body_pos, dtype=wp.vec3),
+            wp.from_torch(body_pos, dtype=wp.vec3),
             wp.from_torch(body_quat, dtype=wp.vec4),
             base,
             base if carrier is None else carrier,
@@ -100,43 +100,3 @@ class SectorDistances:
         self.distances.fill_(self._max_distance)
         self._launch()
         return self.distances
-
-
-def sector_distances(
-    true_ranges: torch.Tensor,
-    directions_s: torch.Tensor,
-    class_id: torch.Tensor,
-    base_quat: torch.Tensor,
-    mount_pos: tuple[float, float, float],
-    mount_quat: tuple[float, float, float, float],
-    obstacle_class: int,
-    max_distance: float,
-    num_sectors: int = 36,
-    num_threads: int | None = None,
-) -> torch.Tensor:
-    """``SectorDistances`` of any tensors, once.
-
-    Args:
-        base_quat: Orientation of the base in the world, (w, x, y, z), (num_envs, 4).
-
-    The other arguments are those of ``SectorDistances``.
-
-    Returns:
-        Distances, metres, (num_envs, num_sectors).
-    """
-    if base_quat.shape != (true_ranges.shape[0], 4):
-        raise ValueError(f"base_quat must be ({true_ranges.shape[0]}, 4), got {tuple(base_quat.shape)}")
-    measure = SectorDistances(
-        true_ranges.contiguous(),
-        directions_s.contiguous(),
-        class_id.contiguous(),
-        base_quat.float().contiguous()[:, None],
-        0,
-        mount_pos,
-        mount_quat,
-        obstacle_class,
-        max_distance,
-        num_sectors,
-        num_threads,
-    )
-    return measure() if true_ranges.shape[1] else measure.distances

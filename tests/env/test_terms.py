@@ -83,14 +83,14 @@ def test_a_quantity_that_is_not_read_is_not_computed(make_env):
     computed = set()
     env.step_hooks.append(lambda: computed.update(vars(env.state)))
     env.step(torch.zeros(4, 12))
-    unread = {"heights", "obstacles", "foot_force", "link_force", "foot_motion", "base_lin_acc_b"}
+    unread = {"heights", "obstacles", "foot_force", "link_force", "foot_motion"}
     assert not unread & computed and {"kinematics", "joint_torque", "joint_acc"} <= computed
     before = env.state.kinematics
     assert env.state.kinematics is before  # computed once in a step
     env.step(torch.zeros(4, 12))
     assert env.state.before is before and env.state.kinematics is not before
-    acceleration = (env.state.kinematics.base_lin_vel_b - before.base_lin_vel_b) / 0.02
-    torch.testing.assert_close(env.state.base_lin_acc_b, acceleration)
+    acceleration = (env.state.kinematics.joint_vel - before.joint_vel) / 0.02
+    torch.testing.assert_close(env.state.joint_acc, acceleration)
 
 
 def test_without_obstacles_there_are_none(make_env):

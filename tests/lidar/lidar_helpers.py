@@ -1,9 +1,9 @@
-"""What several tests of the LiDAR need: a cube, rays from arrays, rotations, a crowd of shapes."""
+"""What several tests of the LiDAR need: a cube, rays from arrays, rows of frames, rotations, a crowd of shapes."""
 
 import numpy as np
 import torch
 
-from omniperception.lidar import RayScene, Shape
+from omniperception.lidar import RayScene, Shape, make_selection
 from omniperception.lidar import ShapeKind as K
 
 CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -34,6 +34,15 @@ def one(shapes, origin, direction, **options):
 
 def clock(num_envs, time):
     return torch.full((num_envs,), time, dtype=torch.float64)
+
+
+def select_rows(pattern, time, period_s, num_rays, phase_rows=0, selection=None, frame=0):
+    """(num_envs, num_rays) table rows of frames number `frame` that end at (num_envs,) s; without a selection every
+    k-th."""
+    selection = selection or make_selection(pattern, period_s, num_rays)
+    first = pattern.first_rows(time, period_s, phase_rows)
+    variants = selection.variants(first, torch.as_tensor(frame))
+    return (first[:, None] + selection.offsets[variants]).remainder(pattern.num_rows)
 
 
 def rotate(quat, vectors):

@@ -7,8 +7,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import torch
+from lidar_helpers import select_rows
 
-from omniperception.lidar import ScanPattern, grid, select_rows, vlp16, xt32
+from omniperception.lidar import ScanPattern, grid, make_selection, vlp16, xt32
 
 RATE = 200_000
 
@@ -105,7 +106,7 @@ def test_first_rows_write_into_the_given_tensor(pattern):
         (lambda: ScanPattern(torch.eye(3), torch.zeros(3), torch.zeros(3), 0.0), "points_per_second"),
         (lambda: ScanPattern(torch.eye(3), torch.zeros(2), torch.zeros(3), 1.0), r"directions_s \(M, 3\)"),
         (lambda: ScanPattern(torch.eye(3) * math.nan, torch.zeros(3), torch.zeros(3), 1.0), "finite"),
-        (lambda: select_rows(tiny(), seconds(0.1), 0.1, 2), r"lidar.num_rays=2 must be in 1..1"),
+        (lambda: make_selection(tiny(), 0.1, 2), r"lidar.num_rays=2 must be in 1..1"),
         (lambda: tiny(num_lasers=0), "num_lasers=0 must be at least 1"),
         (lambda: tiny(rows_per_shot=4), "rows_per_shot=4 must divide the 6 rows"),
         (lambda: tiny(origins_s=torch.zeros(5, 3)), r"origins_s must be finite \(6, 3\), got \(5, 3\)"),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from benchmarks.pattern_coverage import selection_coverage
-from omniperception.lidar import ScanPattern, avia, grid, make_selection, mid40, mid360, os1, select_rows, vlp16, xt16
+from omniperception.lidar import ScanPattern, avia, grid, make_selection, mid40, mid360, os1, vlp16, xt16
 from omniperception.lidar.patterns.cells import SphereCells
 from omniperception.lidar.patterns.selection import _one_per_cell, field_cells
 
@@ -22,10 +22,6 @@ def rosette():
 @pytest.fixture(scope="module")
 def selections(rosette):
     return {s: make_selection(rosette, 0.1, 300, s, seed=5) for s in STRATEGIES}
-
-
-def seconds(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
@@ -103,18 +99,6 @@ class TestVariants:
         assert selection.phase_step == 200 and selection.draw_phases(5).tolist() == [0] * 5
 
 
-class TestRows:
-    @pytest.mark.parametrize("strategy", STRATEGIES)
-    def test_rows_are_first_row_plus_offset(self, rosette, selections, strategy):
-        selection = selections[strategy]
-        phase = torch.tensor([0, 399_990])
-        rows = select_rows(rosette, seconds(0.3, 0.3), 0.1, 300, phase, selection, frame=7)
-        first = [20_000, 19_990]
-        variant = selection.variants(torch.tensor(first), torch.tensor([7])).tolist()
-        for row, f, v in zip(rows.tolist(), first, variant, strict=True):
-            assert row == [(f + o) % 400_000 for o in selection.offsets[v].tolist()]
-
-
 class TestStratified:
     def test_equal_solid_angles_give_equal_counts(self):
         """Frames of 2000 directions all over the sphere, 256 rays: an eighth of the sphere holds an eighth of them."""
@@ -188,10 +172,6 @@ class TestCells:
         (lambda p: make_selection(p, 0.1, 10_001, "every_kth"), r"lidar.num_rays=10001 must be in 1..10000"),
         (lambda p: make_selection(p, 0.1, 10_001, "stratified"), r"lidar.num_rays=10001 must be in 1..10000"),
         (lambda p: SphereCells(0.0), "cell_deg=0"),
-        (
-            lambda p: select_rows(p, seconds(0.1), 0.1, 200, selection=make_selection(p, 0.1, 300)),
-            "selection holds 300 rays of 400000 rows, asked for 200 of 400000",
-        ),
     ],
 )
 def test_wrong_selections_are_refused(rosette, make, message):

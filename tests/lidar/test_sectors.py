@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from omniperception.lidar import quat_from_rpy, sector_distances
+from omniperception.lidar import SectorDistances, quat_from_rpy
 from omniperception.lidar import sectors as module
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -22,9 +22,10 @@ def sectors(points_s, classes, base_quat=UPRIGHT, mount_pos=(0.0, 0.0, 0.0), mou
     points = torch.tensor(points_s, dtype=torch.float32).reshape(1, -1, 3)
     ranges = points.norm(dim=-1)
     class_id = torch.tensor(classes, dtype=torch.int32).reshape(1, -1)
-    quat = torch.tensor([base_quat], dtype=torch.float32)
+    pose = torch.zeros(1, 1, 3), torch.tensor([[base_quat]], dtype=torch.float32)
     options = {"obstacle_class": OBSTACLE, "max_distance": 5.0} | options
-    return sector_distances(ranges, points / ranges[..., None], class_id, quat, mount_pos, mount_quat, **options)[0]
+    rays = ranges, points / ranges[..., None], class_id
+    return SectorDistances(*rays, *pose, 0, mount_pos, mount_quat, **options)()[0]
 
 
 def ring(radius=lambda j: 1.0 + j / 36.0):
@@ -88,10 +89,12 @@ def test_wrong_arguments_are_refused(option, value):
 def test_other_numbers_of_rays_are_refused(name, given):
     right = {"directions_s": torch.zeros(2, 5, 3), "class_id": torch.zeros(2, 5, dtype=torch.int32)}
     with pytest.raises(ValueError, match=f"{name} must be"):
-        sector_distances(
+        SectorDistances(
             torch.ones(2, 5),
             *(right | {name: given}).values(),
-            torch.tensor([UPRIGHT] * 2),
+            torch.zeros(2, 1, 3),
+            torch.tensor([[UPRIGHT]] * 2),
+            0,
             (0.0, 0.0, 0.0),
             UPRIGHT,
             obstacle_class=OBSTACLE,

@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from lidar_helpers import clock, closed_shapes, random_quats, rotate
+from lidar_helpers import clock, closed_shapes, random_quats, rotate, select_rows
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -24,7 +24,7 @@ from omniperception.lidar import (
     grid,
     quat_from_rpy,
 )
-from omniperception.lidar.patterns import make_selection, select_rows
+from omniperception.lidar.patterns import make_selection
 
 K = ShapeKind
 

@@ -7,7 +7,7 @@ import warp as wp
 from clouds import MAX_RANGE, random_rays, sample
 
 from omniperception.avoidance.kernels import worst_sectors
-from omniperception.lidar import sector_distances
+from omniperception.lidar import SectorDistances
 from omniperception.lidar.kernels.sectors import sector_minima
 from omniperception.perception import FpsSampler, PdSampler, standing_kernels
 from omniperception.perception.networks.kernels import write_rings
@@ -50,6 +50,7 @@ def test_cuda_measures_the_sectors_that_the_cpu_does():
     classes = torch.randint(-1, 3, ranges.shape, dtype=torch.int32)
     upright = (1.0, 0.0, 0.0, 0.0)
     given = {"mount_pos": (0.3, 0.0, 0.0), "mount_quat": upright, "obstacle_class": 2, "max_distance": 6.0}
-    tensors = (ranges, directions, classes, torch.tensor([upright]).repeat(37, 1))
-    on_gpu = sector_distances(*(t.cuda() for t in tensors), **given)
-    assert torch.allclose(on_gpu.cpu(), sector_distances(*tensors, **given), atol=1e-5)
+    pose = torch.zeros(37, 1, 3), torch.tensor([[upright]]).repeat(37, 1, 1)
+    tensors = (ranges, directions, classes, *pose)
+    on_gpu = SectorDistances(*(t.cuda() for t in tensors), base=0, **given)()
+    assert torch.allclose(on_gpu.cpu(), SectorDistances(*tensors, base=0, **given)(), atol=1e-5)

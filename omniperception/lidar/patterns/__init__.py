@@ -3,7 +3,7 @@
 from .custom import custom
 from .grid import grid, height_scanner
 from .livox import LIVOX, avia, hap, horizon, mid40, mid70, mid360, mid360_measured, tele15
-from .selection import Selection, make_selection, select_rows
+from .selection import Selection, make_selection
 from .spinning import airy, hdl32e, hdl64e, os0, os1, os2, ouster, spinning, vlp16, vlp32c, xt16, xt32
 from .table import ROW_SLACK, ScanPattern
 from .unitree import unitree_l1, unitree_l2
@@ -31,7 +31,6 @@ __all__ = [
     "os1",
     "os2",
     "ouster",
-    "select_rows",
     "spinning",
     "tele15",
     "unitree_l1",

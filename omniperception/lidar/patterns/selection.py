@@ -111,42 +111,6 @@ def make_selection(
     raise ValueError(f"lidar.selection={strategy!r} must be one of {', '.join(get_args(Strategy))}")
 
 
-def select_rows(
-    pattern: ScanPattern,
-    time: torch.Tensor,
-    period_s: float,
-    num_rays: int,
-    phase_rows: torch.Tensor | int = 0,
-    selection: Selection | None = None,
-    frame: torch.Tensor | int = 0,
-) -> torch.Tensor:
-    """Table rows of the frame that ends at ``time``, chosen among the points of [time - period_s, time).
-
-    Args:
-        pattern: The device's table.
-        time: End of the frame, s, (num_envs,) float64.
-        period_s: Length of the frame, s.
-        num_rays: Points kept.
-        phase_rows: Rows by which each environment's device is ahead, int64, (num_envs,) or scalar.
-        selection: From ``make_selection`` for this pattern, period and number; None: every k-th.
-        frame: Number of the frame, scalar or (num_envs,); "stratified" may depend on it.
-
-    Returns:
-        Rows in 0..M-1, (num_envs, num_rays) int64; exact also after 10^6 s.
-    """
-    if selection is None:
-        selection = make_selection(pattern, period_s, num_rays)
-    if selection.num_rays != num_rays or selection.num_rows != pattern.num_rows:
-        raise ValueError(
-            f"selection holds {selection.num_rays} rays of {selection.num_rows} rows, "
-            f"asked for {num_rays} of {pattern.num_rows}"
-        )
-    first = pattern.first_rows(time, period_s, phase_rows)
-    frame = torch.as_tensor(frame, device=time.device)
-    variants = selection.variants(first, frame)
-    return (first[:, None] + selection.offsets.to(time.device)[variants]).remainder_(pattern.num_rows)
-
-
 def _frame_step(num_rows: int, points: int, max_variants: int) -> int:
     """Smallest divisor of the table, and of the frame if possible, that makes at most ``max_variants`` steps of it.
 
