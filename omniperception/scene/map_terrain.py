@@ -411,25 +411,24 @@ def free_places(
 def connected(heights: np.ndarray, climb: float) -> np.ndarray:
     """(rows, cols) int64 number of the ground that each point belongs to: one can walk between points of the same
     number from neighbour to neighbour, whose heights differ by at most `climb`."""
-    rows, cols = heights.shape
-    right, up = (np.zeros(heights.shape, bool) for _ in range(2))
-    right[:, :-1] = np.abs(np.diff(heights, axis=1)) <= climb
-    up[:-1] = np.abs(np.diff(heights, axis=0)) <= climb
-    to_right, to_up = right.ravel(), up.ravel()
-    number = np.full(rows * cols, -1, np.int64)
-    for start in range(rows * cols):
-        if number[start] >= 0:
-            continue
-        number[start] = start
-        front = np.full(1, start)
-        while len(front):
-            left, down = front - 1, front - cols
-            after = [front[to_right[front]] + 1, left[(left >= 0) & to_right[left]]]
-            after += [front[to_up[front]] + cols, down[(down >= 0) & to_up[down]]]
-            reached = np.concatenate(after)
-            front = np.unique(reached[number[reached] < 0])
-            number[front] = start
-    return number.reshape(rows, cols)
+    begins = np.ones(heights.shape, bool)  # runs along rows, which hang together
+    begins[:, 1:] = ~(np.abs(np.diff(heights, axis=1)) <= climb)
+    run = np.cumsum(begins).reshape(heights.shape) - 1
+    up = np.abs(np.diff(heights, axis=0)) <= climb
+    return np.flatnonzero(begins)[_least_linked(int(run[-1, -1]) + 1, run[:-1][up], run[1:][up])][run]
+
+
+def _least_linked(num: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(num,) int64: the least of the numbers 0 to num - 1 that each hangs together with by (L,) links of two."""
+    least = np.arange(num)
+    while len(one):
+        np.minimum.at(least, np.maximum(one, other), np.minimum(one, other))
+        while not np.array_equal(further := least[least], least):
+            least = further
+        one, other = least[one], least[other]
+        apart = one != other
+        one, other = one[apart], other[apart]
+    return least
 
 
 def _around(values: np.ndarray, reach: int, combine: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:

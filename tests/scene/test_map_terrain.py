@@ -1,5 +1,7 @@
 """Terrain from files: heights by hand, rays and physics against mj_ray, places to start, files that are none."""
 
+import time
+
 import mujoco
 import numpy as np
 import pytest
@@ -135,6 +137,35 @@ def test_places_to_start_are_free(files):
     assert not len(free_places(heights, CELL, StartsConfig(radius=4.0)))
     assert len(np.unique(connected(heights, 0.2))) == 4  # two rooms, the wall's top and the block's
     assert len(np.unique(connected(heights, 2.0))) == 1
+
+
+def flooded(heights, climb):
+    """`connected`, point by point: each ground has the number of its first point, row by row."""
+    number = np.full(heights.shape, -1)
+    for start in np.ndindex(heights.shape):
+        front = [start] if number[start] < 0 else []
+        while front:
+            at = front.pop()
+            number[at] = start[0] * heights.shape[1] + start[1]
+            beside = [(at[0] + dy, at[1] + dx) for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0))]
+            inside = [to for to in beside if 0 <= to[0] < heights.shape[0] and 0 <= to[1] < heights.shape[1]]
+            front += [to for to in inside if number[to] < 0 and abs(heights[to] - heights[at]) <= climb]
+    return number
+
+
+@pytest.mark.parametrize("climb", [0.0, 0.2, 0.45, 0.7, 1.0])
+def test_ground_that_hangs_together_is_what_a_flood_reaches(climb):
+    random = np.random.default_rng(0)
+    for shape in ((1, 1), (1, 9), (9, 1), (2, 2), (17, 23), (30, 30)):
+        heights = random.random(shape)
+        assert np.array_equal(connected(heights, climb), flooded(heights, climb))
+
+
+def test_broken_ground_takes_no_walk_from_point_to_point():
+    heights = 10.0 * np.random.default_rng(0).random((400, 400))
+    begun = time.process_time()
+    assert len(np.unique(connected(heights, 0.2))) > 140_000
+    assert time.process_time() - begun < 1.0
 
 
 def test_rays_physics_and_heights_are_the_files(files, make_env):
