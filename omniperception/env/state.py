@@ -15,7 +15,7 @@ from omniperception.common.rotations import rotate, rotate_yaw
 from omniperception.common.vectors import moved_towards
 from omniperception.env.heights import flat_heights
 from omniperception.env.kinematics import Kinematics
-from omniperception.env.mdp.curriculum import FULL, Curriculum
+from omniperception.env.mdp.curriculum import Curriculum
 from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.scene.stepping import stepping_offsets
 
@@ -118,15 +118,15 @@ class EnvState:
         control_dt: float,
         command: Command,
         randomizer: Randomizer,
-        obstacles: ObstacleField | None = None,
-        height_lookup: HeightLookup | None = None,
-        avoidance: Avoidance | None = None,
-        sensing: LidarSensing | None = None,
-        errors: MeasurementErrors | None = None,
-        episode_steps: torch.Tensor | None = None,
-        command_acceleration: Sequence[float] | None = None,
-        difficulty: Curriculum = FULL,
-        stepping: SteppingConfig | None = None,
+        obstacles: ObstacleField | None,
+        height_lookup: HeightLookup | None,
+        avoidance: Avoidance | None,
+        sensing: LidarSensing | None,
+        errors: MeasurementErrors | None,
+        episode_steps: torch.Tensor,
+        command_acceleration: Sequence[float] | None,
+        difficulty: Curriculum,
+        stepping: SteppingConfig | None,
     ) -> None:
         """
         Args:
@@ -144,9 +144,7 @@ class EnvState:
             difficulty: share of the randomization; the less of it, the faster `reference` follows.
             stepping: of `pose`; None: it is the default pose.
         """
-        self._errors = errors
-        steps = torch.zeros(sim.num_envs, dtype=torch.int64, device=sim.device)
-        self._episode_steps = steps if episode_steps is None else episode_steps
+        self._errors, self._episode_steps = errors, episode_steps
         self._velocity_source: Callable[[], torch.Tensor | None] | None = None
         self._asked_source: Callable[[], torch.Tensor | None] | None = None
         self._sim, self._command, self._obstacles, self._height_lookup = sim, command, obstacles, height_lookup
