@@ -216,14 +216,15 @@ class Lidar:
             Which environments, and their frame with as many rows. It lasts until the next slice.
         """
         if not isinstance(time_s, torch.Tensor):
-            if not np.isfinite(time_s).all():
-                raise ValueError(f"time_s={time_s} must be finite, in seconds")
+            _check_finite(time_s)
             time_s = torch.as_tensor(time_s, dtype=torch.float64, device=self.scene.device)
             time_s = time_s.expand(self.scene.num_envs) if time_s.ndim == 0 else time_s
         if time_s.dtype != torch.float64 or time_s.shape != (self.scene.num_envs,):
             raise ValueError(
                 f"time_s must be float64 ({self.scene.num_envs},), got {time_s.dtype} {tuple(time_s.shape)}"
             )
+        if time_s.device.type == "cpu":  # the host would wait for a GPU
+            _check_finite(time_s.numpy())
         self._seek(time_s)
         if self._track is not None:
             self._track.record_end()
@@ -473,6 +474,12 @@ def env_slices(num_envs: int, most: int) -> tuple[slice, ...]:
 def _require_whole(name: str, value: object, least: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}={value!r} must be a whole number >= {least}")
+
+
+def _check_finite(time_s: np.ndarray | float) -> None:
+    wrong = np.asarray(time_s)[~np.isfinite(time_s)]
+    if wrong.size:
+        raise ValueError(f"time_s={wrong.flat[0]} must be finite, in seconds")
 
 
 def _known_outputs(outputs: Sequence[str]) -> frozenset[str]:

@@ -180,7 +180,8 @@ def test_wrong_sensors_are_refused(pattern, num_rays, body, options, message):
         (None, torch.zeros(2), "float64"),
         (2, 0.1, "2 slices; use cast_slices, or envs_at_once=None"),
         (None, math.nan, "time_s=nan must be finite"),
-        (None, np.array([0.1, math.inf, 0.1]), "must be finite"),
+        (None, np.array([0.1, math.inf, 0.1]), "time_s=inf must be finite"),
+        (None, torch.tensor([0.1, math.nan, 0.1], dtype=torch.float64), "time_s=nan must be finite"),
     ],
 )
 def test_wrong_casts_are_refused(pattern, envs_at_once, time, message):

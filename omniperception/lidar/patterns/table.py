@@ -45,8 +45,9 @@ class ScanPattern:
             raise ValueError(f"pattern.num_lasers={self.num_lasers} must be at least 1")
         if self.rows_per_shot < 1 or self.num_rows % self.rows_per_shot:
             raise ValueError(f"pattern.rows_per_shot={self.rows_per_shot} must divide the {self.num_rows} rows")
-        if not torch.isfinite(self.directions_s).all():
-            raise ValueError("pattern.directions_s must be finite")
+        for name in ("directions_s", "elevation", "azimuth"):
+            if not torch.isfinite(getattr(self, name)).all():
+                raise ValueError(f"pattern.{name} must be finite")
         norms = torch.linalg.vector_norm(self.directions_s, dim=1)
         if (norms - 1.0).abs().max() > 1e-4:
             raise ValueError(f"pattern.directions_s must be unit vectors; norms span {norms.min()}..{norms.max()}")
