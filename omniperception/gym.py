@@ -34,8 +34,9 @@ class OmniVectorEnv:
     critic's groups they are a dict: "observations", "frames" (num_envs, history, points, 3) and "frame_count"
     (num_envs, 1), as an exported policy's inputs, and "critic" (num_envs, width of `observations.critic`).
 
-    An action moves joint targets by `robot.action_scale` times itself from the default pose. Beyond the action space a
-    target lies outside of its joint's range; a joint without limits may be moved by pi.
+    An action moves joint targets by `robot.action_scale` times itself from `EnvState.pose`: the default pose, or with
+    `stepping` that of the motion. Beyond the action space a target that counts from the default pose lies outside of
+    its joint's range; a joint without limits may be moved by pi.
 
     Finished environments are reset in the same step. `infos` then has "final_obs", like observations, of the moment
     before the reset, valid where "_final_obs" (num_envs,) is true. In every step `infos` has (num_envs,) bools, whether

@@ -90,8 +90,9 @@ class EnvState:
     Quantities are computed at first use and hold until the environment calls `invalidate`, after the physics steps of a
     control step and again after resets. They describe the newest moment but for these: contact forces and torques are
     those of the last physics step, which describes the state before it (one physics step old); `measured` is as old
-    as the randomized latency, with the randomized errors; `before` is the start of the control step; V_avoid, sector
-    distances and clouds are those of the newest LiDAR frame.
+    as the randomized latency, with the randomized errors; `before` is the start of the control step; sector distances
+    and clouds are those of the newest LiDAR frame, and V_avoid follows from it, with a velocity risk for the command at
+    the control step's end.
 
     What a term keeps of earlier steps belongs to the term, but for the times of the feet's contacts: they are followed
     from the first read on, at every control step.
@@ -409,7 +410,8 @@ class EnvState:
 
     @property
     def avoidance_velocity(self) -> torch.Tensor:
-        """(num_envs, 2) m/s, yaw-aligned frame: V_avoid, chosen at the control step's end. Requires "avoidance"."""
+        """(num_envs, 2) m/s, yaw-aligned frame: V_avoid of the newest frame; with a velocity risk it is chosen again
+        for the command at every control step's end. Requires "avoidance"."""
         return _declared(self._avoidance, AVOIDANCE).velocity
 
     @property

@@ -66,7 +66,7 @@ def test_contacts_are_those_of_a_model_compiled_with_each_environments_sizes(run
     expected = [touched_when_compiled(run, sizes[e], rest[e].numpy(), pos[:, e], quat[:, e]) for e in range(NUM_ENVS)]
     expected = np.stack(expected, 1)
     assert 0.15 < expected.mean() < 0.85
-    assert (felt == expected).mean() > (0.999 if engine.torch_device.type == "cpu" else 0.99), (felt != expected).sum()
+    assert (felt == expected).mean() > 0.999, (felt != expected).sum()
 
 
 def test_one_environments_size_changes_no_other(run, engine):

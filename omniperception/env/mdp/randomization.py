@@ -114,10 +114,10 @@ class PushesConfig:
 class RandomizationConfig:
     """Ranges (low, high) drawn uniformly per environment; null leaves a row out.
 
-    The rows up to `latency_s` are drawn at every reset, and so are scale errors and biases; noise is drawn in
-    every control step. Errors of what is measured change `EnvState.measured` and what is computed of it (the actor's
-    observations, the odometry of LiDAR frames, the levelling of clouds), never the truth that rewards, terminations
-    and the critic see. What is drawn for several axes or joints is drawn for each.
+    The rows from `added_mass` to `latency_s` are drawn at every reset, and so are scale errors and biases; noise is
+    drawn in every control step, and the LiDAR's with every frame. Errors of what is measured change `EnvState.measured`
+    and what is computed of it (the actor's observations, the odometry of LiDAR frames, the levelling of clouds), never
+    the truth that rewards, terminations and the critic see. What is drawn for several axes or joints is drawn for each.
 
     Attributes:
         lidar_device: whether ranges and directions have the noise that the maker of the LiDAR in use states.

@@ -54,7 +54,7 @@ def sector_minima(
     # in and out
     distances: wp.array2d(dtype=wp.float32),
 ):
-    """Nearest horizontal distance of one environment's hits of a class, per azimuth sector, and what was there.
+    """Nearest horizontal distance of one environment's hits of a class, per azimuth sector.
 
     The lanes share an environment's rays.
     """
