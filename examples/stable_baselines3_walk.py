@@ -1,6 +1,6 @@
 """Trains the PPO of Stable-Baselines3 to walk, in environments of `omniperception.make`.
 
-pip install 'omniperception[train,gym]' stable-baselines3
+pip install -e '.[train,gym]' stable-baselines3    # in a checkout
 python examples/stable_baselines3_walk.py --steps 1500000 --num-envs 256
 
 A test has it learn for a few steps. These 1.5 million take six minutes of one core (Intel Xeon; Stable-Baselines3

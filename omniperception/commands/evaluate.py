@@ -8,8 +8,8 @@ A scenario from conf/scenario replaces the run's obstacles, commands, terminatio
 conf/condition its randomization; the run keeps its robot, LiDAR, observations, rewards and networks. Overrides go on
 top. `suite` is a file of conf/suite: scenarios and the terrains that each is run on. Trial k is the same scene for
 every policy and any number of environments. On split=dev the seed is the scenario's; use it to choose anything. On
-split=test the obstacles are of kinds and sizes that no training scene has, the seed follows from the hash of the run's
-weights, and each result is noted in `log`. Policies:
+split=test the obstacles are of sizes beyond the scene's own, half of the boxes, cylinders and spheres of kinds that no
+training scene has, the seed follows from the hash of the run's weights, and each result is noted in `log`. Policies:
 
     run        the run's
     blind      the same, as it acts before its first frame

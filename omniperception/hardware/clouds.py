@@ -121,10 +121,8 @@ class FrameCutter:
         times = np.concatenate([held.times_ns for held in self._held])
         start, end = self._start, self._start + self._period
         now, rest = (times >= start) & (times < end), times >= end
-        if not now.any():
-            end += (
-                (int(times[rest].min()) - end) // self._period * self._period
-            )  # empty periods are passed over at once
+        if not now.any():  # empty periods are passed over at once
+            end += (int(times[rest].min()) - end) // self._period * self._period
         self._start, self._held = end, [Points(points[rest], times[rest])]
         if not now.any():
             return []
