@@ -123,7 +123,9 @@ class SteppedClock:
             os.kill(os.getpid(), signal.Signals[self._signals.pop(0)[1]])
 
 
-@pytest.mark.parametrize("signals", [[(0.3, "SIGINT")], [(0.3, "SIGTERM"), (0.7, "SIGHUP")]])
+@pytest.mark.parametrize(
+    "signals", [pytest.param([(0.3, "SIGINT")], marks=pytest.mark.slow), [(0.3, "SIGTERM"), (0.7, "SIGHUP")]]
+)
 def test_a_signal_while_it_walks_slows_it_down_and_lays_it_down(lockstep, monkeypatch, signals):
     """And a second one changes nothing, as a service manager sends it."""
     robot = walking(lockstep("scenario=static"), 1.0)
