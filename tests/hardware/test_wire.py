@@ -146,19 +146,21 @@ def test_a_signal_while_it_walks_slows_it_down_and_lays_it_down(lockstep, monkey
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_signals_interrupt_once_and_mean_afterwards_what_they_did(name):
     """One that was ignored, as under nohup, stays so."""
-    number, before = signal.Signals[name], [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)]
-    with control.interruptible():
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), number)
-        os.kill(os.getpid(), number)
-    assert [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGHUP)] == before
-    signal.signal(number, signal.SIG_IGN)
+    both = (signal.SIGTERM, signal.SIGHUP)
+    number, before = signal.Signals[name], [signal.signal(one, signal.SIG_DFL) for one in both]
     try:
+        with control.interruptible():
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), number)
+            os.kill(os.getpid(), number)
+        assert [signal.getsignal(one) for one in both] == [signal.SIG_DFL] * 2
+        signal.signal(number, signal.SIG_IGN)
         with control.interruptible():
             os.kill(os.getpid(), number)
         assert signal.getsignal(number) is signal.SIG_IGN
     finally:
-        signal.signal(number, before[number == signal.SIGHUP])
+        for one, handler in zip(both, before, strict=True):
+            signal.signal(one, handler)
 
 
 def unplugged(robot):
