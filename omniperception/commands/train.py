@@ -140,7 +140,7 @@ def learn(
         trust: packages of one's own whose names the configurations of `init` and the teacher may build.
     """
     torch.set_flush_denormal(True)  # gradients of faint activations are, and one convolution took 40 times as long
-    runner = build.build_runner(run, run_dir)
+    runner, composed = build.build_runner(run, run_dir), OmegaConf.create(run.composed)
     if resume:
         if not runner.load(latest_checkpoint(run_dir)):
             report("its task is another now: new episodes begin")
@@ -153,14 +153,15 @@ def learn(
             given = [config.find_run(name, "init") for name in run.init]
             observed = build.load_run(given[-1], trust=trust).env.observations
             for source in runner.start_from(*given, observations=observed):
-                _report_other_sampler(OmegaConf.create(run.composed), source)
-            _report_other_terms(run, given[-1], "init")
+                _report_other_sampler(composed, source)
+            _report_other_terms(composed, given[-1], "init")
         report(f"run directory: {run_dir}")
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
-        name = run.distillation.teacher
-        _check_motion(OmegaConf.create(run.composed), name, "distillation.teacher")
-        _report_other_terms(run, config.find_run(name, "distillation.teacher"), "distillation.teacher")
-        runner.alg.learn_from(build.load_teacher(config.find_run(name, "distillation.teacher"), runner.env, trust))
+        name, key = run.distillation.teacher, "distillation.teacher"
+        teacher = config.find_run(name, key)
+        _check_motion(composed, name, key)
+        _report_other_terms(composed, teacher, key)
+        runner.alg.learn_from(build.load_teacher(teacher, runner.env, trust))
 
     def save(plan: Plan) -> None:
         plan.save(run_dir)
@@ -206,9 +207,9 @@ def _report_other_sampler(composed: DictConfig, source: Path) -> None:
         report(f"init={source}: its perception was learned from another sampler ({changes}) and goes on from there")
 
 
-def _report_other_terms(run: build.RunConfig, source: Path, name: str) -> None:
+def _report_other_terms(composed: DictConfig, source: Path, name: str) -> None:
     """Says where what a policy observes has other parameters, such as a scale, than in the run that it comes from."""
-    own, given = (_terms(one) for one in (OmegaConf.create(run.composed), config.read(source)))
+    own, given = (_terms(one) for one in (composed, config.read(source)))
     for term, parameters in own.items():
         if term in given and (changes := _changes(given[term], parameters)):
             report(f"{name}={source}: what it observes as {term} is made otherwise here ({changes})")

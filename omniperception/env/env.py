@@ -185,7 +185,8 @@ class OmniEnv(VecEnv):
         everybody = len(env_ids) == self.num_envs
         if seeds is not None:
             self.random.seed(env_ids, seeds)
-            self.step_count = 0 if everybody else self.step_count
+            if everybody:
+                self.step_count = 0
         time_begins = everybody and self.step_count == 0
         if time_begins and self.sensing is not None:
             self.sensing.lidar.reset()

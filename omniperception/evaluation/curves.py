@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,9 +15,10 @@ from omegaconf import OmegaConf
 from omniperception import config
 from omniperception.common.errors import ConfigError
 from omniperception.common.figures import new_figure
+from omniperception.evaluation.records import training_of
 
 MAY_DIFFER = ("seed", "logger", config.SEARCH_PATH)
-"""Keys of a configuration in which runs of one curve may differ; `init` may in the seed of a study's run."""
+"""Keys of a configuration in which runs of one curve may differ; those in `init` may be seeds of one training."""
 UNITS = {
     "velocity_error": "m/s",
     "calm_velocity_error": "m/s",
@@ -57,7 +57,8 @@ def by_recipe(runs: Sequence[Path]) -> dict[str, list[Path]]:
         made = OmegaConf.to_container(config.read(run))
         assert isinstance(made, dict)
         kept = {key: value for key, value in made.items() if key not in MAY_DIFFER}
-        kept["init"] = re.sub(r"/seed\d+(?=\W|$)", "", str(made.get("init")))
+        init = made.get("init") or []
+        kept["init"] = [training_of(name) for name in ([init] if isinstance(init, str) else init)]
         groups.setdefault(json.dumps(kept, sort_keys=True), []).append(run)
     named: dict[str, list[Path]] = {}
     for same in groups.values():

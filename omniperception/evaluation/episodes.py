@@ -29,9 +29,10 @@ def run_episodes(
     """Runs trials 0 to num_trials - 1: an environment whose trial has ended takes the next one.
 
     The scene of a trial depends on its number alone (`TrialRandom`), and every trial that has begun is run to its end.
-    So neither the number of environments nor the length of other trials decides which scenes are measured; what a
-    policy that sees meets there is decided by them as well: frames come in time with all environments, and the LiDAR's
-    noise belongs to an environment. One that finds no trial left goes on unobserved until the last one has ended.
+    So which scenes are measured depends neither on the number of environments nor on the length of other trials. The
+    outcomes of a policy that sees do depend on both: frames are cast at the same control steps for all environments,
+    wherever their trials are, and each environment draws its own LiDAR noise. An environment that finds no trial left
+    goes on unobserved until the last one has ended.
 
     Args:
         env: freshly built with `EnvConfig.trials`: every environment at the start of its first trial.

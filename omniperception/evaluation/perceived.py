@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 
-from omniperception.avoidance.sector_motion import FAINT, NEARNESS_RANGE, decode
+from omniperception.avoidance.sector_motion import decode
 from omniperception.avoidance.velocity import SECTOR_TARGET
 from omniperception.env.config import HEIGHT_TARGET
 from omniperception.env.env import OmniEnv
@@ -58,9 +58,7 @@ def perceived(actor: nn.Module, observations: TensorDict, command: torch.Tensor,
         sectors = decode(actor.read_out.motion(embedding))[0]
         risk = features[0, actor.perception.feature_dim :]
     elif SECTOR_TARGET in actor.supervision:
-        nearness = embedding[0, parts[SECTOR_TARGET]].clamp(max=1.0)
-        distance = torch.where(nearness < FAINT, torch.inf, NEARNESS_RANGE * (1.0 - nearness))
-        sectors = functional.pad(distance[:, None], (0, 2))  # nothing moves
+        sectors = decode(functional.pad(embedding[:, parts[SECTOR_TARGET], None], (0, 2)))[0]  # nothing moves
     if actor.read_out is not None:
         velocity = actor.read_out.velocity(features, command[env_id, None, :2])[0]
     return Perceived(_array(sectors), _array(risk), _array(velocity), _array(heights))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -82,6 +83,12 @@ class Record:
         named = {name: rest.pop(name) for name in (*_KEY, "condition_version", "weights", "seed")}
         episodes = Episodes.from_columns(rest.pop("outcomes"), rest.pop("us_per_env_step"))
         return cls(**named, facts=rest, episodes=episodes)
+
+
+def training_of(run: str) -> str:
+    """The training that a run belongs to: one in a folder seed<n> is a seed of what the folder above names."""
+    path = Path(run)
+    return str(path.parent if re.fullmatch(r"seed\d+", path.name) else path)
 
 
 def write(path: Path, records: Iterable[Record]) -> None:

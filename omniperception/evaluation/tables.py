@@ -23,7 +23,7 @@ import torch
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
-from omniperception.evaluation.records import Record, read
+from omniperception.evaluation.records import Record, read, training_of
 from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, table, without_constants
 from omniperception.evaluation.study_report import study_table
 from omniperception.evaluation.walking_report import level_table, run_table, walking_table
@@ -118,10 +118,10 @@ def by_training(records: Sequence[Record]) -> str:
 
     A run in a folder seed<n> is one of the training that the folder above it names, any other its own.
     """
-    trainings = list(dict.fromkeys(_training(record) for record in records))
+    trainings = list(dict.fromkeys(training_of(record.run) for record in records))
     rows = []
     for key, here in sorted(grouped(records, "terrain", "condition", "policy").items()):
-        of_each = [[record for record in here if _training(record) == training] for training in trainings]
+        of_each = [[record for record in here if training_of(record.run) == training] for training in trainings]
         worlds = sorted({record.world for record in here})
         for world in worlds:
             rows.append([world, *key, *(_untouched([r for r in theirs if r.world == world]) for theirs in of_each)])
@@ -130,11 +130,6 @@ def by_training(records: Sequence[Record]) -> str:
             rows.append([f"all {len(worlds)}", *key, *(_untouched(theirs) for theirs in everywhere)])
     keys = ["world", "terrain", "condition", "policy"]
     return _titled(records, "reached, untouched and without a fall, %", keys, trainings, rows)
-
-
-def _training(record: Record) -> str:
-    run = Path(record.run)
-    return str(run.parent if re.fullmatch(r"seed\d+", run.name) else run)
 
 
 def _over_worlds(records: Sequence[Record], row: str, column: str, columns: list[str]) -> str:

@@ -99,7 +99,7 @@ class FrameCutter:
         self._held: list[Points] = []
 
     def add(self, given: Points) -> list[Frame]:
-        """Frames that are complete, oldest first; a period without any point gives none, however many there are."""
+        """Frames that are complete, oldest first; periods without any point give none."""
         if not len(given.times_ns):
             return []
         first, last = int(given.times_ns.min()), int(given.times_ns.max())
@@ -158,8 +158,8 @@ class _Cdr:
 
 
 _TIME_FIELDS = ("timestamp", "offset_time", "time", "t")
-_LATEST = 2.0**62
-"""ns; no clock of a sensor is there, and sums of two such times fit int64."""
+LATEST_NS = 2**62
+"""146 years; no clock of a sensor is there, and the sum of two such times fits int64."""
 _CUSTOM_POINT = np.dtype(
     {
         "names": ["offset_time", "xyz", "tag"],
@@ -178,7 +178,8 @@ def read_point_cloud2(data: bytes) -> Points:
     seconds, after the header's stamp.
 
     Raises:
-        DeployError: the message is cut off, big-endian, lacks x, y, z or a time, or has a time that is none.
+        DeployError: the message is cut off, big-endian, lacks x, y, z or a time, or has times that are not
+            finite or that no clock shows.
     """
     try:
         return _point_cloud2(data)
@@ -222,9 +223,10 @@ def _point_cloud2(data: bytes) -> Points:
     points[~np.isfinite(points).all(axis=1)] = 0.0
     times = rows[time_field]
     if times.dtype.kind == "f":
-        is_none = ~(abs(times.astype(np.float64)) < _LATEST * (1.0 if time_field == "timestamp" else 1e-9))
-        if is_none.any():
-            raise DeployError(f"PointCloud2: finite numbers were expected in {time_field}, {times[is_none][0]!r} given")
+        latest = LATEST_NS * (1.0 if time_field == "timestamp" else 1e-9)
+        wrong = times[~(abs(times.astype(np.float64)) < latest)]
+        if wrong.size:
+            raise DeployError(f"PointCloud2: finite numbers were expected in {time_field}, {wrong[0]!r} given")
     if time_field == "timestamp":
         if times.dtype.kind == "f" and (times != np.floor(times)).any():
             raise DeployError(

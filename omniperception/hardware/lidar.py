@@ -123,7 +123,7 @@ def _in_one_time(message: Points) -> Points:
     """The message, whose points were measured within a second of each other; a DeployError otherwise."""
     span_s = 1e-9 * float(np.ptp(message.times_ns)) if len(message.times_ns) else 0.0
     if span_s > 1.0:
-        raise DeployError(f"a message's points span {span_s:.3g} s, at most 1 s was expected; a point's time is none")
+        raise DeployError(f"a message's points span {span_s:.3g} s, at most 1 s was expected; see the driver's times")
     return message
 
 

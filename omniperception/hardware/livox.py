@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omniperception.deploy.description import DeployError
+from omniperception.hardware.clouds import LATEST_NS
 
 DETECTION_PORT, POINT_PORT = 56000, 56300
 """Of the sensor: discovery, and where points come from."""
@@ -59,12 +60,11 @@ class Packet:
 
 
 def read_points(data: bytes) -> Packet | None:
-    """A packet of points; None for what is none of Cartesian points, is cut off, or is from a time of 2^62 ns or more,
-    146 years, which no clock shows."""
+    """A packet of points; None for what is none of Cartesian points, is cut off, or is from `LATEST_NS` or later."""
     if len(data) < _POINTS.size:
         return None
     _, length, interval, count, number, _, kind, _, _, _, time_ns = _POINTS.unpack_from(data)
-    if kind not in _KINDS or time_ns >= 2**62:
+    if kind not in _KINDS or time_ns >= LATEST_NS:
         return None
     dtype, metres = _KINDS[kind]
     if length != len(data) or len(data) != _POINTS.size + count * dtype.itemsize or not count:

@@ -23,9 +23,9 @@ class PerceptionActor(EstimatingModel):
     """An MLP on one-dimensional observation groups and the embedding of the LiDAR history.
 
     While it acts, the embedding is computed without gradients, once per LiDAR frame: as long as it is given the same
-    tensor ``frame_tick``. :meth:`reset` forgets it, which is due when weights change. In an
-    update each distinct window of a :class:`WindowedObservations` is embedded once. An environment without a frame
-    since its reset gets the network's embedding of an empty history.
+    tensor ``frame_tick``. :meth:`reset` forgets it, which is due when weights change. In an update each distinct window
+    of a :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the
+    network's embedding of an empty history.
 
     With ``end_to_end`` the supervised loss joins whatever loss is back-propagated through the actor (paper, Sec. 3.3.1:
     privileged height supervision). It is the mean squared error between an observation group and the part of the

@@ -61,8 +61,8 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
     alike = "observations (groups, history and what is estimated), ppo.hidden_dims and ppo.obs_normalization"
     state, copies = model.state_dict(), []
     optional = {name for name in state if name.startswith(_OPTIONAL)}
-    fits = with_perception and bool(optional)
-    fits = fits and all(name in weights and weights[name].shape == state[name].shape for name in optional)
+    alike_shaped = (name in weights and weights[name].shape == state[name].shape for name in optional)
+    fits = with_perception and bool(optional) and all(alike_shaped)
     for name in [name for name in state if fits or name not in optional]:
         own, other = state[name], weights.get(name)
         if name == _FIRST_LAYER and other is not None and not fits:

@@ -115,7 +115,7 @@ def test_levels_are_logged(make_env):
 
 
 def test_levels_outlast_resets_of_all_with_seeds(make_env):
-    """Time begins anew; the curriculum goes on from where it was, and a step of standing takes at most one level."""
+    """Time restarts; the curriculum keeps its levels, but for the one that a step of standing may take."""
     env = make_env("terrain=stairs", "terrain.curriculum.start_level=0", num_envs=8, blind=True)
     levels = torch.tensor([1, 2, 3, 4, 5, 6, 7, 8])
     env.ground.move(torch.arange(8), levels)
