@@ -119,7 +119,8 @@ class SectorTracks:
         self._past = torch.where(
             fresh[:, None, None, None], torch.cat((self._past[:, 1:], place[:, None]), 1), self._past
         )
-        self._merge(distance, place, (velocity * moves[..., None]).gather(1, _pairs(clusters.label)))
+        velocity = (velocity * moves[..., None]).gather(1, _pairs(clusters.label))
+        self._merge(distance, place, velocity, self._unseen + fresh[:, None])
 
     def _width(self, distance: torch.Tensor) -> torch.Tensor:
         """(n, S) m: width of sectors at a distance (m)."""
@@ -156,9 +157,9 @@ class SectorTracks:
         stood = sums_by(clusters.label, (clusters.seen & near).float(), self._sectors)
         return stood >= self.config.stands * clusters.members
 
-    def _merge(self, distance: torch.Tensor, place: torch.Tensor, velocity: torch.Tensor) -> None:
-        """The nearest by sector of what is seen now and what is remembered."""
-        config, was, age = self.config, self._place.norm(dim=-1), self._unseen + 1
+    def _merge(self, distance: torch.Tensor, place: torch.Tensor, velocity: torch.Tensor, age: torch.Tensor) -> None:
+        """The nearest by sector of what is seen now and what is remembered, of `age` (n, S) frames ago."""
+        config, was = self.config, self._place.norm(dim=-1)
         there = distance.gather(1, sector_of(self._place, self._sectors))
         is_near = was < config.blind
         lasts = age <= torch.where(is_near, config.remember_near, config.remember)

@@ -108,6 +108,15 @@ def test_a_lost_frame_lets_things_go_on():
     torch.testing.assert_close(around(after), around(before))
 
 
+def test_any_number_of_lost_frames_ages_nothing():
+    walk, far = Walk(), (2.0, 0.0, 0.1, 0.0, 0.0)
+    first = walk.frame(far)
+    for _ in range(3):
+        kept = walk.frame(fresh=False)
+    torch.testing.assert_close(kept, first)
+    assert walk.frame()[:, 0].isfinite().any() and not walk.frame()[:, 0].isfinite().any()  # as without a loss
+
+
 def test_what_is_near_is_remembered_and_what_is_far_is_not():
     walk = Walk()
     walk.frame((0.6, 0.0, 0.1, 0, 0), (0.0, 2.0, 0.1, 0, 0))
