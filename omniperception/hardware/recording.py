@@ -237,14 +237,18 @@ class Recorder:
         self._writer.write_message(topic, self._schemas[topic], message, log_time=time_ns)
 
     def _write_points(self, time_ns: int, points: Points) -> None:
-        if not len(points.times_ns):
-            return
-        newest = int(points.times_ns.max())
+        jumps = np.flatnonzero(np.abs(np.diff(points.times_ns)) > _CLOCK_JUMP_NS) + 1
+        for part in np.split(np.arange(len(points.times_ns)), jumps):
+            if len(part):
+                self._write_cloud(time_ns, points.points[part], points.times_ns[part])
+
+    def _write_cloud(self, time_ns: int, points: np.ndarray, times_ns: np.ndarray) -> None:
+        newest = int(times_ns.max())
         if self._sensor_start is None or abs(newest + self._sensor_start - time_ns) > _CLOCK_JUMP_NS:
             self._sensor_start = time_ns - newest
-        times = points.times_ns + self._sensor_start
+        times = times_ns + self._sensor_start
         rows = np.zeros(len(times), [("xyz", "<f4", 3), ("t", "<u4")])
-        rows["xyz"], rows["t"] = points.points, times - times.min()
+        rows["xyz"], rows["t"] = points, times - times.min()
         self._write("/lidar/points", time_ns, _cloud(rows, int(times.min()), "lidar"))
 
     def _write_step(self, time_ns: int, step: Step) -> None:

@@ -84,6 +84,19 @@ def test_nothing_is_overwritten_and_a_clock_that_jumps_is_recorded_on(tmp_path):
     assert points[1].times_ns[0] - points[0].times_ns[0] == 10**9
 
 
+def test_a_clock_that_jumps_between_two_points_of_a_step(tmp_path):
+    """By more than the four seconds that nanoseconds of 32 bits hold, and back."""
+    recorder = Recorder(tmp_path / "a.mcap", Described)
+    times = np.array([7 * 10**9, 7 * 10**9 + 5000, 19 * 10**9, 19 * 10**9 + 5000, 7 * 10**9 + 10_000])
+    recorder.points(100.0, Points(np.arange(15, dtype=np.float32).reshape(5, 3), times))
+    recorder.step(Step(100.02, a_state(0), "policy: asked for", np.zeros(3), None, None, np.zeros(12)))
+    recorder.close()
+    points = [event.points for event in events(tmp_path / "a.mcap", Topics()) if event.points is not None]
+    np.testing.assert_array_equal(np.concatenate([p.points for p in points]), np.arange(15).reshape(5, 3))
+    read = np.concatenate([p.times_ns for p in points])
+    np.testing.assert_array_equal(read - read[0], [0, 5000, 0, 5000, 5000])  # the newest of each before the jump is now
+
+
 def test_others_read_it(tmp_path):
     """mcap's own reader, by the definitions in the file."""
     from mcap.reader import make_reader
