@@ -265,7 +265,7 @@ def _count(
     both = (geom >= 0) & (geoms >= 0)
     error = np.zeros(len(ranges))
     error[both] = np.abs(ours[both] - ranges[both]) / (RELATIVE * ranges[both] + ABSOLUTE)
-    right = ((geom >= 0) == (geoms >= 0)) & (error <= 1.0)
+    right = (geom == geoms) & (error <= 1.0)
     tally.rays += len(ranges)
     tally.hits += int((geoms >= 0).sum())
     tally.within += int(right.sum())

@@ -266,7 +266,7 @@ def by_elevation(frame: Frame, spec: DeviceSpec, pattern: ScanPattern) -> list[d
         share = float(((model >= start) & (model < end)).mean())
         seen = inside & frame.seen
         edges = np.radians((max(start, low), min(end, high)))
-        solid_angle = 2.0 * np.pi * float(np.sin(edges[1]) - np.sin(edges[0]))
+        solid_angle = np.radians(spec.horizontal_fov_deg) * float(np.sin(edges[1]) - np.sin(edges[0]))
         rows.append(
             {
                 "elevation from, deg": max(float(start), low),

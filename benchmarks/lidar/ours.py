@@ -58,6 +58,8 @@ class Ours:
 
     def cast(self, frame: int) -> None:
         frame = frame % self.scene.num_frames
+        for _ in range(1, self.lidar.config.motion_segments):
+            self.lidar.record_poses()
         if self.scene.moving:
             self._place(frame)
         self.frame = self.lidar.cast(self._time(frame))

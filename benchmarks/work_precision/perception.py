@@ -24,7 +24,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.env.heights import height_grid
 from omniperception.lidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
 from omniperception.perception import Attitude, PdSampler, PerceptionNetwork, ProximitySampler, Sampler
-from omniperception.scene.rays import HitClass, ray_shapes
+from omniperception.scene.rays import HitClass
 
 from .scene import dense_directions
 
@@ -118,18 +118,17 @@ class Recorder:
 
     def _look_everywhere(self) -> tuple[Lidar, SectorDistances]:
         """A sensor at the same place with rays all over its field of view."""
-        sensing, shapes = self.env.sensing, ray_shapes(self.env.world)
+        sensing = self.env.sensing
         elevation, config = sensing.lidar.pattern.elevation, sensing.config
         directions = dense_directions((float(elevation.min()), float(elevation.max())), DENSE_DEG)
         pattern = ScanPattern.from_directions(directions, len(directions) / config.period_s)
         config = replace(config, num_rays=len(directions), selection="every_kth", motion_segments=0)
-        base = shapes.bodies.index(self.env.world.base_body)
-        housing = shapes.indices(tuple(sensing.config.exclude_geoms))
         outputs = ("true_ranges", "directions_s", "class_id")
-        dense = Lidar(config, pattern, sensing.scene, base, housing, outputs=outputs)
+        dense = Lidar(config, pattern, sensing.scene, sensing.carrier, outputs=outputs)
         rays = (dense.frame.true_ranges, dense.frame.directions_s, dense.frame.class_id)
-        place = (sensing.scene.body_pos, sensing.scene.body_quat, base, config.mount_pos, config.quat)
-        return dense, SectorDistances(*rays, *place, int(HitClass.OBSTACLE), config.max_range, num_threads=1)
+        place = (sensing.scene.body_pos, sensing.scene.body_quat, sensing.base, config.mount_pos, config.quat)
+        kind, carrier = int(HitClass.OBSTACLE), sensing.carrier
+        return dense, SectorDistances(*rays, *place, kind, config.max_range, carrier=carrier, num_threads=1)
 
     def frames(self, count: int) -> list[Cloud]:
         """The next frames while the robots stand and shake a little."""

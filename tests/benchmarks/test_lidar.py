@@ -257,3 +257,13 @@ def test_every_feature_of_the_sensor_is_measured():
     assert {f"output {name}" for name in lidar.OUTPUTS} - {"output ranges"} <= set(cases)
     noises = {type(noise) for case in cases.values() for noise in case.get("noise", ())}
     assert noises == set(get_args(lidar.Noise))
+
+
+@pytest.mark.parametrize("name", ["motion distortion, 1 pieces", "motion distortion, 5 pieces", "all outputs"])
+def test_a_feature_of_the_sensor_is_cast_frame_after_frame(name):
+    scene = obstacle_scene(mid360_scan(2, 40), 3, 4, "smooth")
+    bare, ours = Ours(scene, 1, "cpu"), Ours(scene, 1, "cpu", **feature_cases()[name])
+    for frame in range(3):
+        bare.cast(frame)
+        ours.cast(frame)
+        assert np.isfinite(ours.ranges()).mean() == pytest.approx(np.isfinite(bare.ranges()).mean(), abs=0.1)

@@ -83,6 +83,15 @@ def test_any_name_of_a_frame_comes_back(suffix, frame, tmp_path):
     assert (back.frame, back.time_s) == (frame, 1234.5)
 
 
+@pytest.mark.parametrize("times", [np.array([7.0, 8.0, 9.0]), np.full(3, 7.0)])
+def test_a_column_named_as_the_formats_time_and_a_time_of_numpys(suffix, times, tmp_path):
+    columns = {axis: np.arange(3, dtype=np.float32) for axis in "xyz"} | {"gps_time": times}
+    write_points(tmp_path / f"a{suffix}", table_of(columns, "lidar", np.float64(2.5)))
+    back = read_points(tmp_path / f"a{suffix}")
+    assert (back.frame, back.time_s) == ("lidar", 2.5)
+    np.testing.assert_array_equal(back.points["gps_time"], times)
+
+
 @pytest.mark.parametrize("away", [0.0, 4.5e6])
 def test_points_in_the_coordinates_of_a_survey_come_back(suffix, away, tmp_path):
     """Northings of UTM reach 10,000 km."""
@@ -97,6 +106,9 @@ def test_a_cloud_too_wide_for_las_and_a_time_before_zero_are_refused(tmp_path):
     wide = table_of({axis: np.array([0.0, 5e5]) for axis in "xyz"})
     with pytest.raises(ValueError, match="within 429 km"):
         write_points(tmp_path / "a.las", wide)
+    for name in ("a" * 33, "rückwärts"):
+        with pytest.raises(ValueError, match="at most 32 ASCII characters"):
+            write_points(tmp_path / "a.las", a_table(frame=name))
     with pytest.raises(ValueError, match="time_s=-0.5"):
         write_points(tmp_path / "a.mcap", a_table(time_s=-0.5))
     with pytest.raises(ValueError, match="one line"):

@@ -50,13 +50,20 @@ ANGLES = np.array([[0.0, 10.0], [90.0, -20.0], [-90.0, 0.0], [180.0, 45.0]])
 
 @pytest.mark.parametrize(
     ("name", "header", "rows"),
-    [("scan.csv", "", 4), ("scan.csv", "azimuth_deg,elevation_deg\n", 4), ("one.csv", "", 1), ("scan.npy", "", 4)],
+    [
+        ("scan.csv", "", 4),
+        ("scan.csv", "azimuth_deg,elevation_deg\n", 4),
+        ("scan.csv", "\ufeff", 4),
+        ("scan.csv", "\ufeffazimuth,elevation\n", 4),
+        ("one.csv", "", 1),
+        ("scan.npy", "", 4),
+    ],
 )
 def test_a_users_table(tmp_path, name, header, rows):
     if name.endswith("npy"):
         np.save(tmp_path / name, np.radians(ANGLES).astype(np.float32))
     else:
-        (tmp_path / name).write_text(header + "".join(f"{a},{e}\n" for a, e in ANGLES[:rows]))
+        (tmp_path / name).write_text(header + "".join(f"{a},{e}\n" for a, e in ANGLES[:rows]), encoding="utf-8")
     unit, lasers = ("rad" if name.endswith("npy") else "deg"), min(rows, 2)
     pattern = custom(tmp_path / name, 40.0, unit=unit, num_lasers=lasers, rows_per_shot=lasers)
     assert torch.rad2deg(pattern.elevation).tolist() == pytest.approx([10.0, -20.0, 0.0, 45.0][:rows], abs=1e-4)
@@ -72,6 +79,9 @@ def test_a_users_table(tmp_path, name, header, rows):
         ("scan.csv", "0,0,0\n1,1,1\n", "rad", r"holds \(2, 3\), expected \(M, 2\)"),
         ("scan.csv", "0,0\n1,x\n", "rad", r"row 1 is \[1.0, nan\], expected two numbers"),
         ("scan.csv", "0,0\n1\n", "rad", "cannot be read as numbers"),
+        ("scan.csv", "0,0,\n1,1\n2,2\n", "rad", "cannot be read as numbers"),
+        ("scan.csv", "0.1O,0.2\n1,1\n2,2\n", "rad", r"row 0 is \[nan, 0.2\], expected two numbers"),
+        ("scan.csv", "", "rad", "cannot be read as numbers: it is empty"),
         ("scan.csv", "0,30\n", "rad", "elevation of 30 rad is beyond a right angle.*may have to be deg"),
         ("scan.csv", "0,100\n", "deg", "elevation of 100 deg is beyond a right angle"),
         ("scan.csv", "0,0\n", "turns", "lidar.pattern.unit='turns' must be deg or rad"),

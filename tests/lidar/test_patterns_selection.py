@@ -93,9 +93,11 @@ class TestVariants:
             assert (phases % selection.phase_step == 0).all() and phases.max() < selection.num_rows
             assert len(phases.unique()) > 100
 
-    def test_a_camera_has_no_phase(self):
-        """Its pixels keep their order."""
-        selection = make_selection(grid(20, 10, 90.0, 10.0), 0.1, 200)
+    @pytest.mark.parametrize("strategy", ["every_kth", "stratified"])
+    @pytest.mark.parametrize("num_rays", [200, 90])
+    def test_a_camera_has_no_phase(self, strategy, num_rays):
+        """Its pixels keep their order and are of one instant."""
+        selection = make_selection(grid(20, 10, 90.0, 10.0), 0.1, num_rays, strategy)
         assert selection.phase_step == 200 and selection.draw_phases(5).tolist() == [0] * 5
 
 

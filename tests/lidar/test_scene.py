@@ -173,9 +173,10 @@ def test_general_rays_through_a_thousand_shapes():
 # --- poses -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("reach", [0.0, 1.0])
 @pytest.mark.parametrize("pose_dtype", [torch.float32, torch.float64])
-def test_a_scan_is_what_general_rays_see(pose_dtype):
-    """Every kind of shape in one scene, from a moving sensor, against rays of their own."""
+def test_a_scan_is_what_general_rays_see(pose_dtype, reach):
+    """Every kind of shape in one scene, from a moving sensor, against rays of their own, from one place or many."""
     mesh = TriangleMesh(*random_mesh(np.random.default_rng(0)))
     field = HeightField(np.random.default_rng(1).uniform(0, 1, (9, 12)), 0.8, 0.7, 0.1)
     assets = {ShapeKind.MESH: mesh, ShapeKind.DEFORMABLE: mesh, ShapeKind.HEIGHTFIELD: field}
@@ -191,11 +192,19 @@ def test_a_scan_is_what_general_rays_see(pose_dtype):
         if shape.kind == ShapeKind.DEFORMABLE:
             scene.update_vertices(k, torch.from_numpy(mesh.vertices) * (0.5 + torch.rand(2, 1, 3, generator=generator)))
     config = LidarConfig(num_rays=3000, period_s=0.1, min_range=0.0, max_range=7.0)
-    lidar = Lidar(config, mid360(), scene, len(shapes), outputs=("ranges", "shape_id", "directions_s", "normals_w"))
+    pattern = mid360()
+    if reach:
+        starts = reach * torch.randn(pattern.num_rows, 3, generator=generator)
+        pattern = replace(pattern, origins_s=starts)
+    outputs = ("ranges", "shape_id", "directions_s", "normals_w", "row")
+    lidar = Lidar(config, pattern, scene, len(shapes), outputs=outputs)
     frame = lidar.cast(torch.tensor([0.3, 1.7], dtype=torch.float64))
     quat = torch.nn.functional.normalize(scene.body_quat[:, -1:].double(), dim=-1)
     turned = rotate(quat, frame.directions_s.double())
-    hits = scene.cast(scene.body_pos[:, -1:].expand(2, 3000, 3), turned, max_range=7.0, normals=True)
+    origins = scene.body_pos[:, -1:].double().expand(2, 3000, 3)
+    if reach:
+        origins = origins + rotate(quat, starts[frame.row.long()].double())
+    hits = scene.cast(origins.to(pose_dtype), turned, max_range=7.0, normals=True)
     same = frame.shape_id == hits.shape_id
     assert same.float().mean() > 0.999 and {kinds[k] for k in frame.shape_id.unique() if k >= 0} == set(ShapeKind)
     torch.testing.assert_close(frame.ranges[same], hits.ranges[same], rtol=1e-5, atol=1e-5)

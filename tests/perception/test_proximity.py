@@ -102,6 +102,12 @@ def test_inside_and_outside_of_inference_mode():
     assert torch.equal(sample(proximities, rays, level), inside)
 
 
+@pytest.mark.parametrize("quats", [torch.zeros(3, 4, dtype=torch.float64), torch.zeros(2, 4)])
+def test_attitudes_of_another_type_or_number_are_refused(quats):
+    with pytest.raises(ValueError, match=r"attitude\.base_quat must"):
+        sample(sampler(), random_rays(3, 20), Attitude(quats, MOUNT_POS, quaternion(from_rpy(*MOUNT_RPY))))
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [

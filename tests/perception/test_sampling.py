@@ -210,3 +210,10 @@ class TestInterface:
             FpsSampler(4, max_range=1.0)(ranges, directions, theta, phi, torch.empty(2, 5, 3))
         with pytest.raises(ValueError, match="float32"):
             FpsSampler(4, max_range=1.0)(ranges, directions, theta.double(), phi, torch.empty(2, 4, 3))
+
+    @pytest.mark.parametrize("said", [8, 12])
+    def test_raw_frames_have_as_many_rays_as_was_said(self, said):
+        around = torch.full((2, 16, 3), 7.0)
+        with pytest.raises(ValueError, match=f"frames of {said} rays were said, got 10"):
+            RawSampler(said, max_range=1.0)(*random_rays(2, 10), around[:, :said])
+        assert (around == 7.0).all()

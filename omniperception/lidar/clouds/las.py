@@ -8,6 +8,8 @@ from .table import PointTable, table_of
 
 SCALE = 1e-4
 """Metres to which coordinates are kept."""
+FRAME_BYTES = 32
+"""Of the header's system identifier, which holds the name of the frame."""
 SUFFIX = "_value"
 """Added to a column whose name LAS gives to a number of another type."""
 
@@ -30,8 +32,8 @@ def read(path: Path) -> PointTable:
         values = np.asarray(file[name])
         if name in extra or values.any():
             columns[name.removesuffix(SUFFIX) if name in extra else name] = values
-    times = np.unique(columns.get("gps_time", np.zeros(1)))
-    if len(times) == 1:
+    times = np.unique(file["gps_time"] if "gps_time" in file.point_format.dimension_names else np.zeros(1))
+    if len(times) == 1 and "gps_time" + SUFFIX not in extra:
         columns.pop("gps_time", None)
     return table_of(columns, file.header.system_identifier.rstrip("\0"), float(times[0]) if len(times) == 1 else 0.0)
 
@@ -40,6 +42,8 @@ def write(path: Path, table: PointTable) -> None:
     """Writes LAS 1.4, coordinates to ``SCALE``."""
     import laspy
 
+    if not table.frame.isascii() or len(table.frame) > FRAME_BYTES:
+        raise ValueError(f"{path}: LAS keeps a frame's name of at most {FRAME_BYTES} ASCII characters: {table.frame!r}")
     header = laspy.LasHeader(version="1.4", point_format=6)
     xyz = table.xyz
     missed = ~np.isfinite(xyz).all(axis=1)

@@ -29,6 +29,7 @@ class PointTable:
             raise ValueError(f"points need columns x, y and z; there are {', '.join(names) or 'none'}")
         if not self.frame.isprintable():
             raise ValueError(f"frame={self.frame!r} must be a name in one line of printable characters")
+        object.__setattr__(self, "time_s", float(self.time_s))  # one of NumPy's is written in another way
 
     @property
     def xyz(self) -> np.ndarray:

@@ -279,7 +279,7 @@ def place_shapes(
                 there = near < limits.max_range
                 if kind == PLANE:
                     height = -wp.dot(c, z_axis)
-                    there = there and height >= 0.0
+                    there = there and height >= -slots.reach
                     if size[0] <= 0.0 and size[1] <= 0.0:
                         bound = wp.vec4(-height * z_axis[0], -height * z_axis[1], -height * z_axis[2], 0.0)
                 elif distance > radius * (1.0 + SLACK):

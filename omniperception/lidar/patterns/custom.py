@@ -19,7 +19,7 @@ def custom(
     """A pattern from a file of two columns, azimuth (from x towards y) and elevation (above xy); one row per point.
 
     Args:
-        path: .npy, or .csv with or without a header line; relative to the working directory.
+        path: .npy, or .csv with or without a header line, of names; relative to the working directory.
         points_per_second: Rows are this far apart in time, and the table repeats.
         unit: Of both columns.
         num_lasers: Lasers that fire in turn.
@@ -59,17 +59,16 @@ def _read(path: Path) -> np.ndarray:
         if path.suffix == ".npy":
             return np.asarray(np.load(path), dtype=np.float64)
         if path.suffix == ".csv":
-            return np.genfromtxt(path, delimiter=",", skip_header=_has_header(path), dtype=np.float64, ndmin=2)
+            with path.open(encoding="utf-8-sig") as file:
+                lines = file.readlines()
+            if not lines:
+                raise ValueError("it is empty")
+            return np.genfromtxt(lines[_has_header(lines) :], delimiter=",", dtype=np.float64, ndmin=2)
     except ValueError as error:
         raise ValueError(f"lidar.pattern.path={path} cannot be read as numbers: {str(error).splitlines()[0]}") from None
     raise ValueError(f"lidar.pattern.path={path} must end in .npy or .csv")
 
 
-def _has_header(path: Path) -> int:
-    with path.open() as file:
-        cells = file.readline().split(",")
-    try:
-        [float(cell) for cell in cells]
-    except ValueError:
-        return 1
-    return 0
+def _has_header(lines: list[str]) -> bool:
+    """Whether no cell of the first line begins as a number does."""
+    return not any(cell.strip().lstrip("+-.")[:1].isdigit() for cell in lines[0].split(","))

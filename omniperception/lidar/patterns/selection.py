@@ -35,7 +35,8 @@ class Selection:
         num_rows: Rows of the pattern's table, M.
         phase_step: Phases of environments should be multiples of this many rows. It divides M. For "stratified" it is
             the distance between the frames that the variants were made for (a frame that begins in between gets the
-            nearest one's offsets, and its cells are filled less evenly); otherwise the rows of one shot.
+            nearest one's offsets, and its cells are filled less evenly), whole shots where a frame is; otherwise the
+            rows of one shot.
     """
 
     strategy: Strategy
@@ -105,7 +106,8 @@ def make_selection(
         variants = min(MAX_STRATIFIED_VARIANTS, max(1, MAX_OFFSETS // points))
         frames = pattern.num_rows // math.gcd(pattern.num_rows, points)
         choices = 1 if num_rays == points else min(variants, math.ceil(DISTINCT_FRAMES / frames))
-        step = _frame_step(pattern.num_rows, points, variants // choices)
+        shot = pattern.rows_per_shot if points % pattern.rows_per_shot == 0 else 1
+        step = _frame_step(pattern.num_rows // shot, points // shot, variants // choices) * shot
         offsets = _stratified_offsets(pattern, points, num_rays, step, choices, seed)
         return Selection(strategy, offsets, pattern.num_rows, step)
     raise ValueError(f"lidar.selection={strategy!r} must be one of {', '.join(get_args(Strategy))}")
@@ -114,7 +116,7 @@ def make_selection(
 def _frame_step(num_rows: int, points: int, max_variants: int) -> int:
     """Smallest divisor of the table, and of the frame if possible, that makes at most ``max_variants`` steps of it.
 
-    Frames of a device whose phase is a multiple of such a step begin at multiples of it.
+    All are numbers of shots. Frames of a device whose phase is a multiple of such a step begin at multiples of it.
     """
     for base in (math.gcd(num_rows, points), num_rows):
         if num_rows // base <= max_variants:

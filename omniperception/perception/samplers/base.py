@@ -80,6 +80,10 @@ class Sampler(ABC):
             "out": (n, self.num_points, 3),
         }
         given = {"directions_s": directions_s, "elevation": elevation, "azimuth": azimuth, "out": out}
+        if self.needs_attitude:
+            if attitude is None:
+                raise ValueError(f"{type(self).__name__} needs the attitude of the base")
+            expected["attitude.base_quat"], given["attitude.base_quat"] = (n, 4), attitude.base_quat
         for name, shape in expected.items():
             if tuple(given[name].shape) != shape:
                 raise ValueError(f"sampler: {name} must have shape {shape}, got {tuple(given[name].shape)}")
@@ -88,8 +92,6 @@ class Sampler(ABC):
                 raise ValueError(
                     f"sampler: {name} must be float32 on {ranges.device}, got {tensor.dtype} on {tensor.device}"
                 )
-        if self.needs_attitude and attitude is None:
-            raise ValueError(f"{type(self).__name__} needs the attitude of the base")
         self._sample(ranges, directions_s, elevation, azimuth, out, attitude)
 
     @abstractmethod

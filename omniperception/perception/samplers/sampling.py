@@ -30,6 +30,8 @@ class RawSampler(Sampler):
         return {"num_rays": self.num_points}
 
     def _sample(self, ranges, directions_s, elevation, azimuth, out, attitude) -> None:
+        if ranges.shape[1] != self.num_points:
+            raise ValueError(f"sampler: frames of {self.num_points} rays were said, got {ranges.shape[1]}")
         launch, lanes = _launcher(ranges, self.num_threads), kernels.LANES[ranges.device.type]
         cloud, points = (view(ranges, wp.float32), view(directions_s, wp.vec3)), view(out, wp.vec3)
         launch(kernels.write_raw, lanes, *cloud, 1.0 / self.max_range, lanes, points)
