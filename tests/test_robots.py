@@ -15,6 +15,7 @@ from omniperception.commands import main
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.robots.body import Body
 from omniperception.robots.guess import GUESSED, SURE, Wishes, guess
+from omniperception.robots.preset import text_of
 from omniperception.robots.stand import flat_world, reached_limits, stand
 from omniperception.scene import RobotConfig
 from omniperception.scene.robot_file import compile_robot, read_robot
@@ -273,6 +274,14 @@ def test_a_preset_is_written_and_the_robot_checked_and_trained_with(tmp_path, mo
     assert (tmp_path / "seen" / "picture.png").read_bytes()[:4] == b"\x89PNG"
     env = make_env(f"hydra.searchpath=['file://{tmp_path}']", "robot=spider", "obstacles=none", num_envs=2, blind=True)
     assert env.num_actions == 12 and env.robot.num_joints == 12
+
+
+@pytest.mark.parametrize("name", ["hip #0", "hip: 0", "[hip0]", "0", "on", "a.b c", "- hip"])
+def test_any_name_of_a_joint_is_written_so_that_it_is_read(tmp_path, name):
+    (tmp_path / "biped.xml").write_text(BIPED.replace('"right_hip"', f'"{name}"'))
+    found = guess(tmp_path / "biped.xml", str(tmp_path / "biped.xml"))
+    assert name in found.preset["default_joint_pos"]
+    assert yaml.safe_load(text_of(found, tmp_path / "biped.xml")) == found.preset
 
 
 @pytest.mark.parametrize(

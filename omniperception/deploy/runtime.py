@@ -151,6 +151,8 @@ class ExportedPolicy:
     def thin(self, points: np.ndarray, offsets_s: ArrayLike | None = None) -> np.ndarray:
         """The points of a device's frame that training would have kept, by the time of their measurement.
 
+        Of what was trained with `lidar.selection=stratified`, as many, spread over the frame.
+
         Args:
             points: (n, 3) m; misses are zero, or left out.
             offsets_s: (n,) seconds of each point since the frame began; None: row k is the k-th that the device
@@ -169,6 +171,8 @@ class ExportedPolicy:
             numbers = np.arange(len(points))
         else:
             numbers = np.rint(np.asarray(offsets_s) * (lidar.points_per_frame / lidar.period_s)).astype(np.int64)
+            order = np.argsort(numbers, kind="stable")  # those of one time are of lasers that fire together, in order
+            numbers[order] += np.arange(len(numbers)) - np.searchsorted(numbers[order], numbers[order])
         rays = self._rays
         inside = (numbers >= 0) & (numbers < len(rays))
         rows = rays[numbers[inside]]
@@ -381,8 +385,11 @@ class ExportedPolicy:
 def _rays_of_points(lidar: Lidar) -> np.ndarray:
     """(points_per_frame,) which of training's rays each point of a device's frame is, -1: none."""
     count = np.arange(lidar.num_rays)
-    evenly = count * lidar.points_per_frame // lidar.num_rays
-    kept = evenly if lidar.keep_every is None else count * lidar.keep_every
+    if lidar.keep_every is None:  # one of each part of the frame, so that it is not always the same laser's
+        edges = np.arange(lidar.num_rays + 1) * lidar.points_per_frame // lidar.num_rays
+        kept = np.random.default_rng(0).integers(edges[:-1], edges[1:])
+    else:
+        kept = count * lidar.keep_every
     rays = np.full(lidar.points_per_frame, -1)
     rays[kept] = count
     return rays

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -46,10 +47,15 @@ def _wrapped(text: str) -> list[str]:
 def _shown(key: str, value: object) -> list[str]:
     """A key: lists in lines of their width, mappings and lists of lists with a line for each item."""
     if isinstance(value, Mapping):
-        return [f"{key}:", *(line for name, item in value.items() for line in _item(f"  {name}: ", item))]
+        return [f"{key}:", *(line for name, item in value.items() for line in _item(f"  {_name(name)}: ", item))]
     if isinstance(value, list) and value and isinstance(value[0], list):
         return [f"{key}:", *(line for item in value for line in _item("  - ", item))]
     return _item(f"{key}: ", value)
+
+
+def _name(name: str) -> str:
+    """A key, quoted where YAML would read it as something else."""
+    return yaml.safe_dump(name, width=math.inf).removesuffix("\n").removesuffix("\n...")
 
 
 def _item(head: str, value: object) -> list[str]:

@@ -255,6 +255,10 @@ class BlocksLayout:
         return np.column_stack((local @ turn.T, np.full(2, yaw), half_x, widths / 2, heights))
 
 
+_BARN_BATCHES = 500
+"""Batches of 64 worlds of barn that are drawn before the settings count as impossible."""
+
+
 @dataclass(frozen=True)
 class BarnLayout:
     """Cluttered fields from a cellular automaton, as BARN's (Perille et al. 2020, arXiv 2008.13315).
@@ -304,9 +308,11 @@ class BarnLayout:
             raise ValueError(f"obstacles: smoothing={list(self.smoothing)} of barn must be numbers of steps")
         if not 0 <= self.robot < self.cells[1] // 2:
             raise ValueError(f"obstacles: robot={self.robot} of barn must be cells, fewer than half the field's width")
-        for key in ("cell", "lead", "boxes"):
+        for key in ("cell", "lead"):
             if getattr(self, key) <= 0:
                 raise ValueError(f"obstacles: {key}={getattr(self, key)} of barn must be positive")
+        if self.boxes < 2:
+            raise ValueError(f"obstacles: boxes={self.boxes} of barn must be 2 or more, as both its edges are filled")
         _check_not_negative(self, "depth")
         _check_worlds(self)
 
@@ -347,7 +353,7 @@ class BarnLayout:
     def _grid(self, rng: np.random.Generator, world: int, num_worlds: int) -> np.ndarray:
         settings = list(itertools.product(self.fill, self.smoothing))
         fill, steps = settings[world * len(settings) // num_worlds]
-        for batch in itertools.chain((4, 16), itertools.repeat(64)):  # of thick ones one in hundreds lets a robot pass
+        for batch in (4, 16, *[64] * _BARN_BATCHES):  # of thick ones one in a thousand lets a robot pass
             grids = rng.random((batch, *self.cells)) < fill
             grids[:, :, [0, -1]] = True
             for _ in range(steps):
@@ -355,7 +361,10 @@ class BarnLayout:
             for grid in grids[passable(grids, self.robot)]:
                 if len(rectangles(grid)) <= self.boxes:
                     return grid
-        raise AssertionError("batches never end")
+        raise ValueError(
+            f"obstacles: none of {64 * _BARN_BATCHES} worlds of barn with boxes={self.boxes} or fewer lets a robot of"
+            f" {2 * self.robot + 1} cells through; lower fill={fill} or robot={self.robot}, or raise boxes"
+        )
 
 
 @lru_cache(maxsize=4)

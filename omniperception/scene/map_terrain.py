@@ -286,6 +286,9 @@ class PlaceConfig(MapTerrainConfig):
         heights[empty] = heights[~empty].min() if self.outside is None else self.outside
         return heights, (float(low[0]), float(low[1]))
 
+    def floor(self, heights: np.ndarray) -> np.ndarray:
+        return heights < (math.inf if self.ceiling is None else self.ceiling)  # not where walls are cut
+
     @property
     def _up(self) -> str:
         return self.up or ("y" if Path(self.file).suffix.lower() == ".glb" else "z")
@@ -348,8 +351,9 @@ def read_array(file: str) -> np.ndarray:
 def seen_from_above(corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: float | None) -> np.ndarray:
     """Heights (R, C) of the highest surface of a mesh above points x (C,), y (R,), evenly spaced; -inf above nothing.
 
-    With a ceiling, surfaces above it do not count, and where an odd number of them is above a point, the point is
-    within a solid that goes through the ceiling: there the height is the ceiling's.
+    With a ceiling, surfaces above it do not count. Where an odd number of them is above a point and the lowest of them
+    faces up, the point is within a solid that goes through the ceiling: there the height is the ceiling's. (A single
+    surface that faces down is a room's own ceiling.)
 
     Args:
         corners: (T, 3, 3) m, of triangles.
@@ -357,6 +361,7 @@ def seen_from_above(corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: 
         ceiling: m, or None.
     """
     heights, within = np.full((len(y), len(x)), -np.inf), np.zeros((len(y), len(x)), bool)
+    lowest, faces_up = np.full_like(heights, np.inf), np.zeros_like(within)
     spacing = x[1] - x[0], y[1] - y[0]
     x, y = (at + share * step for at, share, step in zip((x, y), _OFF_LINE, spacing, strict=True))
     low, high = corners.min(1), corners.max(1)
@@ -375,7 +380,9 @@ def seen_from_above(corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: 
         above = inside & (z > ceiling) if ceiling is not None else np.zeros_like(inside)
         heights[window] = np.where(inside & ~above, np.maximum(heights[window], z), heights[window])
         within[window] ^= above
-    return heights if ceiling is None else np.where(within, ceiling, heights)
+        faces_up[window] = np.where(above & (z < lowest[window]), area[k] > 0.0, faces_up[window])
+        lowest[window] = np.where(above, np.minimum(lowest[window], z), lowest[window])
+    return heights if ceiling is None else np.where(within & faces_up, ceiling, heights)
 
 
 def free_places(

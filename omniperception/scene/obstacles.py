@@ -86,7 +86,7 @@ class ObstaclesConfig:
         area: (x_low, x_high, y_low, y_high) in m: where obstacles are placed and move. With boundary 'bounce' it lies
             around the environment's origin, with 'wrap' around the robot.
         boundary: 'bounce': obstacles turn back at the area's edge; 'wrap': one that leaves the area enters it again
-            at the opposite edge, so that a robot can walk for ever among them.
+            at the opposite edge, however near that is to the robot, so that a robot can walk for ever among them.
         clearance: free distance (m) kept at a reset between the robot's centre and an obstacle's edge; what finds no
             place in its area that keeps it is not there in that episode.
         curriculum: None: everything is there from the first step.

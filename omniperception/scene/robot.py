@@ -263,7 +263,7 @@ class RobotConfig:
             self._set_joint(joint)
             actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             actuator.set_to_position(kp=kp, kv=kv)
-            actuator.forcerange = [-limit, limit]
+            actuator.forcerange, actuator.forcelimited = [-limit, limit], mujoco.mjtLimited.mjLIMITED_TRUE
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # a URDF's effort would cap it besides
         self._add_self_collision(spec)
         return spec
@@ -343,6 +343,8 @@ class RobotConfig:
             return self.base_height
         model = self.compiled()
         data = mujoco.MjData(model)
+        start = model.jnt_qposadr[model.body(self.base).jntadr[0]]
+        data.qpos[start + 3 : start + 7] = 1.0, 0.0, 0.0, 0.0  # upright, however the file has it
         for name, angle in self.default_joint_pos.items():
             data.joint(name).qpos = angle
         mujoco.mj_kinematics(model, data)

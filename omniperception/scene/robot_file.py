@@ -16,13 +16,26 @@ _FREE, _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE,
 _READABLE = (".stl", ".obj", ".msh")
 ROUNDING = 1e-3
 """rad: by which a rounded angle may lie beyond the end of its range."""
+_PLACE, _LOOK = ("pos", "quat", "alt", "fromto", "size", "type"), ("rgba", "material", "group")
+_TOUCH = ("margin", "gap", "condim", "friction", "solref", "solimp")
+_LIMITS = ("ctrllimited", "ctrlrange", "forcelimited", "forcerange", "actlimited", "actrange", "inheritrange")
+_DRIVE = ("gear", "dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm", "cranklength", "lengthrange")
+_DEFAULTS = {
+    "geom": _PLACE + _LOOK + _TOUCH + ("contype", "conaffinity", "priority", "solmix", "meshname", "hfieldname"),
+    "site": _PLACE + _LOOK,
+    "mesh": ("scale", "refpos", "refquat", "maxhullvert"),
+    "pair": (*_TOUCH, "solreffriction"),
+    "actuator": (*_LIMITS, *_DRIVE, "actearly", "group"),
+}
+"""What a file's main default class may say of elements that are added to the robot's."""
 _LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 
 
 def read_robot(path: Path) -> mujoco.MjSpec:
     """The robot of a file; a URDF's root link floats.
 
-    The file's own actuators, sensors, keyframes and physics options (gravity, solver, contacts disabled) are left out.
+    The file's own actuators, sensors, keyframes and physics options (gravity, solver, contacts disabled) are left out,
+    and its main default class holds for its own elements alone, not for actuators, ground and obstacles added to them.
 
     Raises:
         ValueError: one line that names the file, what is wrong with which element, and what to do.
@@ -31,7 +44,11 @@ def read_robot(path: Path) -> mujoco.MjSpec:
     _check(spec, path)
     for thing in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(thing)
-    spec.option = mujoco.MjSpec().option  # how physics is computed is said by `sim`, for every robot alike
+    clean = mujoco.MjSpec()
+    for kind, names in _DEFAULTS.items():
+        for name in names:
+            setattr(getattr(spec.default, kind), name, getattr(getattr(clean.default, kind), name))
+    spec.option = clean.option  # how physics is computed is said by `sim`, for every robot alike
     _name_all(spec)
     return spec
 
@@ -197,6 +214,11 @@ def _check(spec: mujoco.MjSpec, path: Path) -> None:
         raise ValueError(
             f"robot.file={path}: geom {geom.name or 'without a name'} stands in the world, which terrain and obstacles"
             " make; name the robot's own file, not a scene with it"
+        )
+    if spec.compiler.settotalmass > 0:
+        raise ValueError(
+            f"robot.file={path}: <compiler settotalmass> would scale the robot by what stands around it; give its links"
+            " their masses"
         )
     for tendon in spec.tendons:
         raise ValueError(

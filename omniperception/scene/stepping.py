@@ -72,7 +72,8 @@ class _Legs:
         model, self._data = self._model, mujoco.MjData(self._model)
         self._pose = self._data.qpos.copy()
         base = model.body(robot.base)
-        self._pose[model.jnt_qposadr[base.jntadr[0]] + 2] = robot.base_height
+        start = model.jnt_qposadr[base.jntadr[0]]
+        self._pose[start + 2 : start + 7] = robot.base_height, 1.0, 0.0, 0.0, 0.0  # upright, however the file has it
         for name, angle in robot.default_joint_pos.items():
             self._pose[model.joint(name).qposadr[0]] = angle
         self._feet = [[model.geom(name).id for name in foot] for foot in robot.feet]

@@ -246,9 +246,16 @@ class TestThinning:
         ):
             policy().thin(self.points[:400])
 
-    def test_other_selections_are_spread_evenly(self):
-        robot = policy(lidar=Lidar(0.1, [0.0] * 3, UPRIGHT, 0.1, 6.0, 100, 250, None))
-        assert robot.thin(self.points[:250])[:4, 0].tolist() == [1.0, 3.0, 6.0, 8.0]  # floor(2.5 k)
+    def test_other_selections_are_spread_over_the_frame_and_its_lasers(self):
+        """Of 32 lasers that fire together, 20 times a frame; one of each 6.4 points."""
+        robot = policy(lidar=Lidar(0.1, [0.0] * 3, UPRIGHT, 0.1, 6.0, 100, 640, None))
+        lasers, shots = np.arange(640) % 32, np.arange(640) // 32
+        points = np.stack((1.0 + np.arange(640), lasers, shots), 1)
+        kept = robot.thin(points)
+        assert np.unique(kept[:, 1]).size > 28 and np.unique(kept[:, 2]).size == 20
+        part = np.searchsorted(np.arange(101) * 640 // 100, kept[:, 0] - 1, "right") - 1
+        assert part.tolist() == list(range(100))
+        assert np.array_equal(robot.thin(points, shots * 0.1 / 20), kept)  # those that fire together in their order
 
 
 def test_the_fingerprint_covers_what_the_network_depends_on(tmp_path):

@@ -295,6 +295,11 @@ def test_thick_worlds_are_harder():
         (lambda: BarnLayout(fill=(0.8,)), "fill"),
         (lambda: BarnLayout(worlds=0), "worlds=0"),
         (lambda: BarnLayout(robot=15), "robot=15"),
+        (lambda: BarnLayout(boxes=1), "boxes=1"),
+        (
+            lambda: BarnLayout(worlds=1, fill=(0.5,), robot=14).table(1, 1),
+            r"none of 32000 .*of 29 cells.*fill=0\.5 or robot=14",
+        ),
     ],
 )
 def test_wrong_layouts_are_refused(make, message):

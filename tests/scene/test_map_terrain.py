@@ -99,6 +99,22 @@ def test_a_place_is_seen_from_above(files, up):
     assert at(larger, 11.0, 8.4) == pytest.approx(1.5)
 
 
+@pytest.mark.parametrize("inward", [True, False])
+def test_a_room_of_single_faces_has_no_slab_for_a_ceiling(files, inward):
+    """As scans have them: floor, walls and ceiling of one face each, and a table."""
+    corners, sides = slab((0.0, 8.0), (0.0, 6.0), (0.0, 2.5))
+    table = slab((5.0, 6.0), (4.0, 4.5), (0.0, 0.75))
+    write_obj(files / "room.obj", (corners, [side[::-1] for side in sides] if inward else sides), table)
+    room = PlaceConfig("room.obj", 0.05, ceiling=2.0)
+    if not inward:  # a solid block, as it is written
+        with pytest.raises(ValueError, match="no place"):
+            room.places  # noqa: B018
+        return
+    assert at(room, 3.0, 3.0) == pytest.approx(0.0, abs=1e-6) and at(room, 5.5, 4.2) == pytest.approx(0.75)
+    heights = room.height_map()
+    assert all(heights[row, col] < 0.1 for col, row in room.places)
+
+
 def test_a_place_on_its_side_is_refused(files):
     hall = slab((0.0, 8.0), (0.0, 6.0), (-0.1, 0.0)), slab((0.0, 0.1), (0.0, 6.0), (0.0, 2.6))
     write_obj(files / "stands.obj", *hall)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.scene import Mount, ObstaclesConfig, RobotConfig, TerrainConfig, build_world
+from omniperception.scene import Mount, ObstacleGroup, ObstaclesConfig, RobotConfig, TerrainConfig, build_world
 from omniperception.scene.rays import ray_shapes
 from omniperception.scene.robot_file import parse, read_robot
 from omniperception.sim import SimConfig
@@ -47,6 +47,44 @@ def test_physics_is_that_of_the_configuration_whatever_the_file_says(tmp_path):
     assert model.opt.gravity.tolist() == [0.0, 0.0, -9.81] and model.npair == 0
     for name in ("impratio", "cone", "disableflags", "solver"):
         assert getattr(model.opt, name) == getattr(plain.opt, name), name
+
+
+def test_what_a_file_says_of_all_elements_is_not_said_of_those_of_the_simulation(tmp_path):
+    """Actuators, ground and obstacles are as beside any other robot; the robot's own geoms are as their file says."""
+    said = (
+        '<default><geom margin="0.02" solref="0.1 1" rgba="1 0 0 1" condim="6" friction="9 9 9" priority="2"/>'
+        '<mesh scale="0.001 0.001 0.001"/><motor ctrllimited="true" ctrlrange="-1 1" gear="50"/>'
+        '<pair margin="0.3"/></default><worldbody>'
+    )
+
+    groups = {"box": ObstacleGroup("box", 1, [[0.2, 0.3]] * 3)}
+    groups["rock"] = ObstacleGroup("mesh", 1, [[0.2, 0.3]] * 3, file="rock")
+    obstacles, models = ObstaclesConfig(groups=groups), []
+    for text in (BIPED, BIPED.replace("<worldbody>", said, 1)):
+        models.append(build_world(biped(tmp_path, text), TerrainConfig(), obstacles).model)
+    plain, model = models
+    for name in ("actuator_gear", "actuator_ctrllimited", "actuator_ctrlrange", "actuator_gainprm", "actuator_biasprm"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(plain, name), name)
+    own = model.geom_bodyid == 0
+    own |= model.body_mocapid[model.geom_bodyid] >= 0
+    assert own.sum() == 3
+    for name in ("margin", "solref", "condim", "friction", "priority", "rbound", "size"):
+        np.testing.assert_array_equal(getattr(model, f"geom_{name}")[own], getattr(plain, f"geom_{name}")[own], name)
+    assert (model.geom_rgba[~own] == (1, 0, 0, 1)).all() and not (model.geom_rgba[own] == (1, 0, 0, 1)).all(1).any()
+
+
+def test_a_file_may_say_that_limits_have_to_be_said(tmp_path):
+    said = BIPED.replace("<worldbody>", '<compiler autolimits="false"/><worldbody>', 1)
+    model = world_of(biped(tmp_path, said.replace(" range=", ' limited="true" range='))).model
+    np.testing.assert_array_equal(model.actuator_forcerange, world_of(biped(tmp_path)).model.actuator_forcerange)
+
+
+def test_heights_are_those_of_an_upright_base_however_the_file_has_it(tmp_path):
+    straight = biped(tmp_path)
+    (tmp_path / "leaning").mkdir()
+    leaning = biped(tmp_path / "leaning", BIPED.replace('<body name="torso"', '<body name="torso" euler="0 90 0"', 1))
+    assert "euler" in Path(leaning.file).read_text()
+    assert leaning.height_of("left_shank") == pytest.approx(straight.height_of("left_shank"))
 
 
 # --- joints in any order, and passive ones ----------------------------------------------------------------------------
@@ -456,6 +494,7 @@ LOOP = '<equality><connect body1="head" body2="tail" anchor="0 0 0"/></equality>
         ('range="-1 1"', 'range="0 0"', "joint tail has a range from 0 to 0, which MuJoCo takes for no limit"),
         ('<geom type="sphere" size="0.05"', '<geom type="mesh" mesh="gone"', "gone.stl.*; put the mesh where"),
         ("<mujoco ", "<scene ", "robot.file="),
+        ("<worldbody>", '<compiler settotalmass="7"/><worldbody>', "settotalmass> would scale .* give its links"),
     ],
 )
 def test_an_mjcf_that_cannot_be_right_is_refused_in_one_line(tmp_path, old, new, message):

@@ -97,6 +97,15 @@ def test_other_rhythms_and_orders_of_joints():
     assert [int(moving[:, foot].nonzero()[0].mean()) for foot in range(4)] == [5, 35, 15, 25]
 
 
+def test_offsets_do_not_hang_on_how_the_file_has_the_base(tmp_path):
+    straight = robot_of("go2")
+    text = straight.path().read_text()
+    (tmp_path / "leaning.xml").write_text(text.replace('<body name="base"', '<body name="base" euler="0 0.06 0"', 1))
+    assert 'euler="0 0.06 0"' in (tmp_path / "leaning.xml").read_text()
+    leaning = replace(straight, file=str(tmp_path / "leaning.xml"))
+    np.testing.assert_allclose(stepping_offsets(leaning, 2.0), stepping_offsets(straight, 2.0), atol=1e-9)
+
+
 def test_what_no_leg_can_do_is_named(tmp_path):
     """Two joints on a leg take its foot up along an arc."""
     (tmp_path / "hexapod.urdf").write_text(HEXAPOD)
