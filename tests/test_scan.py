@@ -109,6 +109,14 @@ def test_a_mesh_that_is_none_is_one_line(command, capsys, tmp_path, monkeypatch,
     assert stop.value.code == 2 and message in error and error.count("\n") == 1
 
 
+@pytest.mark.parametrize(("given", "rays"), [(["lidar.num_rays=500"], 500), (["rays=800"], 800), ([], 20_000)])
+def test_as_many_rays_are_cast_as_were_asked_for(monkeypatch, tmp_path, given, rays):
+    cast = []
+    monkeypatch.setattr(scan, "take_scan", lambda *a: cast.append(pictures.take_scan(*a)) or cast[-1])
+    main(["scan", "lidar=mid360", f"out={tmp_path}", *given])
+    assert cast[0].num_rays == rays
+
+
 @pytest.mark.parametrize(
     ("overrides", "rays", "reach"),
     [

@@ -74,7 +74,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         evaluation = Evaluation(
             [run_dir], [World("walk")], trials=arguments.trials, overrides=tuple(overrides), trust=arguments.trust
         )
-        rows = arguments.rows or robustness.rows_of_the_robot(arguments.preset)
+        folders = config.search_path(overrides, config.read(run_dir))
+        rows = arguments.rows or robustness.rows_of_the_robot(arguments.preset, folders)
         found = robustness.measure(robustness.stretches(evaluation, arguments.preset, rows, arguments.factors))
         print(robustness.table(found))
         robustness.draw(found, picture)

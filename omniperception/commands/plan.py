@@ -30,7 +30,8 @@ class Arguments:
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Prints the plan of a configuration."""
     plan = plan_of(overrides)  # first, because modules that were imported stay
-    fuller = plan_of([f"experiment={arguments.beside}"]) if arguments.beside else None
+    folders = config.as_override(config.search_path(overrides))
+    fuller = plan_of([*folders, f"experiment={arguments.beside}"]) if arguments.beside else None
     print(plan.text(fuller))
 
 

@@ -82,7 +82,7 @@ def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors:
         rows: of it.
         factors: of the ranges.
     """
-    values = _rows(preset)
+    values = _rows(preset, config.search_path(evaluation.overrides, config.read(evaluation.runs[0])))
     unknown = [row for row in rows if row not in values]
     if unknown:
         raise ConfigError(f"rows={','.join(unknown)} are unknown; {config.suggest(unknown[0], tuple(values))}")
@@ -106,9 +106,14 @@ def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors:
     return found
 
 
-def rows_of_the_robot(preset: str) -> tuple[str, ...]:
-    """Rows of a preset that are there and change the robot, its ground or what it measures of itself."""
-    values = _rows(preset)
+def rows_of_the_robot(preset: str, folders: Sequence[Path] = ()) -> tuple[str, ...]:
+    """Rows of a preset that are there and change the robot, its ground or what it measures of itself.
+
+    Args:
+        preset: of `randomization`.
+        folders: the user's, of presets.
+    """
+    values = _rows(preset, folders)
     others = ("payload_position", "frames_lost", "frames_late_s")
     chosen = [row for row in values if not row.startswith("lidar_") and row not in others and values[row] is not None]
     return tuple(chosen)
@@ -175,6 +180,7 @@ def _cell(record: Record | None) -> str:
     return "–" if record is None else f"{rate_cell([_part(record).fell])} / {_error(record):.2f}"
 
 
-def _rows(preset: str) -> dict[str, Any]:
-    """The rows of a preset of `randomization`, as plain data."""
-    return cast(dict, OmegaConf.to_container(config.compose([f"randomization={preset}"])["randomization"]))
+def _rows(preset: str, folders: Sequence[Path] = ()) -> dict[str, Any]:
+    """The rows of a preset of `randomization`, as plain data; `folders`: the user's, of presets."""
+    composed = config.compose([*config.as_override(folders), f"randomization={preset}"])
+    return cast(dict, OmegaConf.to_container(composed["randomization"]))

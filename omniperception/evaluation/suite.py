@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import torch
 import yaml
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, open_dict
 
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
@@ -183,7 +184,16 @@ class Task:
             overrides.append(f"condition={evaluation.condition}")
         if evaluation.split == "test":
             overrides += ["obstacles.split=test", f"seed={reported_seed(self.weights, self.world.name)}"]
-        return config.load(self.walker, [f"scenario={self.world.name}", *overrides, f"num_envs={evaluation.num_envs}"])
+        composed = config.load(
+            self.walker, [f"scenario={self.world.name}", *overrides, f"num_envs={evaluation.num_envs}"]
+        )
+        if self.walker != self.run_dir and evaluation.condition is None:  # the run's own, whoever walks
+            own = config.load(self.run_dir, self._own_overrides())
+            OmegaConf.resolve(own)
+            with open_dict(composed):
+                for name in ("randomization", "condition"):
+                    composed[name] = own.get(name)
+        return composed
 
     def settings(self) -> dict:
         """What decides the outcomes, as the file says it."""
@@ -207,9 +217,11 @@ class Task:
         }
 
     def _fingerprint(self) -> str:
-        """SHA-256 of everything that is configured: presets and files may change under their names."""
+        """SHA-256 of all that is configured, of the files that it names, and of trusted modules: they may change."""
         configs = (self.composed, config.load(self.run_dir, self._own_overrides()))
         parts = [OmegaConf.to_yaml(one, resolve=True) for one in configs]
+        named = {path for one in configs for path in _files(OmegaConf.to_container(one, resolve=True))}
+        parts += [checksum(path) for path in sorted(named | set(_sources(self.evaluation.trust)))]
         if self.policy == "exported" and (described := self.run_dir / EXPORTED / DESCRIPTION).is_file():
             parts.append(described.read_text())
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
@@ -326,6 +338,27 @@ def _exported(run_dir: Path, weights: str) -> ExportedPolicy:
     return policy
 
 
+def _files(value: object) -> Iterator[Path]:
+    """Files that plain data names."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list):
+        for item in value:
+            yield from _files(item)
+    elif isinstance(value, str) and value and "\n" not in value and (path := Path(value).expanduser()).is_file():
+        yield path
+
+
+def _sources(modules: Sequence[str]) -> Iterator[Path]:
+    """Files of Python modules, with what is below them."""
+    for name in modules:
+        spec = importlib.util.find_spec(name)
+        for folder in (spec and spec.submodule_search_locations) or ():
+            yield from Path(folder).rglob("*.py")
+        if spec is not None and spec.origin is not None and Path(spec.origin).is_file():
+            yield Path(spec.origin)
+
+
 def weights_hash(run_dir: Path) -> str:
     """SHA-256 of a run's newest checkpoint."""
     return checksum(latest_checkpoint(run_dir))
@@ -390,6 +423,13 @@ def _check_tasks(tasks: Sequence[Task]) -> None:
         if key in seen:
             raise ConfigError(f"run={task.run_dir} policy={task.policy} world={task.world.name} is given twice")
         seen.add(key)
+    names: dict[str, Path] = {}
+    for run_dir in (task.run_dir.resolve() for task in tasks):
+        if names.setdefault(shown(run_dir), run_dir) != run_dir:
+            raise ConfigError(
+                f"run={run_dir} and {names[shown(run_dir)]} would both be called {shown(run_dir)}; evaluate them from a"
+                " folder above both"
+            )
     weights = {run_dir: weights_hash(run_dir) for run_dir in dict.fromkeys(task.run_dir for task in tasks)}
     for run_dir in dict.fromkeys(task.run_dir for task in tasks if task.policy == "exported"):
         try:
@@ -402,7 +442,7 @@ def _check_tasks(tasks: Sequence[Task]) -> None:
 
 
 def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Record]]:
-    """Numbers of the tasks with their records, in the order in which they end."""
+    """Numbers of the tasks with their records, in the order in which they end; an error once those begun have ended."""
     workers = _workers(list(tasks.values()))
     if workers == 1:
         for k, task in tasks.items():
@@ -411,11 +451,20 @@ def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Rec
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         futures = {pool.submit(_in_worker, task, facts): k for k, task in tasks.items()}
+        failed: BaseException | None = None
         try:
             for future in as_completed(futures):
-                yield futures[future], future.result()
+                error = None if future.cancelled() else future.exception()
+                if error is not None and failed is None:
+                    failed = error
+                    for other in futures:
+                        other.cancel()
+                if error is None and not future.cancelled():
+                    yield futures[future], future.result()
         finally:
             pool.shutdown(cancel_futures=True)
+        if failed is not None:
+            raise failed
 
 
 def _workers(tasks: Sequence[Task]) -> int:

@@ -137,9 +137,13 @@ def _over_worlds(records: Sequence[Record], row: str, column: str, columns: list
     for (name,), theirs in grouped(records, row).items():
         cells = []
         for there in columns:
-            happened = [r.episodes.happened() for r in theirs if getattr(r, column) == there]
-            shares = [torch.cat([one[figure] for one in happened]) for figure in ("untouched", "fall") if happened]
-            cells.append(" / ".join(rate_cell([share]) for share in shares) or "–")
+            found = [record for record in theirs if getattr(record, column) == there]
+            by_seed = [[r.episodes.happened() for r in own] for own in grouped(found, "run").values()]
+            rates = (
+                rate_cell([torch.cat([one[figure] for one in own]) for own in by_seed])
+                for figure in ("untouched", "fall")
+            )
+            cells.append(" / ".join(rates) if found else "–")
         rows.append([name, *cells])
     worlds = len({record.place for record in records})
     what = f"reached, untouched and without a fall / falls, %, over {worlds} worlds"

@@ -145,18 +145,18 @@ class Viewer:
         if not self.server.get_clients():
             return
         now = time.monotonic()
-        due = self._redraw if paused else self.clock.picture_is_due() or self._redraw
-        if due:
+        redraw, self._redraw = self._redraw, False  # what is asked for from here on is drawn the next time
+        due = not paused and self.clock.picture_is_due()
+        if due or redraw:
             perceived, there = self.session.perceived(), true(self.session.env)
             self.stage.draw(perceived, there, self.session.driven is not None)
-            if self.session.frames != self._frames_drawn or self._redraw:
+            if self.session.frames != self._frames_drawn or redraw:
                 self._frames_drawn, self._shown_points = self.session.frames, self.stage.draw_points()
                 started, count = self._frames_window
                 self._frames_window = started, count + 1
-            if now >= self._charts_due or self._redraw:
+            if now >= self._charts_due or redraw:
                 self._charts_due = now + 1.0 / CHART_HZ
                 self.panels.draw_charts(perceived, there)
-            self._redraw = False
         if now >= self._lists_due:
             self._lists_due = now + LISTS_S
             self.panels.renew_lists()
@@ -257,11 +257,16 @@ class Viewer:
         choices = {**self._choices, group: preset}
         if group == "scenario" and preset is not None:
             choices |= {"terrain": None, "obstacles": None}
-        self._switch(choices, self.session.shown)
+        self._switch(choices, self._shown())
 
     def choose_policy(self, name: str) -> None:
         """Switches who acts."""
-        self._switch(self._choices, replace(self.session.shown, policy=name))
+        self._switch(self._choices, replace(self._shown(), policy=name))
+
+    def _shown(self) -> Shown:
+        """What is shown, with the weights that were picked by hand."""
+        shown = self.session.shown
+        return shown if self.follows else replace(shown, checkpoint=self.session.checkpoint)
 
     def choose_run(self, run_dir: Path) -> None:
         """Switches to another run, with the presets that are chosen."""
@@ -315,9 +320,9 @@ class Viewer:
         return {group: self._choices.get(group) for group in SWITCHED}
 
     def presets(self, group: str) -> tuple[str, ...]:
-        """Presets of a group, those in the run's own folders included."""
+        """Presets of a group, those in the run's own folders and in --config-dir included."""
         run = config.read(self.session.shown.run_dir)
-        return config.presets(group, config.search_path((), run))
+        return config.presets(group, config.search_path(self._rest, run))
 
     def _look_for_weights(self) -> None:
         now = time.monotonic()

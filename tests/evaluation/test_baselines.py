@@ -121,7 +121,7 @@ def test_geometry_needs_a_lidar(make_env, name):
 
 
 class TestFromClouds:
-    """Before a wall of 4 m across the way, under the noise of the paper."""
+    """Before a wall of 4 m across the way, with nothing randomized."""
 
     def commanded(self, name, x, steps=12):
         wall = (

@@ -7,8 +7,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from omniperception import build, config
 from omniperception.build import build_runner
@@ -263,6 +265,53 @@ def test_results_with_another_gait_or_another_file_of_presets_stand_apart(walker
         mine = evaluation(walker, "mine", overrides=(SHORT, f"hydra.searchpath=[file://{tmp_path / 'conf'}]"))
         hashes.append(Task(mine, walker, "run", World("mine")).settings()["configuration"])
     assert hashes[0] != hashes[1]
+
+
+def test_without_a_condition_all_have_the_runs_randomization(walker, tmp_path):
+    """Whoever walks: a gait of another randomization."""
+    other = make_run(tmp_path / "other", "experiment=walk", "randomization=paper", "randomization.added_mass=[1.0,2.0]")
+    for runs, walks in ((walker, other), (other, walker)):
+        changed = evaluation(runs, "static", walker=walks, condition=None, policies=("run", "oracle"))
+        rows = [Task(changed, runs, policy, World("static")).composed["randomization"] for policy in ("run", "oracle")]
+        assert rows[0] == rows[1] and (rows[0]["added_mass"] is None) == (runs == walker)
+        Task(changed, runs, "oracle", World("static")).assembled()
+
+
+def test_results_with_another_content_of_a_file_or_a_trusted_module_stand_apart(walker, tmp_path, monkeypatch):
+    plan, module = tmp_path / "plan.png", tmp_path / "own_terms_of_a_test"
+    module.mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    hashes = []
+    for level, text in ((255, "A = 1"), (254, "A = 1"), (254, "A = 2"), (254, "A = 2")):
+        Image.fromarray(np.full((60, 60), level, np.uint8)).save(plan)
+        (module / "__init__.py").write_text(text)
+        given = {"overrides": ("terrain=plan", f"terrain.file={plan}"), "trust": ("own_terms_of_a_test",)}
+        task = Task(evaluation(walker, "static", **given), walker, "run", World("static"))
+        hashes.append(task.settings()["configuration"])
+    assert len(set(hashes[:3])) == 3 and hashes[2] == hashes[3]
+
+
+def test_what_was_measured_beside_a_failure_is_noted(walker, tmp_path, monkeypatch):
+    """And is found again; one process fails at once, while the other measures."""
+    by(monkeypatch, "0a")
+    log = tmp_path / "log.jsonl"
+    given = {"split": "test", "log": log, "overrides": ()}
+    both = evaluation(walker, "static", policies=("run", "blind"), jobs=2, **given)
+    with pytest.raises(ConfigError, match="policy=blind"):
+        evaluate(both)
+    assert [json.loads(line)["policy"] for line in log.read_text().splitlines()] == ["run"]
+
+
+def test_two_runs_of_one_name_are_refused_before_the_trials(walker, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs = [tmp_path.parent / tmp_path.name / arm / "net" / "seed1" for arm in ("a", "b")]
+    for run in runs:
+        shutil.copytree(walker, run)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    twice = Evaluation(runs, [World("static")], trials=4, num_envs=2, jobs=1, overrides=(SHORT,))
+    with pytest.raises(ConfigError, match=r"would both be called net/seed1; evaluate them from a folder above"):
+        evaluate(twice)
 
 
 def test_what_does_not_fit_the_run_is_refused(walker):

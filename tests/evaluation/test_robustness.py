@@ -1,5 +1,7 @@
 """Ranges are stretched as they should be, and kicks hit whom, when and where they should."""
 
+from pathlib import Path
+
 import pytest
 import torch
 import yaml
@@ -59,6 +61,19 @@ def test_rows_of_the_robot_are_the_papers_and_the_robots_without_the_lidars():
     assert {"latency_s", "joint_offset", "motor_strength", "pushes", "gyro_bias"} <= set(rows)
     assert not [row for row in rows if "lidar" in row or "frames" in row]
     assert "pushes" not in rows_of_the_robot("paper") and not rows_of_the_robot("none")
+
+
+def test_ranges_may_be_those_of_a_preset_of_ones_own(tmp_path):
+    (tmp_path / "randomization").mkdir()
+    text = "defaults: [none, _self_]\nadded_mass: [-2.0, 2.0]\n"
+    (tmp_path / "randomization" / "mine.yaml").write_text(text)
+    assert rows_of_the_robot("mine", [tmp_path]) == ("added_mass",)
+    overrides = tuple(config.as_override([tmp_path]))
+    evaluation = Evaluation([Path("pretrained/gait")], [World("walk")], overrides=overrides)
+    (_, stretch) = stretches(evaluation, "mine", ["added_mass"], [0.5])
+    assert list(stretch.task.composed["randomization"]["added_mass"]) == [-1.0, 1.0]
+    with pytest.raises(ConfigError, match="randomization=mine is unknown"):
+        rows_of_the_robot("mine")
 
 
 def test_a_kick_changes_one_velocity_once(make_env):

@@ -96,6 +96,14 @@ def test_trainings_stand_beside_each_other_and_all_worlds_below(data):
     assert rows[3][2] == rows[4][2] == "–" and rows[4][1] == "12.5 [5.0, 28.1] (0.0 to 25.0)"
 
 
+def test_several_seeds_have_their_spread_in_every_view(data):
+    seeds = [record(run="a/seed1"), record(run="a/seed2", touches=[1] * 8)]
+    write(data / "seeds.json.gz", seeds)
+    for view in ("conditions", "policies", "worlds"):
+        text = rendered(page(f"seeds view={view}"), data)
+        assert "(least to most of the runs)" in text and "12.5 [3.5, 36.0] (0.0 to 25.0)" in text, view
+
+
 @pytest.mark.parametrize(
     ("what", "message"),
     [

@@ -66,7 +66,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         env = _task(name, overrides)
         assert env.lidar is not None  # only lidar=none has none
         demo = _surroundings(arguments, env.robot)
-        scans.append(take_scan(name, env.lidar, demo, arguments.seconds, arguments.rays, arguments.seed))
+        rays = arguments.rays or (env.lidar.num_rays if _says_rays(overrides) else None)
+        scans.append(take_scan(name, env.lidar, demo, arguments.seconds, rays, arguments.seed))
         folder = out if arguments.out and len(arguments.lidar) == 1 else out / name
         if demo.mesh is not None and demo.mesh.encloses(scans[-1].sensor_w):
             print(f"{name}: the sensor is inside {arguments.mesh}, a closed surface, and sees it from within")
@@ -113,12 +114,17 @@ def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConf
     sensor = _task(name, overrides).lidar
     assert sensor is not None  # only lidar=none has none
     given = {override.key_or_group for override in config.parse(overrides)}
-    if "lidar.num_rays" not in given:
+    if not _says_rays(overrides):
         whole = sensor.scan_pattern().points_per_frame(sensor.period_s)
         sensor = replace(sensor, num_rays=min(arguments.rays or whole, whole))
     if "lidar.max_range" not in given and sensor.device is not None:
         sensor = replace(sensor, max_range=DEVICES[sensor.device].max_range)
     return sensor
+
+
+def _says_rays(overrides: list[str]) -> bool:
+    """Whether the number of rays is the preset's no longer."""
+    return any(override.key_or_group == "lidar.num_rays" for override in config.parse(overrides))
 
 
 def _surroundings(arguments: Arguments, robot: RobotConfig, walkers: int = 0) -> DemoScene:
