@@ -155,8 +155,8 @@ class ExportedPolicy:
 
         Args:
             points: (n, 3) m; misses are zero, or left out.
-            offsets_s: (n,) seconds of each point since the frame began; None: row k is the k-th that the device
-                measured, so none may have been left out.
+            offsets_s: (n,) seconds of each point since the frame began; of several at one time, by lasers that fire
+                together, none may have been left out. None: row k is the k-th that the device measured, so none at all.
 
         Returns:
             (num_rays, 3), zeros where a ray hit nothing or its point is lacking.

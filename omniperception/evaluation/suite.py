@@ -6,6 +6,7 @@ import hashlib
 import importlib.util
 import json
 import multiprocessing
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -188,7 +189,8 @@ class Task:
             self.walker, [f"scenario={self.world.name}", *overrides, f"num_envs={evaluation.num_envs}"]
         )
         if self.walker != self.run_dir and evaluation.condition is None:  # the run's own, whoever walks
-            own = config.load(self.run_dir, self._own_overrides())
+            given = [o for o in config.parse(evaluation.overrides) if config.group_of(o) == "randomization"]
+            own = config.load(self.run_dir, [*self._own_overrides(), *(str(o.input_line) for o in given)])
             OmegaConf.resolve(own)
             with open_dict(composed):
                 for name in ("randomization", "condition"):
@@ -345,14 +347,17 @@ def _files(value: object) -> Iterator[Path]:
     if isinstance(value, list):
         for item in value:
             yield from _files(item)
-    elif isinstance(value, str) and value and "\n" not in value and (path := Path(value).expanduser()).is_file():
-        yield path
+    elif isinstance(value, str) and os.path.isfile(path := os.path.expanduser(value.partition("#")[0])):
+        yield Path(path)
 
 
 def _sources(modules: Sequence[str]) -> Iterator[Path]:
     """Files of Python modules, with what is below them."""
     for name in modules:
-        spec = importlib.util.find_spec(name)
+        try:
+            spec = importlib.util.find_spec(name)
+        except (ImportError, ValueError):  # refused where the configuration is assembled
+            continue
         for folder in (spec and spec.submodule_search_locations) or ():
             yield from Path(folder).rglob("*.py")
         if spec is not None and spec.origin is not None and Path(spec.origin).is_file():
@@ -454,13 +459,14 @@ def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Rec
         failed: BaseException | None = None
         try:
             for future in as_completed(futures):
-                error = None if future.cancelled() else future.exception()
-                if error is not None and failed is None:
-                    failed = error
-                    for other in futures:
-                        other.cancel()
-                if error is None and not future.cancelled():
+                if future.cancelled():
+                    continue
+                if (error := future.exception()) is None:
                     yield futures[future], future.result()
+                    continue
+                failed = failed or error
+                for other in futures:
+                    other.cancel()
         finally:
             pool.shutdown(cancel_futures=True)
         if failed is not None:

@@ -239,7 +239,8 @@ class PlaceConfig(MapTerrainConfig):
         scale: metres per unit of the file.
         up: axis of the file that points up, 'z' or 'y'; with 'y' its -z is y here. None: y of a GLB, whose format says
             so, z of the others, unless the mesh looks as if it were y.
-        ceiling: height (m) in the file's frame above which nothing counts; a wall that goes on above ends there.
+        ceiling: height (m) in the file's frame above which nothing counts; a wall that goes on above ends there, if
+            its faces are wound as those of a solid are, outwards.
         outside: height (m) where there is nothing; None: that of the lowest point.
     """
 

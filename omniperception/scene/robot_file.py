@@ -16,18 +16,11 @@ _FREE, _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE,
 _READABLE = (".stl", ".obj", ".msh")
 ROUNDING = 1e-3
 """rad: by which a rounded angle may lie beyond the end of its range."""
-_PLACE, _LOOK = ("pos", "quat", "alt", "fromto", "size", "type"), ("rgba", "material", "group")
-_TOUCH = ("margin", "gap", "condim", "friction", "solref", "solimp")
-_LIMITS = ("ctrllimited", "ctrlrange", "forcelimited", "forcerange", "actlimited", "actrange", "inheritrange")
-_DRIVE = ("gear", "dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm", "cranklength", "lengthrange")
-_DEFAULTS = {
-    "geom": _PLACE + _LOOK + _TOUCH + ("contype", "conaffinity", "priority", "solmix", "meshname", "hfieldname"),
-    "site": _PLACE + _LOOK,
-    "mesh": ("scale", "refpos", "refquat", "maxhullvert"),
-    "pair": (*_TOUCH, "solreffriction"),
-    "actuator": (*_LIMITS, *_DRIVE, "actearly", "group"),
-}
-"""What a file's main default class may say of elements that are added to the robot's."""
+_ADDED = ("actuator", "geom", "mesh", "pair", "site")
+"""Kinds of elements that are added to a robot's."""
+_HANDLES = {"classname", "compiler", "frame", "id", "info", "name", "parent", "plugin", "signature", "userdata"}
+"""What a default class does not say of its elements; reading some of it from one ends the process."""
+_PLAIN = (bool, int, float, str, np.ndarray, mujoco.MjsOrientation)
 _LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 
 
@@ -45,9 +38,11 @@ def read_robot(path: Path) -> mujoco.MjSpec:
     for thing in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(thing)
     clean = mujoco.MjSpec()
-    for kind, names in _DEFAULTS.items():
-        for name in names:
-            setattr(getattr(spec.default, kind), name, getattr(getattr(clean.default, kind), name))
+    for kind in _ADDED:
+        said, usual = getattr(spec.default, kind), getattr(clean.default, kind)
+        for name in (name for name in dir(usual) if not name.startswith("_") and name not in _HANDLES):
+            if isinstance(value := getattr(usual, name), _PLAIN) or hasattr(value, "value"):  # of an enumeration
+                setattr(said, name, value)
     spec.option = clean.option  # how physics is computed is said by `sim`, for every robot alike
     _name_all(spec)
     return spec

@@ -120,7 +120,6 @@ class Viewer:
     def ask(self, request: Callable[[], None]) -> None:
         """Has something done between two control steps; from any thread."""
         self._requests.put(request)
-        self._redraw = True
 
     def say(self, line: str) -> None:
         """Shows a line to whoever looks, on the page and in the terminal."""
@@ -134,6 +133,7 @@ class Viewer:
                 request = self._requests.get_nowait()
             except queue.Empty:
                 return
+            self._redraw = True
             try:
                 request()
             except WRONG as error:
@@ -257,16 +257,11 @@ class Viewer:
         choices = {**self._choices, group: preset}
         if group == "scenario" and preset is not None:
             choices |= {"terrain": None, "obstacles": None}
-        self._switch(choices, self._shown())
+        self._switch(choices, self.session.shown)
 
     def choose_policy(self, name: str) -> None:
         """Switches who acts."""
-        self._switch(self._choices, replace(self._shown(), policy=name))
-
-    def _shown(self) -> Shown:
-        """What is shown, with the weights that were picked by hand."""
-        shown = self.session.shown
-        return shown if self.follows else replace(shown, checkpoint=self.session.checkpoint)
+        self._switch(self._choices, replace(self.session.shown, policy=name))
 
     def choose_run(self, run_dir: Path) -> None:
         """Switches to another run, with the presets that are chosen."""
@@ -275,6 +270,7 @@ class Viewer:
     def choose_checkpoint(self, path: Path) -> None:
         """Puts other weights into the network while the robot walks on."""
         self.session.load(path)
+        self.session.shown = replace(self.session.shown, checkpoint=None if self.follows else path)
         self.say(f"{path} walks now")
         self.panels.show_checkpoint(path)
 

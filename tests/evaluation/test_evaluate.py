@@ -275,6 +275,10 @@ def test_without_a_condition_all_have_the_runs_randomization(walker, tmp_path):
         rows = [Task(changed, runs, policy, World("static")).composed["randomization"] for policy in ("run", "oracle")]
         assert rows[0] == rows[1] and (rows[0]["added_mass"] is None) == (runs == walker)
         Task(changed, runs, "oracle", World("static")).assembled()
+    for given, there in (("randomization=none", None), ("randomization.added_mass=[3.0,3.5]", [3.0, 3.5])):
+        changed = evaluation(other, "static", walker=walker, condition=None, overrides=(given,))
+        for policy in ("run", "oracle"):
+            assert Task(changed, other, policy, World("static")).composed["randomization"]["added_mass"] == there
 
 
 def test_results_with_another_content_of_a_file_or_a_trusted_module_stand_apart(walker, tmp_path, monkeypatch):
@@ -303,8 +307,7 @@ def test_what_was_measured_beside_a_failure_is_noted(walker, tmp_path, monkeypat
 
 
 def test_two_runs_of_one_name_are_refused_before_the_trials(walker, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    runs = [tmp_path.parent / tmp_path.name / arm / "net" / "seed1" for arm in ("a", "b")]
+    runs = [tmp_path / arm / "net" / "seed1" for arm in ("a", "b")]
     for run in runs:
         shutil.copytree(walker, run)
     (tmp_path / "here").mkdir()

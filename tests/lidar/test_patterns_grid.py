@@ -81,6 +81,8 @@ def test_a_users_table(tmp_path, name, header, rows):
         ("scan.csv", "0,0\n1\n", "rad", "cannot be read as numbers"),
         ("scan.csv", "0,0,\n1,1\n2,2\n", "rad", "cannot be read as numbers"),
         ("scan.csv", "0.1O,0.2\n1,1\n2,2\n", "rad", r"row 0 is \[nan, 0.2\], expected two numbers"),
+        ("scan.csv", "nan,nan\n1,1\n", "rad", r"row 0 is \[nan, nan\], expected two numbers"),
+        ("scan.csv", '"10","20"\n1,1\n', "rad", r"row 0 is \[nan, nan\], expected two numbers"),
         ("scan.csv", "", "rad", "cannot be read as numbers: it is empty"),
         ("scan.csv", "0,30\n", "rad", "elevation of 30 rad is beyond a right angle.*may have to be deg"),
         ("scan.csv", "0,100\n", "deg", "elevation of 100 deg is beyond a right angle"),

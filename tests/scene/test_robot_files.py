@@ -54,6 +54,7 @@ def test_what_a_file_says_of_all_elements_is_not_said_of_those_of_the_simulation
     said = (
         '<default><geom margin="0.02" solref="0.1 1" rgba="1 0 0 1" condim="6" friction="9 9 9" priority="2"/>'
         '<mesh scale="0.001 0.001 0.001"/><motor ctrllimited="true" ctrlrange="-1 1" gear="50"/>'
+        '<general damping="2" armature="0.3"/>'
         '<pair margin="0.3"/></default><worldbody>'
     )
 
@@ -63,7 +64,9 @@ def test_what_a_file_says_of_all_elements_is_not_said_of_those_of_the_simulation
     for text in (BIPED, BIPED.replace("<worldbody>", said, 1)):
         models.append(build_world(biped(tmp_path, text), TerrainConfig(), obstacles).model)
     plain, model = models
-    for name in ("actuator_gear", "actuator_ctrllimited", "actuator_ctrlrange", "actuator_gainprm", "actuator_biasprm"):
+    names = [name for name in dir(plain) if name.startswith("actuator_")] + ["dof_M0", "dof_armature", "dof_damping"]
+    assert len(names) > 20
+    for name in names:
         np.testing.assert_array_equal(getattr(model, name), getattr(plain, name), name)
     own = model.geom_bodyid == 0
     own |= model.body_mocapid[model.geom_bodyid] >= 0

@@ -59,6 +59,10 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     """Scans the room with each sensor and writes pictures and clouds."""
     if "none" in arguments.lidar:
         raise config.ConfigError("lidar=none has nothing to view; give a sensor, such as lidar=mid360")
+    if arguments.rays is not None and _says_rays(overrides):
+        raise config.ConfigError(
+            f"rays={arguments.rays} and lidar.num_rays= are two words for one thing; give one of them"
+        )
     out, scans = arguments.out or Path("outputs/view_scan"), []
     if arguments.viewer == "web":
         return _serve(arguments, out, overrides)

@@ -70,5 +70,13 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _has_header(lines: list[str]) -> bool:
-    """Whether no cell of the first line begins as a number does."""
-    return not any(cell.strip().lstrip("+-.")[:1].isdigit() for cell in lines[0].split(","))
+    """Whether the first line's cells all are words."""
+    return all(cell.strip()[:1].isalpha() and not _is_number(cell) for cell in lines[0].split(","))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)  # nan, too
+    except ValueError:
+        return False
+    return True
