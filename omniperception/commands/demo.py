@@ -22,7 +22,7 @@ from omniperception.cli import Command, argument, refuse_arguments, refuse_overr
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
-from omniperception.viewer.options import LOCALHOST, PORT
+from omniperception.viewer.options import LOCALHOST, PAGE, PORT
 
 RUN, SCENARIO = "avoider", "scenario=moving"
 
@@ -54,6 +54,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         refuse_arguments(arguments, FILM, "viewer=web films nothing")
         options = PageOptions(arguments.host, arguments.port, arguments.stop_after_s, open_browser=has_display())
         return serve(Shown(run_dir, tuple(overrides)), options)
+    if arguments.viewer == "video":
+        refuse_arguments(arguments, (*PAGE, "stop_after_s"), "viewer=video has no page")
     run = build.load_run(run_dir, [*overrides, f"num_envs={num_envs}"])
     build.check_split(run, "film")
     trained = build.load_policy(run, run_dir)

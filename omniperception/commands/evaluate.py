@@ -49,7 +49,7 @@ from omniperception.evaluation.suite import (
 )
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
-from omniperception.viewer.options import LOCALHOST, PORT
+from omniperception.viewer.options import LOCALHOST, PAGE, PORT
 
 MEASURED = ("trials", "num_envs", "jobs", "plots", "again", "out", "log")
 """Arguments about what is measured."""
@@ -93,6 +93,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     if arguments.viewer == "web":
         refuse_arguments(arguments, MEASURED, "viewer=web measures nothing")
         return serve(_shown(arguments, runs[0], worlds[0], overrides), PageOptions(arguments.host, arguments.port))
+    refuse_arguments(arguments, PAGE, f"viewer={arguments.viewer} has no page")
     if arguments.split != "test":
         refuse_arguments(arguments, ("log",), "only split=test is noted")
     if not set(DRIVEN) & set(arguments.policy):

@@ -22,7 +22,7 @@ from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.report import summary_table, times_line
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
-from omniperception.viewer.options import LOCALHOST, PORT
+from omniperception.viewer.options import LOCALHOST, PAGE, PORT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +47,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         refuse_overrides(overrides, {"num_envs": 1})
         shown = Shown(run_dir, tuple(overrides), trust=arguments.trust)
         return serve(shown, PageOptions(arguments.host, arguments.port))
+    refuse_arguments(arguments, PAGE, f"viewer={arguments.viewer} has no page")
     if arguments.viewer == "none":
         refuse_arguments(arguments, FILM, "viewer=none films nothing")
     video, stem = arguments.video, file_stem("replay", overrides)

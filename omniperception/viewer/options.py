@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 LOCALHOST = "127.0.0.1"
 PORT = 8080
+PAGE = ("host", "port")
+"""Arguments of commands that mean something with viewer=web alone."""
 
 
 class ViewerError(RuntimeError):

@@ -26,7 +26,7 @@ from omniperception.env.sensing import SensorConfig
 from omniperception.lidar import DEVICES, TriangleMesh
 from omniperception.scene import RobotConfig
 from omniperception.viewer import PageOptions, ViewerError, serve_lab
-from omniperception.viewer.options import LOCALHOST, PORT, Room
+from omniperception.viewer.options import LOCALHOST, PAGE, PORT, Room
 
 NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
 """A sensor is looked at, no task is run."""
@@ -65,7 +65,9 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         )
     out, scans = arguments.out or Path("outputs/view_scan"), []
     if arguments.viewer == "web":
+        refuse_arguments(arguments, ("seed", "seconds", "colour", "cloud"), "the lab of viewer=web does not read it")
         return _serve(arguments, out, overrides)
+    refuse_arguments(arguments, PAGE, f"viewer={arguments.viewer} has no page")
     for name in arguments.lidar:
         env = _task(name, overrides)
         assert env.lidar is not None  # only lidar=none has none
