@@ -36,7 +36,7 @@ class Obstacle:
 
 
 @dataclass(frozen=True)
-class CurriculumConfig:
+class ObstacleCurriculumConfig:
     """Raises the share and the speed of obstacles as walking improves.
 
     Attributes:
@@ -105,7 +105,7 @@ class ObstaclesConfig:
     area: Sequence[float] = (-5.0, 5.0, -5.0, 5.0)
     boundary: str = "bounce"
     clearance: float = 0.8
-    curriculum: CurriculumConfig | None = None
+    curriculum: ObstacleCurriculumConfig | None = None
     spacing: float = 0.0
     free_path: FreePathConfig | None = None
     headroom: float = 0.45

@@ -12,7 +12,7 @@ from omniperception.common.random import EnvRandom
 from omniperception.scene import MotionConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
 from omniperception.scene.meshes import MESHES
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
-from omniperception.scene.obstacles import CurriculumConfig
+from omniperception.scene.obstacles import ObstacleCurriculumConfig
 from omniperception.scene.poses import LAYOUT_SEEDS
 
 POST = [[0.1, 0.1], [0.5, 0.5]]
@@ -174,7 +174,7 @@ class TestLayouts:
         assert LAYOUT_SEEDS["dev"] != LAYOUT_SEEDS["test"]
 
     def test_the_curriculum_lets_them_in_by_and_by(self):
-        field = field_of(self.groups, 1000, curriculum=CurriculumConfig())
+        field = field_of(self.groups, 1000, curriculum=ObstacleCurriculumConfig())
         assert not field.active.any()
         field.level = 0.5
         field.reset(torch.arange(1000), torch.zeros(1000, 2))

@@ -8,7 +8,7 @@ import torch
 from omniperception.common.random import EnvRandom
 from omniperception.scene import ApproachConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
-from omniperception.scene.obstacles import CurriculumConfig
+from omniperception.scene.obstacles import ObstacleCurriculumConfig
 
 
 def field_of(num_envs=2000, seed=0, speed=(0.0, 1.0), **settings):
@@ -116,7 +116,7 @@ def test_wrap_keeps_them_in_the_square_around_the_robot():
 
 class TestCurriculum:
     def test_level_rises_only_below_the_error(self):
-        field = field_of(2, curriculum=CurriculumConfig(0.2, max_velocity_error=0.3, rise=0.1))
+        field = field_of(2, curriculum=ObstacleCurriculumConfig(0.2, max_velocity_error=0.3, rise=0.1))
         levels = [field.level]
         for error in (0.29, 0.19, 0.3, 0.29, *[0.1] * 20):  # 0.29 is good enough to go on, not to start
             field.follow(error, 1.0)
@@ -131,7 +131,7 @@ class TestCurriculum:
         assert field.active.all()
 
     def test_level_is_the_share_of_active_obstacles_and_of_their_speed(self):
-        field = field_of(speed=(1.0, 1.0), curriculum=CurriculumConfig())
+        field = field_of(speed=(1.0, 1.0), curriculum=ObstacleCurriculumConfig())
         field.level = 0.4
         reset(field, torch.zeros(2000, 2))
         assert field.active.float().mean().item() == pytest.approx(0.4, abs=0.02)
@@ -203,7 +203,7 @@ def test_fixed_poses_hold_in_every_environment_whatever_moves_around_them():
         "post": ObstacleGroup("cylinder", 1, [[0.1, 0.1], [0.5, 0.5]], [1.0, 1.0]),
     }
     for boundary in ("bounce", "wrap"):
-        config = ObstaclesConfig(groups, boundary=boundary, spacing=0.5, curriculum=CurriculumConfig())
+        config = ObstaclesConfig(groups, boundary=boundary, spacing=0.5, curriculum=ObstacleCurriculumConfig())
         field = ObstacleField(config, *poses(50, 3), EnvRandom(0, 50))
         reset(field, torch.zeros(50, 2))  # one stands on the robot: it is there all the same
         for _ in range(20):
