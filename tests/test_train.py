@@ -166,15 +166,19 @@ def test_a_run_that_goes_on_in_another_task_begins_new_episodes(tmp_path, monkey
     config.save(run.composed, Path("here"))
     first = build.build_runner(run, None)
     first.env.obstacles.level = 0.7
+    first.logger._return_so_far += 123.0
+    first.logger.returns.append(5.0)
     first.save(checkpoint_path("here", 1))
     seen = []
     monkeypatch.setattr(Runner, "learn", lambda self, *_, **__: seen.append(self))
     main(["train", "run=here", "ppo.learning_rate=1e-5"])
     assert torch.equal(seen[0].env.sim.qpos, first.env.sim.qpos) and "another now" not in capsys.readouterr().out
+    assert seen[0].logger._return_so_far.tolist() == [123.0, 123.0] and list(seen[0].logger.returns) == [5.0]
     main(["train", "run=here", *changes])
     assert "its task is another now: new episodes begin" in capsys.readouterr().out
     env, fresh = seen[1].env, build.build_runner(build.load_run(Path("here")), None).env
     assert env.num_envs == fresh.num_envs and bool((env.episode_length_buf == 0).all())
+    assert not seen[1].logger._return_so_far.any() and not seen[1].logger.returns  # they were of other rewards
     assert env.obstacles.level == (1.0 if changes == ("obstacles.curriculum=null",) else 0.7)
     mass, nominal = (one.sim.model_field("body_mass") for one in (env, fresh))
     assert torch.equal(mass, nominal) == (changes[0] == "randomization=none")

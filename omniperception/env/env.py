@@ -474,6 +474,11 @@ class OmniEnv(VecEnv):
         for name, part in self._curricula().items():
             if part.rises and "level" in saved[name]:
                 part.level = saved[name]["level"]
+        levels = state.get("ground", {}).get("level")
+        if self.ground is not None and self.terrain_levels is not None and levels is not None and len(levels):
+            some = torch.arange(self.num_envs) % len(levels)
+            self.ground.load_state_dict({"level": levels.cpu()[some].clamp(max=self.ground.config.levels - 1)})
+            self._has_stepped = True  # so that `reset` does not draw them anew
         self.reset()
 
     def _managers(self) -> dict[str, RewardManager | ObservationManager]:

@@ -374,19 +374,20 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP interrupt as Ctrl-C does, the first of them; as before where others set no handlers.
+    """SIGTERM and SIGHUP interrupt as Ctrl-C does, if they come first; as before where others set no handlers.
 
-    Those that follow are ignored, as service managers send both: what the first has begun is brought to its end.
+    Those that follow, also a Ctrl-C, are ignored, as service managers send both: what has begun is brought to its end.
+    A second Ctrl-C interrupts again.
     """
     if threading.current_thread() is not threading.main_thread():  # Python lets no other set handlers
         yield
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)}
     heard: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
         heard.append(number)
-        if len(heard) == 1:
+        if len(heard) == 1 or number == signal.SIGINT:
             raise KeyboardInterrupt
 
     for number, handler in before.items():

@@ -3,8 +3,8 @@
     python -m omniperception.hardware.guard SETTINGS FD
 
 `robot` starts it. Targets and requests come through the socket FD; the robot's state it reads itself. When the other
-end falls silent or closes, a robot that walks is damped, one that stands lies down and is damped; after a while the
-process ends.
+end falls silent or closes, a robot that walks is damped; when it closes, one that stands lies down and is damped, and
+after a while the process ends.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 from omniperception.deploy.description import DeployError
 from omniperception.hardware.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network, Reader
-from omniperception.hardware.machine import Drive, Machine, MachineConfig, Mode, Request, Sensed
+from omniperception.hardware.machine import DRIVEN, Drive, Machine, MachineConfig, Mode, Request, Sensed
 from omniperception.hardware.messages import LOW_CMD, LOW_STATE, crc, low_cmd, remote, sealed
 
 PERIOD_S = 0.002
@@ -232,7 +232,7 @@ class Guard:
             time.sleep(0.01)
 
     def leave(self, *_: object) -> None:
-        """As when the policy's process has gone: a handler of signals."""
+        """Lays the robot down and ends, a handler of signals; a policy that still drives it may slow it down first."""
         self._is_asked_to_leave = True
 
     def run(self) -> None:
@@ -271,7 +271,10 @@ class Guard:
 
     def _read_link(self, now: float) -> None:
         if self._is_asked_to_leave and self._gone_since is None:
-            self._gone_since = now
+            if self.machine.mode not in DRIVEN:
+                self._gone_since = now
+            elif self.machine.mode is not Mode.SLOWING:
+                self.machine.ask(now, Request.LIE)
         while self._gone_since is None:
             try:
                 data = self._link.recv(256)
@@ -323,7 +326,8 @@ def main(argv: list[str], exit_with: Callable[[int], None] = sys.exit) -> None:
     except DeployError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         return exit_with(2)
-    signal.signal(signal.SIGTERM, guard.leave)
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):  # service managers send several, to all processes
+        signal.signal(number, guard.leave)
     guard.run()
 
 

@@ -61,7 +61,7 @@ class Logger:
         self._writer: LogWriter | None = None
 
     def open(self, first_iteration: int) -> None:
-        """Begin to log; scalars of iterations that will be repeated after a resume are dropped."""
+        """Begin to log; TensorBoard drops scalars of iterations that will be repeated after a resume."""
         if self.log_dir is not None:
             self._line = ProgressLine()
             if self.config is not None:
@@ -184,6 +184,13 @@ class Logger:
         if len(state["return_so_far"]) == self.num_envs:
             self._return_so_far.copy_(state["return_so_far"])
             self._length_so_far.copy_(state["length_so_far"])
+
+    def begin_episodes(self) -> None:
+        """Forgets returns and lengths, as where the task has changed."""
+        self.returns.clear()
+        self.lengths.clear()
+        self._return_so_far.zero_()
+        self._length_so_far.zero_()
 
     def _read_out_episodes(self) -> None:
         """Returns and lengths of the episodes that ended in the iteration, in their order."""

@@ -170,6 +170,7 @@ class Runner:
         if self.config.ppo.mixed_precision is None:
             self.alg.use_mixed_precision = state["use_mixed_precision"]
         if not same_task:
+            self.logger.begin_episodes()
             self.env.begin_at_levels_of(state["env"])
         elif distributed.rank() == 0:
             self.env.load_state_dict(state["env"])

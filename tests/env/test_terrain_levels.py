@@ -123,3 +123,22 @@ def test_levels_outlast_resets_of_all_with_seeds(make_env):
     for _ in range(2):
         env.reset(seeds=torch.arange(8))
         assert env.step_count == 0 and ((env.ground.level - levels).abs() <= 1).all()
+
+
+@pytest.mark.parametrize("num_envs", [8, 3, 11])
+def test_levels_outlast_a_change_of_the_task(make_env, num_envs):
+    """Also of the number of robots; on ground of fewer levels the hardest is the most."""
+    old = make_env("terrain=stairs", num_envs=8, blind=True)
+    old.ground.move(torch.arange(8), torch.tensor([2, 2, 3, 4, 5, 6, 7, 9]))
+    old.step(torch.zeros(8, 12))
+    state = old.state_dict()
+    new = make_env(
+        "terrain=stairs", "terrain.levels=6", "terrain.curriculum.start_level=0", num_envs=num_envs, blind=True
+    )
+    new.begin_at_levels_of(state)
+    expected = [2, 2, 3, 4, 5, 5, 5, 5, 2, 2, 3][:num_envs]
+    assert new.ground.level.tolist() == expected and new.step_count == 0
+    new.step(torch.zeros(num_envs, 12))
+    flat = make_env("terrain=flat", num_envs=2, blind=True)
+    flat.begin_at_levels_of(state)
+    new.begin_at_levels_of(flat.state_dict())

@@ -25,6 +25,16 @@ def test_sticks_reach_the_ends_of_the_trained_ranges():
     assert sticks.poll(0.0, Remote(frozenset(), 0.04, -0.04, 0.0, 0.04), START)[0].tolist() == [0.0, 0.0, 0.0]
 
 
+def test_back_is_never_ahead_where_training_left_zero_out():
+    """Nor does a goal behind the robot lead ahead."""
+    ranges = {"lin_vel_x": [0.3, 1.0], "lin_vel_y": [-0.4, -0.1], "ang_vel_z": [-1.5, 1.5]}
+    sticks = make_operator("remote", ranges)
+    assert sticks.poll(0.0, Remote(frozenset(), -1.0, 0.0, 0.0, -1.0), START)[0].tolist() == [0.0, 0.0, 0.0]
+    assert sticks.poll(0.0, Remote(frozenset(), 1.0, 0.0, 0.0, 1.0), START)[0].tolist() == [1.0, -0.4, 0.0]
+    command, _ = make_operator("goal:-5,0", ranges).poll(0.0, CENTRED, START)
+    assert np.abs(command[:2]).max() < 1e-9 and abs(command[2]) == 1.5
+
+
 def test_datagrams_hold_for_half_a_second():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
         found.bind(("127.0.0.1", 0))

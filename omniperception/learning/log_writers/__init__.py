@@ -45,7 +45,8 @@ class LoggerConfig:
 
         Args:
             run_dir: run directory.
-            first_iteration: what is logged begins there; scalars from there on are dropped, as they will come again.
+            first_iteration: what is logged begins there; TensorBoard drops scalars from there on, as they will come
+                again, services keep them.
             settings: the run's composed configuration.
 
         Raises:
