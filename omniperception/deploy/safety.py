@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 
@@ -76,8 +76,7 @@ class Safety:
         self._names = tuple(joints.names)
         self._lower, self._upper = _or(joints.lower, -math.inf), _or(joints.upper, math.inf)
         self._torque_limits = np.asarray(joints.torque_limits, np.float32)
-        ranges = np.array([description.command[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")], np.float32)
-        self._command_low, self._command_high = np.minimum(ranges[:, 0], 0.0), np.maximum(ranges[:, 1], 0.0)
+        self._command_low, self._command_high = command_limits(description.command).astype(np.float32)
         self._min_cos = math.cos(math.radians(config.max_tilt_deg))
         self._sees = lidar is not None and description.perception is not None
         self._min_hits = config.min_hits * lidar.num_rays if lidar is not None else 0.0
@@ -191,3 +190,9 @@ class Safety:
 
 def _or(limits: Sequence[float | None], without: float) -> np.ndarray:
     return np.array([without if limit is None else limit for limit in limits], np.float32)
+
+
+def command_limits(ranges: Mapping[str, Sequence[float]]) -> np.ndarray:
+    """(2, 3) least and largest v_x, v_y (m/s) and yaw rate (rad/s): training's ranges, widened to 0."""
+    low, high = np.array([ranges[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")]).T
+    return np.stack((np.minimum(low, 0.0), np.maximum(high, 0.0)))

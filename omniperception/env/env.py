@@ -478,7 +478,7 @@ class OmniEnv(VecEnv):
         if self.ground is not None and self.terrain_levels is not None and levels is not None and len(levels):
             some = torch.arange(self.num_envs) % len(levels)
             self.ground.load_state_dict({"level": levels.cpu()[some].clamp(max=self.ground.config.levels - 1)})
-            self._has_stepped = True  # so that `reset` does not draw them anew
+            self._has_stepped = True  # so that `reset` keeps them
         self.reset()
 
     def _managers(self) -> dict[str, RewardManager | ObservationManager]:

@@ -374,10 +374,10 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP interrupt as Ctrl-C does, if they come first; as before where others set no handlers.
+    """SIGTERM and SIGHUP interrupt as Ctrl-C does, where no signal has before; as before where others set no handlers.
 
-    Those that follow, also a Ctrl-C, are ignored, as service managers send both: what has begun is brought to its end.
-    A second Ctrl-C interrupts again.
+    After a first signal of any kind they are ignored, as service managers send both: what it has begun is brought to
+    its end. Every Ctrl-C interrupts.
     """
     if threading.current_thread() is not threading.main_thread():  # Python lets no other set handlers
         yield

@@ -14,10 +14,10 @@ from typing import Protocol
 import numpy as np
 
 from omniperception.deploy.description import DeployError
+from omniperception.deploy.safety import command_limits
 from omniperception.hardware.machine import Request
 from omniperception.hardware.messages import Remote
 
-_NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 _STALE_S = 0.5
 _SEQUENCE = re.compile("\x1b[\\[O][0-9;]*[A-Za-z~]")
 """What a terminal sends for arrows and function keys, which begin as the Escape key does."""
@@ -60,13 +60,8 @@ def make_operator(text: str, ranges: Mapping[str, Sequence[float]]) -> Operator:
 
 def scaled(shares: Sequence[float], ranges: Mapping[str, Sequence[float]]) -> np.ndarray:
     """(3,) command of shares -1 to 1 of each range, 0 being 0."""
-    return np.array([s * (high if s > 0 else -low) for s, low, high in zip(shares, *_limits(ranges), strict=True)])
-
-
-def _limits(ranges: Mapping[str, Sequence[float]]) -> np.ndarray:
-    """(2, 3) least and largest of a command: training's ranges, and 0 where they leave it out."""
-    low, high = np.array([ranges[name] for name in _NAMES]).T
-    return np.stack((np.minimum(low, 0.0), np.maximum(high, 0.0)))
+    limits = command_limits(ranges)
+    return np.array([s * (high if s > 0 else -low) for s, low, high in zip(shares, *limits, strict=True)])
 
 
 class Sticks:
@@ -104,7 +99,7 @@ class Goal:
     def __init__(self, goal: Sequence[float], ranges: Mapping[str, Sequence[float]], speed: float = 0.5) -> None:
         """Args: goal: x ahead and y to the left (m) of where the policy begins; speed: m/s."""
         self._goal, self._speed = np.array(goal), speed
-        self._low, self._high = _limits(ranges)
+        self._low, self._high = command_limits(ranges)
 
     def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         way = self._goal - pose[:2]

@@ -253,7 +253,7 @@ class Viewer:
     # ---- switching ---------------------------------------------------------------------------------------------------
 
     def choose(self, group: str, preset: str | None) -> None:
-        """Switches a preset of SWITCHED, or gives the run its own back; builds the task anew."""
+        """Switches a preset of SWITCHED, or gives the run its own back; rebuilds the task."""
         choices = {**self._choices, group: preset}
         if group == "scenario" and preset is not None:
             choices |= {"terrain": None, "obstacles": None}

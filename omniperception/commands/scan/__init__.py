@@ -59,7 +59,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     """Scans the room with each sensor and writes pictures and clouds."""
     if "none" in arguments.lidar:
         raise config.ConfigError("lidar=none has nothing to view; give a sensor, such as lidar=mid360")
-    if arguments.rays is not None and _says_rays(overrides):
+    of_preset = "lidar.num_rays" in _given(overrides)
+    if arguments.rays is not None and of_preset:
         raise config.ConfigError(
             f"rays={arguments.rays} and lidar.num_rays= are two words for one thing; give one of them"
         )
@@ -72,7 +73,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         env = _task(name, overrides)
         assert env.lidar is not None  # only lidar=none has none
         demo = _surroundings(arguments, env.robot)
-        rays = arguments.rays or (env.lidar.num_rays if _says_rays(overrides) else None)
+        rays = env.lidar.num_rays if of_preset else arguments.rays
         scans.append(take_scan(name, env.lidar, demo, arguments.seconds, rays, arguments.seed))
         folder = out if arguments.out and len(arguments.lidar) == 1 else out / name
         if demo.mesh is not None and demo.mesh.encloses(scans[-1].sensor_w):
@@ -119,8 +120,8 @@ def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConf
     """A sensor as its maker sells it: whole frames as far as it reaches, where nothing else is asked for."""
     sensor = _task(name, overrides).lidar
     assert sensor is not None  # only lidar=none has none
-    given = {override.key_or_group for override in config.parse(overrides)}
-    if not _says_rays(overrides):
+    given = _given(overrides)
+    if "lidar.num_rays" not in given:
         whole = sensor.scan_pattern().points_per_frame(sensor.period_s)
         sensor = replace(sensor, num_rays=min(arguments.rays or whole, whole))
     if "lidar.max_range" not in given and sensor.device is not None:
@@ -128,9 +129,9 @@ def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConf
     return sensor
 
 
-def _says_rays(overrides: list[str]) -> bool:
-    """Whether the number of rays is the preset's no longer."""
-    return any(override.key_or_group == "lidar.num_rays" for override in config.parse(overrides))
+def _given(overrides: list[str]) -> set[str]:
+    """Keys and groups of overrides."""
+    return {override.key_or_group for override in config.parse(overrides)}
 
 
 def _surroundings(arguments: Arguments, robot: RobotConfig, walkers: int = 0) -> DemoScene:
