@@ -15,15 +15,23 @@ class VelocityReadOut(nn.Module):
     def __init__(self, feature_dim: int) -> None:
         """Args: feature_dim: D, size of the embedding."""
         super().__init__()
+        self.feature_dim = feature_dim
         self.layers = zero_mlp(feature_dim, 64, 2)
 
     def extend(self, embedding: torch.Tensor) -> torch.Tensor:
-        """Tensors that are computed once per embedding (..., D): nothing."""
-        return embedding
+        """Embeddings (..., D) with the avoidance velocity appended: (..., D + 2)."""
+        return torch.cat((embedding, self.layers(embedding).float()), -1)
 
     def velocity(self, features: torch.Tensor, command: torch.Tensor) -> torch.Tensor:
-        """(B, 2) avoidance velocity (m/s, yaw-aligned frame) from embeddings (B, D); the command is not read."""
-        return self.layers(features).float()
+        """(B, 2) avoidance velocity (m/s, yaw-aligned frame).
+
+        Args:
+            features: (B, D + 2) from :meth:`extend`, or (B, D) embeddings.
+            command: not read.
+        """
+        if features.shape[1] == self.feature_dim:
+            features = self.extend(features)
+        return features[:, self.feature_dim :]
 
     def error(self, features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """(B,) mean squared error against the avoidance velocity (B, 2) that the simulation's obstacles give."""

@@ -10,9 +10,11 @@ from toy_env import ToyEnv, config
 from omniperception.learning import PerceptivePpo
 
 
-def algorithm(env, **ppo):
+def algorithm(env, avoidance_weight=0.0, **ppo):
     torch.manual_seed(0)
-    return PerceptivePpo.build(env, config(supervised=True, **ppo), "cpu")
+    cfg = config(supervised=True, **ppo)
+    perception = replace(cfg.perception, avoidance_weight=avoidance_weight)
+    return PerceptivePpo.build(env, replace(cfg, perception=perception), "cpu")
 
 
 def parameters(module):
@@ -42,14 +44,17 @@ def test_an_update_trains_both_networks_and_nothing_without_a_target():
     assert unchanged == [name for name in now if name.startswith("perception.distal")]
 
 
-def test_ppo_sees_the_embedding_that_the_policy_acted_on_and_does_not_change_it():
+@pytest.mark.parametrize("avoidance_weight", [0.0, 5.0])
+def test_ppo_sees_what_the_policy_acted_on_and_does_not_change_it(avoidance_weight):
     env = ToyEnv(6, episode=9)
-    alg = algorithm(env)
+    alg = algorithm(env, avoidance_weight)
     collect(alg, env, 8)
     acted_on = alg._embed_rollout()
+    before = list(alg.actor.perception_parameters())[-1].detach().clone()
     alg.train_perception()
     alg.storage.window_features = acted_on
-    after_supervision = parameters(alg.actor.perception)
+    after_supervision = [p.detach().clone() for p in alg.actor.perception_parameters()]
+    assert not avoidance_weight or (after_supervision[-1] - before).abs().max() > 1e-3  # the read-out's bias
     alg.perception_optimizer = None  # what follows is PPO alone
     for batch in alg.storage.mini_batch_generator(2, 1):
         alg.actor(batch.observations, stochastic_output=True)
@@ -59,7 +64,7 @@ def test_ppo_sees_the_embedding_that_the_policy_acted_on_and_does_not_change_it(
         old = batch.old_actions_log_prob.squeeze(-1)
         assert torch.allclose(log_prob[has_frame], old[has_frame], atol=1e-4)
     super(PerceptivePpo, alg).update()
-    assert all(map(torch.equal, after_supervision, parameters(alg.actor.perception)))
+    assert all(map(torch.equal, after_supervision, alg.actor.perception_parameters()))
 
 
 def test_a_rollout_without_a_frame_teaches_nothing():
