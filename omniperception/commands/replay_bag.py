@@ -32,6 +32,9 @@ class Arguments:
 
     file: Path = argument(doc=".mcap file, .db3 file, or folder of a ROS 2 bag")
     policy: Path = argument(Path("exported"), "folder that export has written")
+    joints: str | None = argument(
+        None, "topic of the joints, LowState or JointState; null: the only one, LowState first"
+    )
     points: str | None = argument(None, "topic of the clouds; null: the only one")
     imu: str | None = argument(None, "topic of the base's Imu; null: the only one")
     commands: str | None = argument(None, "topic of the commands; null: the only one")
@@ -42,7 +45,7 @@ class Arguments:
 def main(arguments: Arguments) -> None:
     """Replays, prints and draws."""
     policy = ExportedPolicy.load(arguments.policy)
-    topics = Topics(arguments.points, arguments.imu, arguments.commands)
+    topics = Topics(arguments.joints, arguments.points, arguments.imu, arguments.commands)
     replayed = replay(policy, events(arguments.file, topics), _command(arguments.command))
     print(replayed)
     path = arguments.out or arguments.file.with_suffix(".png")

@@ -52,11 +52,13 @@ class Topics:
     """Which topics are read; None: the only one of its kind.
 
     Attributes:
+        joints: LowState, or JointState where there is none.
         points: PointCloud2 or Livox CustomMsg.
         imu: of the base; not needed with LowState.
         command: Twist or TwistStamped.
     """
 
+    joints: str | None = None
     points: str | None = None
     imu: str | None = None
     command: str | None = None
@@ -153,16 +155,17 @@ def events(path: Path, wanted: Topics) -> Iterator[Event]:
     """
     kinds = {message.topic: message.kind for message in messages(path)}
     inputs = {topic: kind for topic, kind in kinds.items() if not topic.startswith(OUTPUTS)}
-    low = _chosen(path, inputs, (_LOW_STATE,), None, "")
-    joints = None if low else _chosen(path, inputs, (_JOINTS,), None, "")
-    if low is None and joints is None:
+    states = [kind for kind in (_LOW_STATE, _JOINTS) if kind in inputs.values()]
+    if not states:
         raise DeployError(f"{path}: joints were expected, a topic of type {_JOINTS} or {_LOW_STATE}; none is there")
+    joints = _chosen(path, inputs, tuple(states if wanted.joints else states[:1]), wanted.joints, "joints")
+    low = joints if joints is not None and inputs[joints] == _LOW_STATE else None
     imu = None if low else _chosen(path, inputs, (_IMU,), wanted.imu, "imu")
     if low is None and imu is None:
         raise DeployError(f"{path}: the base's orientation was expected, a topic of type {_IMU}; none is there")
     points = _chosen(path, inputs, tuple(_CLOUDS), wanted.points, "points")
     command = _chosen(path, inputs, _TWISTS, wanted.command, "commands")
-    read = {"joints": low or joints, "orientation": low or imu, "points": points, "commands": command}
+    read = {"joints": joints, "orientation": low or imu, "points": points, "commands": command}
     print(
         f"{path}: " + ", ".join(f"{what} from {topic or 'no topic'}" for what, topic in read.items()), file=sys.stderr
     )
@@ -196,8 +199,10 @@ def _chosen(path: Path, topics: dict[str, str], kinds: tuple[str, ...], name: st
         return found[0] if found else None
     if name in found:
         return name
-    mend = f"name one with {key}=" if key else "one was expected"
-    raise DeployError(f"{path}: {name or 'several'} given, of type {' or '.join(kinds)} are {', '.join(found)}; {mend}")
+    there = ", ".join(found) or "none"
+    raise DeployError(
+        f"{path}: {name or 'several'} given, of type {' or '.join(kinds)} are {there}; name one with {key}="
+    )
 
 
 def _take_imu(path: Path, state: np.ndarray, message: Any) -> None:

@@ -137,11 +137,13 @@ def test_points_in_the_levelled_base():
     assert near[18] == pytest.approx(np.hypot(1.0, 0.01)) and near[17] == np.inf and np.isfinite(near).sum() == 1
 
 
-def a_ros_bag(folder, names=MOTORS, imus=("/imu",), positions=12, velocities=12, orientation_covariance=0.0):
+def a_ros_bag(
+    folder, names=MOTORS, imus=("/imu",), positions=12, velocities=12, orientation_covariance=0.0, low_states=()
+):
     """Written by rosbags' own serializer: 100 Hz, a cloud, a Twist, joints in another order, without efforts."""
     pytest.importorskip("rosbags", reason="extra clouds")
     from rosbags.rosbag2 import Writer
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     t = {kind.rpartition("/")[2]: made for kind, made in store.types.items()}
@@ -181,6 +183,10 @@ def a_ros_bag(folder, names=MOTORS, imus=("/imu",), positions=12, velocities=12,
         write("/joint_states", joints, range(1, 50_000_000, 10_000_000))
         write("/cloud", cloud, [20_000_000])
         write("/cmd_vel", twist, [15_000_000])
+        store.register(get_types_from_msg("uint8 unread", "unitree_go/msg/LowState"))  # only its bytes are read
+        for k, topic in enumerate(low_states):
+            connection = bag.add_connection(topic, "unitree_go/msg/LowState", typestore=store)
+            bag.write(connection, 0, LOW_STATE.to_cdr(a_state(k)))
 
 
 def test_a_bag_of_ros_2(tmp_path):
@@ -197,6 +203,23 @@ def test_a_bag_of_ros_2(tmp_path):
     ]
     (command,) = [event for event in found if event.command is not None]
     assert command.command.tolist() == [0.5, 0.0, 0.2] and command.time_s == pytest.approx(0.015)
+
+
+def test_the_topic_of_the_joints_is_named_where_there_are_several(tmp_path):
+    """A Go2 says its state on two topics, on /lf/lowstate less often; JointState may be there besides."""
+
+    def first(folder, **topics):
+        return next(event.state for event in events(tmp_path / folder, Topics(**topics)) if event.state is not None)
+
+    a_ros_bag(tmp_path / "one", low_states=("/lowstate",))
+    a_ros_bag(tmp_path / "two", low_states=("/lowstate", "/lf/lowstate"))
+    assert first("one")["motor_state"]["q"][:12] == pytest.approx(0.1 * np.arange(12))
+    with pytest.raises(DeployError, match=r"several given, .*LowState are .*; name one with joints="):
+        first("two")
+    assert first("two", joints="/lf/lowstate")["motor_state"]["q"][:12] == pytest.approx(0.1 * np.arange(12) + 1)
+    assert first("two", joints="/joint_states")["motor_state"]["q"][:12].tolist() == list(range(12))
+    with pytest.raises(DeployError, match=r"/imu given, .*LowState or .*JointState are .*; name one with joints="):
+        first("two", joints="/imu")
 
 
 def test_bags_that_do_not_say_enough(tmp_path):
