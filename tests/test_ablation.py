@@ -122,8 +122,26 @@ def test_a_file_that_is_no_study_is_named(tmp_path):
 def test_studies_that_are_shipped_compose(name):
     study = load_study(name)
     for arm in study.arms.values():
-        overrides = [f"experiment={study.experiment}", *overrides_of(study.variants[0]), *arm.overrides]
+        overrides = [f"experiment={study.experiment}", *overrides_of(study.variants[0])]
+        overrides += [*study.overrides, *arm.overrides]
         build.assemble(config.compose(overrides))
+
+
+def test_studies_come_one_after_the_other_each_in_its_folder(monkeypatch, capsys):
+    done = []
+    monkeypatch.setattr("omniperception.commands.ablate.train", done.append)
+    main(["ablate", "study=avoider,end_to_end", "stage=train", "seeds=2"])
+    assert [(a.study.experiment, str(a.out), a.study.seeds) for a in done] == [
+        ("avoid", "outputs/avoider", (2,)),
+        ("end_to_end", "outputs/end_to_end", (2,)),
+    ]
+    for given, said in (
+        (["out=x"], "out=x is the folder of one study, 2 are given"),
+        (["arms=lesson"], "arms=lesson is unknown"),  # of avoider; nothing was trained before
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            main(["ablate", "study=end_to_end,avoider", "stage=train", *given])
+        assert said in capsys.readouterr().err and len(done) == 2
 
 
 @pytest.mark.slow
@@ -131,7 +149,11 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
     """Two arms, of which the second begins with the weights of the first."""
     study = {"experiment": "avoid", "variants": ["fps_mlp_small"], "seeds": [1, 2], "scenarios": ["corridor"]}
     short, longer = ["ppo.max_iterations=1", "ppo.gamma=0.9"], ["ppo.max_iterations=2"]
-    study |= {"trials": 2, "arms": {"short": {"overrides": short}, "long": {"after": "short", "overrides": longer}}}
+    study |= {
+        "trials": 2,
+        "overrides": ["ppo.max_iterations=3", "ppo.lam=0.91"],
+        "arms": {"short": {"overrides": short}, "long": {"after": "short", "overrides": longer}},
+    }
     (tmp_path / "conf" / "study").mkdir(parents=True)
     (tmp_path / "conf" / "study" / "mine.yaml").write_text(yaml.safe_dump(study, sort_keys=False))
     out = tmp_path / "out"
@@ -149,7 +171,8 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
     for seed in (1, 2):
         begun = config.load(out / f"long/fps_mlp_small/seed{seed}").init
         assert str(begun) == str(out / f"short/fps_mlp_small/seed{seed}")
-    assert config.load(out / "short/fps_mlp_small/seed1").ppo.gamma == 0.98  # the command line's, not the arm's
+    ppo = config.load(out / "short/fps_mlp_small/seed1").ppo
+    assert (ppo.gamma, ppo.lam) == (0.98, 0.91)  # the command line's before the arm's, the arm's before the study's
     main(["ablate", *arguments])
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
     table = (out / "ablation.md").read_text()

@@ -1,6 +1,7 @@
 """Trains networks, ways of training and seeds against each other, evaluates them, and writes tables with intervals.
 
     ablate study=end_to_end                                  # the paper's ablation, end to end: PPO alone, and taught
+    ablate study=avoider,avoider_ppo sim.num_threads=1       # the avoider from pretrained/gait, and what PPO adds to it
     ablate variants=fps_mlp_small,polar_rings seeds=1,2      # of study=perception
     ablate stage=train hydra/launcher=submitit_slurm hydra.launcher.partition=cpu
 
@@ -32,8 +33,8 @@ class Arguments:
     """The command's own arguments."""
 
     stage: str = argument("all", "what is done", choices=STAGES)
-    study: str = argument("perception", "file of conf/study")
-    out: Path | None = argument(None, "folder of the study; null: outputs/<study>")
+    study: tuple[str, ...] = argument(("perception",), "files of conf/study, one after the other")
+    out: Path | None = argument(None, "folder of the study, where there is one; null: outputs/<study>")
     experiment: str | None = argument(None, "recipe that all trainings share; null, here and below: the study's")
     arms: tuple[str, ...] | None = argument(None, "those of its ways of training that are meant")
     variants: tuple[str, ...] | None = argument(None, "perception variants")
@@ -52,22 +53,31 @@ _OF_THE_STUDY = ("experiment", "variants", "seeds", "scenarios", "suite", "condi
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Runs the stages of the study."""
+    if arguments.out is not None and len(arguments.study) > 1:
+        raise config.ConfigError(
+            f"out={arguments.out} is the folder of one study, {len(arguments.study)} are given; leave it out and each"
+            " has outputs/<study>"
+        )
+    for ablation in [_ablation(name, arguments, overrides) for name in arguments.study]:
+        if arguments.stage in ("train", "all"):
+            train(ablation)
+        if arguments.stage in ("evaluate", "all"):
+            evaluate_all(ablation)
+        if arguments.stage in ("table", "all"):
+            print(write_tables(ablation))
+
+
+def _ablation(name: str, arguments: Arguments, overrides: list[str]) -> Ablation:
+    """A study as the arguments change it, in its folder."""
     given = {name: value for name in _OF_THE_STUDY if (value := getattr(arguments, name)) is not None}
     if ("suite" in given) != ("scenarios" in given):  # one takes the place of the other
         given = {"suite": None, "scenarios": ()} | given
-    study = replace(load_study(arguments.study, config.search_path(overrides)), **given)
+    study = replace(load_study(name, config.search_path(overrides)), **given)
     if arguments.arms is not None:
         study = _with_arms(study, arguments.arms)
-    out = arguments.out or config.OUTPUTS / arguments.study
-    ablation = Ablation(study, out, tuple(overrides), arguments.trust)
     if arguments.stage == "all" and "exported" in study.policies:
         raise config.ConfigError("policies=exported: no run is exported yet; train, export, then give stage=evaluate")
-    if arguments.stage in ("train", "all"):
-        train(ablation)
-    if arguments.stage in ("evaluate", "all"):
-        evaluate_all(ablation)
-    if arguments.stage in ("table", "all"):
-        print(write_tables(ablation))
+    return Ablation(study, arguments.out or config.OUTPUTS / name, tuple(overrides), arguments.trust)
 
 
 def _with_arms(study: Study, names: tuple[str, ...]) -> Study:

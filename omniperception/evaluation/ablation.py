@@ -45,7 +45,7 @@ class Arm:
     """A way of training.
 
     Attributes:
-        overrides: of the study's experiment; those of the command line replace them.
+        overrides: of the study's experiment, after those of the study; those of the command line replace them.
         after: the arm whose weights, of the same network and seed, this one begins with (`init`); None: none.
     """
 
@@ -65,6 +65,7 @@ class Study:
         suite: file of conf/suite, whose worlds take the place of scenarios.
         trials: of each run in each scenario.
         arms: ways of training by name; one that begins with the weights of another stands behind it.
+        overrides: of the experiment, that all arms share.
         conditions: presets of `condition`.
         policies: names from `suite.POLICIES`.
         split: dev or test.
@@ -77,6 +78,7 @@ class Study:
     scenarios: Sequence[str] = ()
     suite: str | None = None
     arms: Mapping[str, Arm] = field(default_factory=lambda: {"own": Arm()})
+    overrides: Sequence[str] = ()
     conditions: Sequence[str] = ("ideal",)
     policies: Sequence[str] = ("run",)
     split: str = "dev"
@@ -179,9 +181,10 @@ def train(ablation: Ablation) -> None:
 def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:
     """Command of a training over the seeds."""
     study, arm = ablation.study, ablation.study.arms[name]
+    shared = (*study.overrides, *arm.overrides)
     subdir = f"{variant}/seed${{seed}}"
     given = {override.key_or_group for override in config.parse(ablation.overrides)}
-    parsed = zip(arm.overrides, config.parse(arm.overrides), strict=True)
+    parsed = zip(shared, config.parse(shared), strict=True)
     own = [text for text, override in parsed if override.key_or_group not in given]
     return [
         *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),

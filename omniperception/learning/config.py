@@ -76,11 +76,6 @@ class PerceptionConfig:
                 f"perception.final_learning_rate={self.final_learning_rate} must lie in (0, {self.learning_rate}], or"
                 " be null"
             )
-        if self.motion_weight and not self.supervised_epochs:
-            raise ValueError(
-                f"perception.motion_weight={self.motion_weight} is learned beside PPO; set"
-                " perception.supervised_epochs to at least 1, or motion_weight=0"
-            )
         if self.supervised_epochs and not self.supervision:
             raise ValueError(
                 f"perception.supervised_epochs={self.supervised_epochs} needs something to learn from; set"

@@ -21,13 +21,13 @@ SMALL = (
 
 @pytest.fixture
 def make_runner(make_config):
-    def make(*settings):
+    def make(*settings, size=0.3):
         torch.manual_seed(0)
         runner = build.build_runner(make_config(*SMALL, *settings), None)
         with torch.no_grad():  # a read-out that sees things everywhere
             for part in (runner.alg.actor.read_out, runner.alg.actor.perception):
                 for parameter in part.parameters():
-                    parameter.add_(0.3 * torch.randn_like(parameter))
+                    parameter.add_(size * torch.randn_like(parameter))
         return runner
 
     return make
@@ -64,6 +64,45 @@ def test_an_update_sees_what_the_policy_acted_on(make_runner):
         got = alg.actor.get_output_log_prob(batch.actions)
     torch.testing.assert_close(got, batch.old_actions_log_prob.squeeze(-1), atol=1e-4, rtol=1e-4)
     assert batch.observations["last_asked"].any()
+
+
+@pytest.mark.parametrize("end_to_end", [True, False])
+def test_the_loss_of_ppo_reaches_perception_by_way_of_the_controller(make_runner, end_to_end):
+    """No weight of the gait's reads the embedding, so there is no other way; against a finite difference."""
+    epochs = f"perception.supervised_epochs={0 if end_to_end else 1}"
+    runner = make_runner(epochs, "rewards.avoidance.max_acceleration=null", size=0.05)
+    obs = runner.env.get_observations()
+    with torch.inference_mode():
+        for _ in range(12):
+            obs = runner.step(obs)
+    actor = runner.alg.actor
+    assert not actor.mlp[0].weight[:, actor.blind_dim :].any()
+    actor.supervision = {}  # its own loss left out
+    [batch] = runner.alg.storage.mini_batch_generator(1, 1)
+    parameters = list(actor.perception.parameters())
+    advantages = torch.randn(batch.old_actions_log_prob.shape[0], dtype=torch.float64)
+
+    def loss():
+        actor(batch.observations, stochastic_output=True)
+        return (advantages * actor.get_output_log_prob(batch.actions).flatten().double()).sum()
+
+    def shifted(shift):
+        before = [parameter.clone() for parameter in parameters]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter += 0.0 if gradient is None else shift * gradient / size
+        value = loss()
+        for parameter, old in zip(parameters, before, strict=True):
+            parameter.copy_(old)
+        return float(value)
+
+    gradients = torch.autograd.grad(loss(), parameters, allow_unused=True)
+    if not end_to_end:
+        assert all(gradient is None for gradient in gradients)
+        return
+    size = float(sum(gradient.square().sum() for gradient in gradients if gradient is not None).sqrt())
+    with torch.no_grad():
+        slope = (shifted(2e-3) - shifted(-2e-3)) / 4e-3
+    assert size > 0.01 and slope == pytest.approx(size, rel=0.15)
 
 
 def test_a_state_goes_on_with_it(make_runner):
