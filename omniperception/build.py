@@ -77,6 +77,11 @@ class RunConfig:
                 f"{given} is a beginning of a policy's learning, and ppo.num_learning_epochs=0 keeps it as it is; leave"
                 " one of them out"
             )
+        if self.distillation is not None and self.perception is None:
+            raise ValueError(
+                "distillation teaches a policy that sees what its teacher is told of, and perception=none sees nothing;"
+                " leave it out or choose a perception"
+            )
         if self.adds_velocity and self.env.observations.estimated is not None and self.ppo.num_learning_epochs > 0:
             raise ValueError(
                 "observations.estimated: estimates would be fitted to the command without the avoidance velocity that"
@@ -316,6 +321,9 @@ def load_teacher(run_dir: Path, env: OmniEnv, trust: Sequence[str] = ()) -> Teac
             f"distillation.teacher={run_dir} does not fit: {reason}; give both the same preset of observations"
         )
     estimated = run.env.observations.estimated
+    if estimated and estimated not in observations:  # its number of values is all that is read
+        values = env.actor_inputs(replace(run.env.observations, actor=[estimated]))
+        observations[estimated] = torch.zeros(env.num_envs, len(values), device=env.device)
     actor = EstimatingModel(
         observations,
         {"actor": list(groups)},

@@ -210,6 +210,13 @@ def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
             raise ConfigError(f"{override.input_line}: {one_line(error.__cause__ or error)}") from None
 
 
+def for_hydra(override: Override, folders: Sequence[Path]) -> str:
+    """An override as Hydra itself takes it: a value as one that is added where it is not there, as `apply` does."""
+    text = str(override.input_line)
+    is_value = not override.is_hydra_override() and not presets(override.key_or_group, folders)
+    return f"++{text}" if is_value and override.type is OverrideType.CHANGE else text
+
+
 def _exists(config: DictConfig, override: Override) -> bool:
     """Tell whether the key of an override exists; raises ConfigError where it cannot."""
     node: Any = config

@@ -62,6 +62,28 @@ def test_a_sweep_gives_every_run_a_directory(tmp_path, monkeypatch, capsys):
         assert (tmp_path / "sweep" / str(seed) / "checkpoints" / "model_1.pt").is_file()
 
 
+def test_a_sweep_takes_what_a_run_does_and_one_that_fails_does_not_end_it(tmp_path, monkeypatch, capsys):
+    """A key that the preset leaves at its default; seed 1's checkpoint is not one."""
+    monkeypatch.chdir(tmp_path)
+    sweep = ["seed=1,2", "hydra.sweep.dir=sweep", "observations.command_acceleration=[4,8]", "ppo.max_iterations=1"]
+    command = ["train", "-m", "experiment=walk", *sweep, "num_envs=2", "ppo.num_steps_per_env=2", *SMALL[3:]]
+    main(command)
+    assert list(config.read(tmp_path / "sweep" / "0").observations.command_acceleration) == [4, 8]
+    assert "observations.command_acceleration=[4,8]" in config.read_recipe(tmp_path / "sweep" / "1")
+    for name in ("0", "1"):
+        broken = tmp_path / "sweep" / name / "checkpoints" / "model_1.pt"
+        (broken.write_bytes(b"no checkpoint") if name == "0" else broken.unlink())
+    capsys.readouterr()
+    with pytest.raises(SystemExit, match="2"):
+        main(command)
+    said = capsys.readouterr()
+    assert (
+        said.out.count("completed: 1 iterations") == 1
+        and (tmp_path / "sweep" / "1" / "checkpoints" / "model_1.pt").is_file()
+    )
+    assert "error: sweep/0: " in said.err and said.err.splitlines()[-1].startswith("error: failed: sweep/0; the others")
+
+
 def test_the_composed_configuration_is_printed(capsys):
     main(["train", "--cfg", "job", "num_envs=7"])
     assert yaml.safe_load(capsys.readouterr().out)["num_envs"] == 7
@@ -85,6 +107,19 @@ def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
     told["command"][1, :2] += torch.tensor([0.3, -0.2])
     with torch.no_grad():
         torch.testing.assert_close(teacher.actions(groups), walks(told))
+
+    guesses = ("observations=gait_without_velocity", "ppo.max_iterations=1")
+    main(["train", "experiment=gait", *quick, *guesses, "hydra.run.dir=guesses"])
+    wants = ("observations=gait_without_velocity", "observations.estimated=null")
+    history = config.read(tmp_path / "guesses").observations.groups.proprioception.history
+    wants += (f"observations.groups.proprioception.history={history}",)
+    other = build.build_runner(build.assemble(config.compose([*student, *wants])), None).env
+    teacher, seen = build.load_teacher(tmp_path / "guesses", other), other.get_observations()
+    walks = build.load_policy(build.load_run(tmp_path / "guesses"), tmp_path / "guesses").policy
+    with torch.no_grad():  # what is estimated is not observed here
+        torch.testing.assert_close(
+            teacher.actions(seen.clone().set("avoidance_target", torch.zeros(2, 2))), walks(seen)
+        )
 
     taught = "distillation={teacher: gait, iterations: 1}"
     lessons, imitate = [], PerceptivePpo._imitate
@@ -139,8 +174,12 @@ def test_what_a_run_goes_on_with_is_written_down(tmp_path, monkeypatch, capsys):
     assert saved.rewards.terms.velocity_tracking.weight == 3.0 and saved.ppo.max_iterations == 2
     assert config.read_recipe(tmp_path / "here")[-4:] == changed
     assert checkpoint(tmp_path, "here", 2)["learning_rate"] == 1e-5
+    for wrong in ("ppo.hidden_dims=[8]", "ppo.start_std=0.5"):
+        with pytest.raises(SystemExit, match="2"):
+            main(["train", "run=here", wrong])
     with pytest.raises(SystemExit, match="2"):
-        main(["train", "run=here", "ppo.hidden_dims=[8]"])
+        main(["train", "run=here", "ppo.schedule=adaptive", "ppo.learning_rate=1e-4"])
+    assert "ppo.schedule=adaptive goes on from the checkpoint's" in capsys.readouterr().err
     assert config.load(tmp_path / "here") == saved
 
 
@@ -171,7 +210,7 @@ def test_a_run_that_goes_on_in_another_task_begins_new_episodes(tmp_path, monkey
     first.save(checkpoint_path("here", 1))
     seen = []
     monkeypatch.setattr(Runner, "learn", lambda self, *_, **__: seen.append(self))
-    main(["train", "run=here", "ppo.learning_rate=1e-5"])
+    main(["train", "run=here", "ppo.save_interval=7"])
     assert torch.equal(seen[0].env.sim.qpos, first.env.sim.qpos) and "another now" not in capsys.readouterr().out
     assert seen[0].logger._return_so_far.tolist() == [123.0, 123.0] and list(seen[0].logger.returns) == [5.0]
     main(["train", "run=here", *changes])

@@ -22,12 +22,14 @@ import torch
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from omniperception import build, config
 from omniperception.cli import Command, argument, fail, trust
 from omniperception.common import provenance
+from omniperception.common.errors import one_line
 from omniperception.learning import (
     CheckpointError,
     RolloutTooSmall,
@@ -40,6 +42,7 @@ from omniperception.learning.ppo import check_rollout
 from omniperception.plan import Plan, Watch
 
 ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
+_OF_A_BEGINNING = ("seed", "init", "ppo.critic_warmup", "ppo.init_std", "ppo.start_std")
 SWEEP, SHOW = {"-m", "--multirun"}, {"--cfg", "job"}
 
 
@@ -73,12 +76,20 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
 def go_on(run_dir: Path, overrides: Sequence[str], trust: Sequence[str]) -> None:
     """Goes on with a run; what overrides change is written into its directory, for whoever reads it next."""
     for override in config.parse(overrides):
-        if override.key_or_group in ("seed", "init", "ppo.critic_warmup"):  # all are of a beginning
+        if override.key_or_group in _OF_A_BEGINNING:
             raise config.ConfigError(
                 f"{override.input_line}: {run_dir} has begun already and goes on from its newest checkpoint; leave it"
                 " out, or train a run of its own"
             )
-    learn(_trainable(build.load_run(run_dir, overrides, trust)), run_dir, resume=True, changes=overrides, trust=trust)
+    run = _trainable(build.load_run(run_dir, overrides, trust))
+    if run.ppo.schedule == "adaptive":
+        for override in config.parse(overrides):
+            if override.key_or_group == "ppo.learning_rate":
+                raise config.ConfigError(
+                    f"{override.input_line}: ppo.schedule=adaptive goes on from the checkpoint's; leave it out, or give"
+                    " ppo.schedule=fixed with it"
+                )
+    learn(run, run_dir, resume=True, changes=overrides, trust=trust)
 
 
 def assemble(composed: DictConfig) -> build.RunConfig:
@@ -236,27 +247,42 @@ def report(text: str) -> None:
 
 def sweep(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
     """Runs every combination of overrides with several values, by Hydra and the launcher that is chosen."""
-    check_jobs(overrides)
+    parsed = check_jobs(overrides)
+    searched = config.search_path([override for override in parsed if override.is_hydra_override()])
+    given = {config.for_hydra(override, searched): str(override.input_line) for override in parsed}
+    added = {override.key_or_group for override in parsed if str(override.input_line) not in given}
+    failed: list[Path] = []
 
     def job(_: DictConfig) -> None:
         settings = HydraConfig.get()
         folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
+        task = [_as_given(text, added) for text in settings.overrides.task]
+        run_dir = Path(os.path.relpath(settings.runtime.output_dir))
         try:
-            composed = config.compose([*settings.overrides.task, *folders])
-            run_dir = Path(os.path.relpath(settings.runtime.output_dir))
-            train(composed, run_dir, list(settings.overrides.task), trust)
+            train(config.compose([*task, *folders]), run_dir, task, trust)
         except (config.ConfigError, *ERRORS) as error:
-            fail(error)
+            if not settings.launcher["_target_"].endswith("BasicLauncher"):  # a process of its own
+                fail(error)
+            print(f"error: {run_dir}: {one_line(error)}", file=sys.stderr, flush=True)
+            failed.append(run_dir)
 
-    given, sys.argv = sys.argv, [sys.argv[0], "-m", *overrides]
+    before, sys.argv = sys.argv, [sys.argv[0], "-m", *given]
     try:
         hydra.main(config_path=str(config.CONFIG_DIR), config_name="config", version_base="1.3")(job)()
     finally:
-        sys.argv = given
+        sys.argv = before
+    if failed:
+        raise config.ConfigError(f"failed: {', '.join(map(str, failed))}; the others have ended")
 
 
-def check_jobs(overrides: Sequence[str]) -> None:
-    """Composes and validates every job of a sweep before the first is started."""
+def _as_given(text: str, added: set[str]) -> str:
+    """An override of a job, as it was before `config.for_hydra`."""
+    key = text.removeprefix("++").partition("=")[0]
+    return text.removeprefix("++") if key in added else text
+
+
+def check_jobs(overrides: Sequence[str]) -> list[Override]:
+    """Composes and validates every job of a sweep before the first is started; the overrides as Hydra reads them."""
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
@@ -264,6 +290,7 @@ def check_jobs(overrides: Sequence[str]) -> None:
     for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None):
         for job in batch:
             assemble(config.compose(job))
+    return parsed
 
 
 command = Command(main, Arguments, __doc__, "of the configuration", ERRORS, flags=(*sorted(SWEEP), *sorted(SHOW)))

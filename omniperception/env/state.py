@@ -165,7 +165,7 @@ class EnvState:
         self.actions: tuple[torch.Tensor, ...] = (torch.zeros(self.num_envs, robot.num_joints, device=self.device),) * 3
         self.drawn_physics = randomizer.drawn
         self._history = None if randomizer.delay is None else StateHistory(sim, randomizer)
-        self._foot_times: ContactTimes | None = None
+        self._foot_times: AirTimes | None = None
         self.before = self.kinematics
         self.stand_s = torch.zeros(self.num_envs, device=self.device)
         self.last_asked = torch.zeros(self.num_envs, 2, device=self.device)
@@ -385,10 +385,10 @@ class EnvState:
         return self.foot_force[..., 2].abs() > CONTACT_FORCE
 
     @property
-    def foot_times(self) -> ContactTimes:
+    def foot_times(self) -> AirTimes:
         """Air and contact time of the feet. Requires "foot_force"."""
         if self._foot_times is None:
-            self._foot_times = ContactTimes(self.foot_contact)
+            self._foot_times = AirTimes(self.foot_contact)
         return self._foot_times
 
     # ---- around the robot --------------------------------------------------------------------------------------------
@@ -511,30 +511,25 @@ class StateHistory:
             past.copy_(saved)
 
 
-class ContactTimes:
-    """Time that each foot has been in the air or in contact, updated in every control step; all (num_envs, F).
+class AirTimes:
+    """Time that each foot has been in the air, updated in every control step; all (num_envs, F).
 
     Attributes:
-        air, contact: s: of the present phase in the air and in contact; 0 in the other one.
-        last_air, last_contact: s: of the last phase that has ended in this episode; 0 before.
+        air: s: of the present phase in the air; 0 in contact.
+        last_air: s: of the last such phase that has ended in this episode; 0 before.
         touched_down: bool: contact began in this control step.
     """
 
     def __init__(self, contact: torch.Tensor) -> None:
         """Starts all times at 0; `contact` (num_envs, F) bool gives the shape."""
-        self.air, self.contact, self.last_air, self.last_contact = torch.zeros(
-            4, *contact.shape, device=contact.device
-        ).unbind(0)
+        self.air, self.last_air = torch.zeros(2, *contact.shape, device=contact.device).unbind(0)
         self.touched_down = torch.zeros_like(contact)
 
     def advance(self, contact: torch.Tensor, dt: float) -> None:
         """Takes in a control step of `dt` (s) at whose end the feet are in `contact` (num_envs, F) bool or not."""
         self.touched_down = contact & (self.air > 0)
-        lifted_off = ~contact & (self.contact > 0)
         self.last_air = torch.where(self.touched_down, self.air, self.last_air)
-        self.last_contact = torch.where(lifted_off, self.contact, self.last_contact)
         self.air = torch.where(contact, 0.0, self.air + dt)
-        self.contact = torch.where(contact, self.contact + dt, 0.0)
 
     def reset(self, env_ids: torch.Tensor) -> None:
         for name, value in vars(self).items():

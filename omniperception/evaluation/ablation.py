@@ -137,7 +137,12 @@ class Ablation:
         check_known("scenarios", self.study.scenarios, (*config.presets("scenario", folders), "all"))
         if self.study.suite is not None:
             suite_worlds(self.study.suite, folders)
-        for override in config.parse(self.overrides):
+        texts = (
+            *self.overrides,
+            *self.study.overrides,
+            *(text for arm in self.study.arms.values() for text in arm.overrides),
+        )
+        for override in config.parse(texts):
             if override.key_or_group in ("experiment", "perception", "seed"):
                 raise ConfigError(f"{override.input_line}: give study=, variants= and seeds= instead")
 
@@ -181,16 +186,15 @@ def train(ablation: Ablation) -> None:
 def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:
     """Command of a training over the seeds."""
     study, arm = ablation.study, ablation.study.arms[name]
-    shared = (*study.overrides, *arm.overrides)
     subdir = f"{variant}/seed${{seed}}"
     given = {override.key_or_group for override in config.parse(ablation.overrides)}
-    parsed = zip(shared, config.parse(shared), strict=True)
-    own = [text for text, override in parsed if override.key_or_group not in given]
+    own: dict[str, str] = {}
+    for texts in (overrides_of(variant), study.overrides, arm.overrides):  # the later ones win
+        own |= {override.key_or_group: str(override.input_line) for override in config.parse(texts)}
     return [
         *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),
-        *overrides_of(variant),
         *([] if arm.after is None else [f"init='{ablation.out}/{arm.after}/{subdir}'"]),
-        *own,
+        *(text for key, text in own.items() if key not in given),
         f"seed={','.join(map(str, study.seeds))}",
         f"hydra.sweep.dir={ablation.out}",
         f"hydra.sweep.subdir={name}/{subdir}",

@@ -393,6 +393,7 @@ def evaluate(evaluation: Evaluation) -> list[Record]:
     if evaluation.plots:
         new_figure(1.0, 1.0)  # refuses now what would fail after hours
     tasks = evaluation.tasks()
+    _check_names(tasks)
     ordered = measure_all(tasks)
     print(f"\n{(walking_table if all(record.episodes.walking for record in ordered) else table)(ordered)}")
     if evaluation.plots:
@@ -428,13 +429,6 @@ def _check_tasks(tasks: Sequence[Task]) -> None:
         if key in seen:
             raise ConfigError(f"run={task.run_dir} policy={task.policy} world={task.world.name} is given twice")
         seen.add(key)
-    names: dict[str, Path] = {}
-    for run_dir in (task.run_dir.resolve() for task in tasks):
-        if names.setdefault(shown(run_dir), run_dir) != run_dir:
-            raise ConfigError(
-                f"run={run_dir} and {names[shown(run_dir)]} would both be called {shown(run_dir)}; evaluate them from a"
-                " folder above both"
-            )
     weights = {run_dir: weights_hash(run_dir) for run_dir in dict.fromkeys(task.run_dir for task in tasks)}
     for run_dir in dict.fromkeys(task.run_dir for task in tasks if task.policy == "exported"):
         try:
@@ -444,6 +438,17 @@ def _check_tasks(tasks: Sequence[Task]) -> None:
     out = tasks[0].evaluation.out
     if out is not None and out.exists():
         read(out)
+
+
+def _check_names(tasks: Sequence[Task]) -> None:
+    """Refuses runs that one table or file would call the same."""
+    names: dict[str, Path] = {}
+    for run_dir in (task.run_dir.resolve() for task in tasks):
+        if names.setdefault(shown(run_dir), run_dir) != run_dir:
+            raise ConfigError(
+                f"run={run_dir} and {names[shown(run_dir)]} would both be called {shown(run_dir)}; evaluate them from a"
+                " folder above both"
+            )
 
 
 def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Record]]:

@@ -13,6 +13,7 @@ from torch import nn
 from torch.nn import functional
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, LAST_ASKED
+from omniperception.learning import distributed
 from omniperception.learning.config import LearningConfig
 from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.distributed import average_gradients
@@ -307,7 +308,7 @@ class PerceptivePpo(PPO):
         for _ in range(epochs):
             for env_ids in self.storage.shuffled_envs(self.num_mini_batches):
                 obs = self.storage.observations_of(env_ids, self.storage.first_steps)
-                if not obs.has_frames:
+                if distributed.mean(float(obs.has_frames), self.device) < 1.0:  # all processes take a step, or none
                     continue
                 with torch.autocast(device_type, dtype=torch.bfloat16, enabled=self.use_mixed_precision):
                     loss = self.actor.supervised_loss(self.actor.embed(obs), obs)

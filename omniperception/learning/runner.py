@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -207,7 +207,12 @@ class Runner:
         state = self._weights(run_dir)
         weights = state["actor_state_dict"]
         own, theirs = self.env.config.observations, observations or self.env.config.observations
-        inputs, given = self.env.actor_inputs(own), self.env.actor_inputs(theirs)
+        inputs, given = self.env.actor_inputs(own), self._inputs(theirs, theirs.actor)
+        if given is None:
+            raise CheckpointError(
+                f"init={run_dir} does not fit: that run's policy observes what this task does not have; give both the"
+                " same observations"
+            )
         if reason := first_difference(inputs, given):
             weights = observing_more(weights, inputs, given)
             if self.config.estimator is not None and theirs.estimated is None:
@@ -221,13 +226,18 @@ class Runner:
             with torch.no_grad():
                 self.alg.actor.distribution.std_param.fill_(self.config.ppo.start_std)
         self.alg.actor.reset()
-        if first_difference(self._critic_inputs(own), self._critic_inputs(theirs)) is None:
+        valued, given = self._inputs(own, own.critic), self._inputs(theirs, theirs.critic)
+        if valued is not None and given is not None and first_difference(valued, given) is None:
             with contextlib.suppress(CheckpointError):  # other hidden layers
                 start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
         return seeing
 
-    def _critic_inputs(self, observations: ObservationsConfig) -> list[ActorInput]:
-        return self.env.actor_inputs(replace(observations, actor=observations.critic))
+    def _inputs(self, observations: ObservationsConfig, groups: Sequence[str]) -> list[ActorInput] | None:
+        """What these groups are here; None: they are of quantities that this task does not have."""
+        try:
+            return self.env.actor_inputs(replace(observations, actor=groups))
+        except ValueError:
+            return None
 
     def _weights(self, run_dir: str | Path) -> dict:
         return load_checkpoint(latest_checkpoint(run_dir), self.device)
@@ -242,8 +252,6 @@ class Runner:
             collected = time.perf_counter()
             self.alg.compute_returns(obs)
         losses = self.alg.update()
-        if self.alg.is_multi_gpu:
-            self.alg.broadcast_parameters()  # running statistics of observations are the first process's
         end = time.perf_counter()
         self.total_time += end - start
         self.current_learning_iteration += 1

@@ -61,6 +61,8 @@ class MujocoWarpConfig(SimConfig):
         kind, _, index = self.device.partition(":")
         if kind not in ("auto", "cpu", "cuda") or (index and not (kind == "cuda" and index.isdigit())):
             raise ValueError(f"sim.device={self.device} is unknown; use auto, cpu, cuda or cuda:<index>")
+        if index and int(os.environ.get("WORLD_SIZE", 1)) > 1:
+            raise ValueError(f"sim.device={self.device} would give all processes the same GPU; use sim.device=cuda")
         if kind == "cuda" and not torch.cuda.is_available():
             raise ValueError(f"sim.device={self.device} needs a GPU that PyTorch can use; use sim.device=cpu")
 

@@ -11,7 +11,7 @@ import torch
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp import rewards
 from omniperception.env.mdp.terms import RewardTerm, StatefulTerm
-from omniperception.env.state import ContactTimes, requires
+from omniperception.env.state import AirTimes, requires
 
 FEET = {
     "air": RewardTerm(1.0, partial(rewards.foot_air_time, target=0.1, min_speed=0.0)),
@@ -116,15 +116,15 @@ def test_feet_move_as_mujoco_says(make_env, sim):
             np.testing.assert_allclose(env.state.foot_vel_w[i, foot], velocity[3:], atol=2e-4)
 
 
-def test_contact_times_by_hand():
+def test_air_times_by_hand():
     """One robot, two feet; steps of 0.5 s. The first is in the air for two steps, the second never."""
-    times = ContactTimes(torch.zeros(1, 2, dtype=torch.bool))
+    times = AirTimes(torch.zeros(1, 2, dtype=torch.bool))
     for contact in ((False, True), (False, True), (True, True)):
         times.advance(torch.tensor([contact]), 0.5)
     assert times.touched_down.tolist() == [[True, False]] and times.last_air.tolist() == [[1.0, 0.0]]
-    assert times.air.tolist() == [[0.0, 0.0]] and times.contact.tolist() == [[0.5, 1.5]]
+    assert times.air.tolist() == [[0.0, 0.0]]
     times.advance(torch.tensor([[False, True]]), 0.5)
-    assert not times.touched_down.any() and times.last_contact.tolist() == [[0.5, 0.0]]
+    assert not times.touched_down.any() and times.last_air.tolist() == [[1.0, 0.0]]
     times.reset(torch.tensor([0]))
     assert not any(value.any() for value in times.state_dict().values())
 

@@ -9,7 +9,7 @@ from toy_env import ToyEnv, config
 from omniperception.learning import Runner, distributed, latest_checkpoint, list_checkpoints
 
 if __name__ == "__main__":
-    run_dir, iterations, out, synchronized = sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4]
+    run_dir, iterations, out = sys.argv[1], int(sys.argv[2]), sys.argv[3]
     rank = distributed.rank()
     torch.set_num_threads(1)
     torch.manual_seed(rank)
@@ -19,9 +19,8 @@ if __name__ == "__main__":
     runner = Runner(env, config(supervised=True), run_dir)
     if list_checkpoints(run_dir):
         runner.load(str(latest_checkpoint(run_dir)))
-    elif synchronized == "once":  # from then on only gradients are exchanged
-        runner.alg.broadcast_parameters()
-        runner.alg.broadcast_parameters = lambda: None
+    if rank == 1:  # one without a frame at the beginning; both take the same steps nevertheless
+        env.frame_count.zero_()
     runner.learn(iterations)
     models = {"actor": runner.alg.actor, "critic": runner.alg.critic}
     ended = {

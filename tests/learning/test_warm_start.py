@@ -1,10 +1,14 @@
 """A policy that starts from another run's weights, and one that stays as it is while perception learns."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from omniperception.build import build_runner
 from omniperception.config import ConfigError
+from omniperception.env.mdp.observations import avoidance_target
+from omniperception.env.mdp.terms import ObservationGroup
 from omniperception.learning import CheckpointError
 from omniperception.learning.checkpoint import checkpoint_path
 
@@ -207,6 +211,17 @@ class TestAsManyNumbersThatMeanOtherThings:
         runner.start_from(plain[0], observations=plain[1])
         assert torch.equal(runner.alg.critic.mlp[0].weight, before)
 
+    def test_of_quantities_that_are_not_here(self, make_config, plain):
+        """V_avoid, in a task without obstacles: a critic stays behind, a policy is refused."""
+        runner = build_runner(make_config(*BLIND, *PLAIN), None)
+        truth = ObservationGroup({"avoidance_target": avoidance_target})
+        groups = {**plain[1].groups, "truth": truth}
+        before = runner.alg.critic.mlp[0].weight.clone()
+        runner.start_from(plain[0], observations=replace(plain[1], groups=groups, critic=[*plain[1].critic, "truth"]))
+        assert torch.equal(runner.alg.critic.mlp[0].weight, before)
+        with pytest.raises(CheckpointError, match="policy observes what this task does not have"):
+            runner.start_from(plain[0], observations=replace(plain[1], groups=groups, actor=[*plain[1].actor, "truth"]))
+
     def test_renamed_groups_are_the_same(self, make_config, plain):
         actor = "observations.actor=[proprioception,command,doing,clock]"
         renamed = "+observations.groups.doing={terms: {previous_action: {}}}"
@@ -214,14 +229,21 @@ class TestAsManyNumbersThatMeanOtherThings:
         runner.start_from(plain[0], observations=plain[1])
 
 
+@pytest.mark.parametrize("estimates", [False, True])
 @pytest.mark.parametrize("normalized", [True, False])
-def test_normalization_is_both_runs_or_none(make_config, tmp_path, normalized):
+def test_normalization_is_both_runs_or_none(make_config, tmp_path, normalized, estimates):
     mine, theirs = (f"ppo.obs_normalization={str(which).lower()}" for which in (not normalized, normalized))
-    build_runner(make_config(*BLIND, theirs), None).save(checkpoint_path(tmp_path, 1))
-    runner = build_runner(make_config(*BLIND, mine), None)
+    other = build_runner(make_config(*BLIND, theirs), None)
+    other.save(checkpoint_path(tmp_path, 1))
+    runner = build_runner(
+        make_config(*BLIND, mine, *(["observations=gait_without_velocity"] if estimates else [])), None
+    )
     before = runner.alg.actor.mlp[0].weight.clone()
-    with pytest.raises(CheckpointError, match=r"does not fit: .*obs_normalizer.* and ppo\.obs_normalization"):
-        runner.start_from(tmp_path)
+    with pytest.raises(
+        CheckpointError,
+        match="does not fit: .*" + ("" if estimates else r"obs_normalizer.* and ppo\.obs_normalization"),
+    ):
+        runner.start_from(tmp_path, observations=other.env.config.observations)
     assert torch.equal(runner.alg.actor.mlp[0].weight, before)
 
 
