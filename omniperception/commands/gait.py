@@ -29,6 +29,12 @@ from omniperception.scene.build import FOOT_FORCE
 
 RANGES, KICKS = ("rows", "factors", "preset", "trials", "out"), ("speeds", "bearings", "repeats")
 """Arguments that mean something for these alone."""
+OWN: dict[str, dict[str, object]] = {
+    "ranges": {"num_envs": Evaluation.num_envs, "scenario": "walk"},
+    "kicks": {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S},
+    "feet": {"num_envs": len(COMMANDS)},
+}
+"""Values that the command sets itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +59,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     """Measures, prints a table and draws a picture."""
     others = {"ranges": (*KICKS, "condition"), "kicks": RANGES, "feet": (*RANGES, *KICKS)}[arguments.what]
     refuse_arguments(arguments, others, f"it is not read for what={arguments.what}")
-    own: dict[str, dict[str, object]] = {
-        "ranges": {"num_envs": Evaluation.num_envs, "scenario": "walk"},
-        "kicks": {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S},
-        "feet": {"num_envs": len(COMMANDS)},
-    }
-    refuse_overrides(overrides, own[arguments.what])
+    refuse_overrides(overrides, OWN[arguments.what])
     run_dir = config.find_run(arguments.run)
     picture = run_dir / FOLDER / f"gait-{arguments.what}.png"
     picture.parent.mkdir(exist_ok=True)
@@ -87,21 +88,21 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
 
 def kicked(arguments: Arguments, run_dir: Path, overrides: list[str]) -> KickResults:
     """Kicks the run's policy."""
-    length = f"terminations.episode_length_s={AFTER_S + WATCHED_S}"
-    trained = policy_on_free_ground(arguments, run_dir, [*overrides, length, "num_envs=64"])
+    trained = policy_on_free_ground(arguments, run_dir, overrides)
     return kick(trained.env, trained.policy, arguments.speeds, arguments.bearings, arguments.repeats)
 
 
 def watched(arguments: Arguments, run_dir: Path, overrides: list[str]) -> Footfall:
     """Watches the feet of the run's policy."""
-    trained = policy_on_free_ground(arguments, run_dir, [*overrides, f"num_envs={len(COMMANDS)}"])
+    trained = policy_on_free_ground(arguments, run_dir, overrides)
     return watch(trained.env, trained.policy)
 
 
 def policy_on_free_ground(arguments: Arguments, run_dir: Path, overrides: list[str]) -> build.TrainedPolicy:
     """The run's policy under the condition, without pushes."""
-    given = [] if arguments.condition is None else [f"condition={arguments.condition}"]
-    run = build.load_run(run_dir, ["scenario=walk", *given, *overrides], arguments.trust)
+    given = {} if arguments.condition is None else {"condition": arguments.condition}
+    own = [f"{key}={value}" for key, value in ({"scenario": "walk"} | given | OWN[arguments.what]).items()]
+    run = build.load_run(run_dir, [*own, *overrides], arguments.trust)
     build.check_split(run, "picture")
     calm = replace(run.env.randomization, pushes=None)
     return build.load_policy(
@@ -119,10 +120,11 @@ def kicks_table(results: KickResults, speeds: tuple[float, ...]) -> str:
 
 def feet_table(footfall: Footfall) -> str:
     """Velocities, step frequencies and duty factors by command."""
-    rows = [
-        [name, *(f"{v:.2f}" for v in velocity.tolist()), f"{float(f.mean()):.2f}", f"{100 * float(d.mean()):.0f}"]
-        for name, velocity, f, d in zip(COMMANDS, footfall.velocity, footfall.frequency(), footfall.duty(), strict=True)
-    ]
+    rows, duty, frequency = [], footfall.duty(), footfall.frequency()
+    for k, name in enumerate(footfall.names()):
+        feet = f"{float(frequency[k].mean()):.2f}", f"{100 * float(duty[k].mean()):.0f}"
+        walked = [*(f"{v:.2f}" for v in footfall.velocity[k].tolist()), *feet]
+        rows.append([name, *(["fell", *[""] * (len(walked) - 1)] if footfall.fell[k] else walked)])
     heads = ["command", "v_x, m/s", "v_y, m/s", "yaw rate, rad/s", "steps of a foot per s", "a foot is down, %"]
     return markdown(heads, rows) + "\n"
 

@@ -208,13 +208,18 @@ class LidarSensing:
             self.unseen = torch.full((n, count), NEVER, device=device)
 
     @property
+    def sliced(self) -> bool:
+        """Whether clouds are cast in slices of the environments, and never there at once."""
+        return len(self.lidar.env_slices) > 1
+
+    @property
     def frame(self) -> LidarFrame | None:
         """The newest clouds of all environments; None before the first.
 
         Raises:
             ValueError: they are cast in slices.
         """
-        if len(self.lidar.env_slices) > 1:
+        if self.sliced:
             raise ValueError(
                 f"the clouds of {self._sim.num_envs} environments take more than"
                 f" lidar.cloud_mb={self.config.cloud_mb:g} MB and are never there at once; raise it, or lower num_envs"

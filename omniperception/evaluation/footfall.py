@@ -11,19 +11,19 @@ import torch
 from omniperception.avoidance.velocity import COMMAND
 from omniperception.common.figures import new_figure
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.commands import VelocityCommand
+from omniperception.env.mdp.commands import VelocityCommand, VelocityCommandConfig
 from omniperception.evaluation.episodes import Policy
 
-COMMANDS = {
-    "stand": (0.0, 0.0, 0.0),
-    "0.5 m/s ahead": (0.5, 0.0, 0.0),
-    "1 m/s ahead": (1.0, 0.0, 0.0),
-    "2 m/s ahead": (2.0, 0.0, 0.0),
-    "1 m/s back": (-1.0, 0.0, 0.0),
-    "1 m/s to the left": (0.0, 1.0, 0.0),
-    "1.5 rad/s to the left": (0.0, 0.0, 1.5),
-}
-"""What robots are commanded, by name: v_x, v_y (m/s), yaw rate (rad/s)."""
+COMMANDS = (
+    (0.0, 0.0, 0.0),
+    (0.5, 0.0, 0.0),
+    (1.0, 0.0, 0.0),
+    (2.0, 0.0, 0.0),
+    (-1.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (0.0, 0.0, 1.5),
+)
+"""What robots are commanded, as far as they are meant for it: v_x, v_y (m/s), yaw rate (rad/s)."""
 SETTLES_S, SHOWN_S = 3.0, 2.0
 """Time (s) before a diagram begins, and its length."""
 
@@ -33,16 +33,24 @@ class Footfall:
     """Feet of robots that each follow one command.
 
     Attributes:
+        commands: (len(COMMANDS), 3) m/s, m/s, rad/s, base frame.
+        fell: (len(COMMANDS),) bool: which fell, and have no figures.
         contact: (T, len(COMMANDS), F) bool: which feet are down in each control step.
         velocity: (len(COMMANDS), 3) mean v_x, v_y (m/s) and yaw rate (rad/s), base frame.
         dt: control step (s).
         feet: names.
     """
 
+    commands: torch.Tensor
+    fell: torch.Tensor
     contact: torch.Tensor
     velocity: torch.Tensor
     dt: float
     feet: Sequence[str]
+
+    def names(self) -> list[str]:
+        """Of the commands."""
+        return [_name(*command) for command in self.commands.tolist()]
 
     def duty(self) -> torch.Tensor:
         """(len(COMMANDS), F) share of the time that each foot is down."""
@@ -58,24 +66,36 @@ def watch(env: OmniEnv, policy: Policy) -> Footfall:
     """Lets each of as many robots as there are COMMANDS follow one of them.
 
     Args:
-        env: freshly built, with velocity commands and the sensor "foot_force".
+        env: freshly built, with velocity commands, whose ranges the robots are meant for, and the sensor "foot_force".
         policy: from observations to actions.
+
+    Raises:
+        ValueError: it has other commands, or the policy is not told them as they are.
     """
-    if not isinstance(env.command, VelocityCommand) or env.num_envs != len(COMMANDS):
+    command, config, observed = env.command, env.config.commands, env.get_observations()
+    if not isinstance(config, VelocityCommandConfig) or env.num_envs != len(COMMANDS):
         raise ValueError(f"a gait diagram needs velocity commands and num_envs={len(COMMANDS)}")
-    wanted = torch.tensor(list(COMMANDS.values()), device=env.device)
+    if COMMAND not in observed or observed[COMMAND].shape[1] != len(COMMANDS[0]):
+        raise ValueError(
+            f"a gait diagram needs observations with a group '{COMMAND}' that holds the command alone, without history"
+        )
+    assert isinstance(command, VelocityCommand)
+    least, most = torch.tensor([config.lin_vel_x, config.lin_vel_y, config.ang_vel_z]).T
+    wanted = torch.tensor(COMMANDS).clamp(least, most).to(env.device)
+    fell = torch.zeros(len(COMMANDS), dtype=torch.bool)
     contact, velocity = [], []
     with torch.no_grad():
         for step in range(round((SETTLES_S + SHOWN_S) / env.control_dt)):
-            env.command.value.copy_(wanted)
-            env.command.time_left.fill_(torch.inf)  # none is drawn, so that what follows from the command stays, too
-            env.observations[COMMAND].copy_(wanted)
+            command.value.copy_(wanted)  # observed from the next step on, as fast as the task lets it change
+            command.time_left.fill_(torch.inf)  # none is drawn, so that what follows from the command stays, too
             env.step(policy(env.get_observations()))
+            fell |= env.done.cpu()
             if step * env.control_dt >= SETTLES_S:
                 k = env.state.kinematics
                 contact.append(env.state.foot_contact.cpu())
                 velocity.append(torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:]), 1).cpu())
-    return Footfall(torch.stack(contact), torch.stack(velocity).mean(0), env.control_dt, env.robot.foot_names)
+    mean = torch.stack(velocity).mean(0)
+    return Footfall(wanted.cpu(), fell, torch.stack(contact), mean, env.control_dt, env.robot.foot_names)
 
 
 def draw_footfall(footfall: Footfall, path: Path) -> None:
@@ -85,8 +105,12 @@ def draw_footfall(footfall: Footfall, path: Path) -> None:
     figure = new_figure(9.0, 1.35 * lines + 0.5)
     axes = figure.subplots(lines, columns, squeeze=False, sharex=True).ravel()
     duty, frequency = footfall.duty(), footfall.frequency()
-    for k, name in enumerate(COMMANDS):
+    for k, name in enumerate(footfall.names()):
         axis = axes[k]
+        if footfall.fell[k]:
+            axis.set_title(f"{name}: fell", fontsize=7.5)
+            axis.set_yticks([])
+            continue
         for foot in range(len(footfall.feet)):
             axis.broken_barh(_bars(footfall.contact[:, k, foot], footfall.dt), (-foot - 0.4, 0.8), color="#35618f")
         axis.set_yticks([-f for f in range(len(footfall.feet))], [n.removesuffix("_foot") for n in footfall.feet])
@@ -99,6 +123,15 @@ def draw_footfall(footfall: Footfall, path: Path) -> None:
     for axis in axes[-columns:]:
         axis.set_xlabel("time (s)", fontsize=8)
     figure.savefig(path, dpi=110)
+
+
+def _name(forward: float, aside: float, turn: float) -> str:
+    """Of a command that has one component, or none."""
+    if forward:
+        return f"{abs(forward):.3g} m/s {'ahead' if forward > 0 else 'back'}"
+    if aside:
+        return f"{abs(aside):.3g} m/s to the {'left' if aside > 0 else 'right'}"
+    return f"{abs(turn):.3g} rad/s to the {'left' if turn > 0 else 'right'}" if turn else "stand"
 
 
 def _bars(contact: torch.Tensor, dt: float) -> list[tuple[float, float]]:

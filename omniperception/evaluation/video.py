@@ -180,7 +180,7 @@ class Recorder:
     def _points(self, env_id: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Points (P, 3) (m, environment frame) of the episode's newest frame, and which are proximal."""
         sensing, device = self._env.sensing, self._env.device
-        if sensing is None or sensing.frame is None or sensing.tick < self._blind_until[env_id]:
+        if sensing is None or sensing.sliced or sensing.frame is None or sensing.tick < self._blind_until[env_id]:
             return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         frame, config = sensing.frame, sensing.config
         if frame.ranges is None or frame.directions_s is None or frame.elevation is None:  # no network looks at points
@@ -199,7 +199,7 @@ class Recorder:
         env = self._env
         speed = float(env.state.kinematics.base_lin_vel_yaw[env_id, 0])
         value = min(max(speed, 0.0), 0.8) + float(env.episode_length_buf[env_id] * env.control_dt > 2.0)
-        frame = env.sensing.frame if env.sensing is not None else None
+        frame = env.sensing.frame if env.sensing is not None and not env.sensing.sliced else None
         if frame is not None and frame.class_id is not None:
             seen = float((frame.class_id[env_id] == HitClass.OBSTACLE).float().mean())
             value += min(10.0 * seen, 1.0)

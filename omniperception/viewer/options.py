@@ -21,6 +21,10 @@ class ViewerError(RuntimeError):
     """The page cannot be opened; one line says why and what to do."""
 
 
+SWITCHED = ("scenario", "condition", "terrain", "obstacles", "lidar", "robot")
+"""Groups of presets that are switched on the page; a scenario brings its own terrain and obstacles."""
+
+
 @dataclass(frozen=True)
 class PageOptions:
     """Where the page listens, and until when.

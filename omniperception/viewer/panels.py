@@ -15,6 +15,7 @@ from omniperception.evaluation.perceived import Perceived
 from omniperception.viewer import charts
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, PROXIMAL
 from omniperception.viewer.drive import MAX_SPEED, MAX_YAW_RATE, Velocity
+from omniperception.viewer.options import SWITCHED
 from omniperception.viewer.session import MOST_POINTS, Session, spare_kinds
 from omniperception.viewer.stage import POINT_COLOURS
 
@@ -95,8 +96,6 @@ class Panels:
 
     def _build_task(self) -> None:
         gui, viewer = self._gui, self._viewer
-        from omniperception.viewer.viewer import SWITCHED
-
         runs = _runs(viewer.session.shown.run_dir)
         self._run = gui.add_dropdown("run", runs, initial_value=runs[0])
         self._on(self._run, lambda name: viewer.choose_run(Path(name)))

@@ -19,7 +19,7 @@ from omniperception.learning import CheckpointError, latest_checkpoint
 from omniperception.learning.checkpoint import list_checkpoints
 from omniperception.viewer.clock import Clock
 from omniperception.viewer.drive import Stick, Velocity
-from omniperception.viewer.options import PageOptions, Shown
+from omniperception.viewer.options import SWITCHED, PageOptions, Shown
 from omniperception.viewer.page import check_free, close_page, open_page
 from omniperception.viewer.panels import Panels
 from omniperception.viewer.session import Session
@@ -32,8 +32,6 @@ LISTS_S = 10.0
 """How often (s) runs and checkpoints are looked for."""
 PUSH_AHEAD_M = 1.5
 """Where (m) before the robot a spare obstacle is put."""
-SWITCHED = ("scenario", "condition", "terrain", "obstacles", "lidar", "robot")
-"""Groups of presets that are switched on the page; a scenario brings its own terrain and obstacles."""
 WRONG = (ConfigError, CheckpointError, ValueError, ImportError)
 """What a person can ask for in vain: one line on the page, and what was there goes on."""
 

@@ -3,16 +3,19 @@
 import pytest
 import torch
 
+from omniperception.commands.gait import feet_table
 from omniperception.evaluation.footfall import COMMANDS, Footfall, _bars, draw_footfall, watch
 
 BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk")
+TASK = (*BLIND, "scenario=walk", f"num_envs={len(COMMANDS)}")
 
 
 def test_shares_frequencies_and_bars_of_a_known_pattern():
     down = torch.tensor([True, True, False, False, True, False, False, False, True, True])
     contact = torch.zeros(10, len(COMMANDS), 2, dtype=torch.bool)
     contact[:, 0, 0], contact[:, 1, 1] = down, True
-    footfall = Footfall(contact, torch.zeros(len(COMMANDS), 3), 0.1, ("a_foot", "b_foot"))
+    nothing = torch.zeros(len(COMMANDS), 3)
+    footfall = Footfall(nothing, nothing[:, 0].bool(), contact, nothing, 0.1, ("a_foot", "b_foot"))
     assert footfall.duty()[0].tolist() == [0.5, 0.0] and footfall.duty()[1].tolist() == [0.0, 1.0]
     assert footfall.frequency()[0, 0].item() == pytest.approx(2 / 0.9)
     assert footfall.frequency()[1, 1].item() == 0.0
@@ -22,7 +25,7 @@ def test_shares_frequencies_and_bars_of_a_known_pattern():
 
 
 def test_robots_that_stand_have_all_feet_down_and_each_is_commanded_its_own(make_env, tmp_path):
-    env = make_env(*BLIND, "scenario=walk", f"num_envs={len(COMMANDS)}", read_besides=("foot_force",))
+    env = make_env(*TASK, read_besides=("foot_force",))
     seen = []
 
     def stand(observations):
@@ -30,13 +33,29 @@ def test_robots_that_stand_have_all_feet_down_and_each_is_commanded_its_own(make
         return torch.zeros(len(COMMANDS), 12)
 
     footfall = watch(env, stand)
-    assert all(torch.equal(command, torch.tensor(list(COMMANDS.values()))) for command in seen)
+    assert all(torch.equal(command, torch.tensor(COMMANDS)) for command in seen[1:])
     assert footfall.contact.shape == (100, len(COMMANDS), 4) and footfall.contact.all()
-    assert footfall.velocity.abs().max() < 0.05
+    assert footfall.velocity.abs().max() < 0.05 and not footfall.fell.any()
+    assert footfall.names()[-3:] == ["1 m/s back", "1 m/s to the left", "1.5 rad/s to the left"]
     draw_footfall(footfall, tmp_path / "feet.png")
     assert (tmp_path / "feet.png").stat().st_size > 10_000
 
 
+def test_one_that_falls_has_no_figures_and_none_is_asked_for_more_than_it_is_for(make_env, tmp_path):
+    """Legs folded by the one that is to walk back; commands of a robot that goes 0.8 m/s at most, never back."""
+    env = make_env(*TASK, "robot.gait.lin_vel_x=[0.0,0.8]", read_besides=("foot_force",))
+    folded = torch.zeros(len(COMMANDS), 12)
+    folded[4, 0::3] = 6.0
+    footfall = watch(env, lambda _: folded)
+    assert footfall.fell.tolist() == [k == 4 for k in range(len(COMMANDS))]
+    assert footfall.names()[1:5] == ["0.5 m/s ahead", "0.8 m/s ahead", "0.8 m/s ahead", "stand"]
+    rows = [[cell.strip() for cell in row.split("|")] for row in feet_table(footfall).splitlines()]
+    assert [row[2] == "fell" for row in rows[2:9]] == footfall.fell.tolist()
+    draw_footfall(footfall, tmp_path / "feet.png")
+
+
 def test_other_environments_are_refused(make_env):
+    with pytest.raises(ValueError, match="a group 'command' that holds the command alone"):
+        watch(make_env(*TASK, "observations.groups.command.history=2"), None)
     with pytest.raises(ValueError, match=r"velocity commands and num_envs=7"):
         watch(make_env(*BLIND, "scenario=static", "num_envs=2"), None)

@@ -283,6 +283,16 @@ def test_lidar_points_lie_on_what_was_hit(make_env, tmp_path):
     assert on_ground[:, 2].abs().max() < 1e-3
 
 
+def test_where_clouds_are_cast_in_slices_the_film_has_no_points(make_env, tmp_path):
+    env = make_env("obstacles=static", "num_envs=5", "lidar.cloud_mb=0.1", "perception=proximity_gru")
+    recorder = Recorder(env, tmp_path / "a.mp4", 1.0, VideoOptions((WIDTH, HEIGHT)))
+    for _ in range(6):
+        env.step(torch.zeros(5, 12))
+        recorder()
+    assert env.sensing.sliced and len(recorder._view(0).points_w) == 0
+    recorder.close()
+
+
 def test_points_of_an_ended_episode_are_not_shown(make_env, tmp_path):
     short = "terminations.episode_length_s=0.14"  # 7 steps, a frame every 5
     env = make_env("obstacles=static", "num_envs=2", short, "perception=proximity_gru")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from lockstep import ROOT
 
+from omniperception import build, config
 from omniperception.commands.robot_sim import world
 from omniperception.common.errors import ConfigError
 from omniperception.deploy import DeployError
@@ -16,6 +17,7 @@ from omniperception.hardware.faults import FAULTS, Faults
 from omniperception.hardware.livox import read_points, write_points
 from omniperception.hardware.messages import LOW_STATE, crc, sealed
 from omniperception.hardware.trials import KNOWN_FAULTS, TrialsConfig, results, run, table
+from omniperception.sim.mujoco import SimConfig
 
 PACKETS = [write_points(np.full((2, 3), 1.0), 1000 * k, k, 500_000) for k in range(20)]
 
@@ -151,6 +153,15 @@ def test_the_simulated_world_is_an_evaluations():
         world(ROOT / "pretrained" / "avoider", ["num_envs=4"])
     with pytest.raises(ConfigError, match=r"sim.timestep=0.001: this command sets sim.timestep=0.002"):
         world(ROOT / "pretrained" / "avoider", ["sim.timestep=0.001"])
+    with pytest.raises(ConfigError, match=r"sim=mujoco_warp: this command sets sim=mujoco"):
+        world(ROOT / "pretrained" / "avoider", ["sim=mujoco_warp"])
+
+
+def test_the_wire_is_mujocos_whatever_a_run_was_trained_in(tmp_path):
+    run = build.load_run(ROOT / "pretrained" / "avoider", ["sim=mujoco_warp", "sim.device=cpu"])
+    config.save(run.composed, tmp_path)
+    env = world(tmp_path, ["scenario=static"])
+    assert type(env.config.sim) is SimConfig and env.control_dt == pytest.approx(0.02)
 
 
 @pytest.mark.slow
