@@ -305,7 +305,7 @@ def load_teacher(run_dir: Path, env: OmniEnv, trust: Sequence[str] = ()) -> Teac
     Raises:
         ConfigError, CheckpointError: it perceives, or does not fit.
     """
-    run, observations = load_run(run_dir, trust=trust), env.get_observations()
+    run, observations = load_run(run_dir, trust=trust), env.get_observations().clone(recurse=False)
     if run.perception is not None:
         raise ConfigError(f"distillation.teacher={run_dir} perceives; give a run of experiment=gait or walk")
     groups = run.env.observations.actor

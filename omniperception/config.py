@@ -210,9 +210,12 @@ def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
             raise ConfigError(f"{override.input_line}: {one_line(error.__cause__ or error)}") from None
 
 
-def for_hydra(override: Override, folders: Sequence[Path]) -> str:
-    """An override as Hydra itself takes it: a value as one that is added where it is not there, as `apply` does."""
+def for_hydra(override: Override, folders: Sequence[Path]) -> str | None:
+    """An override as Hydra itself takes it: a value as one that is added where it is not there, as `apply` does; None
+    for one that leaves an optional group out, which it does not take."""
     text = str(override.input_line)
+    if not override.is_sweep_override() and _chooses_none(override):
+        return None
     is_value = not override.is_hydra_override() and not presets(override.key_or_group, folders)
     return f"++{text}" if is_value and override.type is OverrideType.CHANGE else text
 

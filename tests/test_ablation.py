@@ -12,7 +12,15 @@ from omniperception import build, config
 from omniperception.commands import main
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.ablation import Ablation, Arm, Study, load_study, overrides_of, write_tables
+from omniperception.evaluation.ablation import (
+    Ablation,
+    Arm,
+    Study,
+    _training,
+    check_trainings,
+    load_study,
+    write_tables,
+)
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record, read, write
 from omniperception.evaluation.study_report import study_table
@@ -119,12 +127,23 @@ def test_a_file_that_is_no_study_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("name", config.presets(config.STUDIES))
-def test_studies_that_are_shipped_compose(name):
-    study = load_study(name)
-    for arm in study.arms.values():
-        overrides = [f"experiment={study.experiment}", *overrides_of(study.variants[0])]
-        overrides += [*study.overrides, *arm.overrides]
-        build.assemble(config.compose(overrides))
+def test_studies_that_are_shipped_compose(name, tmp_path):
+    check_trainings(Ablation(load_study(name), tmp_path))
+
+
+def test_an_arm_says_more_than_its_study_and_the_command_line_more_than_both(tmp_path):
+    arms = {"first": Arm(), "then": Arm(["ppo.lam=0.9", "ppo.gamma=0.98"], after="first")}
+    shared = ["init=pretrained/gait", "ppo.lam=0.8", "ppo.gamma=0.97", "ppo.clip_param=0.3"]
+    ablation = Ablation(replace(STUDY, arms=arms, overrides=shared), tmp_path, ("ppo.gamma=0.99",))
+    first, then = (_training(ablation, arm, "fps_gru") for arm in arms)
+    settings = [text for text in then if text.startswith(("ppo.", "init="))]
+    begins = f"init='{tmp_path}/first/fps_gru/seed${{seed}}'"
+    assert sorted(settings) == [begins, "ppo.clip_param=0.3", "ppo.gamma=0.99", "ppo.lam=0.9"]
+    assert "init=pretrained/gait" in first and "ppo.lam=0.8" in first
+    check_trainings(ablation)
+    for given, said in (("init=other", "leave it out"), ("seed=3", "give study="), ("perception=none", "give study=")):
+        with pytest.raises(ConfigError, match=said):
+            Ablation(ablation.study, tmp_path, (given,))
 
 
 def test_studies_come_one_after_the_other_each_in_its_folder(monkeypatch, capsys):

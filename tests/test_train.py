@@ -65,8 +65,9 @@ def test_a_sweep_gives_every_run_a_directory(tmp_path, monkeypatch, capsys):
 def test_a_sweep_takes_what_a_run_does_and_one_that_fails_does_not_end_it(tmp_path, monkeypatch, capsys):
     """A key that the preset leaves at its default; seed 1's checkpoint is not one."""
     monkeypatch.chdir(tmp_path)
-    sweep = ["seed=1,2", "hydra.sweep.dir=sweep", "observations.command_acceleration=[4,8]", "ppo.max_iterations=1"]
+    sweep = ["seed=1,2", "condition=null", "hydra.sweep.dir=sweep", "observations.command_acceleration=[4,8]"]
     command = ["train", "-m", "experiment=walk", *sweep, "num_envs=2", "ppo.num_steps_per_env=2", *SMALL[3:]]
+    command += ["ppo.max_iterations=1"]
     main(command)
     assert list(config.read(tmp_path / "sweep" / "0").observations.command_acceleration) == [4, 8]
     assert "observations.command_acceleration=[4,8]" in config.read_recipe(tmp_path / "sweep" / "1")
@@ -81,7 +82,10 @@ def test_a_sweep_takes_what_a_run_does_and_one_that_fails_does_not_end_it(tmp_pa
         said.out.count("completed: 1 iterations") == 1
         and (tmp_path / "sweep" / "1" / "checkpoints" / "model_1.pt").is_file()
     )
-    assert "error: sweep/0: " in said.err and said.err.splitlines()[-1].startswith("error: failed: sweep/0; the others")
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", "-m", "experiment=walk", "condition=null,robot"])
+    assert "condition=null,robot: null beside other values" in capsys.readouterr().err
+    assert "error: sweep/0: " in said.err and said.err.splitlines()[-1] == "error: 1 of 2 jobs failed: sweep/0"
 
 
 def test_the_composed_configuration_is_printed(capsys):

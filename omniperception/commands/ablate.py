@@ -21,7 +21,15 @@ from pathlib import Path
 from omniperception import config
 from omniperception.cli import Command, argument, trust
 from omniperception.common.errors import check_known
-from omniperception.evaluation.ablation import Ablation, Study, evaluate_all, load_study, train, write_tables
+from omniperception.evaluation.ablation import (
+    Ablation,
+    Study,
+    check_trainings,
+    evaluate_all,
+    load_study,
+    train,
+    write_tables,
+)
 from omniperception.evaluation.suite import POLICIES, SPLITS
 from omniperception.learning import CheckpointError
 
@@ -58,7 +66,11 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
             f"out={arguments.out} is the folder of one study, {len(arguments.study)} are given; leave it out and each"
             " has outputs/<study>"
         )
-    for ablation in [_ablation(name, arguments, overrides) for name in arguments.study]:
+    ablations = [_ablation(name, arguments, overrides) for name in arguments.study]
+    if arguments.stage in ("train", "all"):
+        for ablation in ablations:
+            check_trainings(ablation)
+    for ablation in ablations:
         if arguments.stage in ("train", "all"):
             train(ablation)
         if arguments.stage in ("evaluate", "all"):

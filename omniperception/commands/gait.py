@@ -20,7 +20,7 @@ from omniperception.cli import RESULTS, Command, argument, refuse_arguments, ref
 from omniperception.common.figures import PlotsUnavailable
 from omniperception.common.tables import markdown
 from omniperception.evaluation import robustness
-from omniperception.evaluation.footfall import COMMANDS, Footfall, draw_footfall, watch
+from omniperception.evaluation.footfall import COMMANDS, SETTLES_S, SHOWN_S, Footfall, draw_footfall, watch
 from omniperception.evaluation.kicks import AFTER_S, WATCHED_S, KickResults, draw_kicks, kick
 from omniperception.evaluation.records import FOLDER, merge
 from omniperception.evaluation.suite import Evaluation, World
@@ -32,7 +32,7 @@ RANGES, KICKS = ("rows", "factors", "preset", "trials", "out"), ("speeds", "bear
 OWN: dict[str, dict[str, object]] = {
     "ranges": {"num_envs": Evaluation.num_envs, "scenario": "walk"},
     "kicks": {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S},
-    "feet": {"num_envs": len(COMMANDS)},
+    "feet": {"num_envs": len(COMMANDS), "terminations.episode_length_s": 2 * (SETTLES_S + SHOWN_S)},
 }
 """Values that the command sets itself."""
 
@@ -124,7 +124,7 @@ def feet_table(footfall: Footfall) -> str:
     for k, name in enumerate(footfall.names()):
         feet = f"{float(frequency[k].mean()):.2f}", f"{100 * float(duty[k].mean()):.0f}"
         walked = [*(f"{v:.2f}" for v in footfall.velocity[k].tolist()), *feet]
-        rows.append([name, *(["fell", *[""] * (len(walked) - 1)] if footfall.fell[k] else walked)])
+        rows.append([name, *(["fell, or left its ground", *[""] * (len(walked) - 1)] if footfall.fell[k] else walked)])
     heads = ["command", "v_x, m/s", "v_y, m/s", "yaw rate, rad/s", "steps of a foot per s", "a foot is down, %"]
     return markdown(heads, rows) + "\n"
 

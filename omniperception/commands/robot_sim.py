@@ -77,7 +77,10 @@ def world(run_dir: Path, overrides: list[str], trust: Sequence[str] = ()) -> Omn
         ConfigError: an override is unknown, or changes WIRE.
     """
     refuse_overrides(overrides, WIRE)
-    run = build.load_run(run_dir, [*overrides, *(f"{key}={value}" for key, value in WIRE.items())], trust)
+    own = dict(WIRE)
+    if config.read(run_dir).sim.type == own["sim"]:  # with settings of the run's
+        del own["sim"]
+    run = build.load_run(run_dir, [*overrides, *(f"{key}={value}" for key, value in own.items())], trust)
     build.check_split(run, "trial on the wire")
     return OmniEnv(replace(run.env, full_level=True, trials=True))
 

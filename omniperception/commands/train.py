@@ -249,30 +249,33 @@ def sweep(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
     """Runs every combination of overrides with several values, by Hydra and the launcher that is chosen."""
     parsed = check_jobs(overrides)
     searched = config.search_path([override for override in parsed if override.is_hydra_override()])
-    given = {config.for_hydra(override, searched): str(override.input_line) for override in parsed}
-    added = {override.key_or_group for override in parsed if str(override.input_line) not in given}
-    failed: list[Path] = []
+    given = {str(override.input_line): config.for_hydra(override, searched) for override in parsed}
+    left_out = [text for text, passed in given.items() if passed is None]
+    added = {override.key_or_group for override in parsed if given[str(override.input_line)] != override.input_line}
+    jobs, failed = 0, list[Path]()
 
     def job(_: DictConfig) -> None:
         settings = HydraConfig.get()
         folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
-        task = [_as_given(text, added) for text in settings.overrides.task]
+        nonlocal jobs
+        jobs += 1
+        task = [*(_as_given(text, added) for text in settings.overrides.task), *left_out]
         run_dir = Path(os.path.relpath(settings.runtime.output_dir))
         try:
             train(config.compose([*task, *folders]), run_dir, task, trust)
         except (config.ConfigError, *ERRORS) as error:
-            if not settings.launcher["_target_"].endswith("BasicLauncher"):  # a process of its own
-                fail(error)
+            if distributed.world_size() > 1 or not settings.launcher["_target_"].endswith("BasicLauncher"):
+                fail(error)  # this process has others that wait for it, or is the job's own
             print(f"error: {run_dir}: {one_line(error)}", file=sys.stderr, flush=True)
             failed.append(run_dir)
 
-    before, sys.argv = sys.argv, [sys.argv[0], "-m", *given]
+    before, sys.argv = sys.argv, [sys.argv[0], "-m", *(text for text in given.values() if text is not None)]
     try:
         hydra.main(config_path=str(config.CONFIG_DIR), config_name="config", version_base="1.3")(job)()
     finally:
         sys.argv = before
     if failed:
-        raise config.ConfigError(f"failed: {', '.join(map(str, failed))}; the others have ended")
+        raise config.ConfigError(f"{len(failed)} of {jobs} jobs failed: {', '.join(map(str, failed))}")
 
 
 def _as_given(text: str, added: set[str]) -> str:
@@ -290,6 +293,10 @@ def check_jobs(overrides: Sequence[str]) -> list[Override]:
     for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None):
         for job in batch:
             assemble(config.compose(job))
+    for override in parsed:
+        key, _, values = str(override.input_line).partition("=")
+        if override.is_sweep_override() and key in config.OPTIONAL_GROUPS and "null" in values.split(","):
+            raise config.ConfigError(f"{key}={values}: null beside other values; give it to a sweep of its own")
     return parsed
 
 

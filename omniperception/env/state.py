@@ -463,10 +463,14 @@ def _membership(sizes: Sequence[int], device: torch.device) -> torch.Tensor | No
     return (foot == torch.arange(len(sizes))[:, None]).float().to(device)
 
 
+class NotHere(ValueError):
+    """A quantity that this task does not have."""
+
+
 def _declared(part: Part | None, name: str) -> Part:
     """A quantity that exists if a term has declared it."""
     if part is None:
-        raise ValueError(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
+        raise NotHere(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
     return part
 
 

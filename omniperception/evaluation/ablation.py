@@ -10,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-from omniperception import config
+from omniperception import build, config
 from omniperception.common.errors import check_known
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record, read, write
@@ -137,14 +137,16 @@ class Ablation:
         check_known("scenarios", self.study.scenarios, (*config.presets("scenario", folders), "all"))
         if self.study.suite is not None:
             suite_worlds(self.study.suite, folders)
-        texts = (
-            *self.overrides,
-            *self.study.overrides,
-            *(text for arm in self.study.arms.values() for text in arm.overrides),
-        )
-        for override in config.parse(texts):
-            if override.key_or_group in ("experiment", "perception", "seed"):
+        arms = self.study.arms.values()
+        own = config.parse([*self.study.overrides, *(text for arm in arms for text in arm.overrides)])
+        given = config.parse(self.overrides)
+        fixed = {o.key_or_group for variant in self.study.variants for o in config.parse(overrides_of(variant))}
+        for override in (*own, *given):
+            if override.key_or_group in ("experiment", "seed", *fixed):
                 raise ConfigError(f"{override.input_line}: give study=, variants= and seeds= instead")
+
+        if any(override.key_or_group == "init" for override in given) and any(arm.after for arm in arms):
+            raise ConfigError("init is given, and an arm of the study begins where another has ended; leave it out")
 
     def run_dir(self, arm: str, variant: str, seed: int) -> Path:
         return self.out / arm / variant / f"seed{seed}"
@@ -185,22 +187,33 @@ def train(ablation: Ablation) -> None:
 
 def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:
     """Command of a training over the seeds."""
-    study, arm = ablation.study, ablation.study.arms[name]
-    subdir = f"{variant}/seed${{seed}}"
-    given = {override.key_or_group for override in config.parse(ablation.overrides)}
-    own: dict[str, str] = {}
-    for texts in (overrides_of(variant), study.overrides, arm.overrides):  # the later ones win
-        own |= {override.key_or_group: str(override.input_line) for override in config.parse(texts)}
+    study = ablation.study
     return [
-        *(sys.executable, "-m", "omniperception", "train", "-m", f"experiment={study.experiment}"),
-        *([] if arm.after is None else [f"init='{ablation.out}/{arm.after}/{subdir}'"]),
-        *(text for key, text in own.items() if key not in given),
+        *(sys.executable, "-m", "omniperception", "train", "-m"),
+        *_training(ablation, name, variant),
         f"seed={','.join(map(str, study.seeds))}",
         f"hydra.sweep.dir={ablation.out}",
-        f"hydra.sweep.subdir={name}/{subdir}",
+        f"hydra.sweep.subdir={name}/{variant}/seed${{seed}}",
         *([f"trust={','.join(ablation.trust)}"] if ablation.trust else []),
-        *ablation.overrides,
     ]
+
+
+def _training(ablation: Ablation, name: str, variant: str) -> list[str]:
+    """What an arm says of a variant's trainings: the study's overrides, then the arm's, then the command line's."""
+    study, arm = ablation.study, ablation.study.arms[name]
+    after = [] if arm.after is None else [f"init='{ablation.out}/{arm.after}/{variant}/seed${{seed}}'"]
+    chosen: dict[str, str] = {}
+    for texts in (study.overrides, after, arm.overrides, ablation.overrides):  # the later ones win
+        chosen |= {override.key_or_group: str(override.input_line) for override in config.parse(texts)}
+    return [f"experiment={study.experiment}", *overrides_of(variant), *chosen.values()]
+
+
+def check_trainings(ablation: Ablation) -> None:
+    """Composes and validates a training of each variant in each arm, before the first of them is started."""
+    for arm in ablation.study.arms:
+        for variant in ablation.study.variants:
+            settings = [*_training(ablation, arm, variant), f"seed={ablation.study.seeds[0]}"]
+            build.assemble(config.compose(settings), ablation.trust)
 
 
 def overrides_of(variant: str) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from omniperception.avoidance.velocity import COMMAND
+from omniperception.common.errors import ConfigError
 from omniperception.common.figures import new_figure
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.commands import VelocityCommand, VelocityCommandConfig
@@ -34,7 +35,7 @@ class Footfall:
 
     Attributes:
         commands: (len(COMMANDS), 3) m/s, m/s, rad/s, base frame.
-        fell: (len(COMMANDS),) bool: which fell, and have no figures.
+        fell: (len(COMMANDS),) bool: which fell, or left their ground, and have no figures.
         contact: (T, len(COMMANDS), F) bool: which feet are down in each control step.
         velocity: (len(COMMANDS), 3) mean v_x, v_y (m/s) and yaw rate (rad/s), base frame.
         dt: control step (s).
@@ -70,14 +71,16 @@ def watch(env: OmniEnv, policy: Policy) -> Footfall:
         policy: from observations to actions.
 
     Raises:
-        ValueError: it has other commands, or the policy is not told them as they are.
+        ValueError: it has other commands.
+        ConfigError: the policy is not told them as they are.
     """
     command, config, observed = env.command, env.config.commands, env.get_observations()
     if not isinstance(config, VelocityCommandConfig) or env.num_envs != len(COMMANDS):
         raise ValueError(f"a gait diagram needs velocity commands and num_envs={len(COMMANDS)}")
     if COMMAND not in observed or observed[COMMAND].shape[1] != len(COMMANDS[0]):
-        raise ValueError(
-            f"a gait diagram needs observations with a group '{COMMAND}' that holds the command alone, without history"
+        raise ConfigError(
+            f"what=feet needs observations with a group '{COMMAND}' that holds the command alone, without history;"
+            f" set observations.groups.{COMMAND}.history=1"
         )
     assert isinstance(command, VelocityCommand)
     least, most = torch.tensor([config.lin_vel_x, config.lin_vel_y, config.ang_vel_z]).T
@@ -108,7 +111,7 @@ def draw_footfall(footfall: Footfall, path: Path) -> None:
     for k, name in enumerate(footfall.names()):
         axis = axes[k]
         if footfall.fell[k]:
-            axis.set_title(f"{name}: fell", fontsize=7.5)
+            axis.set_title(f"{name}: fell, or left its ground", fontsize=7.5)
             axis.set_yticks([])
             continue
         for foot in range(len(footfall.feet)):

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from omniperception.common.errors import one_line
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig, first_difference
+from omniperception.env.state import NotHere
 from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
     CheckpointError,
@@ -226,8 +227,8 @@ class Runner:
             with torch.no_grad():
                 self.alg.actor.distribution.std_param.fill_(self.config.ppo.start_std)
         self.alg.actor.reset()
-        valued, given = self._inputs(own, own.critic), self._inputs(theirs, theirs.critic)
-        if valued is not None and given is not None and first_difference(valued, given) is None:
+        valued, given = self.env.actor_inputs(replace(own, actor=own.critic)), self._inputs(theirs, theirs.critic)
+        if given is not None and first_difference(valued, given) is None:
             with contextlib.suppress(CheckpointError):  # other hidden layers
                 start_from(self.alg.critic, state["critic_state_dict"], str(run_dir))
         return seeing
@@ -236,7 +237,7 @@ class Runner:
         """What these groups are here; None: they are of quantities that this task does not have."""
         try:
             return self.env.actor_inputs(replace(observations, actor=groups))
-        except ValueError:
+        except NotHere:
             return None
 
     def _weights(self, run_dir: str | Path) -> dict:

@@ -110,9 +110,7 @@ def estimating(
     kept = [given.index(one) for one in own]
     layer, bias = weights[_FIRST_LAYER], weights[_FIRST_BIAS].clone()
     mean, scale = torch.zeros(len(given)), torch.ones(len(given))
-    if isinstance(model.obs_normalizer, EmpiricalNormalization):
-        if "obs_normalizer._mean" not in weights:
-            return weights
+    if isinstance(model.obs_normalizer, EmpiricalNormalization) and "obs_normalizer._mean" in weights:
         mean = weights["obs_normalizer._mean"][0]
         scale = weights["obs_normalizer._std"][0] + model.obs_normalizer.eps
     of_estimates = layer.new_zeros(len(layer), len(truth))
