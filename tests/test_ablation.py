@@ -141,7 +141,7 @@ def test_an_arm_says_more_than_its_study_and_the_command_line_more_than_both(tmp
     assert sorted(settings) == [begins, "ppo.clip_param=0.3", "ppo.gamma=0.99", "ppo.lam=0.9"]
     assert "init=pretrained/gait" in first and "ppo.lam=0.8" in first
     check_trainings(ablation)
-    for given, said in (("init=other", "leave it out"), ("seed=3", "give study="), ("perception=none", "give study=")):
+    for given, said in (("init=other", "another has ended"), ("seed=3", "say this"), ("perception=none", "say this")):
         with pytest.raises(ConfigError, match=said):
             Ablation(ablation.study, tmp_path, (given,))
 

@@ -207,7 +207,7 @@ LINES = [
     ("ablate variants=fps_gruu", "variants=fps_gruu is unknown; did you mean fps_gru?"),
     ("ablate seeds=a", "seeds=a"),
     ("ablate scenarios=statik", "scenarios=statik"),
-    ("ablate seed=3", "seed=3: give study=, variants= and seeds= instead"),
+    ("ablate seed=3", "seed=3: experiment=, seeds= and variants= of the study say this; leave it out"),
     ("ablate stage=table out=EMPTY variants=fps_mlp seeds=1", "has not been trained; use stage=train or stage=all"),
     ("export run=RUN formats=tarball", "formats=tarball"),
     ("export run=RUN num_envs=3", "num_envs=3"),

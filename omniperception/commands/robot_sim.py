@@ -18,6 +18,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from omegaconf import OmegaConf
+
 from omniperception import build, config
 from omniperception.cli import Command, argument, refuse_overrides, trust
 from omniperception.deploy.description import DeployError
@@ -78,7 +80,7 @@ def world(run_dir: Path, overrides: list[str], trust: Sequence[str] = ()) -> Omn
     """
     refuse_overrides(overrides, WIRE)
     own = dict(WIRE)
-    if config.read(run_dir).sim.type == own["sim"]:  # with settings of the run's
+    if OmegaConf.select(config.read(run_dir), "sim.type") == own["sim"]:  # with settings of the run's
         del own["sim"]
     run = build.load_run(run_dir, [*overrides, *(f"{key}={value}" for key, value in own.items())], trust)
     build.check_split(run, "trial on the wire")

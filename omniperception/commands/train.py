@@ -290,13 +290,13 @@ def check_jobs(overrides: Sequence[str]) -> list[Override]:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
         raise config.ConfigError(config.one_line(error)) from None
+    for override in parsed:
+        several = override.is_sweep_override() and override.key_or_group in config.OPTIONAL_GROUPS
+        if several and "null" in override.sweep_string_iterator():
+            raise config.ConfigError(f"{override.input_line}: null beside other values; give it to a sweep of its own")
     for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None):
         for job in batch:
             assemble(config.compose(job))
-    for override in parsed:
-        key, _, values = str(override.input_line).partition("=")
-        if override.is_sweep_override() and key in config.OPTIONAL_GROUPS and "null" in values.split(","):
-            raise config.ConfigError(f"{key}={values}: null beside other values; give it to a sweep of its own")
     return parsed
 
 

@@ -143,8 +143,9 @@ class Ablation:
         fixed = {o.key_or_group for variant in self.study.variants for o in config.parse(overrides_of(variant))}
         for override in (*own, *given):
             if override.key_or_group in ("experiment", "seed", *fixed):
-                raise ConfigError(f"{override.input_line}: give study=, variants= and seeds= instead")
-
+                raise ConfigError(
+                    f"{override.input_line}: experiment=, seeds= and variants= of the study say this; leave it out"
+                )
         if any(override.key_or_group == "init" for override in given) and any(arm.after for arm in arms):
             raise ConfigError("init is given, and an arm of the study begins where another has ended; leave it out")
 
@@ -204,7 +205,9 @@ def _training(ablation: Ablation, name: str, variant: str) -> list[str]:
     after = [] if arm.after is None else [f"init='{ablation.out}/{arm.after}/{variant}/seed${{seed}}'"]
     chosen: dict[str, str] = {}
     for texts in (study.overrides, after, arm.overrides, ablation.overrides):  # the later ones win
-        chosen |= {override.key_or_group: str(override.input_line) for override in config.parse(texts)}
+        for override in config.parse(texts):
+            chosen.pop(override.key_or_group, None)  # so that it comes last
+            chosen[override.key_or_group] = str(override.input_line)
     return [f"experiment={study.experiment}", *overrides_of(variant), *chosen.values()]
 
 
@@ -213,7 +216,7 @@ def check_trainings(ablation: Ablation) -> None:
     for arm in ablation.study.arms:
         for variant in ablation.study.variants:
             settings = [*_training(ablation, arm, variant), f"seed={ablation.study.seeds[0]}"]
-            build.assemble(config.compose(settings), ablation.trust)
+            build.assemble(config.compose(settings))
 
 
 def overrides_of(variant: str) -> tuple[str, ...]:

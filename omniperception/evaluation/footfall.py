@@ -79,8 +79,8 @@ def watch(env: OmniEnv, policy: Policy) -> Footfall:
         raise ValueError(f"a gait diagram needs velocity commands and num_envs={len(COMMANDS)}")
     if COMMAND not in observed or observed[COMMAND].shape[1] != len(COMMANDS[0]):
         raise ConfigError(
-            f"what=feet needs observations with a group '{COMMAND}' that holds the command alone, without history;"
-            f" set observations.groups.{COMMAND}.history=1"
+            f"what=feet needs a run whose observations have a group '{COMMAND}' that holds the command alone, trained"
+            f" with observations.groups.{COMMAND}.history=1"
         )
     assert isinstance(command, VelocityCommand)
     least, most = torch.tensor([config.lin_vel_x, config.lin_vel_y, config.ang_vel_z]).T

@@ -196,10 +196,6 @@ def test_only_what_is_read_exists(make_config):
     [
         (["rewards=default"], r"perception\.motion_weight needs rewards\.avoidance\.risk; use rewards=veloc"),
         (["perception.avoidance_weight=1.0"], r"avoidance_weight=1\.0 and motion_weight=10\.0 would both change the"),
-        (
-            ["perception.supervised_epochs=0", "ppo.num_learning_epochs=2"],
-            r"set perception\.supervised_epochs to at le",
-        ),
     ],
 )
 def test_motion_needs_its_avoidance_controller(make_config, overrides, message):

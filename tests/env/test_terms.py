@@ -142,4 +142,4 @@ def test_legged_terms_in_the_task(make_env):
     expected = [0.02 * 4 * 0.04 * bool(command.norm() > 0) for command in env.state.command[:, :2]]
     assert env.rewards.weighted["air"].tolist() == pytest.approx(expected)
     env._reset(torch.tensor([2]))
-    assert not times.contact[2].any() and times.contact[1].all()
+    assert not times.last_air[2].any() and times.last_air[1].all()

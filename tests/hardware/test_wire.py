@@ -123,6 +123,17 @@ class SteppedClock:
             os.kill(os.getpid(), signal.Signals[self._signals.pop(0)[1]])
 
 
+@pytest.fixture
+def heard():
+    """Signals as at a terminal; where tests run in the background some are ignored, and so they would be here."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize("signals", [[(0.3, "SIGINT"), (0.7, "SIGTERM")], [(0.3, "SIGTERM"), (0.7, "SIGHUP")]])
 def test_a_signal_while_it_walks_slows_it_down_and_lays_it_down(lockstep, monkeypatch, signals):
     """And a second one changes nothing, as a service manager sends it."""
