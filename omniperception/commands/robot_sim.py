@@ -28,7 +28,10 @@ from omniperception.hardware.faults import FAULTS
 from omniperception.hardware.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
 
 WIRE = {
-    **{"sim": "mujoco", "sim.timestep": STEP_S, "sim.decimation": CONTROL_STEPS, "sim.num_threads": 1},
+    "sim": "mujoco",
+    "sim.timestep": STEP_S,
+    "sim.decimation": CONTROL_STEPS,
+    "sim.num_threads": 1,
     "num_envs": 1,
 }
 """What the wire's timing needs, of one robot."""

@@ -255,10 +255,10 @@ def sweep(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
     jobs, failed = 0, list[Path]()
 
     def job(_: DictConfig) -> None:
-        settings = HydraConfig.get()
-        folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
         nonlocal jobs
         jobs += 1
+        settings = HydraConfig.get()
+        folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
         task = [*(_as_given(text, added) for text in settings.overrides.task), *left_out]
         run_dir = Path(os.path.relpath(settings.runtime.output_dir))
         try:

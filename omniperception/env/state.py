@@ -386,7 +386,7 @@ class EnvState:
 
     @property
     def foot_times(self) -> AirTimes:
-        """Air and contact time of the feet. Requires "foot_force"."""
+        """Time of the feet in the air. Requires "foot_force"."""
         if self._foot_times is None:
             self._foot_times = AirTimes(self.foot_contact)
         return self._foot_times

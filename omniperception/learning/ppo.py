@@ -16,7 +16,6 @@ from omniperception.avoidance.velocity import AVOIDANCE_TARGET, LAST_ASKED
 from omniperception.learning import distributed
 from omniperception.learning.config import LearningConfig
 from omniperception.learning.distillation import DistillationConfig, Teacher
-from omniperception.learning.distributed import average_gradients
 from omniperception.learning.divergence import DivergenceGuard
 from omniperception.learning.estimator import EstimatingModel
 from omniperception.learning.models import PerceptionActor
@@ -279,7 +278,7 @@ class PerceptivePpo(PPO):
             self.optimizer.zero_grad()
             loss.backward()
             for model in (self.actor, self.critic):
-                average_gradients(list(model.parameters()))
+                distributed.average_gradients(list(model.parameters()))
                 nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
             self.optimizer.step()
             losses.append(torch.stack((error.detach(), value_error.detach())))
@@ -314,7 +313,7 @@ class PerceptivePpo(PPO):
                     loss = self.actor.supervised_loss(self.actor.embed(obs), obs)
                 optimizer.zero_grad()
                 loss.backward()
-                average_gradients(self._perception_parameters)
+                distributed.average_gradients(self._perception_parameters)
                 nn.utils.clip_grad_norm_(self._perception_parameters, self.max_grad_norm)
                 self.guard.check_gradients("perception network", self._perception_parameters)
                 optimizer.step()
@@ -341,7 +340,7 @@ class PerceptivePpo(PPO):
             loss = self.actor.estimation_error(obs)
             optimizer.zero_grad()
             loss.backward()
-            average_gradients(self._estimator_parameters)
+            distributed.average_gradients(self._estimator_parameters)
             self.guard.check_gradients("estimator", self._estimator_parameters)
             optimizer.step()
             losses.append(loss.detach())
