@@ -24,6 +24,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import Condition
 from omniperception.env.mdp.terms import first_difference
 from omniperception.env.mirror import Mirror
+from omniperception.env.state import NotHere
 from omniperception.learning import CheckpointError, Runner, distributed, latest_checkpoint, load_checkpoint
 from omniperception.learning.checkpoint import difference
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
@@ -316,7 +317,14 @@ def load_teacher(run_dir: Path, env: OmniEnv, trust: Sequence[str] = ()) -> Teac
             " both the same preset of observations"
         )
     own = replace(env.config.observations, actor=list(groups))
-    if reason := first_difference(env.actor_inputs(own), env.actor_inputs(run.env.observations)):
+    try:
+        theirs = env.actor_inputs(run.env.observations)
+    except NotHere as error:
+        raise CheckpointError(
+            f"distillation.teacher={run_dir} observes {error.name}, which nothing here reads; give both the same preset"
+            " of observations"
+        ) from None
+    if reason := first_difference(env.actor_inputs(own), theirs):
         raise CheckpointError(
             f"distillation.teacher={run_dir} does not fit: {reason}; give both the same preset of observations"
         )

@@ -157,6 +157,11 @@ def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
     (tmp_path / "gait" / "config.yaml").write_text(OmegaConf.to_yaml(made))
     with pytest.raises(CheckpointError, match="teacher=.*gait does not fit: input 0 .* proprioception.joint_pos_off"):
         build.load_teacher(tmp_path / "gait", env)
+    made.observations.groups.clock.terms, made.lidar = {"avoidance_target": {}}, config.read(tmp_path / "end").lidar
+    (tmp_path / "gait" / "config.yaml").write_text(OmegaConf.to_yaml(made))
+    blind = build.build_runner(build.assemble(config.compose(["experiment=gait", *quick])), None).env
+    with pytest.raises(CheckpointError, match="teacher=.*gait observes avoidance, which nothing here reads; give both"):
+        build.load_teacher(tmp_path / "gait", blind)
 
 
 def test_what_a_run_goes_on_with_is_written_down(tmp_path, monkeypatch, capsys):

@@ -1,8 +1,11 @@
-"""Files of which nobody sees a half."""
+"""Files that several processes read and write."""
 
 from __future__ import annotations
 
+import fcntl
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -11,3 +14,14 @@ def write_whole(path: Path, content: bytes) -> None:
     half = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     half.write_bytes(content)
     os.replace(half, path)
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keeps other processes that ask for the same folder waiting, so that none loses what another writes there."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)

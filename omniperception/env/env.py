@@ -9,7 +9,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from omniperception.avoidance.velocity import LAST_ASKED
+from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
 from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
@@ -432,6 +432,12 @@ class OmniEnv(VecEnv):
             for age in reversed(range(group.history)):
                 inputs += [ActorInput(name, term, age, i) for term, at in slices for i in range(at.stop - at.start)]
         return inputs
+
+    @property
+    def observes_command(self) -> bool:
+        """Whether a group holds the command of the present alone, so that another can be observed in its place."""
+        observed = self.observations.get(COMMAND)
+        return observed is not None and observed.shape == self.command.value.shape
 
     def terms_not_finite(self, name: str, env_id: int) -> list[str]:
         """Terms of "rewards", or of an observation group, that are not finite for an environment."""

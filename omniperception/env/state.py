@@ -464,13 +464,17 @@ def _membership(sizes: Sequence[int], device: torch.device) -> torch.Tensor | No
 
 
 class NotHere(ValueError):
-    """A quantity that this task does not have."""
+    """A quantity, by its name, that this task does not have, because none of its terms declares it."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
+        self.name = name
 
 
 def _declared(part: Part | None, name: str) -> Part:
     """A quantity that exists if a term has declared it."""
     if part is None:
-        raise NotHere(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
+        raise NotHere(name)
     return part
 
 

@@ -284,8 +284,7 @@ def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | N
         steering: the velocity, asked for once at each control step.
         limits: ranges to which it is clipped: what the policy has learned to follow; None for no limits.
     """
-    shape = env.get_observations()[COMMAND].shape if COMMAND in env.get_observations() else None
-    if shape is None or shape[1] != env.command.value.shape[1]:
+    if not env.observes_command:
         raise ValueError(
             f"it drives a policy by its command and needs observations with a group '{COMMAND}' that holds the"
             " command alone, without history; name another gait: walker=<run directory of experiment=walk>"

@@ -74,10 +74,10 @@ def watch(env: OmniEnv, policy: Policy) -> Footfall:
         ValueError: it has other commands.
         ConfigError: the policy is not told them as they are.
     """
-    command, config, observed = env.command, env.config.commands, env.get_observations()
+    command, config = env.command, env.config.commands
     if not isinstance(config, VelocityCommandConfig) or env.num_envs != len(COMMANDS):
         raise ValueError(f"a gait diagram needs velocity commands and num_envs={len(COMMANDS)}")
-    if COMMAND not in observed or observed[COMMAND].shape[1] != len(COMMANDS[0]):
+    if not env.observes_command:
         raise ConfigError(
             f"what=feet needs a run whose observations have a group '{COMMAND}' that holds the command alone, trained"
             f" with observations.groups.{COMMAND}.history=1"

@@ -1,11 +1,13 @@
 """Rates and figures of hand-made trials, as numbers, as files and as tables."""
 
 import json
+import multiprocessing
 from dataclasses import replace
 
 import pytest
 import torch
 
+from omniperception.common.files import alone_in
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.outcomes import Episodes
@@ -138,6 +140,20 @@ def test_a_result_replaces_the_earlier_one_of_the_same(tmp_path):
     run, blind = read(path)
     assert (run.policy, blind.policy) == ("run", "blind")
     assert run.episodes.contacts.sum() == 0 and blind.episodes.contacts.sum() == 6
+
+
+def test_what_another_process_adds_meanwhile_is_kept(tmp_path):
+    path = tmp_path / "all.json"
+    merge(path, [record()])
+    with multiprocessing.get_context("spawn").Pool(1) as other:
+        other.apply(read, (path,))  # it has started
+        with alone_in(tmp_path):
+            added = other.apply_async(merge, (path, [record(policy="blind")]))
+            with pytest.raises(multiprocessing.TimeoutError):
+                added.get(timeout=0.5)
+            write(path, [record(), record(policy="oracle")])
+        added.get()
+    assert [one.policy for one in read(path)] == ["run", "oracle", "blind"]
 
 
 def test_a_file_that_is_none_is_refused_in_one_line(tmp_path):
