@@ -124,6 +124,10 @@ def test_a_file_that_is_no_study_is_named(tmp_path):
     (tmp_path / "study" / "mine.yaml").write_text("experiment: avoid\nvariant: [fps_gru]\n")
     with pytest.raises(ConfigError, match=r"mine.yaml is no study: .*unexpected keyword argument 'variant'"):
         load_study("mine", [tmp_path])
+    (tmp_path / "study" / "mine.yaml").write_text("variants: [fps_gru\nseeds: 1\n")
+    with pytest.raises(ConfigError, match=r"mine.yaml is no study: while parsing") as error:
+        load_study("mine", [tmp_path])
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("name", config.presets(config.STUDIES))

@@ -290,5 +290,8 @@ def test_the_command_leaves_what_is_there(package, monkeypatch, capsys):
     monkeypatch.setattr("omniperception.commands.robot_fetch.MJLAB", found)
     main(["robot-fetch", f"wheel={wheel}"])
     main(["robot-fetch"])
-    said = capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["robot-fetch", f"wheel={wheel}"])
+    said, error = capsys.readouterr()
+    assert "wheel= would mean nothing: " in error
     assert "written: " in said and "already there: " in said and "robot-check one" in said

@@ -295,6 +295,7 @@ def test_any_name_of_a_joint_is_written_so_that_it_is_read(tmp_path, name):
         (["robot-new", "ghost.xml"], "no geom collides"),
         (["robot-new", "biped.xml", "frequency=0"], "frequency=0 must be a number above 0"),
         (["robot-check", "wolf"], "robot=wolf is unknown"),
+        (["robot-check", "go2", "robot=anymal"], "robot=anymal: this command sets robot=go2 itself"),
         (["robot-check", "go2", "lidar=sonar"], "lidar=sonar is unknown"),
     ],
 )

@@ -31,8 +31,8 @@ RANGES, KICKS = ("rows", "factors", "preset", "trials", "out"), ("speeds", "bear
 """Arguments that mean something for these alone."""
 OWN: dict[str, dict[str, object]] = {
     "ranges": {"num_envs": Evaluation.num_envs, "scenario": "walk"},
-    "kicks": {"num_envs": 64, "terminations.episode_length_s": AFTER_S + WATCHED_S},
-    "feet": {"num_envs": len(COMMANDS), "terminations.episode_length_s": 2 * (SETTLES_S + SHOWN_S)},
+    "kicks": {"num_envs": 64, "scenario": "walk", "terminations.episode_length_s": AFTER_S + WATCHED_S},
+    "feet": {"num_envs": len(COMMANDS), "scenario": "walk", "terminations.episode_length_s": 2 * (SETTLES_S + SHOWN_S)},
 }
 """Values that the command sets itself."""
 
@@ -101,7 +101,7 @@ def watched(arguments: Arguments, run_dir: Path, overrides: list[str]) -> Footfa
 def policy_on_free_ground(arguments: Arguments, run_dir: Path, overrides: list[str]) -> build.TrainedPolicy:
     """The run's policy under the condition, without pushes."""
     given = {} if arguments.condition is None else {"condition": arguments.condition}
-    own = [f"{key}={value}" for key, value in ({"scenario": "walk"} | given | OWN[arguments.what]).items()]
+    own = [f"{key}={value}" for key, value in (OWN[arguments.what] | given).items()]
     run = build.load_run(run_dir, [*own, *overrides], arguments.trust)
     build.check_split(run, "picture")
     calm = replace(run.env.randomization, pushes=None)
@@ -113,7 +113,7 @@ def policy_on_free_ground(arguments: Arguments, run_dir: Path, overrides: list[s
 def kicks_table(results: KickResults, speeds: tuple[float, ...]) -> str:
     """Shares survived by size."""
     rates = [results.rate(speed) for speed in speeds]
-    cells = [f"{100 * r['rate']:.1f} [{100 * r['low']:.1f}, {100 * r['high']:.1f}]" for r in rates]
+    cells = [f"{100 * r['rate']:.1f} [{100 * r['low']:.1f}, {100 * r['high']:.1f}]" if r else "–" for r in rates]
     rows = [[f"{speed:g}", cell] for speed, cell in zip(speeds, cells, strict=True)]
     return markdown(["kick, m/s", f"no fall within {WATCHED_S:g} s, %"], rows) + "\n"
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import build, config
-from omniperception.cli import Command, argument
+from omniperception.cli import Command, argument, refuse_overrides
 from omniperception.robots.look import Sight, draw, look
 from omniperception.robots.stand import NEAR, Standing, flat_world, reached_limits, stand
 from omniperception.scene import World
@@ -39,6 +39,7 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Prints the findings and draws the robot."""
+    refuse_overrides(overrides, {"robot": arguments.name})
     composed = config.compose([*NO_TASK, f"robot={arguments.name}", f"lidar={arguments.lidar}", *overrides])
     env = build.assemble(composed).env
     world = flat_world(env.robot)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from omniperception.cli import Command, argument
+from omniperception.cli import Command, argument, refuse_arguments
 from omniperception.robots.fetch import MJLAB, fetch
 
 
@@ -28,6 +28,8 @@ class Arguments:
 def main(arguments: Arguments) -> None:
     """Fetches, and says what is where."""
     there = MJLAB.folder.is_dir() and not arguments.again
+    if there:
+        refuse_arguments(arguments, ("wheel",), f"{MJLAB.folder} is there already, and again=true writes over it")
     folder = MJLAB.folder if there else fetch(MJLAB, arguments.wheel)
     print(f"{'already there' if there else 'written'}: {folder} ({MJLAB.name} {MJLAB.version}, {MJLAB.licence})")
     print("next: " + ", ".join(f"omniperception robot-check {name}" for name in MJLAB.robots))

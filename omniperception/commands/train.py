@@ -11,6 +11,7 @@ of values with commas, on a cluster with hydra/launcher=submitit_slurm. `--cfg j
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 from collections.abc import Sequence
@@ -43,7 +44,7 @@ from omniperception.plan import Plan, Watch
 
 ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
 _OF_A_BEGINNING = ("seed", "init", "ppo.critic_warmup", "ppo.init_std", "ppo.start_std")
-SWEEP, SHOW = {"-m", "--multirun"}, {"--cfg", "job"}
+SWEEP, SHOW = {"-m", "--multirun"}, ("--cfg", "job")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,13 +57,17 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Resumes a run, runs a sweep, or trains one run."""
-    flags = {text for text in overrides if text in SWEEP | SHOW}
+    flags = {text for text in overrides if text in SWEEP | set(SHOW)}
     values = [text for text in overrides if text not in flags]
+    if flags & set(SHOW) and SHOW not in itertools.pairwise(overrides):
+        raise config.ConfigError(
+            f"{' '.join(flags & set(SHOW))} by itself means nothing; {' '.join(SHOW)} shows what a run would be"
+        )
     if arguments.run is not None:
         if flags:
             raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
         go_on(config.find_run(arguments.run), values, arguments.trust)
-    elif flags & SHOW:
+    elif flags & set(SHOW):
         print(config.as_yaml(assemble(config.compose(values)).composed), end="")
     elif flags:
         sweep(values, arguments.trust)
@@ -300,4 +305,4 @@ def check_jobs(overrides: Sequence[str]) -> list[Override]:
     return parsed
 
 
-command = Command(main, Arguments, __doc__, "of the configuration", ERRORS, flags=(*sorted(SWEEP), *sorted(SHOW)))
+command = Command(main, Arguments, __doc__, "of the configuration", ERRORS, flags=(*sorted(SWEEP), *SHOW))

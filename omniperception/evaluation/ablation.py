@@ -11,7 +11,7 @@ from pathlib import Path
 import yaml
 
 from omniperception import build, config
-from omniperception.common.errors import check_known
+from omniperception.common.errors import check_known, one_line
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record, read, write
 from omniperception.evaluation.study_report import study_table
@@ -102,14 +102,14 @@ def load_study(name: str, folders: Sequence[Path] = ()) -> Study:
     """The study of a file of conf/study."""
     path = config.listed(config.STUDIES, name, folders)
     try:
-        given = dict(yaml.safe_load(path.read_text()))
+        given = dict(yaml.safe_load(path.read_text()) or {})
         if "arms" in given:
             given["arms"] = {arm: Arm(**settings) for arm, settings in given["arms"].items()}
         return Study(**given)
-    except (TypeError, ValueError) as error:
+    except (yaml.YAMLError, TypeError, ValueError) as error:
         if isinstance(error, ConfigError):
             raise ConfigError(f"{path}: {error}") from None
-        raise ConfigError(f"{path} is no study: {error}") from None
+        raise ConfigError(f"{path} is no study: {one_line(error)}") from None
 
 
 @dataclass(frozen=True)

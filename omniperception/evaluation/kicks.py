@@ -64,10 +64,10 @@ class KickResults:
     kicked: torch.Tensor
     survived: torch.Tensor
 
-    def rate(self, speed: float) -> dict:
-        """Share of the kicks of one size that was survived, with its interval."""
+    def rate(self, speed: float) -> dict | None:
+        """Share of the kicks of one size that was survived, with its interval; None where no robot still walked."""
         wanted = self.kicked & (self.speed == speed)
-        return rate(self.survived[wanted])
+        return rate(self.survived[wanted]) if bool(wanted.any()) else None
 
     def shares(self, speeds: Sequence[float], num_bearings: int) -> torch.Tensor:
         """(len(speeds), num_bearings) share survived by size and direction."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -111,7 +112,7 @@ def read(path: Path) -> list[Record]:
         if content["format"] != FORMAT:
             raise ConfigError(f"{path} has format {content['format']}, this version reads {FORMAT}; evaluate again")
         return [Record.of(plain) for plain in content["records"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{path} holds no results of evaluate: {error!r}") from None

@@ -86,7 +86,9 @@ def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors:
     unknown = [row for row in rows if row not in values]
     if unknown:
         raise ConfigError(f"rows={','.join(unknown)} are unknown; {config.suggest(unknown[0], tuple(values))}")
-    parts = [("", 0.0)] + [(row, factor) for row in rows for factor in factors if factor > 0]
+    if min(factors, default=0.0) < 0:
+        raise ConfigError(f"factors={','.join(f'{factor:g}' for factor in factors)} must not be negative")
+    parts = [("", 0.0)] + [(row, factor) for row in rows for factor in sorted(set(factors)) if factor > 0]
     if len(parts) == 1:
         raise ConfigError(
             f"nothing is left to measure: preset={preset} has no rows of the robot, or no factor is above 0; give"

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf, open_dict
 
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
-from omniperception.common.errors import check_known
+from omniperception.common.errors import check_known, one_line
 from omniperception.common.figures import new_figure
 from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
@@ -135,7 +135,10 @@ class Evaluation:
 def suite_worlds(name: str, folders: Sequence[Path] = ()) -> list[World]:
     """The worlds of a suite, a file of conf/suite with the terrains of each scenario."""
     path = config.listed(config.SUITES, name, folders)
-    worlds = yaml.safe_load(path.read_text()).get("worlds")
+    try:
+        worlds = dict(yaml.safe_load(path.read_text()) or {}).get("worlds")
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path} is no suite: {one_line(error)}") from None
     if not isinstance(worlds, dict) or not all(isinstance(terrains, list) for terrains in worlds.values()):
         raise ConfigError(f"{path} must have 'worlds: {{scenario: [terrain, ...]}}'")
     return [World(scenario, terrain) for scenario, terrains in worlds.items() for terrain in terrains]

@@ -91,7 +91,13 @@ def _by_world(records: Sequence[Record], column: str, keys: Sequence[str]) -> st
 
 
 def by_condition(records: Sequence[Record]) -> str:
-    """How often each policy arrived untouched, and how often it fell, in the trials of all worlds."""
+    """How often each policy arrived untouched, and how often it fell, in the trials of all worlds.
+
+    Raises:
+        ConfigError: policies or runs were in different worlds.
+    """
+    for _, theirs in grouped(records, "condition").items():
+        _check_same_worlds(theirs, "policy", "run")
     return _over_worlds(records, "policy", "condition", sorted({record.condition for record in records}))
 
 
@@ -101,15 +107,7 @@ def by_run(records: Sequence[Record]) -> str:
     Raises:
         ConfigError: runs were in different worlds, or under different conditions.
     """
-    groups = grouped(records, "run", "policy").items()
-    worlds = {key: {f"{record.place} ({record.condition})" for record in theirs} for key, theirs in groups}
-    (first, most), *others = worlds.items()
-    for key, found in others:
-        if found != most:
-            raise ConfigError(
-                f"{' '.join(key)} and {' '.join(first)} were not in the same worlds (only one of them in"
-                f" {', '.join(sorted(found ^ most))}); filter for what all have: world=... terrain=... condition=..."
-            )
+    _check_same_worlds(records, "run", "policy")
     return _over_worlds(records, "run", "policy", [policy for (policy,) in grouped(records, "policy")])
 
 
@@ -125,11 +123,27 @@ def by_training(records: Sequence[Record]) -> str:
         worlds = sorted({record.world for record in here})
         for world in worlds:
             rows.append([world, *key, *(_untouched([r for r in theirs if r.world == world]) for theirs in of_each)])
-        everywhere = [theirs if {r.world for r in theirs} == set(worlds) else [] for theirs in of_each]
+        everywhere = [
+            theirs if all({r.world for r in own} == set(worlds) for own in grouped(theirs, "run").values()) else []
+            for theirs in of_each
+        ]
         if len(worlds) > 1:
             rows.append([f"all {len(worlds)}", *key, *(_untouched(theirs) for theirs in everywhere)])
     keys = ["world", "terrain", "condition", "policy"]
     return _titled(records, "reached, untouched and without a fall, %", keys, trainings, rows)
+
+
+def _check_same_worlds(records: Sequence[Record], *keys: str) -> None:
+    """Refuses to put all worlds of these groups together where one group was in others."""
+    groups = grouped(records, *keys).items()
+    worlds = {key: {f"{record.place} ({record.condition})" for record in theirs} for key, theirs in groups}
+    (first, most), *others = worlds.items()
+    for key, found in others:
+        if found != most:
+            raise ConfigError(
+                f"{' '.join(key)} and {' '.join(first)} were not in the same worlds (only one of them in"
+                f" {', '.join(sorted(found ^ most))}); filter for what all have: world=... terrain=... condition=..."
+            )
 
 
 def _over_worlds(records: Sequence[Record], row: str, column: str, columns: list[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -133,6 +134,9 @@ def figures(parts: Sequence[Part]) -> list[str]:
     """The cells of HEADINGS, of one run or of several training seeds."""
 
     def cell(values: list[float], digits: int) -> str:
+        values = [value for value in values if math.isfinite(value)]
+        if not values:
+            return "–"
         mean = sum(values) / len(values)
         spread = f" ({min(values):.{digits}f} to {max(values):.{digits}f})" if len(values) > 1 else ""
         return f"{mean:.{digits}f}{spread}"

@@ -213,6 +213,23 @@ def test_outside_of_a_checkout_the_note_is_beside_the_results(walker, tmp_path, 
     assert suite.log_file(evaluation(walker, "static")) == walker / "evaluation" / "evaluations.jsonl"
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "must have 'worlds: "),
+        ("worlds: [walk", "is no suite: while parsing"),
+        ("- walk", "is no suite"),
+        ("worlds: [walk]", "must have 'worlds: "),
+    ],
+)
+def test_a_file_that_is_no_suite_is_one_line(text, message, tmp_path):
+    (tmp_path / "suite").mkdir()
+    (tmp_path / "suite" / "mine.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message) as error:
+        suite_worlds("mine", [tmp_path])
+    assert "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize("world", suite_worlds("held_out"), ids=lambda world: f"{world.name}-{world.terrain}")
 def test_every_world_of_the_suite_can_be_evaluated(walker, world):
     Task(evaluation(walker, world.name), walker, "run", world).assembled()

@@ -159,7 +159,12 @@ def test_what_another_process_adds_meanwhile_is_kept(tmp_path):
 def test_a_file_that_is_none_is_refused_in_one_line(tmp_path):
     (tmp_path / "a.json").write_text("[]")
     (tmp_path / "b.json").write_text(json.dumps({"format": 99, "records": []}))
-    for name, message in (("a.json", "holds no results"), ("b.json", "has format 99"), ("c.json", "holds no results")):
+    write(tmp_path / "d.json.gz", [record()])
+    for name, share in (("e", 0.5), ("f", 0.0)):
+        whole = (tmp_path / "d.json.gz").read_bytes()
+        (tmp_path / f"{name}.json.gz").write_bytes(whole[: int(share * len(whole))])
+    none = {name: "holds no results" for name in ("a.json", "c.json", "e.json.gz", "f.json.gz")}
+    for name, message in {**none, "b.json": "has format 99"}.items():
         with pytest.raises(ConfigError, match=message):
             read(tmp_path / name)
 

@@ -7,6 +7,7 @@ import torch
 import yaml
 
 from omniperception import config
+from omniperception.commands.gait import kicks_table
 from omniperception.config import ConfigError
 from omniperception.evaluation.kicks import AFTER_S, KickResults, Kicks
 from omniperception.evaluation.robustness import rows_of_the_robot, stretched, stretches
@@ -47,13 +48,15 @@ def test_what_has_no_range_is_refused():
 
 def test_a_range_that_ends_where_it_did_is_not_measured_again():
     evaluation = Evaluation(runs=[config.find_run("pretrained/gait")], worlds=[World("walk")])
-    found = stretches(evaluation, "robot", ("ground_restitution", "ground_friction"), (1.0, 2.0, 3.0))
+    found = stretches(evaluation, "robot", ("ground_restitution", "ground_friction"), (3.0, 1.0, 2.0, 1.0))
     rows = [(one.row, one.factor) for one in found]
     assert rows == [
         ("", 0.0),
         ("ground_restitution", 1.0),
         *(("ground_friction", factor) for factor in (1.0, 2.0, 3.0)),
     ]
+    with pytest.raises(ConfigError, match="factors=-1,2 must not be negative"):
+        stretches(evaluation, "robot", ("ground_friction",), (-1.0, 2.0))
 
 
 def test_rows_of_the_robot_are_the_papers_and_the_robots_without_the_lidars():
@@ -103,3 +106,4 @@ def test_shares_are_of_those_that_still_walked():
     results = KickResults(speed, kicked, survived)
     assert results.rate(1.0)["rate"] == pytest.approx(2 / 3)
     assert results.shares([1.0], 2).tolist() == [[1.0, 0.5]]
+    assert results.rate(2.0) is None and "| 2         | –" in kicks_table(results, (1.0, 2.0))

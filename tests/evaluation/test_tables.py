@@ -82,18 +82,25 @@ def test_runs_of_several_files_stand_below_each_other_if_they_were_in_the_same_w
         ConfigError, match=r"a blind and a run were not in the same worlds \(only one of them in rod \(ideal\)\)"
     ):
         rendered(page("first view=trained condition=ideal"), data)
+    with pytest.raises(ConfigError, match=r"blind a and run a were not in the same worlds"):
+        rendered(page("first view=conditions"), data)
 
 
 def test_trainings_stand_beside_each_other_and_all_worlds_below(data):
-    """Of a/seed1 2 of 8 trials arrive untouched in each world, of a/seed2 none; b was in one world only."""
+    """Of a/seed1 2 of 8 trials arrive untouched in each world, of a/seed2 none; b and c/seed2 were in one."""
     runs = [("a/seed1", None), ("a/seed2", [1] * 8)]
     both = [record(run=run, world=world, touches=touched) for run, touched in runs for world in ("rod", "corridor")]
     write(data / "third.json.gz", [*both, record(run="b")])
+    third = [record(run="c/seed1"), record(run="c/seed1", world="rod"), record(run="c/seed2")]
+    write(data / "fourth.json.gz", [*both, *third])
     text = rendered(page("third view=trainings"), data)
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
     assert rows[0] == ["world", "a", "b"] and [row[0] for row in rows[2:]] == ["corridor", "rod", "all 2"]
     assert rows[2][1:] == ["12.5 [3.5, 36.0] (0.0 to 25.0)", "25.0 [7.1, 59.1]"]
     assert rows[3][2] == rows[4][2] == "–" and rows[4][1] == "12.5 [5.0, 28.1] (0.0 to 25.0)"
+    text = rendered(page("fourth view=trainings"), data)
+    (row,) = [line for line in text.splitlines() if line.startswith("| all 2")]
+    assert [cell.strip() for cell in row.split("|")][2:-1] == ["12.5 [5.0, 28.1] (0.0 to 25.0)", "–"]
 
 
 def test_several_seeds_have_their_spread_in_every_view(data):

@@ -155,6 +155,11 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     at = [cell.strip() for cell in lines[0]].index("falls, %")
     rows = {cells[2].strip(): cells[at].strip() for cells in lines}
     assert rows["levels 0 to 4"].startswith("100.0") and rows["levels 5 and above"].startswith("0.0")
+    none = {**episodes.walking, "standing_s": torch.zeros(9)}  # a seed whose robots never stood still
+    still = {**episodes.walking, "standing_s": torch.ones(9), "standing_speed": torch.full((9,), 0.5)}
+    for stood, cell in (((none, still), "0.500"), ((none, none), "–")):
+        told = [replace(a, episodes=replace(episodes, walking=b)) for a, b in zip((first, second), stood, strict=True)]
+        assert walking_table(told).splitlines()[-1].split("|")[-2].strip() == cell
 
 
 def test_commands_to_a_goal_have_no_figures_of_a_gait(make_env):

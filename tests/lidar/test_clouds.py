@@ -3,6 +3,7 @@
 import inspect
 import struct
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from omniperception.lidar import (
     write_scans,
 )
 from omniperception.lidar.clouds import table_of
-from omniperception.lidar.clouds.pointcloud2 import message_from_table
+from omniperception.lidar.clouds.pointcloud2 import message_from_table, table_from_message
 
 NEEDS = {".pcd": "pypcd4", ".ply": None, ".las": "laspy", ".npz": None, ".mcap": "mcap_ros2"}
 OUTPUTS = ("ranges", "valid", "points_w", "points_s", "normals_w", "intensity", "class_id", "time_s", "row")
@@ -201,6 +202,8 @@ def test_a_bag_of_ros_is_read(tmp_path):
     table = read_points(tmp_path / "bag")
     np.testing.assert_array_equal(table.xyz, xyz)
     assert (table.frame, table.time_s) == ("velodyne", 5.5)
+    empty = replace(cloud, height=0, data=np.zeros(0, np.uint8))
+    assert len(table_from_message(empty)) == 0 and table_from_message(empty).names == table.names
 
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\n"
@@ -214,6 +217,9 @@ XYZ = "".join(f"property int {axis}\n" for axis in "xyz")
         ("a.ply", "solid", "is not a PLY file"),
         ("a.ply", f"{PLY}property list int int x\nend_header\n", "expected a number"),
         ("a.ply", f"{PLY}{XYZ}end_header\n1 2 3\n", "ends after 1 of 2 points"),
+        ("a.ply", f"{PLY}property int\nend_header\n1\n2\n", "a.ply is broken: IndexError"),
+        ("a.npz", "", "a.npz is broken: EOFError"),
+        ("a.npz", "PK\x03\x04", "a.npz is broken: BadZipFile"),
         ("a.ply", f"{PLY}property int x\nend_header\n1\n2\n", "need columns x, y and z"),
     ],
 )

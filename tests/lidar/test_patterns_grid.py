@@ -88,6 +88,7 @@ def test_a_users_table(tmp_path, name, header, rows):
         ("scan.csv", "0,100\n", "deg", "elevation of 100 deg is beyond a right angle"),
         ("scan.csv", "0,0\n", "turns", "lidar.pattern.unit='turns' must be deg or rad"),
         ("scan.npy", "no array", "rad", "cannot be read as numbers"),
+        ("scan.npy", "", "rad", "cannot be read as numbers"),
     ],
 )
 def test_wrong_files_are_refused_in_one_line(tmp_path, name, content, unit, message):

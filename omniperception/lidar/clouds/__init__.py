@@ -6,6 +6,7 @@ for MCAP, rosbags for bags of ROS 1 and 2, which are read only.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 from .table import PointTable, table_of
 
@@ -60,10 +62,13 @@ def read_scans(path: str | Path, topic: str | None = None) -> Iterator[PointTabl
         raise FileNotFoundError(f"{path} does not exist; give a file of points: {', '.join(FORMATS)}")
     form, module = _format("folder" if path.is_dir() else path.suffix.lower(), path, "read", tuple(FORMATS))
     with _needing(form, path):
-        if form.many:
-            yield from module.read(path, topic)
-        else:
-            yield module.read(path)
+        try:
+            if form.many:
+                yield from module.read(path, topic)
+            else:
+                yield module.read(path)
+        except (EOFError, LookupError, BadZipFile, zlib.error) as error:
+            raise ValueError(f"{path} is broken: {error!r}") from error
 
 
 def read_points(path: str | Path, index: int = 0, topic: str | None = None) -> PointTable:

@@ -58,8 +58,9 @@ def table_from_message(message: Any) -> PointTable:
             "itemsize": message.point_step,
         }
     )
-    data = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, -1)
-    rows = data[:, : message.width * message.point_step]
+    used = message.width * message.point_step
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    rows = data.reshape(message.height, -1)[:, :used] if message.height else data.reshape(0, used)
     stamp = message.header.stamp
     time_s = stamp.sec + 1e-9 * stamp.nanosec
     return PointTable(np.ascontiguousarray(rows).reshape(-1).view(dtype), message.header.frame_id, time_s)

@@ -64,7 +64,7 @@ def _read(path: Path) -> np.ndarray:
             if not lines:
                 raise ValueError("it is empty")
             return np.genfromtxt(lines[_has_header(lines) :], delimiter=",", dtype=np.float64, ndmin=2)
-    except ValueError as error:
+    except (ValueError, EOFError) as error:
         raise ValueError(f"lidar.pattern.path={path} cannot be read as numbers: {str(error).splitlines()[0]}") from None
     raise ValueError(f"lidar.pattern.path={path} must end in .npy or .csv")
 
