@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, Literal
@@ -134,7 +134,8 @@ class OmniVectorEnv:
         """Seeds (m,) of those of environments (n,) that get one, and which do (n,) bool."""
         if isinstance(seed, Integral):
             seed = int(seed)
-        many: list = [seed + k for k in range(self.num_envs)] if isinstance(seed, int) else list(seed)
+        counted: list = [seed + k for k in range(self.num_envs)] if isinstance(seed, int) else []
+        many = list(seed) if isinstance(seed, Iterable) else counted
         if len(many) != self.num_envs or not all(one is None or _is_seed(one) for one in many):
             raise ConfigError(
                 f"seed={seed} must be a whole number from 0 to {MOST_SEEDS - 1}, or {self.num_envs} of them or None"

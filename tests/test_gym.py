@@ -129,6 +129,7 @@ def test_tensors_stay_where_they_are():
     ("call", "message"),
     [
         (lambda env: env.reset(seed=[1]), r"seed=\[1\] must be a whole number from 0 to 8796093022207, or 2 of"),
+        (lambda env: env.reset(seed=1.5), "seed=1.5 must be a whole number from 0"),
         (lambda env: env.reset(seed=[1.5, 2]), r"seed=\[1.5, 2\] must be a whole number from 0"),
         (lambda env: env.reset(seed=2**64), "seed=18446744073709551616 must be a whole number from 0"),
         (lambda env: env.reset(options={"mask": 1}), r"options=\['mask'\] is unknown; known: reset_mask"),

@@ -42,8 +42,8 @@ class Episodes:
         energy: sum over joints and control steps of |torque * joint velocity| * dt (J), the torque of the last physics
             step of each control step.
         path: length (m) of the base's horizontal way.
-        free_time_s: time (s) that the straight way to the goal takes at the commanded speed, at least until which the
-            goal has to be held; None without goals.
+        free_time_s: time (s) that the straight way to the goal takes at the commanded speed, in a maze the
+            route through the middles of its cells, at least until which the goal has to be held; None without goals.
         velocity_error: mean error of the horizontal velocity (m/s) against the task's command.
         free_velocity_error: the same over the moments with no obstacle near, NaN in a trial without such a moment; None
             where the run does not measure distances to obstacles.

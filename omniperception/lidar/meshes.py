@@ -51,10 +51,14 @@ class TriangleMesh:
         self.vertices = np.array(vertices, dtype=np.float32, order="C")  # its own: what follows from it is kept
         triangles = np.ascontiguousarray(triangles, dtype=np.int64)
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
-            raise ValueError(f"mesh needs vertices (V, 3), triangles (T, 3); got {vertices.shape}, {triangles.shape}")
+            raise ValueError(
+                f"mesh needs vertices (V, 3), triangles (T, 3); got {self.vertices.shape}, {triangles.shape}"
+            )
         outside = (triangles < 0) | (triangles >= len(self.vertices))
         if outside.any():
-            raise ValueError(f"mesh.triangles has index {triangles[outside][0]}; vertices are 0..{len(vertices) - 1}")
+            raise ValueError(
+                f"mesh.triangles has index {triangles[outside][0]}; vertices are 0..{len(self.vertices) - 1}"
+            )
         corners = self.vertices[triangles].astype(np.float64)
         broken = ~np.isfinite(corners).all(axis=(1, 2))
         if broken.any():

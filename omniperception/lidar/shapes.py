@@ -123,7 +123,10 @@ class Shape:
 
 def finite_tuple(key: str, value: Sequence[float], length: int, names: Sequence[str] = ()) -> tuple[float, ...]:
     """``value`` as a tuple of ``length`` finite floats, or a ValueError that names ``key``."""
-    result = tuple(float(item) for item in value)
+    try:
+        result = tuple(float(item) for item in value)
+    except TypeError:
+        raise ValueError(f"{key}={value} must have {length} values") from None
     if len(result) != length:
         hint = f" {tuple(names)}" if key.endswith("size") else ""
         raise ValueError(f"{key}={result} must have {length} values{hint}, got {len(result)}")

@@ -41,12 +41,10 @@ class Outcome:
 
     Attributes:
         cause: name of the termination.
-        time_s: s since it began.
         touched: whether the robot touched an obstacle.
     """
 
     cause: str
-    time_s: float
     touched: bool
 
 
@@ -116,7 +114,7 @@ class Session:
         if bool(env.done[0]):
             cause = next(name for name, happened in env.outcomes.items() if happened[0])
             cause, self._given_up = BY_HAND if self._given_up and cause == "time_out" else cause, False
-            self.outcomes.append(Outcome(cause, float(env.episode_length_buf[0]) * dt, self._touched))
+            self.outcomes.append(Outcome(cause, self._touched))
             self._touched = False
             self._held.clear()
 
