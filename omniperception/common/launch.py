@@ -63,6 +63,15 @@ def constant(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
         return torch.tensor(values, dtype=torch.float32, device=device)
 
 
+_threads: int | None = None
+
+
+def use_threads(num_threads: int | None) -> None:
+    """CPU threads of the launches that name none, from now on, as `torch.set_num_threads`; None: all cores."""
+    global _threads
+    _threads = num_threads
+
+
 def launch_over_envs(
     kernel: wp.Kernel,
     num_envs: int,
@@ -84,9 +93,9 @@ def launch_over_envs(
         device: where the arrays live. On CUDA the launch goes to torch's current stream.
         inner: size of the second launch dimension; 0 for a one-dimensional launch.
         block_dim: CUDA threads per block.
-        num_threads: CPU threads; all the process may use by default.
+        num_threads: CPU threads; those of `use_threads` by default.
     """
-    threads = num_threads or default_num_threads()
+    threads = num_threads or _threads or default_num_threads()
     key = (kernel, num_envs, inner, block_dim, threads, device, *map(_identity, inputs))
     known = _launches.get(key)
     if known is None:

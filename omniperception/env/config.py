@@ -105,11 +105,8 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
             raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
-        on_route = isinstance(self.commands, GoalCommandConfig) and self.commands.route_ahead is not None
-        if on_route and not self.obstacles.has_routes:
-            raise ValueError(
-                "commands.route_ahead leads through a maze, and these obstacles have none; use scenario=maze"
-            )
+        if isinstance(self.commands, GoalCommandConfig):
+            self._check_goal(self.commands)
         if MOTION_TARGET in self.targets and self.rewards.avoidance.risk is None:
             raise ValueError(
                 "perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
@@ -135,7 +132,8 @@ class EnvConfig:
                 " perception.base_motion=false with another network than polar_rings"
             )
         if isinstance(self.terrain, MapTerrainConfig):
-            self.terrain.check_footing(self.robot.footing)
+            spawn = self.commands.spawn
+            self.terrain.check_footing(self.robot.footing, max(map(abs, (*spawn.x, *spawn.y))))
         if self.lidar is None:
             if self.sampler is not None:
                 raise ValueError(
@@ -147,6 +145,25 @@ class EnvConfig:
                     f"rewards or observations require {', '.join(unmet)} from the LiDAR, but lidar=none;"
                     " use lidar=mid360 or rewards=walk observations=walk"
                 )
+
+    def _check_goal(self, commands: GoalCommandConfig) -> None:
+        if commands.hold_s > self.terminations.episode_length_s:
+            raise ValueError(
+                f"commands.hold_s={commands.hold_s} is longer than an episode, so that no goal is ever reached; give at"
+                f" most terminations.episode_length_s={self.terminations.episode_length_s}"
+            )
+        if commands.route_ahead is None:
+            return
+        end = self.obstacles.route_end
+        if end is None:
+            raise ValueError(
+                "commands.route_ahead leads through a maze, and these obstacles have none; use scenario=maze"
+            )
+        if (*commands.goal_x, *commands.goal_y) != (end[0], end[0], end[1], end[1]):
+            raise ValueError(
+                f"commands.goal_x={list(commands.goal_x)} and goal_y={list(commands.goal_y)} are not where"
+                f" commands.route_ahead leads; the maze's goal is [{end[0]}, {end[0]}] and [{end[1]}, {end[1]}]"
+            )
 
     def _check_measured_noise(self) -> None:
         if not self.randomization.lidar_measured or self.lidar is None:

@@ -10,6 +10,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
+from omniperception.common.launch import use_threads
 from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
@@ -65,6 +66,7 @@ class OmniEnv(VecEnv):
         self.max_episode_length = round(config.terminations.episode_length_s / self.control_dt)
         self.timer, self.step_count, self._has_stepped = StageTimer(), 0, False
         self.step_hooks: list[Callable[[], None]] = []
+        use_threads(config.sim.num_threads or None)
         sensors = config.requirements() & CONTACT_SENSORS
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
         late = config.randomization.latency_s is not None
@@ -96,6 +98,7 @@ class OmniEnv(VecEnv):
             config.observations.command_acceleration,
             self.difficulty,
             config.stepping,
+            config.requirements(),
         )
         if config.full_level:
             self.curriculum_levels = (1.0,) * len(self._curricula())

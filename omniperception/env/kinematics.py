@@ -22,9 +22,13 @@ class Kinematics:
 
     def __init__(self, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         """From `Simulator.robot_state`: (n, 7 + joints) and (n, 6 + joints)."""
-        qpos, qvel = qpos.float(), qvel.float()
+        qpos, qvel = self._state = qpos.float(), qvel.float()
         self.base_pos_w, self.base_quat_w, self.joint_pos = qpos[:, :3], qpos[:, 3:7], qpos[:, 7:]
         self.base_lin_vel_w, self.base_ang_vel_b, self.joint_vel = qvel[:, :3], qvel[:, 3:6], qvel[:, 6:]
+
+    def replaced(self, which: torch.Tensor, by: Kinematics) -> Kinematics:
+        """These, and in the rows that (n, 1) bool names the others."""
+        return Kinematics(*(torch.where(which, new, own) for own, new in zip(self._state, by._state, strict=True)))
 
     @lazy
     def yaw(self) -> torch.Tensor:

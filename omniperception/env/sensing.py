@@ -85,9 +85,9 @@ class LidarSensing:
       next one that comes is that since the last one that came. Before any has come `frame_count` stays 0.
     - A late frame is cast from where base and obstacles were when it was taken. It is levelled with the attitude of the
       moment at which it comes, and so does the odometry count, as on a robot whose frames bear no time. What rays say
-      without noise (sector distances, distal ranges, sightings) is of the moment at which they were cast, lost or not;
-      what is known of poses (true sectors, heights, targets of supervision by these) is of the moment of the tick, so
-      that a network learns what is there now.
+      without noise (sector distances, distal ranges, sightings) is of the moment at which they were cast, and counts
+      where the frame is lost, too, but for sightings; what is known of poses (true sectors, heights, targets of
+      supervision by these) is of the moment of the tick, so that a network learns what is there now.
 
     A sensor on a link that moves against the base (`config.mount_body`): a sampler that levels points does so in the
     heading of that link and around its origin, with the attitude that the base's measured one and the joints give.

@@ -99,10 +99,11 @@ class EnvState:
 
     Attributes:
         actions: (num_envs, num_actions) each: those applied, the newest first, and the two before; 0 after a reset.
-        pose: (num_envs, num_joints) rad: to which the actions of the control step are added.
+        pose: (num_envs, num_joints) rad: to which the actions of the control step are added; the default pose after a
+            reset.
         targets: (num_envs, num_joints) rad each: of the control step, and of the one before; the default pose after a
             reset.
-        before: kinematics at the start of the control step.
+        before: kinematics at the start of the control step; the present ones after a reset.
         default_joint_pos, joint_lower, joint_upper: (num_joints,) rad; joints without limits have infinite ones.
         action_scale: (num_joints,) rad.
         joint_torque_limit: (num_joints,) N m.
@@ -128,6 +129,7 @@ class EnvState:
         command_acceleration: Sequence[float] | None,
         difficulty: Curriculum,
         stepping: SteppingConfig | None,
+        declared: frozenset[str],
     ) -> None:
         """
         Args:
@@ -144,7 +146,9 @@ class EnvState:
             command_acceleration: of `reference`; see `ObservationsConfig`.
             difficulty: share of the randomization; the less of it, the faster `reference` follows.
             stepping: of `pose`; None: it is the default pose.
+            declared: what terms and others have said that they read; see `requires`.
         """
+        self._declared = declared
         self._errors, self._episode_steps = errors, episode_steps
         self._velocity_source: Callable[[], torch.Tensor | None] | None = None
         self._asked_source: Callable[[], torch.Tensor | None] | None = None
@@ -206,7 +210,8 @@ class EnvState:
         self.actions = tuple(action.index_fill(0, env_ids, 0.0) for action in self.actions)
         fresh = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device).index_fill(0, env_ids, True)
         last, before = (torch.where(fresh, self.default_joint_pos, targets) for targets in self.targets)
-        self.targets = (last, before)
+        self.targets, self.pose = (last, before), torch.where(fresh, self.default_joint_pos, self.pose)
+        self.before = self.before.replaced(fresh, self.kinematics)
         self.stand_s = self.stand_s.index_fill(0, env_ids, 0.0)
         self.last_asked = self.last_asked.index_fill(0, env_ids, 0.0)
         self._reference = self._reference.index_fill(0, env_ids, 0.0)
@@ -355,7 +360,8 @@ class EnvState:
         return self._sim.contact_impulse(OBSTACLE_FORCE)
 
     def _contact_force(self, kind: str) -> torch.Tensor:
-        _declared(kind if kind in self._sim.world.sensors else None, kind)
+        if kind not in self._sim.world.sensors:
+            raise NotHere(kind)
         return self._sim.contact_sensor(kind).unflatten(1, (-1, 3))
 
     # ---- feet, in the order of robot.foot_geoms ----------------------------------------------------------------------
@@ -412,17 +418,23 @@ class EnvState:
     def avoidance_velocity(self) -> torch.Tensor:
         """(num_envs, 2) m/s, yaw-aligned frame: V_avoid of the newest frame; with a velocity risk it is chosen again
         for the command at every control step's end. Requires "avoidance"."""
-        return _declared(self._avoidance, AVOIDANCE).velocity
+        return self._part(self._avoidance, AVOIDANCE).velocity
 
     @property
     def cloud(self) -> LidarFrame | None:
         """The newest frame of the LiDAR, with noise-free ranges; None before the first. Requires "cloud"."""
-        return _declared(self._sensing, CLOUD).frame
+        return self._part(self._sensing, CLOUD).frame
 
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
         """(num_envs,) m: mean of the noise-free distal ranges of the newest frame, each capped at `max_distance` (m);
         the cap before the first frame. Requires "distal_range"."""
-        return _declared(self._sensing, DISTAL_RANGE).mean_distal_range(max_distance)
+        return self._part(self._sensing, DISTAL_RANGE).mean_distal_range(max_distance)
+
+    def _part(self, part: Part | None, name: str) -> Part:
+        """The part that has a quantity, if it was declared: otherwise it is not computed."""
+        if part is None or name not in self._declared:
+            raise NotHere(name)
+        return part
 
 
 def rests(state: EnvState, after_s: float) -> torch.Tensor:
@@ -469,13 +481,6 @@ class NotHere(ValueError):
     def __init__(self, name: str) -> None:
         super().__init__(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
         self.name = name
-
-
-def _declared(part: Part | None, name: str) -> Part:
-    """A quantity that exists if a term has declared it."""
-    if part is None:
-        raise NotHere(name)
-    return part
 
 
 def with_velocity(state: Kinematics, lin_vel_b: torch.Tensor) -> Kinematics:

@@ -45,6 +45,8 @@ class StartsConfig:
     def __post_init__(self) -> None:
         if self.num < 1:
             raise ValueError(f"terrain.start.num={self.num} must be at least 1")
+        if self.seed < 0:
+            raise ValueError(f"terrain.start.seed={self.seed} must not be negative")
         for key in ("radius", "step", "climb"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"terrain.start.{key}={getattr(self, key)} must be positive")
@@ -91,18 +93,19 @@ class MapTerrainConfig:
         """(rows, cols) heights (m), x along columns, y along rows, and where (m) the first point is in the file."""
         raise NotImplementedError
 
-    def check_footing(self, footing: float) -> None:
-        """Refuses places where `RobotConfig.footing` (m) reaches beyond the ground that is known to be level.
+    def check_footing(self, footing: float, beside: float) -> None:
+        """Refuses places where `RobotConfig.footing` (m) reaches beyond the ground that is known to be level, from as
+        far beside them (m) as robots start.
 
         Raises:
             ValueError: they would be found, and robots start on top of what stands beside them.
         """
-        cells = math.ceil(footing / self.cell) + 1  # as Ground.highest looks
+        cells = math.ceil((footing + beside) / self.cell) + 1  # as Ground.highest looks
         if round(self.start.radius / self.cell) < cells:
             raise ValueError(
                 f"terrain.start.radius={self.start.radius} is too small for robot.footing={footing} with"
-                f" terrain.cell={self.cell}: robots would start on top of what stands beside a place; give"
-                f" terrain.start.radius={cells * self.cell:g}"
+                f" terrain.cell={self.cell} and commands.spawn up to {beside:g} m away: robots would"
+                f" start on top of what stands beside a place; give terrain.start.radius={cells * self.cell:g}"
             )
 
     def floor(self, heights: np.ndarray) -> np.ndarray:

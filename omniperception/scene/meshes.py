@@ -80,7 +80,7 @@ def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
         points, unit = np.unique(mesh.vertices[mesh.triangles.flatten()].astype(np.float64), axis=0), None
     low, high = points.min(0), points.max(0)
     half = (high - low) / 2
-    if not (half > 0).all():
+    if np.linalg.matrix_rank(points - points.mean(0), tol=1e-6 * np.ptp(points)) < 3:
         raise ValueError(f"obstacles: file={file} is flat; a mesh needs a volume")
     x, y, z = half if unit is None else (unit, unit, unit)
     return (points - (low + high) / 2) / half, (float(x), float(y), float(z))

@@ -140,10 +140,11 @@ class ObstaclesConfig:
                 )
 
     @property
-    def has_routes(self) -> bool:
-        """Tell whether the obstacles' worlds have ways through them, to be followed by `commands.route_ahead`."""
+    def route_end(self) -> tuple[float, float] | None:
+        """Where (m) ways through the obstacles' worlds lead, to be followed by `commands.route_ahead`; None: there are
+        none."""
         layouts = [group.layout for group in self.groups.values() if group.layout is not None]
-        return len(layouts) == 1 and isinstance(layouts[0], MazeLayout)
+        return layouts[0].goal if len(layouts) == 1 and isinstance(layouts[0], MazeLayout) else None
 
     @property
     def num_obstacles(self) -> int:

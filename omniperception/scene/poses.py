@@ -45,7 +45,7 @@ class Poses:
                 self._tables.append((group.layout.worlds, table))
         self.world = torch.zeros(len(like), len(self._tables), dtype=torch.int64, device=like.device)
         self.routes: torch.Tensor | None = None
-        for group in config.groups.values() if config.has_routes else ():
+        for group in config.groups.values() if config.route_end is not None else ():
             if isinstance(group.layout, MazeLayout):
                 self.routes = like.new_tensor(group.layout.routes(LAYOUT_SEEDS[config.split], group.layout.worlds))
 

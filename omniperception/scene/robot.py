@@ -177,8 +177,8 @@ class RobotConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "penalized_geoms", tuple(self.penalized_geoms))
         object.__setattr__(self, "joints", tuple(joint for joint in self.joints if joint not in self.locked))
-        if self.locked and not self.joints:
-            raise ValueError("robot.locked leaves no joint to drive; leave one of robot.joints out of it")
+        if not self.joints:
+            raise ValueError("robot.joints without those of robot.locked is empty; a robot needs a joint to drive")
         for name in ("default_joint_pos", *_BY_JOINT):
             given = getattr(self, name)
             if isinstance(given, Mapping):
@@ -188,6 +188,10 @@ class RobotConfig:
         object.__setattr__(self, "foot_geoms", feet)
         if not feet or not all(feet):
             raise ValueError("robot.foot_geoms has an empty list; a robot needs feet, and a foot at least one geom")
+        geoms = [geom for foot in self.feet for geom in foot]
+        if len(set(geoms)) != len(geoms):
+            twice = sorted({geom for geom in geoms if geoms.count(geom) > 1})
+            raise ValueError(f"robot.foot_geoms names {', '.join(twice)} more than once")
         for name in ("base_height", "footing", "height", "radius"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"robot.{name}={getattr(self, name)} must be positive")

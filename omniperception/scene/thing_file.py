@@ -54,7 +54,10 @@ def parts_of(file: str, frequency: float) -> dict[str, PartConfig]:
 def mesh_vertices(file: str, name: str) -> np.ndarray:
     """(V, 3) m, of a mesh of a thing, in its geom's frame."""
     model = _compiled(file)
-    mesh = model.mesh(name).id
+    names = [model.mesh(k).name for k in range(model.nmesh)]
+    if name not in names:
+        raise ValueError(f"obstacles: file={file}#{name}: it has meshes {', '.join(names) or 'none'}")
+    mesh = names.index(name)
     first = model.mesh_vertadr[mesh]
     return model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(np.float64)
 

@@ -86,6 +86,8 @@ class TiledTerrainConfig:
         for key in ("levels", "columns"):
             if getattr(self, key) < 1:
                 raise ValueError(f"terrain.{key}={getattr(self, key)} must be at least 1")
+        if self.seed < 0:
+            raise ValueError(f"terrain.seed={self.seed} must not be negative")
         if len(self.difficulty) != 2 or not 0 <= self.difficulty[0] <= self.difficulty[1] <= 1:
             raise ValueError(
                 f"terrain.difficulty={list(self.difficulty)} must be [low, high] with 0 <= low <= high <= 1"
@@ -94,9 +96,10 @@ class TiledTerrainConfig:
             raise ValueError(f"terrain.cell={self.cell} must lie in (0, 0.5]")
         if abs(self.tile_size / self.cell / 2 - self.grid.half) > 1e-6 or self.grid.half < 2:
             raise ValueError(f"terrain.tile_size={self.tile_size} must be an even number of cells of {self.cell} m")
-        if not 1.0 <= self.platform < self.tile_size:
+        if not (self.platform >= 1.0 and self.grid.platform < self.grid.half):
             raise ValueError(
-                f"terrain.platform={self.platform} must be at least 1, where a robot fits, and fit the tile"
+                f"terrain.platform={self.platform} must be at least 1, where a robot fits, and smaller than the tile by"
+                f" two cells of {self.cell} m"
             )
         if self.border < 2.0:
             raise ValueError(f"terrain.border={self.border} must be at least 2: an episode ends 1 m before its edge")

@@ -288,9 +288,9 @@ class MujocoWarpSimulator:
         row_count, contact_count = torch.stack(bits).sum(1).tolist()
         self.overflow.zero_()
         if row_count:
-            self._warn(f"{row_count} environments had no room for all constraints", "rows_per_env", self.capacity.rows)
+            self._warn("some environments had no room for all constraints", "rows_per_env", self.capacity.rows)
         if contact_count:
-            self._warn(f"{contact_count} environments had no room", "contacts_per_env", self.capacity.contacts)
+            self._warn("some environments had no room", "contacts_per_env", self.capacity.contacts)
         return {"constraint_overflow": row_count, "contact_overflow": contact_count}
 
     def state_dict(self) -> dict:

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from omniperception.common.errors import ConfigError
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import yaw_quat
 from omniperception.env.kinematics import Kinematics
@@ -211,6 +212,18 @@ class TestGoal:
     def test_a_route_needs_a_way_ahead_and_a_place(self, radius, ahead):
         with pytest.raises(ValueError, match=r"commands\.route_ahead"):
             GoalCommandConfig((4.0, 4.0), (0.0, 0.0), radius, 1.0, 2.0, 1.0, SpawnConfig(), route_ahead=ahead)
+
+    @pytest.mark.parametrize(
+        ("overrides", "message"),
+        [
+            (("scenario=static", "commands.route_ahead=3"), "leads through a maze"),
+            (("scenario=maze", "obstacles.groups.wall.layout.cell=1.5"), r"goal is \[13.5, 13.5\] and \[0.0, 0.0\]"),
+            (("scenario=hold", "terminations.episode_length_s=10"), "hold_s=20.0 is longer than an episode"),
+        ],
+    )
+    def test_goals_that_cannot_be_reached_are_refused(self, make_config, overrides, message):
+        with pytest.raises(ConfigError, match=message):
+            make_config(*overrides)
 
     def test_a_line_cannot_be_held(self):
         with pytest.raises(ValueError, match=r"commands\.hold_s=3"):

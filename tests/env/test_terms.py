@@ -93,6 +93,26 @@ def test_a_quantity_that_is_not_read_is_not_computed(make_env):
     torch.testing.assert_close(env.state.joint_acc, acceleration)
 
 
+def test_what_is_there_for_others_is_refused_where_it_was_not_declared(make_env):
+    """A velocity risk needs avoidance and clouds, whose other figures nobody computes."""
+    env = make_env("experiment=avoid", "init=null", "lidar.num_rays=100", num_envs=2)
+    with pytest.raises(ValueError, match="reads avoidance without declaring it"):
+        _ = env.state.avoidance_velocity
+    with pytest.raises(ValueError, match="reads distal_range without declaring it"):
+        env.state.mean_distal_range(5.0)
+    with pytest.raises(ValueError, match="reads cloud without declaring it"):
+        _ = env.state.cloud
+
+
+def test_a_reset_robot_has_not_been_accelerated(make_env):
+    env = make_env("obstacles=none", blind=True)
+    env.step(torch.ones(4, 12))
+    before = env.state.joint_acc.clone()
+    assert (before.abs().amax(1) > 1.0).all()
+    env.reset(torch.tensor([1, 3]))
+    assert torch.equal(env.state.joint_acc[[0, 2]], before[[0, 2]]) and not env.state.joint_acc[[1, 3]].any()
+
+
 def test_without_obstacles_there_are_none(make_env):
     state = make_env("obstacles=none", blind=True).state
     assert [tuple(part.shape) for part in state.obstacles] == [(4, 0, 2)] * 2 + [(4, 0)] * 2 + [(4, 0, 2)] * 2

@@ -124,9 +124,17 @@ def test_a_preset_that_does_not_fit_its_file_is_refused_in_one_line(make_config,
     assert "\n" not in str(error.value)
 
 
-def test_joints_named_twice_are_refused(make_config):
-    with pytest.raises(ValueError, match="robot.joints names FL_hip_joint more than once"):
-        make_config("robot.joints=[FL_hip_joint,FL_hip_joint]")
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("robot.joints=[FL_hip_joint,FL_hip_joint]", "robot.joints names FL_hip_joint more than once"),
+        ("robot.joints=[]", "robot.joints .*is empty"),
+        ("robot.foot_geoms=[FL_foot,[FR_foot,FL_foot]]", "robot.foot_geoms names FL_foot more than once"),
+    ],
+)
+def test_joints_and_feet_are_there_once(make_config, override, message):
+    with pytest.raises(ValueError, match=message):
+        make_config(override)
 
 
 @pytest.mark.parametrize(("restitution", "ratio"), [(0.0, 1.0), (1.0, 0.0), (math.exp(-math.pi), 0.7071068)])

@@ -233,6 +233,8 @@ PLAN, PLACE = ("terrain=plan",), ("terrain=place",)
         ),
         ((*PLAN, "terrain.wall_height=0.1"), "terrain.wall_height=0.1 must be above terrain.start.climb"),
         ((*PLAN, "terrain.start.radius=0.4"), "robot.footing=0.35 .* give terrain.start.radius=0.5"),
+        ((*PLAN, "commands.spawn.y=[-0.3,0.1]"), "spawn up to 0.3 m away.* give terrain.start.radius=0.8"),
+        ((*PLAN, "terrain.start.seed=-1"), "terrain.start.seed=-1 must not be negative"),
         ((*PLAN, "robot=anymal"), "robot.footing=0.65 .* give terrain.start.radius=0.8"),
         ((*PLACE, "terrain.scale=0.001"), "is 0.01 x 0.008 m, smaller than terrain.cell"),
         ((*PLAN, "terrain.start.radius=0"), "terrain.start.radius=0 must be positive"),

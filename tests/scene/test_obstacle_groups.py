@@ -10,7 +10,7 @@ import torch
 
 from omniperception.common.random import EnvRandom
 from omniperception.scene import MotionConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
-from omniperception.scene.meshes import MESHES
+from omniperception.scene.meshes import MESHES, mesh_points
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
 from omniperception.scene.obstacles import ObstacleCurriculumConfig
 from omniperception.scene.poses import LAYOUT_SEEDS
@@ -260,3 +260,9 @@ def test_capsules_stand_upright_on_their_caps():
     torch.testing.assert_close(field.pos_w[:, 0, 2], field.size[:, 0, 0] + field.size[:, 0, 1])
     torch.testing.assert_close(field.half_height, field.pos_w[..., 2])
     assert (field.outline[..., 1] == -1).all()
+
+    def test_a_plane_is_refused_however_it_lies(self, tmp_path):
+        path = tmp_path / "slanted.obj"
+        path.write_text("v 0 0 0\nv 1 0 1\nv 0 1 1\nv 1 1 2\nf 1 2 4\nf 1 4 3\n")
+        with pytest.raises(ValueError, match=r"slanted.obj is flat; a mesh needs a volume"):
+            mesh_points(str(path))

@@ -104,6 +104,8 @@ class TestLayout:
             (TERRAIN, {"difficulty": [0.5, 2.0]}, "terrain.difficulty=[0.5, 2.0]"),
             (TERRAIN, {"border": 1.0}, "terrain.border=1.0 must be at least 2"),
             (TERRAIN, {"platform": 0.5}, "terrain.platform=0.5"),
+            (TERRAIN, {"platform": 7.96}, "terrain.platform=7.96 must be at least 1"),
+            (TERRAIN, {"seed": -1}, "terrain.seed=-1 must not be negative"),
             (TERRAIN, {"friction": -1.0}, "terrain.friction=-1.0"),
             (TERRAIN, {"curriculum": TerrainCurriculumConfig(10)}, "curriculum.start_level=10 must be below"),
             (TerrainCurriculumConfig, {"down_share": 0.9}, "terrain.curriculum.down_share=0.9"),

@@ -8,6 +8,7 @@ from mj_rays import assert_rays_are_those_of_mj_ray
 
 from omniperception.common.random import EnvRandom
 from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.scene.thing_file import mesh_vertices
 
 DOOR = """
 <mujoco>
@@ -161,3 +162,9 @@ def test_what_is_wrong_with_a_file_is_said_in_one_line(files, change, message):
 def test_wrong_groups_are_refused(files, group, message):
     with pytest.raises(ValueError, match=message):
         ObstacleGroup(count=1, **group)
+
+
+def test_a_mesh_that_a_file_has_not_is_refused(files):
+    (files / "door.xml").write_text(DOOR)
+    with pytest.raises(ValueError, match="file=door.xml#nope: it has meshes knob"):
+        mesh_vertices("door.xml", "nope")
