@@ -8,7 +8,6 @@ import torch
 from rsl_rl.modules import HiddenState
 from tensordict import TensorDict
 from torch import nn
-from torch.nn import functional
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, LAST_ASKED, MOTION_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
@@ -126,8 +125,8 @@ class PerceptionActor(EstimatingModel):
         """(N, D) embeddings of the current histories, extended for the read-out; the empty one without a frame."""
         frames, count, tick = obs["frames"], obs["frame_count"], obs["frame_tick"]
         if self._newest is None or self._newest[0] is not tick:
-            features, empty = self.perception(frames, count)[:, 0], self.perception.empty(frames)
-            self._newest = (tick, self._extend(features), self._extend(empty))
+            features = self._extend(self.perception(frames, count)[:, 0])
+            self._newest = (tick, features, self.embed_empty(frames))
         features, empty = self._newest[1:]
         return torch.where(count > 0, features, empty)
 
@@ -139,20 +138,23 @@ class PerceptionActor(EstimatingModel):
     def embed(self, obs: WindowedObservations) -> torch.Tensor:
         """(B, D) embeddings of the steps of an update, or (B, D + K) those that were acted on; each window is embedded
         once."""
-        empty = self.perception.empty(obs.frames)
-        if not obs.has_frames:  # no frame has been cast yet: there is nothing to embed
-            return empty.expand(obs.batch_size[0], -1)
-        windows = obs.window_features
-        if windows is None:
-            windows = self.perception(obs.frames, obs.window_count)
+        if obs.acted_on is not None:
+            windows, empty = obs.acted_on.windows, obs.acted_on.empty
         else:
-            empty = functional.pad(empty, (0, windows.shape[2] - empty.shape[1]))
+            empty = self.perception.empty(obs.frames)
+            if not obs.has_frames:  # no frame has been cast yet: there is nothing to embed
+                return empty.expand(obs.batch_size[0], -1)
+            windows = self.perception(obs.frames, obs.window_count)
         table = torch.cat([windows.flatten(0, 1), empty])
         return table[torch.where(obs.step_count > 0, obs.step_window, table.shape[0] - 1)]
 
     def embed_windows(self, obs: WindowedObservations) -> torch.Tensor:
         """(E, W, D) embeddings of an update's windows, extended for the read-out."""
         return self._extend(self.perception(obs.frames, obs.window_count))
+
+    def embed_empty(self, frames: torch.Tensor) -> torch.Tensor:
+        """(1, D) embedding of a history without a frame, extended for the read-out; see `PerceptionNetwork.empty`."""
+        return self._extend(self.perception.empty(frames))
 
     def perception_parameters(self) -> Iterator[nn.Parameter]:
         """Parameters of the network and of what is read out of its embedding."""

@@ -19,7 +19,7 @@ from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.divergence import DivergenceGuard
 from omniperception.learning.estimator import EstimatingModel
 from omniperception.learning.models import PerceptionActor
-from omniperception.learning.storage import PerceptiveStorage, WindowedObservations
+from omniperception.learning.storage import Embedded, PerceptiveStorage, WindowedObservations
 
 ESTIMATOR_LEARNING_RATE = 1.0e-3
 """Of the estimator's own optimiser, which passes over each rollout once."""
@@ -217,7 +217,7 @@ class PerceptivePpo(PPO):
         if self.perception_optimizer is not None:
             acted_on = self._embed_rollout() if self.learns_policy else None
             self.train_perception()
-            self.storage.window_features = acted_on  # PPO sees what the policy acted on
+            self.storage.acted_on = acted_on  # PPO sees what the policy acted on
         losses = {}
         if self.learns_policy:
             losses = self._update_policy()
@@ -387,10 +387,13 @@ class PerceptivePpo(PPO):
         transition.distribution_params = tuple(p.detach() for p in self.actor.output_distribution_params)
         return transition.actions
 
-    def _embed_rollout(self) -> torch.Tensor | None:
-        """(N, W, D) embeddings of the rollout's windows; None without a frame."""
-        everyone = self.storage.observations_of(torch.arange(self.storage.num_envs, device=self.device))
-        if not everyone.has_frames:
+    def _embed_rollout(self) -> Embedded | None:
+        """What the policy acted on, in as many parts as there are mini-batches; None without a frame."""
+        storage = self.storage
+        parts = torch.arange(storage.num_envs, device=self.device).tensor_split(self.num_mini_batches)
+        seen = [storage.observations_of(part) for part in parts]
+        if not any(obs.has_frames for obs in seen):
             return None
         with torch.no_grad():
-            return self.actor.embed_windows(everyone)
+            windows = torch.cat([self.actor.embed_windows(obs) for obs in seen])
+            return Embedded(windows, self.actor.embed_empty(storage.frames))

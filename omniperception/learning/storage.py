@@ -15,6 +15,19 @@ frame, the same in all environments."""
 
 
 @dataclass(frozen=True)
+class Embedded:
+    """Embeddings that the policy acted on, where an update of perception must not change them.
+
+    Attributes:
+        windows: (N, W, D) of each environment's windows.
+        empty: (1, D) of a history without a frame.
+    """
+
+    windows: torch.Tensor
+    empty: torch.Tensor
+
+
+@dataclass(frozen=True)
 class WindowedObservations:
     """Observations of B = T x E control steps whose LiDAR frames are stored once per environment.
 
@@ -24,7 +37,7 @@ class WindowedObservations:
         window_count: (E, W) valid frames of the window that ends at frame H - 1 + w; 0 where no step needs it.
         step_window: (B,) index e * W + w of each step's window.
         step_count: (B,) valid frames at each step; 0 after a reset until the next frame.
-        window_features: (E, W, D) embeddings of the windows, where they are fixed during the update, else None.
+        acted_on: embeddings of the E environments, where they are fixed during the update, else None.
     """
 
     groups: TensorDict
@@ -32,7 +45,7 @@ class WindowedObservations:
     window_count: torch.Tensor
     step_window: torch.Tensor
     step_count: torch.Tensor
-    window_features: torch.Tensor | None = None
+    acted_on: Embedded | None = None
 
     @property
     def has_frames(self) -> bool:
@@ -67,7 +80,7 @@ class PerceptiveStorage(RolloutStorage):
     Attributes:
         has_frames: whether the actor reads LiDAR frames.
         frames: (N, H - 1 + W, P, 3) frames of the rollout, oldest first.
-        window_features: (N, W, D) embeddings that the policy acted on, where an update must not change them.
+        acted_on: see `Embedded`.
     """
 
     def __init__(
@@ -109,7 +122,7 @@ class PerceptiveStorage(RolloutStorage):
         capacity = self.history - 1 + max_windows(num_steps, steps_per_frame)
         self.frames = torch.zeros(num_envs, capacity, *obs["frames"].shape[2:], device=device)
         self.frame_count = torch.zeros(num_steps, num_envs, dtype=torch.int16, device=device)
-        self.window_features: torch.Tensor | None = None
+        self.acted_on: Embedded | None = None
         self._ticks: list[int] = []  # of the newest frame at each step
 
     @property
@@ -157,7 +170,7 @@ class PerceptiveStorage(RolloutStorage):
         """Start the next rollout."""
         super().clear()
         if self.has_frames:
-            self.window_features = None
+            self.acted_on = None
             self._ticks.clear()
 
     def mini_batch_generator(
@@ -202,6 +215,7 @@ class PerceptiveStorage(RolloutStorage):
             env_ids: (E,).
             steps: control steps of the rollout, all by default.
         """
+        fixed = self.acted_on
         windows = torch.tensor(self._ticks, device=self.device) - self._ticks[0]  # (T,)
         num_windows = self._ticks[-1] - self._ticks[0] + 1
         step_count = self.frame_count[:, env_ids]  # (T, E)
@@ -218,5 +232,5 @@ class PerceptiveStorage(RolloutStorage):
             window_count=count.t().contiguous().long(),
             step_window=(first + windows.unsqueeze(1)).flatten(),
             step_count=step_count.flatten().long(),
-            window_features=None if self.window_features is None else self.window_features[env_ids],
+            acted_on=fixed and Embedded(fixed.windows[env_ids], fixed.empty),
         )

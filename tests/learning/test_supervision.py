@@ -1,5 +1,6 @@
 """A perception network that supervision alone trains, beside PPO."""
 
+import functools
 from dataclasses import replace
 
 import pytest
@@ -8,12 +9,16 @@ from test_ppo import collect
 from toy_env import ToyEnv, config
 
 from omniperception.learning import PerceptivePpo
+from omniperception.perception import FpsMlp, FpsSampler
 
 
-def algorithm(env, avoidance_weight=0.0, **ppo):
+def algorithm(env, avoidance_weight=0.0, network=None, **ppo):
     torch.manual_seed(0)
     cfg = config(supervised=True, **ppo)
     perception = replace(cfg.perception, avoidance_weight=avoidance_weight)
+    if network is not None:
+        sampler = functools.partial(FpsSampler, 3, max_range=5.0)
+        perception = replace(perception, sampler=sampler, network=functools.partial(network), height_weight=0.0)
     return PerceptivePpo.build(env, replace(cfg, perception=perception), "cpu")
 
 
@@ -44,15 +49,16 @@ def test_an_update_trains_both_networks_and_nothing_without_a_target():
     assert unchanged == [name for name in now if name.startswith("perception.distal")]
 
 
-@pytest.mark.parametrize("avoidance_weight", [0.0, 5.0])
-def test_ppo_sees_what_the_policy_acted_on_and_does_not_change_it(avoidance_weight):
+@pytest.mark.parametrize(("avoidance_weight", "network"), [(0.0, None), (5.0, None), (5.0, FpsMlp)])
+def test_ppo_sees_what_the_policy_acted_on_and_does_not_change_it(avoidance_weight, network):
+    """With and without frames; an MLP's embedding of no frame depends on its weights, too."""
     env = ToyEnv(6, episode=9)
-    alg = algorithm(env, avoidance_weight)
+    alg = algorithm(env, avoidance_weight, network)
     collect(alg, env, 8)
     acted_on = alg._embed_rollout()
     before = list(alg.actor.perception_parameters())[-1].detach().clone()
     alg.train_perception()
-    alg.storage.window_features = acted_on
+    alg.storage.acted_on = acted_on
     after_supervision = [p.detach().clone() for p in alg.actor.perception_parameters()]
     assert not avoidance_weight or (after_supervision[-1] - before).abs().max() > 1e-3  # the read-out's bias
     alg.perception_optimizer = None  # what follows is PPO alone
@@ -60,9 +66,8 @@ def test_ppo_sees_what_the_policy_acted_on_and_does_not_change_it(avoidance_weig
         alg.actor(batch.observations, stochastic_output=True)
         log_prob = alg.actor.get_output_log_prob(batch.actions)
         has_frame = batch.observations.step_count > 0
-        assert has_frame.any()
-        old = batch.old_actions_log_prob.squeeze(-1)
-        assert torch.allclose(log_prob[has_frame], old[has_frame], atol=1e-4)
+        assert has_frame.any() and not has_frame.all()
+        assert torch.allclose(log_prob, batch.old_actions_log_prob.squeeze(-1), atol=1e-4)
     super(PerceptivePpo, alg).update()
     assert all(map(torch.equal, after_supervision, alg.actor.perception_parameters()))
 
