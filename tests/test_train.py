@@ -144,6 +144,8 @@ def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
     assert "init=end" not in capsys.readouterr().out
     main(["train", *seen, "perception.sampler.split_deg=10", "hydra.run.dir=other"])
     assert "learned from another sampler (split_deg 20.0 -> 10)" in capsys.readouterr().out
+    main(["train", "init=end", *seen[1:], "perception.network.distal_dim=9", "hydra.run.dir=apart"])
+    assert "init=end: its perception or its read-out has another form, and both stay" in capsys.readouterr().out
 
     timed = ("init=gait", "ppo.max_iterations=1", "observations.groups.clock.terms.gait_phase.frequency=4.0")
     main(["train", *(one for one in student if not one.startswith("init=")), *timed, taught, "hydra.run.dir=timed"])

@@ -167,9 +167,12 @@ def learn(
     else:
         if run.init:
             given = [config.find_run(name, "init") for name in run.init]
-            observed = build.load_run(given[-1], trust=trust).env.observations
-            for source in runner.start_from(*given, observations=observed):
+            theirs = build.load_run(given[-1], trust=trust)
+            seeing = runner.start_from(*given, observations=theirs.env.observations)
+            for source in seeing:
                 _report_other_sampler(composed, source)
+            if run.perception is not None and theirs.perception is not None and not seeing:
+                report(f"init={given[-1]}: its perception or its read-out has another form, and both stay behind")
             _report_other_terms(composed, given[-1], "init")
         report(f"run directory: {run_dir}")
     if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:

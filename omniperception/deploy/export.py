@@ -46,7 +46,7 @@ from omniperception.learning.config import PerceptionConfig
 from omniperception.learning.estimator import estimates_velocity
 from omniperception.learning.models import PerceptionActor
 from omniperception.learning.read_out import MotionReadOut
-from omniperception.perception import PdSampler, ProximitySampler, RawSampler, Sampler, StandingSampler
+from omniperception.perception import FpsSampler, PdSampler, ProximitySampler, RawSampler, Sampler, StandingSampler
 from omniperception.scene import RobotConfig
 from omniperception.scene.stepping import stepping_offsets
 
@@ -266,13 +266,14 @@ def _perception(config: PerceptionConfig) -> Perception:
 
 def sampler_parameters(sampler: Sampler) -> dict:
     """Kind and parameters of a sampler, as `omniperception.deploy.sampling.make_sampler` takes them."""
+    if type(sampler) not in (RawSampler, StandingSampler, PdSampler, FpsSampler, ProximitySampler):
+        raise ConfigError(f"perception.sampler: a {type(sampler).__name__} cannot be exported")
     if isinstance(sampler, RawSampler):
         return {"kind": "raw", "num_points": sampler.num_points, "max_range": sampler.max_range}
     if isinstance(sampler, StandingSampler):
         geometry = asdict(sampler.geometry)
         return {"kind": "standing", "max_range": sampler.max_range, **_cells(sampler), "geometry": geometry}
-    if not isinstance(sampler, PdSampler):
-        raise ConfigError(f"perception.sampler: a {type(sampler).__name__} cannot be exported")
+    assert isinstance(sampler, PdSampler)  # and what derives from it
     halves = {
         "num_proximal": sampler.num_proximal,
         "max_range": sampler.max_range,

@@ -250,6 +250,8 @@ class ExportedPolicy:
         command = np.asarray(command, np.float32)
         if self.safety is not None:
             self._check(state, command, self.safety)
+        elif command.shape != (3,):
+            raise DeployError(f"command: 3 numbers were expected, {command.tolist()} given")
         if self._odometry is not None:
             self._odometry.advance(_quaternion(state.base_quat), self._velocity(state))
         if points is not None:

@@ -144,8 +144,8 @@ class Safety:
 
     def check_torque(self, torque: np.ndarray) -> None:
         """Raises SafetyStop where a joint has given its whole torque (num_joints,), N m, for too long."""
-        if not np.isfinite(torque).all():
-            raise SafetyStop(f"joint_torque: finite numbers were expected, {torque} given")
+        if torque.shape != (len(self._names),) or not np.isfinite(torque).all():
+            raise SafetyStop(f"joint_torque: {len(self._names)} finite numbers were expected, {torque} given")
         self._strained = np.where(abs(torque) >= 0.98 * self._torque_limits, self._strained + 1, 0)
         if self._strained.max() > self.config.torque_s / self._dt:
             worst = int(self._strained.argmax())

@@ -6,6 +6,7 @@ import os
 import pickle
 import random
 import re
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -68,14 +69,14 @@ def load_checkpoint(path: str | os.PathLike, map_location: str | torch.device | 
         content = torch.load(path, weights_only=True, map_location=map_location)
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({error.strerror or error})") from error
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, struct.error) as error:
         raise CheckpointError(
             f"{path} ({path.stat().st_size:,} bytes) is damaged or no checkpoint of this program; use an older one"
         ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path} is no checkpoint of this program: it has no format '{FORMAT}'")
-    if content["version"] != VERSION:
-        raise CheckpointError(f"{path} has checkpoint version {content['version']}, this program reads {VERSION}")
+    if content.get("version") != VERSION:
+        raise CheckpointError(f"{path} has checkpoint version {content.get('version')}, this program reads {VERSION}")
     return content
 
 

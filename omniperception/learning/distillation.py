@@ -43,8 +43,13 @@ class Teacher:
     def __init__(self, actor: MLPModel) -> None:
         """
         Args:
-            actor: reads one-dimensional groups, the command among them.
+            actor: reads one-dimensional groups, the command's among them.
+
+        Raises:
+            ValueError: it does not.
         """
+        if COMMAND not in actor.obs_groups:
+            raise ValueError(f"distillation.teacher reads {', '.join(actor.obs_groups)}, but no group '{COMMAND}'")
         self._actor = actor.eval().requires_grad_(False)
         self.groups = (*actor.obs_groups, AVOIDANCE_TARGET)
 

@@ -362,8 +362,9 @@ class PerceptivePpo(PPO):
         self.actor.reset()
         if load_cfg is not None:
             return False
-        if self.perception_optimizer is not None:
-            self.perception_optimizer.load_state_dict(state["perception_optimizer_state_dict"])
+        supervised = state.get("perception_optimizer_state_dict")  # None: perception was not supervised before
+        if self.perception_optimizer is not None and supervised is not None:
+            self.perception_optimizer.load_state_dict(supervised)
         if self.estimator_optimizer is not None:
             self.estimator_optimizer.load_state_dict(state["estimator_optimizer_state_dict"])
         self.num_updates = state["num_updates"]

@@ -177,7 +177,9 @@ BENT = [*POSE[:2], -3.0, *POSE[3:]]
         ({"base_quat": [0.0] * 4}, "base_quat: a unit quaternion .* was expected"),
         ({"joint_pos": BENT}, r"FR_calf_joint is at -3.00 rad, 0.30 beyond its limit"),
         ({"joint_vel": [0.0] * 11 + [60.0]}, "RL_calf_joint turns at 60 rad/s"),
-        ({"joint_torque": [float("inf")] * 12}, "joint_torque: finite numbers"),
+        ({"joint_torque": [float("inf")] * 12}, "joint_torque: 12 finite numbers"),
+        ({"joint_torque": [1.0] * 3}, "joint_torque: 12 finite numbers"),
+        ({"joint_torque": [1.0]}, "joint_torque: 12 finite numbers"),
     ],
 )
 def test_a_state_that_is_none_to_walk_in_stops(change, message):

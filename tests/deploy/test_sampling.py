@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from omniperception.common.errors import ConfigError
 from omniperception.deploy import DeployError
 from omniperception.deploy.export import sampler_parameters
 from omniperception.deploy.sampling import Attitude, farthest_points, make_sampler
@@ -127,3 +128,11 @@ def test_wrong_clouds_and_samplers_are_named():
         make_sampler({"kind": "voxels"})
     with pytest.raises(DeployError, match=r"\(301, 3\) was expected, \(300, 3\) given"):
         by_robot(SAMPLERS["raw"](), np.ones((300, 3), np.float32))
+
+
+def test_a_sampler_of_ones_own_is_not_taken_for_the_one_it_derives_from():
+    class Mine(FpsSampler):
+        pass
+
+    with pytest.raises(ConfigError, match=r"perception\.sampler: a Mine cannot be exported"):
+        sampler_parameters(Mine(3, max_range=5.0))

@@ -37,6 +37,13 @@ def test_a_teacher_follows_command_and_avoidance_together():
     assert torch.equal(obs["command"], kept) and not torch.equal(actor(obs), expected)
 
 
+def test_a_teacher_without_a_group_of_its_command_is_refused():
+    actor = teacher(ToyEnv(5))
+    actor.obs_groups = ["proprioception"]
+    with pytest.raises(ValueError, match="distillation.teacher reads proprioception, but no group 'command'"):
+        Teacher(actor)
+
+
 @pytest.mark.parametrize("frames", [True, False])
 def test_the_student_comes_to_do_what_the_teacher_does(frames):
     env = ToyEnv(32, frames=frames)
