@@ -396,7 +396,7 @@ def read(run_dir: Path) -> DictConfig:
         raise ConfigError(f"{run_dir} is not a run directory: it has no {CONFIG_FILE}; run=latest finds the newest run")
     try:
         config = OmegaConf.load(path)
-    except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError, OSError) as error:
         raise ConfigError(f"{path} is not a configuration: {one_line(error)}") from None
     if not isinstance(config, DictConfig):
         raise ConfigError(f"{path} is not a configuration")

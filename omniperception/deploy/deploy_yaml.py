@@ -96,10 +96,13 @@ def _caveats(description: Description) -> list[str]:
         lines.append("It also reads 'frames' and 'frame_count' of a LiDAR, which this form has no place for.")
     if any(group.history > 1 and len(group.terms) > 1 for group in description.observations):
         lines.append("History is by time: all terms of the oldest step first, where Isaac Lab goes term by term.")
-    own = [term.quantity for _, term in _terms(description) if term.quantity not in _NAMES]
+    every = [term.quantity for _, term in _terms(description)]
+    if twice := sorted({name for name in every if every.count(name) > 1}):
+        lines.append(f"The network reads {', '.join(twice)} more than once; here each has one entry, its last.")
+    own = [name for name in every if name not in _NAMES]
     if own:
         lines.append(f"Of unitree_rl_lab's observations none is {', '.join(own)}.")
-    if any(term.quantity == "base_lin_vel" for _, term in _terms(description)):
+    if "base_lin_vel" in every:
         lines.append("base_lin_vel is no observation of unitree_rl_lab's controller; a state estimator must give it.")
     if description.command_acceleration is not None:
         lines.append(

@@ -518,6 +518,9 @@ def test_deploy_yaml_names_what_it_has_no_place_for(exported_run):
     assert "# Actions, and last_action, are clipped to +-100 before their scale.\n" in deploy_yaml(described)
     clocked = (exported_run("clock") / "exported" / "deploy.yaml").read_text()
     assert "NOT TO BE USED" in clocked and "# gait_phase is 0 once the command has been 0 for 0.1 s.\n" in clocked
+    twice = replace(described, observations=[*described.observations, described.observations[0]])
+    assert "more than once; here each has one entry" in deploy_yaml(twice)
+    assert "more than once" not in deploy_yaml(described)
     other = replace(described.joints, names=[f"leg_{k}" for k in range(12)])
     assert deploy_yaml(replace(described, joints=other)) is None
 

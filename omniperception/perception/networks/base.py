@@ -85,6 +85,10 @@ class FpsMlp(PerceptionNetwork):
         """Args: num_points: P; history: H; hidden: sizes of the hidden layers; feature_dim: D."""
         super().__init__(num_points, history, feature_dim)
         sizes = [*hidden, feature_dim]
+        if min(sizes) < 1:
+            raise ValueError(
+                f"perception.network: hidden={list(hidden)} and feature_dim={feature_dim} must be positive"
+            )
         self.first = WindowedLinear(3 * num_points, sizes[0], history)
         rest: list[nn.Module] = []
         for fan_in, fan_out in itertools.pairwise(sizes):

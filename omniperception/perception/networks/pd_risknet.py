@@ -42,6 +42,13 @@ class PdRiskNet(PerceptionNetwork):
         """
         check_path("proximal", num_proximal, proximal_dim)
         check_path("distal", num_distal, distal_dim)
+        for name, size in (
+            ("proximal_dim", proximal_dim),
+            ("distal_dim", distal_dim),
+            ("distal_encoder", distal_encoder),
+        ):
+            if size < 0:
+                raise ValueError(f"perception.network.{name}={size} must not be negative; 0 leaves it out")
         super().__init__(num_proximal + num_distal, history, proximal_dim + distal_dim)
         self.num_proximal = num_proximal
         self.supervised = {}

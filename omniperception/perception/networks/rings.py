@@ -163,13 +163,19 @@ class RingPath(nn.Module):
             match: candidate velocities, scored against the nearest hits; None: the convolutions find motion alone.
         """
         super().__init__()
-        if num_cells % num_sectors:
-            raise ValueError(f"rings: num_cells={num_cells} must be a multiple of num_sectors={num_sectors}")
-        if len(kernel_sizes) != len(channels) or any(size % 2 == 0 for size in kernel_sizes):
+        if num_sectors < 1 or num_cells % num_sectors:
             raise ValueError(
-                f"rings: kernel_sizes={list(kernel_sizes)} must be one odd number for each of the {len(channels)}"
-                " channels"
+                f"perception.network.rings: num_cells={num_cells} must be a multiple of num_sectors={num_sectors}; the"
+                " network needs perception.base_motion=true"
             )
+        if len(kernel_sizes) != len(channels) or any(n % 2 == 0 or not 0 < n <= num_sectors for n in kernel_sizes):
+            raise ValueError(
+                f"perception.network.rings.kernel_sizes={list(kernel_sizes)} must be one odd number, up to"
+                f" num_sectors={num_sectors}, for each of the {len(channels)} channels"
+            )
+        for name, values in (("channels", channels), ("decays", decays), ("decay", [decay])):
+            if not values or min(values) <= 0:
+                raise ValueError(f"perception.network.rings.{name}={list(values)} must be at least one, all positive")
         num_bands = num_cells // num_sectors
         if match is not None and history < 2:
             raise ValueError(
