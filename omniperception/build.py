@@ -234,12 +234,7 @@ def _sensor(preset: object, robot: RobotConfig, trust: Sequence[str] | None) -> 
 
 
 def _check_sampler(sampler: Sampler, lidar: SensorConfig) -> None:
-    """A sampler's figures of the sensor are the sensor's; ValueError otherwise."""
-    if sampler.max_range != lidar.max_range:
-        raise ValueError(
-            f"perception.sampler.max_range={sampler.max_range} must be lidar.max_range={lidar.max_range}, the longest"
-            " distance there is; change that"
-        )
+    """Refuses, as a ValueError, to sample another number of rays than there are."""
     if isinstance(sampler, RawSampler) and sampler.num_points != lidar.num_rays:
         raise ValueError(
             f"perception.sampler.num_rays={sampler.num_points} must be lidar.num_rays={lidar.num_rays}; change that"

@@ -56,7 +56,6 @@ LINES = [
     ("train job", "job by itself means nothing; --cfg job shows"),
     ("train --cfg num_envs=3 job", "--cfg job shows"),
     ("train experiment=walk ppo.start_std=0.3", "is of a policy that another run gives"),
-    ("train perception.sampler.max_range=5", "must be lidar.max_range"),
     ("train perception=direct_mlp_small perception.sampler.num_rays=7", "num_rays=7 must be lidar.num_rays="),
     ("gait run=RUN what=kicks trials=5", "trials= would mean nothing: it is not read for what=kicks"),
     ("gait run=RUN speeds=1", "speeds= would mean nothing"),

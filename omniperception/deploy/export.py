@@ -149,7 +149,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         command_acceleration=run.env.observations.command_acceleration,
         stepping=_stepping(run),
         lidar=_lidar(run.env.lidar, robot) if run.perception is not None and run.env.lidar is not None else None,
-        perception=_perception(run.perception) if run.perception is not None else None,
+        perception=_perception(run.perception, run.env.lidar) if run.perception is not None else None,
         estimated=_estimated(run),
         max_acceleration=run.max_acceleration,
     )
@@ -259,8 +259,13 @@ def _turns(robot: RobotConfig, carrier: str) -> tuple[Turn, ...]:
     return tuple(found)
 
 
-def _perception(config: PerceptionConfig) -> Perception:
+def _perception(config: PerceptionConfig, lidar: SensorConfig | None) -> Perception:
     sampler, moves = config.sampler(), config.base_motion
+    if lidar is not None and sampler.max_range != lidar.max_range:
+        raise ConfigError(
+            f"perception.sampler.max_range={sampler.max_range} cannot be exported: on a robot, points beyond it are"
+            f" misses, in training those beyond lidar.max_range={lidar.max_range}; train with both the same"
+        )
     return Perception(config.history, sampler.num_points + moves, sampler_parameters(sampler), moves)
 
 

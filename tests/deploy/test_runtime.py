@@ -535,6 +535,12 @@ def test_what_cannot_be_exported_is_named(exported_run, tmp_path):
         describe(run, OmniEnv(run.env))
 
 
+def test_a_range_that_is_not_the_sensors_cannot_be_exported():
+    run = build.assemble(config.compose(("perception=fps_mlp_small", "perception.sampler.max_range=5", "num_envs=1")))
+    with pytest.raises(config.ConfigError, match=r"perception\.sampler\.max_range=5(\.0)? cannot be exported"):
+        describe(run, OmniEnv(run.env))
+
+
 class Still:
     """A network that reads flat observations and moves nothing."""
 
