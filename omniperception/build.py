@@ -32,7 +32,6 @@ from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.memory import check_fits
-from omniperception.perception import RawSampler, Sampler
 from omniperception.scene import Mount, RobotConfig, SteppingConfig
 from omniperception.scene.held_out import held_out
 from omniperception.schema import ANYTHING, make, types_of
@@ -79,10 +78,6 @@ class RunConfig:
                 f"{given} is a beginning of a policy's learning, and ppo.num_learning_epochs=0 keeps it as it is; leave"
                 " one of them out"
             )
-        if self.ppo.start_std is not None and not self.init:
-            raise ValueError(
-                f"ppo.start_std={self.ppo.start_std} is of a policy that another run gives (init=); use ppo.init_std"
-            )
         if self.distillation is not None and self.perception is None:
             raise ValueError(
                 "distillation teaches a policy that sees what its teacher is told of, and perception=none sees nothing;"
@@ -122,7 +117,6 @@ _TASK = (
 _BESIDE_THE_TASK = (
     *("ppo", "logger", "init", "seed", "sim.num_threads", configs.SEARCH_PATH),
     *("perception.learning_rate", "perception.final_learning_rate", "perception.supervised_epochs"),
-    "perception.memory_gb",
 )
 """Keys of a configuration that change nothing in the environments."""
 
@@ -158,8 +152,6 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         seen["targets"] = tuple(dict.fromkeys((*seen.get("targets", ()), AVOIDANCE_TARGET)))
     try:
         lidar = _sensor(composed["lidar"], task["robot"], trusted) if composed["lidar"] else None
-        if lidar is not None and perception is not None:
-            _check_sampler(perception.sampler(), lidar)
         stepping = make(SteppingConfig | None, composed.get("stepping"), "stepping")
         env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, stepping=stepping, **seen)
         condition = make(Condition | None, composed.get("condition"), "condition")
@@ -231,14 +223,6 @@ def _sensor(preset: object, robot: RobotConfig, trust: Sequence[str] | None) -> 
     for name in settings.keys() & mounted.keys():
         raise ConfigError(f"lidar.{name} is unknown; a mount has it: lidar.mount=... or robot.mounts.<name>=...")
     return make(SensorConfig, settings | mounted, "lidar", trust)
-
-
-def _check_sampler(sampler: Sampler, lidar: SensorConfig) -> None:
-    """Refuses, as a ValueError, to sample another number of rays than there are."""
-    if isinstance(sampler, RawSampler) and sampler.num_points != lidar.num_rays:
-        raise ValueError(
-            f"perception.sampler.num_rays={sampler.num_points} must be lidar.num_rays={lidar.num_rays}; change that"
-        )
 
 
 def _logger(composed: dict, trust: Sequence[str] | None) -> LoggerConfig | None:

@@ -60,9 +60,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     flags = {text for text in overrides if text in SWEEP | set(SHOW)}
     values = [text for text in overrides if text not in flags]
     if flags & set(SHOW) and SHOW not in itertools.pairwise(overrides):
-        raise config.ConfigError(
-            f"{' '.join(flags & set(SHOW))} by itself means nothing; {' '.join(SHOW)} shows what a run would be"
-        )
+        raise config.ConfigError("--cfg and job mean something next to each other alone: --cfg job shows what a run is")
     if arguments.run is not None:
         if flags:
             raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
@@ -101,10 +99,16 @@ def assemble(composed: DictConfig) -> build.RunConfig:
     """Builds and validates a run that may be trained; see `build.assemble`.
 
     Raises:
-        ConfigError: it would see obstacles of the test split.
+        ConfigError: it would see obstacles of the test split, or gives noise to a policy that nothing begins with.
         LoggerError: a library is missing.
     """
-    return _trainable(build.assemble(composed))
+    run = build.assemble(composed)
+    if run.ppo.start_std is not None and not run.init:
+        raise config.ConfigError(
+            f"ppo.start_std={run.ppo.start_std} is of a policy that another run gives (init=); give ppo.start_std=null,"
+            " and ppo.init_std for the noise of a new one"
+        )
+    return _trainable(run)
 
 
 def _trainable(run: build.RunConfig) -> build.RunConfig:

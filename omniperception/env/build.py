@@ -108,13 +108,19 @@ def build_sampler(config: EnvConfig) -> Sampler | None:
     """What a network sees of a cloud.
 
     Raises:
-        ValueError: its bands of height, which count from the base's origin, begin above the ground that carries it.
+        ValueError: its bands of height, which count from the base's origin, begin above the ground that carries it, or
+            it takes another number of rays than there are.
     """
     if config.sampler is None or config.lidar is None:
         return None
-    from omniperception.perception import ProximitySampler
+    from omniperception.perception import ProximitySampler, RawSampler
 
     sampler, link = config.sampler(), config.lidar.mount_body
+    if isinstance(sampler, RawSampler) and config.shows_frames and sampler.num_points != config.lidar.num_rays:
+        raise ValueError(
+            f"lidar.num_rays={config.lidar.num_rays} must be perception.sampler.num_rays={sampler.num_points}: the"
+            " network reads every ray; give both the same"
+        )
     if isinstance(sampler, ProximitySampler):
         height, lowest = config.robot.height_of(link), float(sampler.edges[0])
         if lowest + height > LOWEST_BAND:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -159,10 +160,11 @@ class EnvConfig:
             raise ValueError(
                 "commands.route_ahead leads through a maze, and these obstacles have none; use scenario=maze"
             )
-        if (*commands.goal_x, *commands.goal_y) != (end[0], end[0], end[1], end[1]):
+        goal, there = (*commands.goal_x, *commands.goal_y), (end[0], end[0], end[1], end[1])
+        if not all(math.isclose(own, meant, abs_tol=1e-6) for own, meant in zip(goal, there, strict=True)):
             raise ValueError(
                 f"commands.goal_x={list(commands.goal_x)} and goal_y={list(commands.goal_y)} are not where"
-                f" commands.route_ahead leads; the maze's goal is [{end[0]}, {end[0]}] and [{end[1]}, {end[1]}]"
+                f" commands.route_ahead leads; the maze's goal is [{end[0]:g}, {end[0]:g}] and [{end[1]:g}, {end[1]:g}]"
             )
 
     def _check_measured_noise(self) -> None:

@@ -94,10 +94,9 @@ def by_condition(records: Sequence[Record]) -> str:
     """How often each policy arrived untouched, and how often it fell, in the trials of all worlds.
 
     Raises:
-        ConfigError: policies or runs were in different worlds.
+        ConfigError: policies or runs were in different worlds, or under one condition in others than under another.
     """
-    for _, theirs in grouped(records, "condition").items():
-        _check_same_worlds(theirs, "policy", "run")
+    _check_same_worlds(records, "policy", "run", "condition")
     return _over_worlds(records, "policy", "condition", sorted({record.condition for record in records}))
 
 
@@ -136,7 +135,11 @@ def by_training(records: Sequence[Record]) -> str:
 def _check_same_worlds(records: Sequence[Record], *keys: str) -> None:
     """Refuses to put all worlds of these groups together where one group was in others."""
     groups = grouped(records, *keys).items()
-    worlds = {key: {f"{record.place} ({record.condition})" for record in theirs} for key, theirs in groups}
+    apart = "condition" in keys
+    worlds = {
+        key: {record.place if apart else f"{record.place} ({record.condition})" for record in theirs}
+        for key, theirs in groups
+    }
     (first, most), *others = worlds.items()
     for key, found in others:
         if found != most:

@@ -391,10 +391,9 @@ class PerceptivePpo(PPO):
     def _embed_rollout(self) -> Embedded | None:
         """What the policy acted on, in as many parts as there are mini-batches; None without a frame."""
         storage = self.storage
-        parts = torch.arange(storage.num_envs, device=self.device).tensor_split(self.num_mini_batches)
-        seen = [storage.observations_of(part) for part in parts]
-        if not any(obs.has_frames for obs in seen):
+        if not storage.frame_count.any():
             return None
+        parts = torch.arange(storage.num_envs, device=self.device).tensor_split(self.num_mini_batches)
         with torch.no_grad():
-            windows = torch.cat([self.actor.embed_windows(obs) for obs in seen])
+            windows = torch.cat([self.actor.embed_windows(storage.observations_of(part)) for part in parts])
             return Embedded(windows, self.actor.embed_empty(storage.frames))

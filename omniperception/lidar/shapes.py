@@ -126,7 +126,7 @@ def finite_tuple(key: str, value: Sequence[float], length: int, names: Sequence[
     try:
         result = tuple(float(item) for item in value)
     except TypeError:
-        raise ValueError(f"{key}={value} must have {length} values") from None
+        raise ValueError(f"{key}={value} must be {length} numbers") from None
     if len(result) != length:
         hint = f" {tuple(names)}" if key.endswith("size") else ""
         raise ValueError(f"{key}={result} must have {length} values{hint}, got {len(result)}")

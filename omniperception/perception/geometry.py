@@ -116,7 +116,7 @@ class Standing:
     """
 
     def __init__(self, config: GeometryConfig, num_threads: int | None = None) -> None:
-        """Args: num_threads: CPU threads; all the process may use by default."""
+        """Args: num_threads: CPU threads; those of `use_threads` by default."""
         self.config, self._num_threads = config, num_threads
         self._settings = Settings()
         self._settings.back, self._settings.front, self._settings.side = config.body

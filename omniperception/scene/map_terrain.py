@@ -100,7 +100,7 @@ class MapTerrainConfig:
         Raises:
             ValueError: they would be found, and robots start on top of what stands beside them.
         """
-        cells = math.ceil((footing + beside) / self.cell) + 1  # as Ground.highest looks
+        cells = math.ceil(footing / self.cell) + round(beside / self.cell) + 1  # as Ground.highest looks
         if round(self.start.radius / self.cell) < cells:
             raise ValueError(
                 f"terrain.start.radius={self.start.radius} is too small for robot.footing={footing} with"

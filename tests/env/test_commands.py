@@ -217,7 +217,7 @@ class TestGoal:
         ("overrides", "message"),
         [
             (("scenario=static", "commands.route_ahead=3"), "leads through a maze"),
-            (("scenario=maze", "obstacles.groups.wall.layout.cell=1.5"), r"goal is \[13.5, 13.5\] and \[0.0, 0.0\]"),
+            (("scenario=maze", "obstacles.groups.wall.layout.cell=1.5"), r"goal is \[13.5, 13.5\] and \[0, 0\]"),
             (("scenario=hold", "terminations.episode_length_s=10"), "hold_s=20.0 is longer than an episode"),
         ],
     )

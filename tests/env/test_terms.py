@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from omniperception.common import launch
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp import rewards
 from omniperception.env.mdp.terms import RewardTerm, StatefulTerm
 from omniperception.env.state import AirTimes, requires
+from omniperception.lidar.launch import default_num_threads
 
 FEET = {
     "air": RewardTerm(1.0, partial(rewards.foot_air_time, target=0.1, min_speed=0.0)),
@@ -163,3 +165,14 @@ def test_legged_terms_in_the_task(make_env):
     assert env.rewards.weighted["air"].tolist() == pytest.approx(expected)
     env._reset(torch.tensor([2]))
     assert not times.last_air[2].any() and times.last_air[1].all()
+
+
+def test_launches_take_the_environments_threads(make_env, monkeypatch):
+    taken = []
+    monkeypatch.setattr(launch, "SplitLaunch", lambda *given: taken.append(given[5]) or (lambda: None))
+    for threads, expected in ((1, 1), (2, 2), (0, default_num_threads())):
+        make_env("obstacles=none", f"sim.num_threads={threads}", blind=True, num_envs=1)
+        launch.launch_over_envs("kernel", 1, [threads], torch.device("cpu"))
+        launch.launch_over_envs("kernel", 1, [threads], torch.device("cpu"), num_threads=3)
+        assert taken[-2:] == [expected, 3]
+    launch.use_threads(None)

@@ -82,8 +82,10 @@ def test_runs_of_several_files_stand_below_each_other_if_they_were_in_the_same_w
         ConfigError, match=r"a blind and a run were not in the same worlds \(only one of them in rod \(ideal\)\)"
     ):
         rendered(page("first view=trained condition=ideal"), data)
-    with pytest.raises(ConfigError, match=r"blind a and run a were not in the same worlds"):
+    with pytest.raises(ConfigError, match=r"blind a ideal and run a ideal were not in the same worlds"):
         rendered(page("first view=conditions"), data)
+    with pytest.raises(ConfigError, match=r"run a robot and run a ideal were not in the same worlds"):
+        rendered(page("first view=conditions policy=run"), data)
 
 
 def test_trainings_stand_beside_each_other_and_all_worlds_below(data):

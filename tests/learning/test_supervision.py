@@ -72,6 +72,18 @@ def test_ppo_sees_what_the_policy_acted_on_and_does_not_change_it(avoidance_weig
     assert all(map(torch.equal, after_supervision, alg.actor.perception_parameters()))
 
 
+def test_a_policy_may_be_supervised_from_some_iteration_on():
+    env = ToyEnv(6)
+    alone = PerceptivePpo.build(env, config(), "cpu")
+    collect(alone, env, 8)
+    alone.update()
+    supervised = algorithm(env)
+    supervised.load(alone.save())
+    assert not supervised.perception_optimizer.state
+    collect(supervised, env, 8)
+    assert supervised.update()["height_target"] > 0
+
+
 def test_a_rollout_without_a_frame_teaches_nothing():
     env = ToyEnv(4, period=1000)
     alg = algorithm(env)

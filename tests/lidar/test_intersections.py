@@ -113,7 +113,7 @@ def test_grazing_the_ground(height, angle):
     [
         ((K.SPHERE, (0.0,)), "must be positive"),
         ((K.BOX, (1.0, 1.0)), "must have 3 values"),
-        ((K.SPHERE, 0.5), "must have 1 values"),
+        ((K.SPHERE, 0.5), "must be 1 numbers"),
         ((K.PLANE, (1.0,)), "must have 2 values"),
         ((K.PLANE, (1.0, -1.0)), "must be >= 0"),
         ((17, (1.0,)), "must be one of ShapeKind"),

@@ -261,8 +261,9 @@ def test_capsules_stand_upright_on_their_caps():
     torch.testing.assert_close(field.half_height, field.pos_w[..., 2])
     assert (field.outline[..., 1] == -1).all()
 
-    def test_a_plane_is_refused_however_it_lies(self, tmp_path):
-        path = tmp_path / "slanted.obj"
-        path.write_text("v 0 0 0\nv 1 0 1\nv 0 1 1\nv 1 1 2\nf 1 2 4\nf 1 4 3\n")
-        with pytest.raises(ValueError, match=r"slanted.obj is flat; a mesh needs a volume"):
-            mesh_points(str(path))
+
+def test_a_plane_is_refused_however_it_lies(tmp_path):
+    path = tmp_path / "slanted.obj"
+    path.write_text("v 0 0 0\nv 1 0 1\nv 0 1 1\nv 1 1 2\nf 1 2 4\nf 1 4 3\n")
+    with pytest.raises(ValueError, match=r"slanted.obj is flat; a mesh needs a volume"):
+        mesh_points(str(path))

@@ -22,7 +22,7 @@ class RawSampler(Sampler):
     """Every ray's point in ray order, a miss as zeros: the input of the direct MLP."""
 
     def __init__(self, num_rays: int, *, max_range: float, num_threads: int | None = None) -> None:
-        """Args: num_rays: R of every frame; max_range: metres; num_threads: CPU threads, all cores by default."""
+        """Args: num_rays: R of every frame; max_range: metres; num_threads: those of `use_threads` by default."""
         super().__init__(num_rays, max_range, num_threads)
 
     @property
@@ -68,7 +68,7 @@ class PdSampler(Sampler):
             max_range: metres; points are divided by it.
             split_deg: elevation in the sensor frame that separates the halves, degrees.
             ring_deg: height of a theta ring for sorting, degrees.
-            num_threads: CPU threads; all cores by default.
+            num_threads: CPU threads; those of `use_threads` by default.
         """
         if num_proximal < 0 or num_distal < 0:
             raise ValueError(f"num_proximal and num_distal must not be negative, got {num_proximal} and {num_distal}")
@@ -176,7 +176,7 @@ class ProximitySampler(PdSampler):
             blind: nearest range that counts, metres.
             body: half length and half width of the robot's own body around the base's origin, metres.
             ring_deg: height of a theta ring for sorting the proximal half, degrees.
-            num_threads: CPU threads; all cores by default.
+            num_threads: CPU threads; those of `use_threads` by default.
         """
         edges = checked_edges(band_edges, num_sectors, decay)
         if not 0.0 <= blind < max_range:
@@ -243,7 +243,7 @@ class FpsSampler(PdSampler):
             num_points: slots.
             max_range: metres; points are divided by it.
             ring_deg: height of a theta ring for sorting, degrees.
-            num_threads: CPU threads; all cores by default.
+            num_threads: CPU threads; those of `use_threads` by default.
         """
         super().__init__(
             num_points, 0, max_range=max_range, split_deg=-math.inf, ring_deg=ring_deg, num_threads=num_threads

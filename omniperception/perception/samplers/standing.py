@@ -42,7 +42,7 @@ class StandingSampler(Sampler):
             band_edges: increasing heights that separate the bands, metres above the ground.
             decay: distance over which the proximity falls by e, metres.
             geometry: what is ground, noise and body; None: as :class:`GeometryConfig` has it.
-            num_threads: CPU threads; all cores by default.
+            num_threads: CPU threads; those of `use_threads` by default.
         """
         edges = checked_edges(band_edges, num_sectors, decay)
         super().__init__(num_sectors * (len(edges) - 1), max_range, num_threads)
