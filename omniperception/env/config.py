@@ -106,8 +106,8 @@ class EnvConfig:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
             raise ValueError("obstacles.free_path leads to a goal, and these commands have none; use commands=goal")
-        if isinstance(self.commands, GoalCommandConfig):
-            self._check_goal(self.commands)
+        if isinstance(self.commands, GoalCommandConfig) and self.commands.route_ahead is not None:
+            self._check_route(self.commands)
         if MOTION_TARGET in self.targets and self.rewards.avoidance.risk is None:
             raise ValueError(
                 "perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk or"
@@ -147,14 +147,7 @@ class EnvConfig:
                     " use lidar=mid360 or rewards=walk observations=walk"
                 )
 
-    def _check_goal(self, commands: GoalCommandConfig) -> None:
-        if commands.hold_s > self.terminations.episode_length_s:
-            raise ValueError(
-                f"commands.hold_s={commands.hold_s} is longer than an episode, so that no goal is ever reached; give at"
-                f" most terminations.episode_length_s={self.terminations.episode_length_s}"
-            )
-        if commands.route_ahead is None:
-            return
+    def _check_route(self, commands: GoalCommandConfig) -> None:
         end = self.obstacles.route_end
         if end is None:
             raise ValueError(
