@@ -133,9 +133,9 @@ class OmniVectorEnv:
     def _seeds(self, seed: int | Sequence[int | None], env_ids: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Seeds (m,) of those of environments (n,) that get one, and which do (n,) bool."""
         if isinstance(seed, Integral):
-            seed = int(seed)
-        counted: list = [seed + k for k in range(self.num_envs)] if isinstance(seed, int) else []
-        many = list(seed) if isinstance(seed, Iterable) else counted
+            many: list = [int(seed) + k for k in range(self.num_envs)]
+        else:
+            many = list(seed) if isinstance(seed, Iterable) else []
         if len(many) != self.num_envs or not all(one is None or _is_seed(one) for one in many):
             raise ConfigError(
                 f"seed={seed} must be a whole number from 0 to {MOST_SEEDS - 1}, or {self.num_envs} of them or None"

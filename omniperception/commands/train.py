@@ -58,14 +58,14 @@ class Arguments:
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Resumes a run, runs a sweep, or trains one run."""
     flags = {text for text in overrides if text in SWEEP | set(SHOW)}
-    values = [text for text in overrides if text not in flags]
-    if flags & set(SHOW) and SHOW not in itertools.pairwise(overrides):
+    values, shows = [text for text in overrides if text not in flags], flags & set(SHOW)
+    if shows and SHOW not in itertools.pairwise(overrides):
         raise config.ConfigError("--cfg and job mean something next to each other alone: --cfg job shows what a run is")
     if arguments.run is not None:
         if flags:
             raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
         go_on(config.find_run(arguments.run), values, arguments.trust)
-    elif flags & set(SHOW):
+    elif shows:
         print(config.as_yaml(assemble(config.compose(values)).composed), end="")
     elif flags:
         sweep(values, arguments.trust)

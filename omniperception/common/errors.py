@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 
@@ -47,6 +48,11 @@ def check_known(key: str, names: Iterable[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             raise ConfigError(f"{key}={name} is unknown; {suggest(name, known)}")
+
+
+def repeated(names: Sequence[str]) -> list[str]:
+    """Those that are there more than once, sorted."""
+    return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
 def one_line(error: BaseException) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import yaml
 
+from omniperception.common.errors import repeated
 from omniperception.deploy.description import Description, Group, Joints, Term
 from omniperception.deploy.go2 import MOTORS
 
@@ -97,7 +98,7 @@ def _caveats(description: Description) -> list[str]:
     if any(group.history > 1 and len(group.terms) > 1 for group in description.observations):
         lines.append("History is by time: all terms of the oldest step first, where Isaac Lab goes term by term.")
     every = [term.quantity for _, term in _terms(description)]
-    if twice := sorted({name for name in every if every.count(name) > 1}):
+    if twice := repeated(every):
         lines.append(f"The network reads {', '.join(twice)} more than once; here each has one entry, its last.")
     own = [name for name in every if name not in _NAMES]
     if own:

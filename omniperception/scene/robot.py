@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from omniperception.common.errors import repeated
 from omniperception.scene.fetched import SCHEME, fetched
 from omniperception.scene.robot_file import (
     FRAME,
@@ -189,9 +190,9 @@ class RobotConfig:
         if not feet or not all(feet):
             raise ValueError("robot.foot_geoms has an empty list; a robot needs feet, and a foot at least one geom")
         geoms = [geom for foot in self.feet for geom in foot]
-        if len(set(geoms)) != len(geoms):
-            twice = sorted({geom for geom in geoms if geoms.count(geom) > 1})
-            raise ValueError(f"robot.foot_geoms names {', '.join(twice)} more than once")
+        for name, names in (("joints", self.joints), ("foot_geoms", geoms)):
+            if twice := repeated(names):
+                raise ValueError(f"robot.{name} names {', '.join(twice)} more than once")
         for name in ("base_height", "footing", "height", "radius"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"robot.{name}={getattr(self, name)} must be positive")
@@ -205,9 +206,6 @@ class RobotConfig:
                 f"robot.min_base_height={self.min_base_height}, robot.half_length={self.half_length} and"
                 f" robot.footprint={list(self.footprint)} must not be negative"
             )
-        if len(set(self.joints)) != len(self.joints):
-            twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
-            raise ValueError(f"robot.joints names {', '.join(twice)} more than once")
         missing = sorted(set(self.joints) - set(self.default_joint_pos))
         if missing:
             raise ValueError(f"robot.default_joint_pos must name all of robot.joints; missing: {missing}")

@@ -164,12 +164,10 @@ class RingPath(nn.Module):
         """
         super().__init__()
         if num_sectors < 1 or num_cells % num_sectors:
-            motion = (
-                "; it needs perception.base_motion=true" if num_sectors > 0 == (num_cells + 1) % num_sectors else ""
-            )
+            lacks_motion = num_sectors > 0 and (num_cells + 1) % num_sectors == 0  # its row was taken from the cells
             raise ValueError(
-                f"perception.network.rings: num_cells={num_cells} must be a multiple of"
-                f" num_sectors={num_sectors}{motion}"
+                f"perception.network.rings: num_cells={num_cells} must be a multiple of num_sectors={num_sectors}"
+                f"{'; it needs perception.base_motion=true' if lacks_motion else ''}"
             )
         if len(kernel_sizes) != len(channels) or any(n % 2 == 0 or not 0 < n <= num_sectors for n in kernel_sizes):
             raise ValueError(
