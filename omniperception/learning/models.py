@@ -104,7 +104,9 @@ class PerceptionActor(EstimatingModel):
     ) -> torch.Tensor:
         """Normalised one-dimensional groups and the embedding, concatenated."""
         if isinstance(obs, WindowedObservations):
-            with torch.set_grad_enabled(torch.is_grad_enabled() and self.end_to_end):
+            # In the precision that was acted in: V_avoid makes much of what bfloat16 rounds off (docs/lab/learning.md)
+            exact = torch.autocast(obs.frames.device.type, enabled=False)
+            with exact, torch.set_grad_enabled(torch.is_grad_enabled() and self.end_to_end):
                 features, has_frame = self.embed(obs), obs.step_count > 0
                 if self.supervision and obs.has_frames and torch.is_grad_enabled():
                     features = _AddLoss.apply(features, self.supervised_loss(features, obs))

@@ -25,6 +25,10 @@ ESTIMATOR_LEARNING_RATE = 1.0e-3
 """Of the estimator's own optimiser, which passes over each rollout once."""
 
 
+FIRST_LEARNING_RATE = 1.0e-5
+"""Where an adaptive step begins for a policy that had stayed while its critic warmed up, or had been taught; rsl_rl's least."""
+
+
 def check_rollout(num_envs: int, num_steps: int, num_mini_batches: int, has_frames: bool) -> None:
     """Refuses rollouts that leave a mini-batch without content; those with frames are of whole environments.
 
@@ -237,6 +241,8 @@ class PerceptivePpo(PPO):
         if self.distillation is not None and self.num_updates < self.distillation.iterations:
             return self._imitate(self.distillation.learning_rate)
         if self.num_updates >= self.critic_warmup:
+            if self.num_updates == self._first_update and self.schedule == "adaptive":
+                self._set_learning_rate(FIRST_LEARNING_RATE)  # the critic's would carry it off in a single step
             return super().update()
         schedule = self.schedule
         self.schedule = "fixed"  # a policy that stays would have its steps grow without end
@@ -246,6 +252,17 @@ class PerceptivePpo(PPO):
         finally:
             self.schedule = schedule
             self.actor.requires_grad_(True)
+
+    @property
+    def _first_update(self) -> int | None:
+        """The update in which PPO begins with the policy, after a warm-up or lessons; None without either."""
+        lessons = self.distillation.iterations if self.distillation is not None else 0
+        return max(self.critic_warmup, lessons) or None
+
+    def _set_learning_rate(self, learning_rate: float) -> None:
+        self.learning_rate: float = learning_rate
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate
 
     def learn_from(self, teacher: Teacher) -> None:
         """Lets a teacher teach the first updates.
@@ -368,9 +385,7 @@ class PerceptivePpo(PPO):
         if self.estimator_optimizer is not None:
             self.estimator_optimizer.load_state_dict(state["estimator_optimizer_state_dict"])
         self.num_updates = state["num_updates"]
-        self.learning_rate: float = configured if self.schedule == "fixed" else state["learning_rate"]
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
+        self._set_learning_rate(configured if self.schedule == "fixed" else state["learning_rate"])
         return True
 
     def check_rollout(self) -> None:
