@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from rsl_rl.modules import HiddenState
@@ -104,9 +105,7 @@ class PerceptionActor(EstimatingModel):
     ) -> torch.Tensor:
         """Normalised one-dimensional groups and the embedding, concatenated."""
         if isinstance(obs, WindowedObservations):
-            # In the precision that was acted in: V_avoid makes much of what bfloat16 rounds off (docs/lab/learning.md)
-            exact = torch.autocast(obs.frames.device.type, enabled=False)
-            with exact, torch.set_grad_enabled(torch.is_grad_enabled() and self.end_to_end):
+            with self._precision(obs.frames), torch.set_grad_enabled(torch.is_grad_enabled() and self.end_to_end):
                 features, has_frame = self.embed(obs), obs.step_count > 0
                 if self.supervision and obs.has_frames and torch.is_grad_enabled():
                     features = _AddLoss.apply(features, self.supervised_loss(features, obs))
@@ -187,6 +186,11 @@ class PerceptionActor(EstimatingModel):
 
     def _get_latent_dim(self) -> int:
         return super()._get_latent_dim() + self._feature_dim
+
+    def _precision(self, frames: torch.Tensor) -> AbstractContextManager:
+        """In which an update embeds: that of acting with a read-out, as V_avoid makes much of what bfloat16 rounds off
+        (docs/lab/learning.md, "PPO on top"), otherwise the update's."""
+        return nullcontext() if self.read_out is None else torch.autocast(frames.device.type, enabled=False)
 
     def _extend(self, embedding: torch.Tensor) -> torch.Tensor:
         return embedding if self.read_out is None else self.read_out.extend(embedding)

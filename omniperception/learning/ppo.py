@@ -26,7 +26,7 @@ ESTIMATOR_LEARNING_RATE = 1.0e-3
 
 
 FIRST_LEARNING_RATE = 1.0e-5
-"""Where an adaptive step begins for a policy that had stayed while its critic warmed up, or had been taught; rsl_rl's least."""
+"""Of an adaptive schedule's first update of a policy that has waited for its critic, or was taught; rsl_rl's least."""
 
 
 def check_rollout(num_envs: int, num_steps: int, num_mini_batches: int, has_frames: bool) -> None:
