@@ -67,6 +67,25 @@ def test_an_update_sees_what_the_policy_acted_on(make_runner):
 
 
 @pytest.mark.parametrize("end_to_end", [True, False])
+def test_an_update_in_bfloat16_perceives_what_was_acted_on(make_runner, end_to_end):
+    """What rounds off there moves V_avoid by so much that PPO would take it for a step of its own."""
+    runner = make_runner(f"perception.supervised_epochs={0 if end_to_end else 1}")
+    obs = runner.env.get_observations()
+    with torch.inference_mode():
+        for _ in range(12):
+            obs = runner.step(obs)
+    alg, seen = runner.alg, []
+    velocity = alg.actor.read_out.velocity
+    alg.actor.read_out.velocity = lambda *given: seen.append(given) or velocity(*given)
+    [batch] = alg.storage.mini_batch_generator(1, 1)
+    for in_bfloat16 in (False, True):
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=in_bfloat16):
+            alg.actor(batch.observations)
+    (features, _), (in_bfloat16, _) = seen
+    assert features.any() and torch.equal(features, in_bfloat16)
+
+
+@pytest.mark.parametrize("end_to_end", [True, False])
 def test_the_loss_of_ppo_reaches_perception_by_way_of_the_controller(make_runner, end_to_end):
     """No weight of the gait's reads the embedding, so there is no other way; against a finite difference."""
     epochs = f"perception.supervised_epochs={0 if end_to_end else 1}"

@@ -10,6 +10,7 @@ from toy_env import ToyEnv, collect, config
 
 from omniperception.learning import PerceptivePpo, WindowedObservations
 from omniperception.learning.distillation import DistillationConfig, Teacher
+from omniperception.learning.ppo import FIRST_LEARNING_RATE
 
 
 def teacher(env, seed=1):
@@ -66,8 +67,11 @@ def test_the_student_comes_to_do_what_the_teacher_does(frames):
     with torch.no_grad():
         error = (alg.actor(batch) - Teacher(actor).actions(groups)).square().mean()
     assert error < 0.2 * imitation[0]
+    rates = []
+    alg.optimizer.register_step_pre_hook(lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"]))
     losses = alg.update()
     assert "surrogate" in losses and "imitation" not in losses  # PPO's turn
+    assert rates[0] <= 1.5 * FIRST_LEARNING_RATE  # a lesson is not lost in PPO's first step
 
 
 def test_what_does_not_fit_is_refused():

@@ -8,6 +8,7 @@ from toy_env import ToyEnv, collect, config
 
 from omniperception.learning import PerceptivePpo, TrainingDiverged, precision
 from omniperception.learning import config as learning_config
+from omniperception.learning.ppo import FIRST_LEARNING_RATE
 
 
 def algorithm(env, num_steps=8, frames=True, **options):
@@ -134,12 +135,30 @@ def test_final_desired_kl_is_checked():
         algorithm(env, frames=False, final_desired_kl=0.002, schedule="fixed")
 
 
+def steps_of(alg):
+    """Learning rates of the steps from now on."""
+    rates = []
+    alg.optimizer.register_step_pre_hook(lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"]))
+    return rates
+
+
+def test_fixed_steps_stay_after_a_warm_up():
+    env = ToyEnv(4)
+    alg = algorithm(env, critic_warmup=1, schedule="fixed")
+    steps = steps_of(alg)
+    for _ in range(2):
+        collect(alg, env, 8)
+        alg.update()
+    assert steps == [1e-3] * 8
+
+
 def test_the_critic_warms_up_alone():
     env = ToyEnv(4)
     alg = algorithm(env, critic_warmup=2)
     first_rate, changed, rates, divergence = alg.learning_rate, [], [], alg.actor.get_kl_divergence
     # a policy that stays has a divergence a little above 0 where rounding makes it so
     alg.actor.get_kl_divergence = lambda *given: divergence(*given).abs() + 1e-9
+    steps = steps_of(alg)
     for _ in range(3):
         before = [{n: p.clone() for n, p in model.named_parameters()} for model in (alg.actor, alg.critic)]
         collect(alg, env, 8)
@@ -152,6 +171,10 @@ def test_the_critic_warms_up_alone():
     assert changed == [[False, True], [False, True], [True, True]]
     assert all(p.requires_grad for p in alg.actor.parameters())
     assert rates[:2] == [first_rate] * 2 and rates[2] != first_rate and alg.schedule == "adaptive"
+    assert steps == [first_rate] * 8 + [pytest.approx(FIRST_LEARNING_RATE * 1.5**k) for k in (1, 2, 3, 4)]
+    collect(alg, env, 8)
+    alg.update()
+    assert alg.learning_rate > FIRST_LEARNING_RATE * 1.5**4  # it goes on from there
     with pytest.raises(ValueError, match="ppo.critic_warmup=-1 must not be negative"):
         algorithm(env, critic_warmup=-1)
 
