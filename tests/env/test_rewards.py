@@ -96,6 +96,7 @@ class TestTerms:
             ("yaw_rate_tracking", {"beta": 2.0}, [math.exp(-0.5), 1.0]),
             ("velocity_error", {}, [0.5, math.sqrt(0.04 + 0.09)]),
             ("yaw_rate_error", {}, [0.5, 0.0]),
+            ("progress", {}, [0.5, 0.0]),
             ("capped_ray_distance", {"max_distance": 8.0}, [1.0, 0.25]),
             ("vertical_velocity_squared", {}, [0.25, 1.0]),
             ("roll_pitch_rate_squared", {}, [0.25, 0.0]),
@@ -117,6 +118,8 @@ class TestTerms:
             ("action_rate_squared", {}, [0.25 + 1.0, 0.0]),
             ("action_acceleration_squared", {}, [9.0, 1.0]),
             ("obstacle_contact", {}, [1.0, 0.0]),
+            ("obstacle_impulse", {}, [30.0 / 0.02, 0.0]),
+            ("obstacle_impulse", {"most": 10.0}, [10.0 / 0.02, 0.0]),
             ("alive", {}, [1.0, 1.0]),
         ],
     )
@@ -146,10 +149,26 @@ class TestTerms:
             pose=torch.tensor([1.2, -0.7, 0.8]),
             actions=(tensor([1.0, 0.0], [0.0, 0.0]), tensor([0.5, 1.0], [0.0, 0.0]), tensor([0.0, -1.0], [0.0, 1.0])),
             obstacle_contact=torch.tensor([True, False]),
+            obstacle_impulse=tensor(30.0, 0.0),
+            control_dt=0.02,
             num_envs=2,
             device="cpu",
         )
         assert getattr(rewards, term)(state, **settings).tolist() == pytest.approx(expected)
+
+    @pytest.mark.parametrize(
+        ("velocity", "wanted", "expected"),
+        [
+            ([0.0, 0.7], [0.0, 0.5], 0.5),  # no more than is asked for
+            ([0.6, 0.8], [2.0, 0.0], 0.6),
+            ([-0.3, 0.0], [1.0, 0.0], -0.3),
+            ([0.3, -0.4], [0.6, 0.8], -0.14),
+            ([0.5, 0.5], [0.0, 0.0], 0.0),
+        ],
+    )
+    def test_progress(self, velocity, wanted, expected):
+        state = given(kinematics={"base_lin_vel_yaw": tensor(velocity)}, reference=tensor([*wanted, 1.0]))
+        assert rewards.progress(state).item() == pytest.approx(expected)
 
     def test_standing_counts_where_the_command_has_said_so_for_long_enough(self):
         joint_vel = tensor([1.0, -2.0], [1.0, -2.0], [0.0, 0.0], [1.0, -2.0])

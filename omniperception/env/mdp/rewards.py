@@ -34,6 +34,14 @@ def yaw_rate_tracking(state: EnvState, beta: float) -> torch.Tensor:
     return torch.exp(-beta * error.square())
 
 
+def progress(state: EnvState) -> torch.Tensor:
+    """v_xy along v_ref, at most |v_ref|, m/s: below 0 for a robot that backs off, 0 where none is asked for."""
+    wanted = state.reference[:, :2]
+    speed = wanted.norm(dim=1)
+    along = (state.kinematics.base_lin_vel_yaw * wanted).sum(1) / speed.clamp(min=1e-6)
+    return torch.minimum(along, speed)
+
+
 def velocity_error(state: EnvState) -> torch.Tensor:
     """|v_xy - v_ref|, m/s: unlike `velocity_tracking` as steep far from the reference as near it."""
     return (state.kinematics.base_lin_vel_yaw - state.reference[:, :2]).norm(dim=1)
@@ -88,6 +96,13 @@ def link_collision(state: EnvState, unit: float, most: float = math.inf) -> torc
 def obstacle_contact(state: EnvState) -> torch.Tensor:
     """1 while any link touches an obstacle."""
     return state.obstacle_contact.float()
+
+
+@requires("obstacle_force")
+def obstacle_impulse(state: EnvState, most: float = math.inf) -> torch.Tensor:
+    """|Impulse| on obstacles in this control step, at most `most` (N s), by its duration: N. So its sum over an episode
+    is what all touches came to in N s: a light touch costs little, a long one no more than what it pushes."""
+    return state.obstacle_impulse.clamp(max=most) / state.control_dt
 
 
 def closing_speed(state: EnvState, horizon: float, margin: float) -> torch.Tensor:
