@@ -23,10 +23,8 @@ from omniperception.learning.storage import Embedded, PerceptiveStorage, Windowe
 
 ESTIMATOR_LEARNING_RATE = 1.0e-3
 """Of the estimator's own optimiser, which passes over each rollout once."""
-
-
 FIRST_LEARNING_RATE = 1.0e-5
-"""Of an adaptive schedule's first update of a policy that has waited for its critic, or was taught; rsl_rl's least."""
+"""Of an adaptive schedule's first update of a policy that can do something already; rsl_rl's least."""
 
 
 def check_rollout(num_envs: int, num_steps: int, num_mini_batches: int, has_frames: bool) -> None:
@@ -77,6 +75,7 @@ class PerceptivePpo(PPO):
         distillation: of how many updates a teacher teaches the actor instead of PPO, and how; None: of none.
         teacher: that does.
         learns_policy: whether PPO changes the policy.
+        is_new: whether the policy begins with weights of its own, not with another run's.
         perception_optimizer: of the perception network and its read-out; None where PPO trains them, or there is none.
         estimator_optimizer: of the actor's estimator; None where there is none, or it stays as it is.
     """
@@ -96,7 +95,7 @@ class PerceptivePpo(PPO):
             self.symmetry: Symmetry | None = MirrorImages(**kwargs["symmetry_cfg"])
         self.num_updates = 0
         self._annealed: dict[str, tuple[float, float, int]] = {}
-        self.critic_warmup, self.distillation = 0, None
+        self.critic_warmup, self.distillation, self.is_new = 0, None, True
         self.learns_policy = self.num_learning_epochs > 0
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)  # rsl_rl's is not fused
@@ -241,8 +240,8 @@ class PerceptivePpo(PPO):
         if self.distillation is not None and self.num_updates < self.distillation.iterations:
             return self._imitate(self.distillation.learning_rate)
         if self.num_updates >= self.critic_warmup:
-            if self.num_updates == self._first_update and self.schedule == "adaptive":
-                self._set_learning_rate(FIRST_LEARNING_RATE)  # the critic's would carry it off in a single step
+            if self._begins_with_what_is() and self.schedule == "adaptive":
+                self._set_learning_rate(FIRST_LEARNING_RATE)  # a larger one carries it off in a single step
             return super().update()
         schedule = self.schedule
         self.schedule = "fixed"  # a policy that stays would have its steps grow without end
@@ -253,11 +252,10 @@ class PerceptivePpo(PPO):
             self.schedule = schedule
             self.actor.requires_grad_(True)
 
-    @property
-    def _first_update(self) -> int | None:
-        """The update in which PPO begins with the policy, after a warm-up or lessons; None without either."""
+    def _begins_with_what_is(self) -> bool:
+        """Whether this is PPO's first update of a policy that is another run's, has been taught or has waited."""
         lessons = self.distillation.iterations if self.distillation is not None else 0
-        return max(self.critic_warmup, lessons) or None
+        return self.num_updates == max(self.critic_warmup, lessons) and (self.num_updates > 0 or not self.is_new)
 
     def _set_learning_rate(self, learning_rate: float) -> None:
         self.learning_rate: float = learning_rate

@@ -227,6 +227,7 @@ class Runner:
             with torch.no_grad():
                 self.alg.actor.distribution.std_param.fill_(self.config.ppo.start_std)
         self.alg.actor.reset()
+        self.alg.is_new = False
         valued, given = self.env.actor_inputs(replace(own, actor=own.critic)), self._inputs(theirs, theirs.critic)
         if given is not None and first_difference(valued, given) is None:
             with contextlib.suppress(CheckpointError):  # other hidden layers

@@ -152,6 +152,15 @@ def test_fixed_steps_stay_after_a_warm_up():
     assert steps == [1e-3] * 8
 
 
+@pytest.mark.parametrize(("is_new", "first"), [(True, 1e-3), (False, FIRST_LEARNING_RATE)])
+def test_what_another_run_has_learned_is_not_lost_in_the_first_step(is_new, first):
+    alg = collected()
+    alg.is_new = is_new
+    steps = steps_of(alg)
+    alg.update()
+    assert first / 1.5 <= steps[0] <= first * 1.5
+
+
 def test_the_critic_warms_up_alone():
     env = ToyEnv(4)
     alg = algorithm(env, critic_warmup=2)

@@ -43,7 +43,9 @@ def seeing(make_config, tmp_path_factory):
 def test_walks_alike_before_it_has_seen_anything(make_config, walk):
     run_dir, blind = walk
     runner = build_runner(make_config(*SEEING, f"init={run_dir}"), None)
+    assert runner.alg.is_new
     runner.start_from(run_dir)
+    assert not runner.alg.is_new
     obs = runner.env.get_observations()
     obs["frame_count"] = torch.zeros_like(obs["frame_count"])
     with torch.no_grad():
