@@ -125,6 +125,8 @@ class PPOConfig:
         critic_warmup: iterations at the beginning in which only the critic learns, for a policy that starts from
             another run's weights (init=): advantages by a critic that knows nothing destroy it. Those in which a
             teacher teaches (`distillation`) are among them: there the critic learns as well.
+        critic_learning_rate: of the critic's steps, which stay so; None: they are the policy's, which shrink with what
+            its trust region allows, and a critic that can no longer follow leads a good policy astray.
         final_entropy_coef: what entropy_coef changes to, linearly, until max_iterations; None: it stays as it is.
         final_desired_kl: what desired_kl changes to, likewise: smaller steps at the end.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
@@ -157,6 +159,7 @@ class PPOConfig:
     final_entropy_coef: float | None = None
     final_desired_kl: float | None = None
     critic_warmup: int = 0
+    critic_learning_rate: float | None = None
     symmetry: bool = False
 
     def __post_init__(self) -> None:
@@ -177,7 +180,7 @@ class PPOConfig:
         for name in ("clip_param", "learning_rate", "max_grad_norm", "init_std", "desired_kl"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive")
-        for name in ("start_std", "final_desired_kl"):
+        for name in ("start_std", "final_desired_kl", "critic_learning_rate"):
             if getattr(self, name) is not None and getattr(self, name) <= 0:
                 raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive or null")
         if self.final_desired_kl is not None and self.schedule != "adaptive":

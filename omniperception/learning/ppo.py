@@ -88,8 +88,8 @@ class PerceptivePpo(PPO):
     distillation: DistillationConfig | None
     teacher: Teacher | None = None
 
-    def __init__(self, *args, **kwargs) -> None:
-        """Arguments of rsl_rl's PPO."""
+    def __init__(self, *args, critic_learning_rate: float | None = None, **kwargs) -> None:
+        """Arguments of rsl_rl's PPO, and the critic's own learning rate; None: it takes the policy's steps."""
         super().__init__(*args, **kwargs)
         if kwargs.get("symmetry_cfg") is not None:
             self.symmetry: Symmetry | None = MirrorImages(**kwargs["symmetry_cfg"])
@@ -97,8 +97,12 @@ class PerceptivePpo(PPO):
         self._annealed: dict[str, tuple[float, float, int]] = {}
         self.critic_warmup, self.distillation, self.is_new = 0, None, True
         self.learns_policy = self.num_learning_epochs > 0
-        parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)  # rsl_rl's is not fused
+        own = critic_learning_rate is not None
+        parts = [[self.actor], [self.critic]] if own else [[self.actor, self.critic]]
+        groups = [{"params": [p for model in part for p in model.parameters()]} for part in parts]
+        self.optimizer = torch.optim.Adam(groups, lr=self.learning_rate, fused=True)  # rsl_rl's is not fused
+        if own:  # rsl_rl sets the rate of all groups
+            self.optimizer.register_step_pre_hook(lambda adam, *_: adam.param_groups[1].update(lr=critic_learning_rate))
         self.guard = DivergenceGuard(self)
 
     @classmethod
@@ -173,6 +177,7 @@ class PerceptivePpo(PPO):
             device=device,
             symmetry_cfg=symmetry if config.mirror is not None else None,
             multi_gpu_cfg=multi_gpu,
+            critic_learning_rate=ppo.critic_learning_rate,
             **ppo.algorithm(device),
         )
         for name, final in (("entropy_coef", ppo.final_entropy_coef), ("desired_kl", ppo.final_desired_kl)):

@@ -161,6 +161,27 @@ def test_what_another_run_has_learned_is_not_lost_in_the_first_step(is_new, firs
     assert first / 1.5 <= steps[0] <= first * 1.5
 
 
+def test_the_critic_keeps_steps_of_its_own():
+    env = ToyEnv(4)
+    alg = algorithm(env, critic_warmup=1, critic_learning_rate=2e-3)
+    rates = []
+    alg.optimizer.register_step_pre_hook(lambda own, *_: rates.append([group["lr"] for group in own.param_groups]))
+    for _ in range(3):
+        collect(alg, env, 8)
+        before = [p.clone() for p in alg.critic.parameters()]
+        alg.update()
+    policy, critic = zip(*rates, strict=True)
+    assert set(critic) == {2e-3} and max(policy[4:]) < 1e-3 and policy[0] == 1e-3
+    moved = max((p - was).abs().max().item() for p, was in zip(alg.critic.parameters(), before, strict=True))
+    assert 1e-3 < moved < 4 * 2.1e-3  # four steps of Adam
+    state = alg.save()
+    again = algorithm(ToyEnv(4), critic_warmup=1, critic_learning_rate=2e-3)
+    again.load(state)
+    assert again.learning_rate == alg.learning_rate < 1e-3
+    with pytest.raises(ValueError, match=r"ppo.critic_learning_rate=0.0 must be positive or null"):
+        algorithm(env, critic_learning_rate=0.0)
+
+
 def test_the_critic_warms_up_alone():
     env = ToyEnv(4)
     alg = algorithm(env, critic_warmup=2)
