@@ -82,6 +82,7 @@ class PerceptivePpo(PPO):
 
     storage: PerceptiveStorage
     entropy_coef: float
+    learning_rate: float
     schedule: str
     perception_optimizer: torch.optim.Adam | None = None
     estimator_optimizer: torch.optim.Adam | None = None
@@ -246,7 +247,7 @@ class PerceptivePpo(PPO):
             return self._imitate(self.distillation.learning_rate)
         if self.num_updates >= self.critic_warmup:
             if self._begins_with_what_is() and self.schedule == "adaptive":
-                self._set_learning_rate(FIRST_LEARNING_RATE)  # a larger one carries it off in a single step
+                self.learning_rate = FIRST_LEARNING_RATE  # a larger one carries it off in a single step
             return super().update()
         schedule = self.schedule
         self.schedule = "fixed"  # a policy that stays would have its steps grow without end
@@ -262,8 +263,8 @@ class PerceptivePpo(PPO):
         lessons = self.distillation.iterations if self.distillation is not None else 0
         return self.num_updates == max(self.critic_warmup, lessons) and (self.num_updates > 0 or not self.is_new)
 
-    def _set_learning_rate(self, learning_rate: float) -> None:
-        self.learning_rate: float = learning_rate
+    def _step_by(self, learning_rate: float) -> None:
+        """Gives the optimiser a rate, where rsl_rl does not give it `learning_rate` in an update."""
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
 
@@ -285,8 +286,7 @@ class PerceptivePpo(PPO):
         """Fits the actor to what the teacher would have done where the actor was, and the critic to the returns."""
         if self.teacher is None:
             raise RuntimeError("distillation needs a teacher: learn_from")
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate
+        self._step_by(learning_rate)
         device_type, losses = torch.device(self.device).type, []
         for batch in self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
             obs = batch.observations
@@ -306,8 +306,7 @@ class PerceptivePpo(PPO):
         self.actor.update_normalization(observed)
         self.critic.update_normalization(observed)
         self.storage.clear()
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
+        self._step_by(self.learning_rate)
         imitation, value = torch.stack(losses).mean(0).tolist()
         return {"imitation": imitation, "value": value}
 
@@ -388,7 +387,8 @@ class PerceptivePpo(PPO):
         if self.estimator_optimizer is not None:
             self.estimator_optimizer.load_state_dict(state["estimator_optimizer_state_dict"])
         self.num_updates = state["num_updates"]
-        self._set_learning_rate(configured if self.schedule == "fixed" else state["learning_rate"])
+        self.learning_rate = configured if self.schedule == "fixed" else state["learning_rate"]
+        self._step_by(self.learning_rate)
         return True
 
     def check_rollout(self) -> None:

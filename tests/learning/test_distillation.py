@@ -6,7 +6,7 @@ import pytest
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
-from toy_env import ToyEnv, collect, config
+from toy_env import ToyEnv, collect, config, steps_of
 
 from omniperception.learning import PerceptivePpo, WindowedObservations
 from omniperception.learning.distillation import DistillationConfig, Teacher
@@ -67,8 +67,7 @@ def test_the_student_comes_to_do_what_the_teacher_does(frames):
     with torch.no_grad():
         error = (alg.actor(batch) - Teacher(actor).actions(groups)).square().mean()
     assert error < 0.2 * imitation[0]
-    rates = []
-    alg.optimizer.register_step_pre_hook(lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"]))
+    rates = steps_of(alg)
     losses = alg.update()
     assert "surrogate" in losses and "imitation" not in losses  # PPO's turn
     assert rates[0] <= 1.5 * FIRST_LEARNING_RATE  # a lesson is not lost in PPO's first step

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from toy_env import ToyEnv, collect, config
+from toy_env import ToyEnv, collect, config, steps_of
 
 from omniperception.learning import PerceptivePpo, TrainingDiverged, precision
 from omniperception.learning import config as learning_config
@@ -135,13 +135,6 @@ def test_final_desired_kl_is_checked():
         algorithm(env, frames=False, final_desired_kl=0.002, schedule="fixed")
 
 
-def steps_of(alg):
-    """Learning rates of the steps from now on."""
-    rates = []
-    alg.optimizer.register_step_pre_hook(lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"]))
-    return rates
-
-
 def test_fixed_steps_stay_after_a_warm_up():
     env = ToyEnv(4)
     alg = algorithm(env, critic_warmup=1, schedule="fixed")
@@ -164,13 +157,11 @@ def test_what_another_run_has_learned_is_not_lost_in_the_first_step(is_new, firs
 def test_the_critic_keeps_steps_of_its_own():
     env = ToyEnv(4)
     alg = algorithm(env, critic_warmup=1, critic_learning_rate=2e-3)
-    rates = []
-    alg.optimizer.register_step_pre_hook(lambda own, *_: rates.append([group["lr"] for group in own.param_groups]))
+    policy, critic = steps_of(alg, group=0), steps_of(alg, group=1)
     for _ in range(3):
         collect(alg, env, 8)
         before = [p.clone() for p in alg.critic.parameters()]
         alg.update()
-    policy, critic = zip(*rates, strict=True)
     assert set(critic) == {2e-3} and max(policy[4:]) < 1e-3 and policy[0] == 1e-3
     moved = max((p - was).abs().max().item() for p, was in zip(alg.critic.parameters(), before, strict=True))
     assert 1e-3 < moved < 4 * 2.1e-3  # four steps of Adam

@@ -137,6 +137,13 @@ def collect(alg, env, steps):
         alg.compute_returns(obs)
 
 
+def steps_of(alg, group=0):
+    """Learning rates of the optimiser's steps from now on, of one group of its parameters."""
+    rates = []
+    alg.optimizer.register_step_pre_hook(lambda optimizer, *_: rates.append(optimizer.param_groups[group]["lr"]))
+    return rates
+
+
 def rollout(env, storage, num_steps):
     """Fill the storage; returns copies of the observations of every step."""
     seen = []
