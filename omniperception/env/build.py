@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from omniperception.env.mdp.curriculum import Curriculum
     from omniperception.env.mdp.pushes import Pushes
     from omniperception.env.measurement import MeasurementErrors
+    from omniperception.env.replay import CollisionReplay, Moment
     from omniperception.env.sensing import LidarSensing
     from omniperception.env.terrain_levels import TerrainLevels
     from omniperception.perception import Sampler
@@ -60,6 +62,15 @@ def build_pushes(config: EnvConfig, sim: Simulator, random: EnvRandom, curriculu
     from omniperception.env.mdp.pushes import Pushes
 
     return Pushes(config.randomization.pushes, sim, config.sim.control_dt, random.branch("pushes"), curriculum)
+
+
+def build_replay(config: EnvConfig, random: EnvRandom, now: Callable[[], Moment]) -> CollisionReplay | None:
+    """What lets episodes begin again before a touch; `now` gives the present scenes."""
+    if config.replay is None or config.full_level:
+        return None
+    from omniperception.env.replay import CollisionReplay
+
+    return CollisionReplay(config.replay, config.sim.control_dt, random.branch("replay"), now)
 
 
 def build_obstacles(

@@ -20,6 +20,7 @@ from omniperception.env.build import (
     build_ground,
     build_obstacles,
     build_pushes,
+    build_replay,
     build_sensing,
 )
 from omniperception.env.config import HEIGHT_TARGET, EnvConfig
@@ -29,6 +30,7 @@ from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 from omniperception.env.metrics import OUTCOMES, EpisodeMetrics
+from omniperception.env.replay import Moment
 from omniperception.env.state import CONTACT_SENSORS, EnvState
 from omniperception.scene import ObstacleField, build_world
 
@@ -46,7 +48,7 @@ class OmniEnv(VecEnv):
     Attributes:
         state: what terms read.
         difficulty: share of the randomization.
-        ground, terrain_levels, obstacles, avoidance, sensing, pushes: None where the task has none.
+        ground, terrain_levels, obstacles, avoidance, sensing, pushes, replay: None where the task has none.
         step_hooks: called at the end of each step, before finished environments are reset.
         healthy: (num_envs,) bool: whose physics was sound in the last step.
         done: (num_envs,) bool: which environments ended in the last step.
@@ -117,6 +119,7 @@ class OmniEnv(VecEnv):
         self.velocity_error = self.yaw_rate_error = torch.zeros(self.num_envs, device=self.device)
         self.contacts = self.done
         self.no_obstacle_near: torch.Tensor | None = None
+        self.replay = build_replay(config, self.random, self._moment)
         self._reset(self._all_envs)
         self.healthy = ~self.sim.failed
         self._sense()
@@ -156,6 +159,8 @@ class OmniEnv(VecEnv):
             self._terminate()
             rewards = self.rewards.compute(self.state, self.healthy)
             self._record()
+        if self.replay is not None:
+            self.replay.follow(self.step_count, self.contacts)
         for hook in self.step_hooks:
             hook()
         with self.timer.stage("resets"):
@@ -341,6 +346,10 @@ class OmniEnv(VecEnv):
                 self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
             self.obstacles.approach(env_ids, pose[:, :2], rotate_yaw(pose[:, 2], self.command.value[env_ids, :2]))
         self.episode_length_buf.index_fill_(0, env_ids, 0)
+        if self.replay is not None:
+            if not interrupted:
+                self._put_back(*self.replay.draw(env_ids))
+            self.replay.begin(env_ids)
         self.metrics.reset(env_ids)
         if self.sensing is not None:
             self.sensing.reset(env_ids, self.state.measured, seeds)
@@ -350,6 +359,37 @@ class OmniEnv(VecEnv):
             self._frame_heights = self._frame_heights.index_fill(0, env_ids, 0.0)
         for manager in self._managers().values():
             manager.reset(env_ids)
+
+    def _moment(self) -> Moment:
+        """(num_envs, ...) copies of all that makes the scenes, but for what is measured of them."""
+        qpos, qvel = self.sim.robot_state()
+        moment = {"qpos": qpos.clone(), "qvel": qvel.clone(), "episode_length": self.episode_length_buf.clone()}
+        if self.ground is not None:
+            moment["tile"] = self.ground.level.clone()
+        for name, part in self._that_go_back().items():
+            moment |= {f"{name}.{key}": value for key, value in part.moment().items()}
+        return moment
+
+    def _put_back(self, env_ids: torch.Tensor, moment: Moment) -> None:
+        """Begins episodes of environments (n,), which have been reset, with the scenes of a moment (n, ...)."""
+        if not len(env_ids):
+            return
+        if self.ground is not None:
+            self.ground.move(env_ids, moment["tile"])
+        self.sim.reset(env_ids, moment["qpos"], moment["qvel"])
+        self.state.reset(env_ids)
+        for name, part in self._that_go_back().items():
+            begin = f"{name}."
+            part.put_back(env_ids, {key.removeprefix(begin): x for key, x in moment.items() if key.startswith(begin)})
+        if self.obstacles is not None:
+            self._resize(self.obstacles, env_ids)
+        self.episode_length_buf[env_ids] = moment["episode_length"]
+
+    def _that_go_back(self) -> dict[str, VelocityCommand | ObstacleField | EnvState]:
+        """Parts that `_put_back` brings to another moment, by name."""
+        assert isinstance(self.command, VelocityCommand)
+        assert self.obstacles is not None
+        return {"command": self.command, "obstacles": self.obstacles, "state": self.state}
 
     def _completed(self, env_ids: torch.Tensor, interrupted: bool) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now commanded no more; None before the first ones."""
@@ -497,7 +537,7 @@ class OmniEnv(VecEnv):
     def _with_state(self) -> dict:
         """Components with a state to be saved, by name."""
         names = ["sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing"]
-        names += ["pushes", "state", "metrics", "difficulty"]
+        names += ["pushes", "state", "metrics", "difficulty", "replay"]
         parts = {name: getattr(self, name) for name in names} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}
 
