@@ -51,7 +51,8 @@ class Curve:
 
 
 def by_recipe(runs: Sequence[Path]) -> dict[str, list[Path]]:
-    """Runs by what they were trained with, but for the seed; the names are their recipes, or a run directory."""
+    """Runs by what they were trained with, but for the seed; the names are their recipes, without the overrides that
+    all of them have, or a run directory."""
     groups: dict[str, list[Path]] = {}
     for run in runs:
         made = OmegaConf.to_container(config.read(run))
@@ -61,15 +62,16 @@ def by_recipe(runs: Sequence[Path]) -> dict[str, list[Path]]:
         kept["init"] = [training_of(name) for name in ([init] if isinstance(init, str) else init)]
         groups.setdefault(json.dumps(kept, sort_keys=True), []).append(run)
     named: dict[str, list[Path]] = {}
-    for same in groups.values():
-        label = _label(same[0])
+    words = [_words(same[0]) for same in groups.values()]
+    common = set(words[0]).intersection(*words[1:]) if len(words) > 1 else set()
+    for same, own in zip(groups.values(), words, strict=True):
+        label = " ".join(word for word in own if word not in common) or str(same[0])
         named[label if label not in named else f"{label} ({same[0]})"] = same
     return named
 
 
-def _label(run: Path) -> str:
-    words = (config.recipe(run) or str(run)).split()
-    return " ".join(word for word in words if not word.startswith(("seed=", "logger"))) or str(run)
+def _words(run: Path) -> list[str]:
+    return [word for word in (config.recipe(run) or "").split() if not word.startswith(("seed=", "logger"))]
 
 
 def read_scalars(run: Path, tags: Sequence[str]) -> dict[str, dict[int, float]]:

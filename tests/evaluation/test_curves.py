@@ -33,13 +33,18 @@ def test_runs_that_differ_by_their_seed_are_one_curve(tmp_path):
     one = make_run(tmp_path / "one", 1, [4.0, 2.0, 1.0])
     two = make_run(tmp_path / "two", 2, [6.0, 4.0], logger="wandb")
     other = make_run(tmp_path / "other", 1, [9.0], num_envs=8)
-    assert by_recipe([one, two, other]) == {
-        "experiment=walk num_envs=4": [one, two],
-        "experiment=walk num_envs=8": [other],
-    }
+    assert by_recipe([one, two, other]) == {"num_envs=4": [one, two], "num_envs=8": [other]}
+    assert by_recipe([one, two]) == {"experiment=walk num_envs=4": [one, two]}
     same, alone = curves_of([one, two, other], [TAG])[TAG]
     assert same.steps.tolist() == [0, 1] and same.values.tolist() == [[4.0, 2.0], [6.0, 4.0]]
     assert alone.values.tolist() == [[9.0]]
+
+
+def test_a_run_whose_overrides_all_others_have_is_named_by_its_directory(tmp_path):
+    runs = [make_run(tmp_path / name, 1, [1.0], num_envs=n) for name, n in (("few", 4), ("more", 8))]
+    config.save_recipe(["experiment=walk"], runs[0])
+    config.save_recipe(["experiment=walk", "num_envs=8"], runs[1])
+    assert list(by_recipe(runs)) == [str(runs[0]), "num_envs=8"]
 
 
 def test_a_running_mean_has_fewer_values_at_the_beginning():
