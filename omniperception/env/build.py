@@ -10,6 +10,7 @@ import torch
 from omniperception.avoidance.velocity import MOTION_TARGET
 from omniperception.common.random import EnvRandom
 from omniperception.env.config import EnvConfig
+from omniperception.env.replay import CollisionReplay, Moment
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
 from omniperception.scene import ObstacleField, TerrainConfig
 from omniperception.sim import Simulator
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from omniperception.env.mdp.curriculum import Curriculum
     from omniperception.env.mdp.pushes import Pushes
     from omniperception.env.measurement import MeasurementErrors
-    from omniperception.env.replay import CollisionReplay, Moment
     from omniperception.env.sensing import LidarSensing
     from omniperception.env.terrain_levels import TerrainLevels
     from omniperception.perception import Sampler
@@ -68,8 +68,6 @@ def build_replay(config: EnvConfig, random: EnvRandom, now: Callable[[], Moment]
     """What lets episodes begin again before a touch; `now` gives the present scenes."""
     if config.replay is None or config.full_level:
         return None
-    from omniperception.env.replay import CollisionReplay
-
     return CollisionReplay(config.replay, config.sim.control_dt, random.branch("replay"), now)
 
 
