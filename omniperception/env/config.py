@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, MOTION_TARGET, SECTOR_TARGET
 from omniperception.common.random import MOST_SEEDS
+from omniperception.env.collision_replay import CollisionReplayConfig
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mdp.terminations import TerminationsConfig
 from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
-from omniperception.env.replay import ReplayConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
 from omniperception.lidar import DEVICES, Noise
 from omniperception.lidar.noise import NAMES as NOISE_NAMES
@@ -53,7 +53,7 @@ class EnvConfig:
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
         stepping: the motion to which actions are added; None: they are added to the default pose.
-        replay: which episodes begin again before a touch; None: none. Not where `full_level` is.
+        collision_replay: which episodes begin again before a touch; None: none. Not where `full_level` is.
         base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
         shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
@@ -80,7 +80,7 @@ class EnvConfig:
     sampler: Callable | None = None
     frame_history: int = 0
     stepping: SteppingConfig | None = None
-    replay: ReplayConfig | None = None
+    collision_replay: CollisionReplayConfig | None = None
     base_motion: bool = False
     targets: Sequence[str] = ()
     shows_frames: bool = True
@@ -127,7 +127,6 @@ class EnvConfig:
                 f"observations.groups.command.history={command.history}: an avoidance velocity is added to the command"
                 " of the present; use 1, or perception.avoidance_weight=0 and motion_weight=0"
             )
-        self._check_replay()
         self._check_measured_noise()
         self._check_one_noise_of_a_kind()
         if self.base_motion and self.lidar is not None and self.lidar.mount_body is not None:
@@ -162,19 +161,6 @@ class EnvConfig:
             raise ValueError(
                 f"commands.goal_x={list(commands.goal_x)} and goal_y={list(commands.goal_y)} are not where"
                 f" commands.route_ahead leads; the maze's goal is [{end[0]:g}, {end[0]:g}] and [{end[1]:g}, {end[1]:g}]"
-            )
-
-    def _check_replay(self) -> None:
-        if self.replay is None:
-            return
-        if not self.obstacles.num_obstacles:
-            raise ValueError("replay begins episodes again before a touch, and there is no obstacle; use replay=null")
-        if not isinstance(self.commands, VelocityCommandConfig):
-            raise ValueError("replay needs commands that are drawn, not a goal; use commands=velocity or replay=null")
-        if isinstance(self.terrain, TiledTerrainConfig) and self.terrain.curriculum is not None:
-            raise ValueError(
-                "replay begins episodes again on their tile, and terrain.curriculum moves them to another; use"
-                " terrain.curriculum=null or replay=null"
             )
 
     def _check_measured_noise(self) -> None:

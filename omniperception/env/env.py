@@ -16,13 +16,14 @@ from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
 from omniperception.env.build import (
     build_avoidance,
+    build_collision_replay,
     build_errors,
     build_ground,
     build_obstacles,
     build_pushes,
-    build_replay,
     build_sensing,
 )
+from omniperception.env.collision_replay import Moment
 from omniperception.env.config import HEIGHT_TARGET, EnvConfig
 from omniperception.env.mdp.commands import GoalCommand, VelocityCommand
 from omniperception.env.mdp.curriculum import Curriculum
@@ -30,7 +31,6 @@ from omniperception.env.mdp.managers import ObservationManager, RewardManager
 from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 from omniperception.env.metrics import OUTCOMES, EpisodeMetrics
-from omniperception.env.replay import Moment
 from omniperception.env.state import CONTACT_SENSORS, EnvState
 from omniperception.scene import ObstacleField, build_world
 
@@ -48,7 +48,7 @@ class OmniEnv(VecEnv):
     Attributes:
         state: what terms read.
         difficulty: share of the randomization.
-        ground, terrain_levels, obstacles, avoidance, sensing, pushes, replay: None where the task has none.
+        ground, terrain_levels, obstacles, avoidance, sensing, pushes, collision_replay: None where the task has none.
         step_hooks: called at the end of each step, before finished environments are reset.
         healthy: (num_envs,) bool: whose physics was sound in the last step.
         done: (num_envs,) bool: which environments ended in the last step.
@@ -119,7 +119,7 @@ class OmniEnv(VecEnv):
         self.velocity_error = self.yaw_rate_error = torch.zeros(self.num_envs, device=self.device)
         self.contacts = self.done
         self.no_obstacle_near: torch.Tensor | None = None
-        self.replay = build_replay(config, self.random, self._moment)
+        self.collision_replay = build_collision_replay(config, self.random, self._moment)
         self._reset(self._all_envs)
         self.healthy = ~self.sim.failed
         self._sense()
@@ -159,12 +159,12 @@ class OmniEnv(VecEnv):
             self._terminate()
             rewards = self.rewards.compute(self.state, self.healthy)
             self._record()
-        if self.replay is not None:
-            self.replay.follow(self.step_count, self.contacts)
         for hook in self.step_hooks:
             hook()
         with self.timer.stage("resets"):
             self.command.advance(self.control_dt, self.state.kinematics)
+            if self.collision_replay is not None:
+                self.collision_replay.follow(self.step_count, self.contacts)
             ended = self.done.nonzero().flatten()
             if len(ended):
                 self._reset(ended)
@@ -346,10 +346,10 @@ class OmniEnv(VecEnv):
                 self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
             self.obstacles.approach(env_ids, pose[:, :2], rotate_yaw(pose[:, 2], self.command.value[env_ids, :2]))
         self.episode_length_buf.index_fill_(0, env_ids, 0)
-        if self.replay is not None:
+        if self.collision_replay is not None:
             if not interrupted:
-                self._put_back(*self.replay.draw(env_ids))
-            self.replay.begin(env_ids)
+                self._put_back(*self.collision_replay.draw(env_ids))
+            self.collision_replay.begin(env_ids)
         self.metrics.reset(env_ids)
         if self.sensing is not None:
             self.sensing.reset(env_ids, self.state.measured, seeds)
@@ -537,7 +537,7 @@ class OmniEnv(VecEnv):
     def _with_state(self) -> dict:
         """Components with a state to be saved, by name."""
         names = ["sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing"]
-        names += ["pushes", "state", "metrics", "difficulty", "replay"]
+        names += ["pushes", "state", "metrics", "difficulty", "collision_replay"]
         parts = {name: getattr(self, name) for name in names} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}
 

@@ -17,7 +17,7 @@ Moment = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
-class ReplayConfig:
+class CollisionReplayConfig:
     """Which episodes begin again before a touch, and how long before.
 
     Attributes:
@@ -31,9 +31,11 @@ class ReplayConfig:
 
     def __post_init__(self) -> None:
         if not 0 < self.share <= 1:
-            raise ValueError(f"replay.share={self.share} must lie in (0, 1]; replay=null begins every episode anew")
+            raise ValueError(
+                f"collision_replay.share={self.share} must lie in (0, 1]; collision_replay=null begins all episodes anew"
+            )
         if self.before_s <= 0:
-            raise ValueError(f"replay.before_s={self.before_s} must be positive")
+            raise ValueError(f"collision_replay.before_s={self.before_s} must be positive")
 
 
 class CollisionReplay:
@@ -43,7 +45,9 @@ class CollisionReplay:
         kept: (num_envs,) bool: whose episode has had a touch, so that its scene before it is kept.
     """
 
-    def __init__(self, config: ReplayConfig, control_dt: float, random: Branch, now: Callable[[], Moment]) -> None:
+    def __init__(
+        self, config: CollisionReplayConfig, control_dt: float, random: Branch, now: Callable[[], Moment]
+    ) -> None:
         """
         Args:
             config: which episodes, and how long before.

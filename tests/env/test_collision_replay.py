@@ -9,7 +9,7 @@ from omniperception.env.env import OmniEnv
 
 EVERY = 5
 """Control steps in `before_s` below."""
-REPLAY = ("replay={share: 1.0, before_s: 0.1}", "obstacles=all", "terminations.episode_length_s=30")
+REPLAY = ("collision_replay={share: 1.0, before_s: 0.1}", "obstacles=all", "terminations.episode_length_s=30")
 
 
 def scene(env):
@@ -24,7 +24,7 @@ def scene(env):
 def touch(env, which):
     env.contacts = torch.zeros(env.num_envs, dtype=torch.bool)
     env.contacts[which] = True
-    env.replay.follow(env.step_count, env.contacts)
+    env.collision_replay.follow(env.step_count, env.contacts)
 
 
 def end(env, which):
@@ -49,7 +49,7 @@ def test_an_episode_begins_again_before_its_touch_and_others_anew(env):
         env.step(action)
         past[env.step_count] = scene(env)
     assert not env.done.any()
-    env.replay.kept[:] = False  # whoever touched something by chance
+    env.collision_replay.kept[:] = False  # whoever touched something by chance
     touch(env, [2])
     _, _, done, _ = end(env, [1, 2])
     assert done.tolist() == [0, 1, 1, 0]
@@ -58,13 +58,13 @@ def test_an_episode_begins_again_before_its_touch_and_others_anew(env):
     assert now["steps"].tolist() == [14, 0, EVERY, 14]
     assert (now["action"][1] == 0).all()
     assert not torch.equal(now["bodies"][1], past[EVERY]["bodies"][1])
-    assert not env.replay.kept.any()
+    assert not env.collision_replay.kept.any()
 
 
 def test_a_touch_right_after_the_beginning_begins_again_there(env):
     first = scene(env)
     env.step(still(env))
-    env.replay.kept[:] = False
+    env.collision_replay.kept[:] = False
     touch(env, [0])
     end(env, [0])
     close(scene(env), first, 0)
@@ -74,24 +74,24 @@ def test_a_touch_right_after_the_beginning_begins_again_there(env):
 def test_only_the_first_touch_of_an_episode_counts(env):
     for k in range(4 * EVERY):
         env.step(still(env))
-        env.replay.kept[1:] = False
+        env.collision_replay.kept[1:] = False
         if k == 2 * EVERY:
-            env.replay.kept[0] = False
+            env.collision_replay.kept[0] = False
+        if k in (2 * EVERY, 3 * EVERY + 2):
             touch(env, [0])
-            at = scene(env)["steps"][0] - EVERY - 1
     end(env, [0])
-    assert env.episode_length_buf[0] == at == EVERY
+    assert env.episode_length_buf[0] == EVERY  # 5 before the step 11 of the first one; for the second it would be 10
 
 
 def test_it_begins_again_once_per_touch_and_not_after_a_reset_from_outside(env):
     for _ in range(2 * EVERY + 1):
         env.step(still(env))
-    env.replay.kept[:] = False
+    env.collision_replay.kept[:] = False
     touch(env, [1, 3])
     env.reset(torch.tensor([3]))
     end(env, [1, 3])
     assert env.episode_length_buf[[1, 3]].tolist() == [EVERY, 0]
-    env.replay.kept[:] = False
+    env.collision_replay.kept[:] = False
     end(env, [1])
     assert env.episode_length_buf[1] == 0
 
@@ -101,7 +101,7 @@ def test_share(make_env):
     for _ in range(2 * EVERY + 1):
         env.step(still(env))
     everybody = list(range(400))
-    env.replay.kept[:] = False
+    env.collision_replay.kept[:] = False
     touch(env, everybody)
     end(env, everybody)
     again = int((env.episode_length_buf == EVERY).sum())
@@ -116,7 +116,7 @@ def test_sizes_of_geoms_and_rays_go_back(make_env):
     for _ in range(2 * EVERY + 1):
         ends.step(still(ends))
         past.append(ends.obstacles.size.clone())
-    ends.replay.kept[:] = False
+    ends.collision_replay.kept[:] = False
     touch(ends, [1])
     end(ends, [1])
     assert torch.equal(ends.obstacles.size[1], past[EVERY - 1][1])
@@ -135,7 +135,7 @@ def test_on_uneven_ground_the_tile_comes_back(make_env):
     for _ in range(2 * EVERY + 1):
         env.step(still(env))
     tiles, place = env.ground.level.clone(), env.sim.ground_pos.clone()
-    env.replay.kept[:] = False
+    env.collision_replay.kept[:] = False
     touch(env, [0, 1, 2, 3])
     end(env, list(range(8)))
     assert torch.equal(env.ground.level[:4], tiles[:4])
@@ -151,7 +151,7 @@ def test_going_on_from_a_saved_state_is_exact(make_env):
     touch(first, [1])
     second.sim.qpos.copy_(first.sim.qpos)
     second.load_state_dict(first.state_dict())
-    assert torch.equal(first.replay.kept, second.replay.kept)
+    assert torch.equal(first.collision_replay.kept, second.collision_replay.kept)
     for env in (first, second):
         end(env, [1, 2])
     assert first.episode_length_buf.tolist() == second.episode_length_buf.tolist()
@@ -163,22 +163,25 @@ def test_going_on_from_a_saved_state_is_exact(make_env):
 def test_evaluations_begin_every_episode_anew(make_config):
     from dataclasses import replace
 
-    run = make_config("perception=none", "lidar=none", "rewards=walk", "observations=walk", *REPLAY)
-    assert OmniEnv(replace(run.env, full_level=True)).replay is None
+    blind = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
+    for overrides in (REPLAY, (REPLAY[0], "scenario=corridor"), (REPLAY[0], "scenario=static", "terrain=mixed")):
+        run = make_config(*blind, *overrides, "num_envs=2")
+        assert OmniEnv(replace(run.env, full_level=True, trials=True)).collision_replay is None
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
+    ("replay", "other", "message"),
     [
-        (("replay={share: 0, before_s: 2}",), "replay.share=0 must lie in (0, 1]; replay=null"),
-        (("replay={share: 0.5, before_s: 0}",), "replay.before_s=0 must be positive"),
-        (("replay={share: 0.5}",), "before_s"),
-        (("replay={share: 0.5, before_s: 2}", "obstacles=none"), "there is no obstacle; use replay=null"),
-        (("replay={share: 0.5, before_s: 2}", "commands=goal"), "use commands=velocity or replay=null"),
-        (("replay={share: 0.5, before_s: 2}", "terrain=mixed"), "use terrain.curriculum=null or replay=null"),
+        ("{share: 0, before_s: 2}", None, ".share=0 must lie in (0, 1]; collision_replay=null"),
+        ("{share: 0.5, before_s: 0}", None, ".before_s=0 must be positive"),
+        ("{share: 0.5}", None, "before_s"),
+        ("{share: 0.5, before_s: 2}", "obstacles=none", "there is no obstacle; use collision_replay=null"),
+        ("{share: 0.5, before_s: 2}", "commands=goal", "use commands=velocity or collision_replay=null"),
+        ("{share: 0.5, before_s: 2}", "terrain=mixed", "use terrain.curriculum=null or collision_replay=null"),
     ],
 )
-def test_wrong_input(make_config, overrides, message):
-    with pytest.raises(ConfigError, match="^[^\n]*$") as error:
-        make_config(*overrides)
+def test_wrong_input(make_env, replay, other, message):
+    overrides = (f"collision_replay={replay}", *(() if other is None else (other,)))
+    with pytest.raises((ConfigError, ValueError), match="^[^\n]*$") as error:
+        make_env(*overrides)
     assert message in str(error.value)
