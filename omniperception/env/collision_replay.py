@@ -32,7 +32,7 @@ class CollisionReplayConfig:
     def __post_init__(self) -> None:
         if not 0 < self.share <= 1:
             raise ValueError(
-                f"collision_replay.share={self.share} must lie in (0, 1]; collision_replay=null begins all episodes anew"
+                f"collision_replay.share={self.share} must lie in (0, 1]; collision_replay=null begins all anew"
             )
         if self.before_s <= 0:
             raise ValueError(f"collision_replay.before_s={self.before_s} must be positive")
