@@ -19,7 +19,6 @@ from omniperception.avoidance.velocity import AVOIDANCE_TARGET
 from omniperception.common.errors import DoesNotFit
 from omniperception.common.provenance import made_at
 from omniperception.config import ConfigError, is_composed, one_line
-from omniperception.env.collision_replay import CollisionReplayConfig
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import Condition
@@ -154,8 +153,6 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     try:
         lidar = _sensor(composed["lidar"], task["robot"], trusted) if composed["lidar"] else None
         stepping = make(SteppingConfig | None, composed.get("stepping"), "stepping")
-        key = "collision_replay"
-        seen[key] = make(CollisionReplayConfig | None, composed.get(key), key)
         env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, stepping=stepping, **seen)
         condition = make(Condition | None, composed.get("condition"), "condition")
         logger = _logger(composed, trusted)

@@ -169,7 +169,7 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
 def _keys() -> set[str]:
     """Keys at the top of a command line."""
     groups = {path.name for path in CONFIG_DIR.iterdir() if path.is_dir()} - {SUITES, STUDIES}
-    return {"seed", "num_envs", "collision_replay", "distillation", "init", "stepping", *groups}
+    return {"seed", "num_envs", "distillation", "init", "stepping", *groups}
 
 
 def _check_keys(config: DictConfig) -> None:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
 
 from omniperception.avoidance.velocity import MOTION_TARGET
 from omniperception.common.random import EnvRandom
-from omniperception.env.collision_replay import CollisionReplay, Moment
 from omniperception.env.config import EnvConfig
-from omniperception.env.mdp.commands import VelocityCommandConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
-from omniperception.scene import ObstacleField, TerrainConfig, TiledTerrainConfig
+from omniperception.scene import ObstacleField, TerrainConfig
 from omniperception.sim import Simulator
 
 if TYPE_CHECKING:
@@ -63,31 +60,6 @@ def build_pushes(config: EnvConfig, sim: Simulator, random: EnvRandom, curriculu
     from omniperception.env.mdp.pushes import Pushes
 
     return Pushes(config.randomization.pushes, sim, config.sim.control_dt, random.branch("pushes"), curriculum)
-
-
-def build_collision_replay(config: EnvConfig, random: EnvRandom, now: Callable[[], Moment]) -> CollisionReplay | None:
-    """What lets episodes begin again before a touch, which evaluations do not; `now` gives the present scenes.
-
-    Raises:
-        ValueError: nothing can be touched, or a goal or a curriculum of the terrain would lead elsewhere.
-    """
-    replay, terrain = config.collision_replay, config.terrain
-    if replay is None or config.full_level:
-        return None
-    if not config.obstacles.num_obstacles:
-        raise ValueError(
-            "collision_replay begins episodes again before a touch, and there is no obstacle; use collision_replay=null"
-        )
-    if not isinstance(config.commands, VelocityCommandConfig):
-        raise ValueError(
-            "collision_replay needs commands that are drawn, not a goal; use commands=velocity or collision_replay=null"
-        )
-    if isinstance(terrain, TiledTerrainConfig) and terrain.curriculum is not None:
-        raise ValueError(
-            "collision_replay begins episodes again on their tile, and terrain.curriculum moves them to another; use"
-            " terrain.curriculum=null or collision_replay=null"
-        )
-    return CollisionReplay(replay, config.sim.control_dt, random.branch("collision_replay"), now)
 
 
 def build_obstacles(

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, MOTION_TARGET, SECTOR_TARGET
 from omniperception.common.random import MOST_SEEDS
-from omniperception.env.collision_replay import CollisionReplayConfig
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mdp.terminations import TerminationsConfig
@@ -53,7 +52,6 @@ class EnvConfig:
         sampler: makes the point sampler, or None when no network looks at the cloud.
         frame_history: LiDAR frames kept for the network.
         stepping: the motion to which actions are added; None: they are added to the default pose.
-        collision_replay: which episodes begin again before a touch; None: none. Not where `full_level` is.
         base_motion: whether a frame's last row is the base's motion since the frame before.
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
         shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
@@ -80,7 +78,6 @@ class EnvConfig:
     sampler: Callable | None = None
     frame_history: int = 0
     stepping: SteppingConfig | None = None
-    collision_replay: CollisionReplayConfig | None = None
     base_motion: bool = False
     targets: Sequence[str] = ()
     shows_frames: bool = True

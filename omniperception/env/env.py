@@ -16,14 +16,12 @@ from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
 from omniperception.env.build import (
     build_avoidance,
-    build_collision_replay,
     build_errors,
     build_ground,
     build_obstacles,
     build_pushes,
     build_sensing,
 )
-from omniperception.env.collision_replay import Moment
 from omniperception.env.config import HEIGHT_TARGET, EnvConfig
 from omniperception.env.mdp.commands import GoalCommand, VelocityCommand
 from omniperception.env.mdp.curriculum import Curriculum
@@ -48,7 +46,7 @@ class OmniEnv(VecEnv):
     Attributes:
         state: what terms read.
         difficulty: share of the randomization.
-        ground, terrain_levels, obstacles, avoidance, sensing, pushes, collision_replay: None where the task has none.
+        ground, terrain_levels, obstacles, avoidance, sensing, pushes: None where the task has none.
         step_hooks: called at the end of each step, before finished environments are reset.
         healthy: (num_envs,) bool: whose physics was sound in the last step.
         done: (num_envs,) bool: which environments ended in the last step.
@@ -119,7 +117,6 @@ class OmniEnv(VecEnv):
         self.velocity_error = self.yaw_rate_error = torch.zeros(self.num_envs, device=self.device)
         self.contacts = self.done
         self.no_obstacle_near: torch.Tensor | None = None
-        self.collision_replay = build_collision_replay(config, self.random, self._moment)
         self._reset(self._all_envs)
         self.healthy = ~self.sim.failed
         self._sense()
@@ -163,8 +160,6 @@ class OmniEnv(VecEnv):
             hook()
         with self.timer.stage("resets"):
             self.command.advance(self.control_dt, self.state.kinematics)
-            if self.collision_replay is not None:
-                self.collision_replay.follow(self.step_count, self.contacts)
             ended = self.done.nonzero().flatten()
             if len(ended):
                 self._reset(ended)
@@ -346,10 +341,6 @@ class OmniEnv(VecEnv):
                 self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
             self.obstacles.approach(env_ids, pose[:, :2], rotate_yaw(pose[:, 2], self.command.value[env_ids, :2]))
         self.episode_length_buf.index_fill_(0, env_ids, 0)
-        if self.collision_replay is not None:
-            if not interrupted:
-                self._put_back(*self.collision_replay.draw(env_ids))
-            self.collision_replay.begin(env_ids)
         self.metrics.reset(env_ids)
         if self.sensing is not None:
             self.sensing.reset(env_ids, self.state.measured, seeds)
@@ -359,37 +350,6 @@ class OmniEnv(VecEnv):
             self._frame_heights = self._frame_heights.index_fill(0, env_ids, 0.0)
         for manager in self._managers().values():
             manager.reset(env_ids)
-
-    def _moment(self) -> Moment:
-        """(num_envs, ...) copies of all that makes the scenes, but for what is measured of them."""
-        qpos, qvel = self.sim.robot_state()
-        moment = {"qpos": qpos.clone(), "qvel": qvel.clone(), "episode_length": self.episode_length_buf.clone()}
-        if self.ground is not None:
-            moment["tile"] = self.ground.level.clone()
-        for name, part in self._that_go_back().items():
-            moment |= {f"{name}.{key}": value for key, value in part.moment().items()}
-        return moment
-
-    def _put_back(self, env_ids: torch.Tensor, moment: Moment) -> None:
-        """Begins episodes of environments (n,), which have been reset, with the scenes of a moment (n, ...)."""
-        if not len(env_ids):
-            return
-        if self.ground is not None:
-            self.ground.move(env_ids, moment["tile"])
-        self.sim.reset(env_ids, moment["qpos"], moment["qvel"])
-        self.state.reset(env_ids)
-        for name, part in self._that_go_back().items():
-            begin = f"{name}."
-            part.put_back(env_ids, {key.removeprefix(begin): x for key, x in moment.items() if key.startswith(begin)})
-        if self.obstacles is not None:
-            self._resize(self.obstacles, env_ids)
-        self.episode_length_buf[env_ids] = moment["episode_length"]
-
-    def _that_go_back(self) -> dict[str, VelocityCommand | ObstacleField | EnvState]:
-        """Parts that `_put_back` brings to another moment, by name."""
-        assert isinstance(self.command, VelocityCommand)
-        assert self.obstacles is not None
-        return {"command": self.command, "obstacles": self.obstacles, "state": self.state}
 
     def _completed(self, env_ids: torch.Tensor, interrupted: bool) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now commanded no more; None before the first ones."""
@@ -537,7 +497,7 @@ class OmniEnv(VecEnv):
     def _with_state(self) -> dict:
         """Components with a state to be saved, by name."""
         names = ["sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing"]
-        names += ["pushes", "state", "metrics", "difficulty", "collision_replay"]
+        names += ["pushes", "state", "metrics", "difficulty"]
         parts = {name: getattr(self, name) for name in names} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -221,23 +221,6 @@ class EnvState:
             self._errors.reset(env_ids)
         if self._foot_times is not None:
             self._foot_times.reset(env_ids)
-
-    def moment(self) -> dict[str, torch.Tensor]:
-        """(num_envs, ...) copies, by name, of what `put_back` takes: what was done and asked for last."""
-        done = {"actions": torch.stack(self.actions, 1), "targets": torch.stack(self.targets, 1)}
-        return done | {name: getattr(self, name).clone() for name in _ASKED}
-
-    def put_back(self, env_ids: torch.Tensor, moment: Mapping[str, torch.Tensor]) -> None:
-        """Lets environments (n,), which have been reset, go on from a moment (n, ...)."""
-        self.actions = tuple(
-            new.index_copy(0, env_ids, old) for new, old in zip(self.actions, moment["actions"].unbind(1), strict=True)
-        )
-        last, before = (
-            new.index_copy(0, env_ids, old) for new, old in zip(self.targets, moment["targets"].unbind(1), strict=True)
-        )
-        self.targets = last, before
-        for name in _ASKED:
-            setattr(self, name, getattr(self, name).index_copy(0, env_ids, moment[name]))
 
     def invalidate(self) -> None:
         """Drops the cached quantities, because the simulation has changed."""
@@ -480,8 +463,6 @@ def _ramped(now: torch.Tensor, there: torch.Tensor, linear: float, angular: floa
     turn = (there - now)[:, 2:].clamp(-angular, angular)
     return torch.cat((moved_towards(now[:, :2], there[:, :2], linear), now[:, 2:] + turn), 1)
 
-
-_ASKED = ("stand_s", "last_asked", "_reference")
 
 _CACHED = frozenset(name for name, value in vars(EnvState).items() if isinstance(value, lazy))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -289,23 +289,6 @@ class ObstacleField:
         for name, part in self._with_state().items():
             part.load_state_dict(state[name])
         self._follow_sizes()
-
-    def moment(self) -> dict[str, torch.Tensor]:
-        """(num_envs, ...) copies, by name, of all that is drawn or moves; `put_back` takes them."""
-        return {name: value.clone() for name, value in self._of_envs().items()}
-
-    def put_back(self, env_ids: torch.Tensor, moment: Mapping[str, torch.Tensor]) -> None:
-        """Brings the obstacles of environments (n,) to where they were at a moment (n, ...), in their sizes of then."""
-        for name, value in self._of_envs().items():
-            value[env_ids] = moment[name]
-        self._follow_sizes(env_ids)
-
-    def _of_envs(self) -> dict[str, torch.Tensor]:
-        """(num_envs, ...) tensors of the state, poses included, by name."""
-        parts = self._with_state().items()
-        own = {f"{name}.{key}": getattr(part, key) for name, part in parts for key in part.state_dict()}
-        kept = {name: value for name, value in self._kept().items() if len(value)}
-        return {"pos_w": self.pos_w, "quat_w": self.quat_w, **kept, **own}
 
     def _kept(self) -> dict[str, torch.Tensor]:
         """Tensors of the state, by name."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -160,7 +160,6 @@ class Command(Protocol):
 _ROUNDING_S = 1e-3  # of times that are sums or products of control steps
 SETTLE_S = 0.5
 """Time (s) after a new command from which on a robot is held to it."""
-_KEPT = ("value", "time_left", "age")
 
 
 class VelocityCommand:
@@ -197,19 +196,11 @@ class VelocityCommand:
         return None
 
     def state_dict(self) -> dict:
-        return self.moment() | self.curriculum.state_dict()
-
-    def moment(self) -> dict[str, torch.Tensor]:
-        """(num_envs, ...) copies of the commands and their times, by name; `put_back` takes them."""
-        return {name: getattr(self, name).clone() for name in _KEPT}
-
-    def put_back(self, env_ids: torch.Tensor, moment: Mapping[str, torch.Tensor]) -> None:
-        """Gives environments (n,) the commands of a moment (n, ...) again."""
-        for name in _KEPT:
-            getattr(self, name)[env_ids] = moment[name]
+        tensors = {name: getattr(self, name).clone() for name in ("value", "time_left", "age")}
+        return tensors | self.curriculum.state_dict()
 
     def load_state_dict(self, state: dict) -> None:
-        for name in _KEPT:
+        for name in ("value", "time_left", "age"):
             getattr(self, name).copy_(state[name])
         self.curriculum.load_state_dict(state)
 
