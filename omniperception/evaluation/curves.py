@@ -72,7 +72,7 @@ def by_recipe(runs: Sequence[Path]) -> dict[str, list[Path]]:
 
 def _words(run: Path) -> list[str]:
     beside = ("seed=", "logger", "hydra.")
-    return [] if config.recipe(run) is None else [w for w in config.read_recipe(run) if not w.startswith(beside)]
+    return [word for word in config.read_recipe(run) if not word.startswith(beside)]
 
 
 def read_scalars(run: Path, tags: Sequence[str]) -> dict[str, dict[int, float]]:
