@@ -12,6 +12,9 @@ the run directory; with scenario=moving they are replay-moving.json and so on.
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
 from omniperception import build, config
@@ -21,6 +24,7 @@ from omniperception.common.provenance import provenance
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.report import summary_table, times_line
 from omniperception.learning import CheckpointError
+from omniperception.learning.progress import ProgressLine
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT
 
@@ -59,11 +63,11 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     if films:
         video.check_fits(run.env.num_envs)
     trained = build.load_policy(run, run_dir)
-    if films:
-        with film(arguments, trained.env, trained.policy, run_dir / f"{stem}.mp4") as recorder:
-            episodes = run_episodes(trained.env, trained.policy, arguments.trials, on_step=recorder)
-    else:
-        episodes = run_episodes(trained.env, trained.policy, arguments.trials)
+    with ExitStack() as stack:
+        movie = run_dir / f"{stem}.mp4"
+        recorder = stack.enter_context(film(arguments, trained.env, trained.policy, movie)) if films else None
+        progress = stack.enter_context(_progress(arguments.trials))
+        episodes = run_episodes(trained.env, trained.policy, arguments.trials, on_step=recorder, on_left=progress)
     summary = episodes.summary()
     print(f"{trained.checkpoint} in {run.env.num_envs} environments, seed {run.env.seed}")
     print(summary_table(summary))
@@ -80,5 +84,27 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     written = [run_dir / f"{stem}.{kind}" for kind in ("json", *(("mp4", "png") if films else ()))]
     print(f"wrote {', '.join(map(str, written))}")
 
+
+@contextmanager
+def _progress(trials: int) -> Iterator[Callable[[int], None]]:
+    """A function that is told how many trials are left and says so every ten seconds."""
+    line, begin = ProgressLine(), time.perf_counter()
+    said = begin
+
+    def show(left: int) -> None:
+        nonlocal said
+        now = time.perf_counter()
+        if now - said > INTERVAL_S:
+            said = now
+            line.show(f"{trials - left} of {trials} trials have ended after {now - begin:.0f} s")
+
+    try:
+        yield show
+    finally:
+        line.end()
+
+
+INTERVAL_S = 10.0
+"""Between two lines of progress."""
 
 command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError, ViewerError))

@@ -25,6 +25,7 @@ def run_episodes(
     num_trials: int,
     on_step: Callable[[], None] | None = None,
     keep_tracks: bool = False,
+    on_left: Callable[[int], None] | None = None,
 ) -> Episodes:
     """Runs trials 0 to num_trials - 1: an environment whose trial has ended takes the next one.
 
@@ -40,6 +41,7 @@ def run_episodes(
         num_trials: number of trials.
         on_step: called after every control step, in which environments that ended have already been reset.
         keep_tracks: whether to keep the robots' ways.
+        on_left: called after every control step with the number of trials that have not ended.
     """
     if num_trials < 1:
         raise ValueError(f"trials={num_trials} must be at least 1")
@@ -65,6 +67,8 @@ def run_episodes(
                 clock.record(extras)
                 if on_step is not None:
                     on_step()
+                if on_left is not None:
+                    on_left(tally.left)
     finally:
         for hook in hooks:
             env.step_hooks.remove(hook)

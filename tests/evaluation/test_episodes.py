@@ -19,7 +19,9 @@ def test_errors_are_means_over_the_steps_of_the_episode(make_env):
     env = make_env(*BLIND, SHORT, "num_envs=4")
     names, errors = ("velocity_error", "yaw_rate_error"), []
     keep = lambda: errors.append(torch.stack([getattr(env, name) for name in names]))  # noqa: E731
-    episodes = run_episodes(env, stand, 8, on_step=keep)
+    left = []
+    episodes = run_episodes(env, stand, 8, on_step=keep, on_left=left.append)
+    assert left == 19 * [8] + 20 * [4] + [0]
     for name, kept in zip(names, torch.stack(errors, 1), strict=True):
         by_episode = kept.reshape(2, 20, 4).mean(1).flatten().double()
         assert torch.allclose(getattr(episodes, name), by_episode, atol=1e-6), name

@@ -26,11 +26,13 @@ def run_dir(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_run_is_replayed(run_dir, capsys):
+def test_a_run_is_replayed(run_dir, capsys, monkeypatch):
+    monkeypatch.setattr("omniperception.commands.play.INTERVAL_S", 0.0)
     overrides = ("num_envs=3", "terminations.episode_length_s=0.3")
     main(["play", f"run={run_dir}", "trials=6", "video_s=0.2", *overrides])
     printed = capsys.readouterr().out
     assert "success" in printed and "us" in printed
+    assert "0 of 6 trials have ended after 0 s" in printed and "6 of 6 trials have ended" in printed
     report = json.loads((run_dir / "replay.json").read_text())
     assert report["trials"] == 6 and report["checkpoint"] == "model_1.pt" and report["num_envs"] == 3
     assert report["overrides"] == list(overrides)
