@@ -1,7 +1,11 @@
 """Studies: one command trains, goes on, evaluates and writes the tables."""
 
 import hashlib
+import os
 import re
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -16,6 +20,7 @@ from omniperception.evaluation.ablation import (
     Ablation,
     Arm,
     Study,
+    _ended_with_this_process,
     _training,
     check_trainings,
     load_study,
@@ -203,3 +208,10 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
     with pytest.raises(SystemExit, match="2"):
         main(["ablate", *arguments, "ppo.lam=0.8"])
     assert "holds a run of another configuration" in capfd.readouterr().err
+
+
+def test_trainings_do_not_outlive_who_started_them():
+    with pytest.raises(KeyboardInterrupt), _ended_with_this_process() as running:
+        running.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]))
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert running[0].returncode == -signal.SIGTERM

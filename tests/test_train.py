@@ -12,7 +12,9 @@ from omegaconf import OmegaConf
 
 from omniperception import build, config
 from omniperception.commands import main
+from omniperception.commands.train import LOCK
 from omniperception.common import provenance
+from omniperception.common.files import held
 from omniperception.learning import CheckpointError, Runner, distributed, load_checkpoint
 from omniperception.learning.checkpoint import checkpoint_path
 from omniperception.learning.ppo import PerceptivePpo
@@ -50,6 +52,20 @@ def test_the_configuration_is_saved_before_anything_uses_it(tmp_path, monkeypatc
     saved = config.load(tmp_path / "here")
     assert saved.num_envs == 5 and list(saved.robot.mounts.head.exclude_geoms) == ["nose"]
     assert provenance.read(tmp_path / "here")["seed"] == saved.seed
+
+
+def test_two_processes_do_not_train_in_one_directory(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    command = ["train", "experiment=walk", *SMALL, "ppo.max_iterations=1", "hydra.run.dir=here"]
+    for again in (command, ["train", "run=here", "ppo.max_iterations=2"]):
+        Path("here").mkdir(exist_ok=True)
+        with held(tmp_path / "here" / LOCK) as alone:
+            assert alone
+            with pytest.raises(SystemExit, match="2"):
+                main(again)
+        assert "here: another process trains there" in capsys.readouterr().err
+        main(again)
+        assert "completed" in capsys.readouterr().out
 
 
 def test_a_sweep_gives_every_run_a_directory(tmp_path, monkeypatch, capsys):

@@ -14,7 +14,8 @@ from __future__ import annotations
 import itertools
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from omniperception import build, config
 from omniperception.cli import Command, argument, fail, trust
 from omniperception.common import provenance
 from omniperception.common.errors import one_line
+from omniperception.common.files import held
 from omniperception.learning import (
     CheckpointError,
     RolloutTooSmall,
@@ -92,7 +94,8 @@ def go_on(run_dir: Path, overrides: Sequence[str], trust: Sequence[str]) -> None
                     f"{override.input_line}: ppo.schedule=adaptive goes on from the checkpoint's; leave it out, or give"
                     " ppo.schedule=fixed with it"
                 )
-    learn(run, run_dir, resume=True, changes=overrides, trust=trust)
+    with _alone_in(run_dir):
+        learn(run, run_dir, resume=True, changes=overrides, trust=trust)
 
 
 def assemble(composed: DictConfig) -> build.RunConfig:
@@ -129,12 +132,32 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: 
         _check_sources(run)
         ppo = run.ppo
         check_rollout(run.env.num_envs, ppo.num_steps_per_env, ppo.num_mini_batches, run.perception is not None)
-    if distributed.rank() == 0:
-        config.save(run.composed, run_dir)
-        if not begun:
-            provenance.write(run_dir, provenance.provenance(run.env.sim.torch_device, seed=run.env.seed))
-            config.save_recipe(overrides, run_dir)
-    learn(run, run_dir, resume=begun, trust=trust)
+    with _alone_in(run_dir):
+        if distributed.rank() == 0:
+            config.save(run.composed, run_dir)
+            if not begun:
+                provenance.write(run_dir, provenance.provenance(run.env.sim.torch_device, seed=run.env.seed))
+                config.save_recipe(overrides, run_dir)
+        learn(run, run_dir, resume=begun, trust=trust)
+
+
+@contextmanager
+def _alone_in(run_dir: Path) -> Iterator[None]:
+    """Refuses to train in a directory in which another process trains."""
+    if distributed.rank() > 0:
+        yield
+        return
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with held(run_dir / LOCK) as alone:
+        if not alone:
+            raise config.ConfigError(
+                f"{run_dir}: another process trains there; wait for its end, or stop it: what it saved is gone on with"
+            )
+        yield
+
+
+LOCK = ".training"
+"""In a run directory: a file that is held as long as somebody trains there."""
 
 
 def _check_sources(run: build.RunConfig) -> None:

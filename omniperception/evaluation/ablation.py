@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import yaml
 
 from omniperception import build, config
 from omniperception.common.errors import check_known, one_line
+from omniperception.common.signals import interruptible
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record, read, write
 from omniperception.evaluation.study_report import study_table
@@ -177,13 +179,29 @@ def train(ablation: Ablation) -> None:
     """
     together = any(override.startswith("hydra/launcher=") for override in ablation.overrides)
     for arm in ablation.study.arms:
-        running = []
-        for variant in ablation.study.variants:
-            running.append(subprocess.Popen(_sweep(ablation, arm, variant)))
-            if not together:
-                _wait(running.pop())
-        for process in running:
-            _wait(process)
+        with _ended_with_this_process() as running:
+            for variant in ablation.study.variants:
+                running.append(subprocess.Popen(_sweep(ablation, arm, variant)))
+                if not together:
+                    _wait(running[-1])
+            for process in running:
+                _wait(process)
+
+
+@contextmanager
+def _ended_with_this_process() -> Iterator[list[subprocess.Popen]]:
+    """Trainings that are waited for; when this process is told to end, so are they, and save first."""
+    running: list[subprocess.Popen] = []
+    with interruptible():
+        try:
+            yield running
+        except KeyboardInterrupt:
+            for process in running:
+                process.terminate()
+            raise
+        finally:
+            for process in running:
+                process.wait()
 
 
 def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:

@@ -89,7 +89,8 @@ class Runner:
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations beyond the completed ones, or until the time budget is spent.
 
-        A first Ctrl-C finishes the iteration, saves and raises ``KeyboardInterrupt``; a second one does not wait.
+        A first Ctrl-C or SIGTERM finishes the iteration, saves and raises ``KeyboardInterrupt``; a second one does
+        not wait.
 
         Args:
             num_learning_iterations: iterations to add.
@@ -331,21 +332,30 @@ class Runner:
 
     @contextlib.contextmanager
     def _interrupts_noted(self) -> Iterator[None]:
-        """Turn the first Ctrl-C into a flag; the second acts as always. Outside the main thread nothing changes."""
+        """Turn the first Ctrl-C or SIGTERM into a flag; the second of its kind acts as always.
+
+        Outside the main thread nothing changes, nor does SIGTERM where others handle it.
+        """
         if threading.current_thread() is not threading.main_thread():
             yield
             return
+        before = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
+        if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+            before[signal.SIGTERM] = signal.SIG_DFL
 
-        def note(signum, frame) -> None:
-            self._interrupted = True
-            signal.signal(signal.SIGINT, previous)
-            self.logger.say("interrupted: finishing this iteration, then saving (Ctrl-C again stops at once)")
+        def note(signum: int, frame: object) -> None:
+            signal.signal(signum, before[signal.Signals(signum)])
+            if not self._interrupted:
+                self._interrupted = True
+                self.logger.say("interrupted: finishing this iteration, then saving (Ctrl-C again stops at once)")
 
-        previous = signal.signal(signal.SIGINT, note)
+        for number in before:
+            signal.signal(number, note)
         try:
             yield
         finally:
-            signal.signal(signal.SIGINT, previous)
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 def _without_streams(state: dict) -> dict:

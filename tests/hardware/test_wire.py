@@ -23,6 +23,7 @@ from lockstep import ROOT, Lockstep, Memory
 from messages_by_hand import LIVOX, point_cloud2
 
 from omniperception.commands import main
+from omniperception.common.signals import interruptible
 from omniperception.deploy import DeployError, Description, ExportedPolicy
 from omniperception.deploy.export import export
 from omniperception.hardware import control, guard, lidar
@@ -142,7 +143,7 @@ def test_a_signal_while_it_walks_slows_it_down_and_lays_it_down(lockstep, monkey
     monkeypatch.setattr(robot.machine, "_enter", lambda now, mode, why: (modes.append(mode), enter(now, mode, why)))
     clock = SteppedClock(robot, signals)
     monkeypatch.setattr(control, "time", clock)
-    with control.interruptible():
+    with interruptible():
         begins, _, _ = control.drive(robot.control, robot.link, 0.02)
     assert 14 <= len(begins) <= 17 and modes == [Mode.SLOWING, Mode.LYING_DOWN] and not clock._signals
     assert speed(robot) < 0.3
@@ -170,13 +171,13 @@ def test_signals_interrupt_once_and_mean_afterwards_what_they_did(name):
     both = (signal.SIGTERM, signal.SIGHUP)
     number, before = signal.Signals[name], [signal.signal(one, signal.SIG_DFL) for one in both]
     try:
-        with control.interruptible():
+        with interruptible():
             with pytest.raises(KeyboardInterrupt):
                 os.kill(os.getpid(), number)
             os.kill(os.getpid(), number)
         assert [signal.getsignal(one) for one in both] == [signal.SIG_DFL] * 2
         signal.signal(number, signal.SIG_IGN)
-        with control.interruptible():
+        with interruptible():
             os.kill(os.getpid(), number)
         assert signal.getsignal(number) is signal.SIG_IGN
     finally:

@@ -253,21 +253,22 @@ class TestLearn:
         hours, minutes, seconds = capsys.readouterr().out.strip().partition("ETA ")[2].partition(" |")[0].split(":")
         return 3600 * int(hours) + 60 * int(minutes) + int(seconds)
 
-    def test_interrupt_saves_and_leaves(self, tmp_path):
+    @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+    def test_interrupt_saves_and_leaves(self, tmp_path, sent):
         runner = runner_for(tmp_path)
         update = runner.alg.update
 
         def update_then_interrupt():
             if runner.current_learning_iteration == 1:
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), sent)
             return update()
 
         runner.alg.update = update_then_interrupt
-        handler = signal.getsignal(signal.SIGINT)
+        handler = signal.getsignal(sent)
         with pytest.raises(KeyboardInterrupt):
             runner.learn(50)
         assert latest_checkpoint(tmp_path).name == "model_2.pt"
-        assert signal.getsignal(signal.SIGINT) is handler
+        assert signal.getsignal(sent) is handler
 
     @pytest.mark.parametrize("what", ["rewards", "command"])
     def test_non_finite_environment_output_stops(self, tmp_path, what):
