@@ -332,15 +332,16 @@ def load_teacher(run_dir: Path, env: OmniEnv, trust: Sequence[str] = ()) -> Teac
     if estimated and estimated not in observations:  # its number of values is all that is read
         values = env.actor_inputs(replace(run.env.observations, actor=[estimated]))
         observations[estimated] = torch.zeros(env.num_envs, len(values), device=env.device)
-    actor = EstimatingModel(
-        observations,
-        {"actor": list(groups)},
-        "actor",
-        env.num_actions,
-        EstimatorConfig(estimated) if estimated else None,
-        distribution_cfg={"class_name": "GaussianDistribution", "init_std": run.ppo.init_std},
-        **run.ppo.mlp,
-    ).to(env.device)
+    with torch.random.fork_rng(devices=[]):  # learning draws as if nobody had taught
+        actor = EstimatingModel(
+            observations,
+            {"actor": list(groups)},
+            "actor",
+            env.num_actions,
+            EstimatorConfig(estimated) if estimated else None,
+            distribution_cfg={"class_name": "GaussianDistribution", "init_std": run.ppo.init_std},
+            **run.ppo.mlp,
+        ).to(env.device)
     weights = load_checkpoint(latest_checkpoint(run_dir), str(env.device))["actor_state_dict"]
     reason = difference(actor.state_dict(), weights)
     if reason is not None:

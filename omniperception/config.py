@@ -374,7 +374,15 @@ def save_recipe(overrides: Sequence[str], run_dir: Path) -> None:
 def read_recipe(run_dir: Path) -> list[str]:
     """The overrides that a run was begun and went on with; none where it was begun before they were kept."""
     path = run_dir / RECIPE_FILE
-    return (yaml.safe_load(path.read_text()) or []) if path.is_file() else []
+    if not path.is_file():
+        return []
+    try:
+        overrides = yaml.safe_load(path.read_text()) or []
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise ConfigError(f"{path} holds no overrides: {one_line(error)}") from None
+    if not isinstance(overrides, list) or not all(isinstance(text, str) for text in overrides):
+        raise ConfigError(f"{path} holds no overrides, a list of texts")
+    return overrides
 
 
 def recipe(run_dir: Path) -> str | None:
@@ -411,6 +419,7 @@ def is_begun(run_dir: Path, composed: dict) -> bool:
     path = run_dir / CONFIG_FILE
     if not path.is_file() or not list_checkpoints(run_dir):
         return False
+    read(run_dir)  # a damaged one is refused
     if yaml.safe_load(path.read_text()) != yaml.safe_load(yaml.safe_dump(composed)):
         raise ConfigError(
             f"{run_dir} holds a run of another configuration; go on with it by train run={run_dir}, or choose"

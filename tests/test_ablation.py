@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 
 import pytest
@@ -210,8 +211,12 @@ def test_a_study_goes_on_where_it_was_and_writes_the_table(tmp_path, capfd):
     assert "holds a run of another configuration" in capfd.readouterr().err
 
 
-def test_trainings_do_not_outlive_who_started_them():
+@pytest.mark.parametrize("another_failed", [False, True])
+def test_trainings_do_not_outlive_who_started_them(another_failed):
     with pytest.raises(KeyboardInterrupt), _ended_with_this_process() as running:
         running.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]))
-        os.kill(os.getpid(), signal.SIGTERM)
+        threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        if another_failed:
+            raise ConfigError("this one is waited for all the same")
+        running[0].wait()
     assert running[0].returncode == -signal.SIGTERM

@@ -134,6 +134,18 @@ def test_what_has_no_checkpoint_has_not_begun(tmp_path):
         config.is_begun(tmp_path, {"num_envs": 2})
 
 
+@pytest.mark.parametrize("text", ["a: [", "[1]", "a: b"])
+def test_damaged_files_of_a_run_are_named(tmp_path, text):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "model_1.pt").touch()
+    (tmp_path / config.CONFIG_FILE).write_text("a: [")
+    with pytest.raises(ConfigError, match=rf"{config.CONFIG_FILE} is not a configuration"):
+        config.is_begun(tmp_path, {"num_envs": 1})
+    (tmp_path / config.RECIPE_FILE).write_text(text)
+    with pytest.raises(ConfigError, match=rf"{config.RECIPE_FILE} holds no overrides"):
+        config.read_recipe(tmp_path)
+
+
 def test_what_comes_with_the_package_is_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert (config.find_run("pretrained/gait") / config.CONFIG_FILE).is_file()

@@ -86,6 +86,15 @@ def test_a_training_is_not_published_over(run, tmp_path):
     assert latest_checkpoint(run).read_bytes() == latest_checkpoint(other).read_bytes() == before
 
 
+def test_nothing_of_others_is_published_over(run, tmp_path):
+    kept = tmp_path / "theirs" / "evaluation" / "notes.txt"
+    kept.parent.mkdir(parents=True)
+    kept.write_text("mine")
+    with pytest.raises(config.ConfigError, match="is no earlier publication and not empty; give a new folder"):
+        publish.publish(run, tmp_path / "theirs")
+    assert kept.read_text() == "mine"
+
+
 def test_what_was_made_of_an_earlier_publication_goes(run, tmp_path):
     published = tmp_path / "published"
     publish.publish(run, published)

@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 
 from omniperception import build, config
 from omniperception.commands import main
-from omniperception.commands.train import LOCK
 from omniperception.common import provenance
 from omniperception.common.files import held
 from omniperception.learning import CheckpointError, Runner, distributed, load_checkpoint
@@ -58,8 +57,8 @@ def test_two_processes_do_not_train_in_one_directory(tmp_path, monkeypatch, caps
     monkeypatch.chdir(tmp_path)
     command = ["train", "experiment=walk", *SMALL, "ppo.max_iterations=1", "hydra.run.dir=here"]
     for again in (command, ["train", "run=here", "ppo.max_iterations=2"]):
-        Path("here").mkdir(exist_ok=True)
-        with held(tmp_path / "here" / LOCK) as alone:
+        Path("here/checkpoints").mkdir(parents=True, exist_ok=True)
+        with held(tmp_path / "here" / "checkpoints") as alone:
             assert alone
             with pytest.raises(SystemExit, match="2"):
                 main(again)
@@ -121,7 +120,9 @@ def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
     env = build.build_runner(run, None).env
     groups = env.get_observations()
     groups["avoidance_target"] = torch.tensor([[0.0, 0.0], [0.3, -0.2]])
+    drawn = torch.get_rng_state()
     teacher = build.load_teacher(tmp_path / "gait", env)
+    assert torch.equal(torch.get_rng_state(), drawn)  # or a run that goes on while it is taught goes another way
     walks = build.load_policy(build.load_run(tmp_path / "gait"), tmp_path / "gait").policy
     told = groups.clone()
     told["command"][1, :2] += torch.tensor([0.3, -0.2])

@@ -31,6 +31,7 @@ from omegaconf import DictConfig, OmegaConf
 from omniperception import build, config
 from omniperception.cli import Command, argument, fail, trust
 from omniperception.common import provenance
+from omniperception.common.checkpoints import checkpoint_path
 from omniperception.common.errors import one_line
 from omniperception.common.files import held
 from omniperception.learning import (
@@ -133,6 +134,7 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: 
         ppo = run.ppo
         check_rollout(run.env.num_envs, ppo.num_steps_per_env, ppo.num_mini_batches, run.perception is not None)
     with _alone_in(run_dir):
+        begun = distributed.of_first(config.is_begun(run_dir, run.composed))  # another process may have ended meanwhile
         if distributed.rank() == 0:
             config.save(run.composed, run_dir)
             if not begun:
@@ -143,21 +145,21 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: 
 
 @contextmanager
 def _alone_in(run_dir: Path) -> Iterator[None]:
-    """Refuses to train in a directory in which another process trains."""
+    """Refuses to train in a directory in which another process trains: it holds the folder of the checkpoints."""
     if distributed.rank() > 0:
         yield
         return
-    run_dir.mkdir(parents=True, exist_ok=True)
-    with held(run_dir / LOCK) as alone:
+    checkpoints = checkpoint_path(run_dir, 0).parent
+    try:
+        checkpoints.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise config.ConfigError(
+            f"{run_dir} cannot be written: {one_line(error)}; choose another hydra.run.dir"
+        ) from None
+    with held(checkpoints) as alone:
         if not alone:
-            raise config.ConfigError(
-                f"{run_dir}: another process trains there; wait for its end, or stop it: what it saved is gone on with"
-            )
+            raise config.ConfigError(f"{run_dir}: another process trains there; wait for its end, or stop it and go on")
         yield
-
-
-LOCK = ".training"
-"""In a run directory: a file that is held as long as somebody trains there."""
 
 
 def _check_sources(run: build.RunConfig) -> None:

@@ -28,12 +28,12 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def held(path: Path) -> Iterator[bool]:
-    """Holds a file, made where there is none, and says whether no other process holds it; it is let go when this ends.
+def held(folder: Path) -> Iterator[bool]:
+    """Holds a folder, and says whether no other process does; it is let go when this ends, or the process dies.
 
-    A process that dies lets go, too. On a file system without locks nobody is kept off.
+    On a file system without locks nobody is kept off.
     """
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    handle = os.open(folder, os.O_RDONLY)
     try:
         yield _locked(handle)
     finally:

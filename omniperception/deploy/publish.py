@@ -33,7 +33,8 @@ def publish(run_dir: Path, folder: Path) -> dict:
         What provenance.json holds.
 
     Raises:
-        ConfigError: the weights are larger than LIMIT, the run is a published one, or `folder` holds a training.
+        ConfigError: the weights are larger than LIMIT, the run is a published one, or `folder` holds something that is
+            no earlier publication.
         CheckpointError: the run has no checkpoint.
     """
     newest = latest_checkpoint(run_dir)
@@ -43,6 +44,8 @@ def publish(run_dir: Path, folder: Path) -> dict:
     theirs = list_checkpoints(folder)
     if theirs and "total_time" in load_checkpoint(theirs[-1], "cpu"):
         raise ConfigError(f"to={folder} holds a training, whose checkpoints would be lost; give another folder")
+    if not theirs and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(f"to={folder} is no earlier publication and not empty; give a new folder")
     weights = {name: state[name] for name in ("actor_state_dict", "critic_state_dict")}
     size = sum(tensor.numel() * tensor.element_size() for part in weights.values() for tensor in part.values())
     if size > LIMIT:

@@ -192,16 +192,22 @@ def train(ablation: Ablation) -> None:
 def _ended_with_this_process() -> Iterator[list[subprocess.Popen]]:
     """Trainings that are waited for; when this process is told to end, so are they, and save first."""
     running: list[subprocess.Popen] = []
+
+    def wait() -> None:
+        for process in running:
+            process.wait()
+
     with interruptible():
         try:
-            yield running
+            try:
+                yield running
+            finally:
+                wait()
         except KeyboardInterrupt:
             for process in running:
                 process.terminate()
+            wait()
             raise
-        finally:
-            for process in running:
-                process.wait()
 
 
 def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:

@@ -143,15 +143,26 @@ def mean_figures(records: Sequence[Record]) -> list[str]:
 
 def difference(ours: Sequence[Record], theirs: Sequence[Record]) -> str:
     """Difference of the first column between two policies on the same trials, in percentage points."""
-    pairs = {(record.run, record.world, record.terrain): record for record in theirs}
-    at = [(record, (record.run, record.world, record.terrain)) for record in ours]
-    matched = [(record, pairs[key]) for record, key in at if key in pairs]
-    matched = [(a, b) for a, b in matched if a.seed == b.seed and len(a.episodes) == len(b.episodes)]
-    if not matched:
+    pairs = {_trials(record): record for record in theirs}
+    if any(_trials(record) not in pairs for record in ours):
         return "not the same trials"
+    matched = [(record, pairs[_trials(record)]) for record in ours]
     clean, reference = (torch.cat([pair[k].episodes.clean for pair in matched]) for k in (0, 1))
     found = paired_difference(clean, reference)
     return f"{100 * found['difference']:+.1f} [{100 * found['low']:+.1f}, {100 * found['high']:+.1f}]"
+
+
+def _trials(record: Record) -> tuple:
+    """What trials follow from, whoever acts in them."""
+    task = (
+        record.run,
+        record.world,
+        record.terrain,
+        record.condition,
+        record.split,
+        *record.facts.get("overrides", ()),
+    )
+    return (*task, record.seed, len(record.episodes))
 
 
 def rate_cell(by_seed: Sequence[torch.Tensor]) -> str:

@@ -13,7 +13,7 @@ import torch
 from rsl_rl.utils.log_writer import LogWriter
 
 from omniperception.learning.log_writers import LoggerConfig
-from omniperception.learning.progress import ProgressLine, save_progress
+from omniperception.learning.progress import ProgressLine, save_progress, say
 
 METRICS, ANOMALIES = "Metrics/", "Anomalies/"
 """Keys of ``extras["log"]`` that begin so are shown on the console; anomalies only if there are any."""
@@ -80,7 +80,7 @@ class Logger:
         """Print a line of its own beside the console's line."""
         if self._line is not None:
             self._line.end()
-        print(text, flush=True)
+        say(text)
 
     def save_video(self, path: Path, iteration: int) -> None:
         """Hand a video on to the service that logs."""

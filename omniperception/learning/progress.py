@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 from collections.abc import Mapping
@@ -27,17 +28,25 @@ class ProgressLine:
     def show(self, text: str) -> None:
         """Prints the line; on a terminal as much of it as fits."""
         if not self._in_place:
-            print(text, flush=True)
+            say(text)
             return
         width = shutil.get_terminal_size().columns
-        print(_CLEAR + (text if len(text) < width else f"{text[: width - 2]}…"), end="", flush=True)
+        say(_CLEAR + (text if len(text) < width else f"{text[: width - 2]}…"), end="")
         self._shown = True
 
     def end(self) -> None:
         """Leaves the line as it is, so that what is printed next has one of its own."""
         if self._shown:
-            print(flush=True)
+            say("")
             self._shown = False
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Prints; where nobody reads any more, a closed pipe or terminal, nothing is printed from then on."""
+    try:
+        print(text, end=end, flush=True)
+    except OSError:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
 
 
 def save_progress(run_dir: Path, iterations: int, total: int, rates: Mapping[str, float]) -> None:

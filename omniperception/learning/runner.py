@@ -89,8 +89,8 @@ class Runner:
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations beyond the completed ones, or until the time budget is spent.
 
-        A first Ctrl-C or SIGTERM finishes the iteration, saves and raises ``KeyboardInterrupt``; a second one does
-        not wait.
+        A first Ctrl-C, SIGTERM or SIGHUP finishes the iteration, saves and raises ``KeyboardInterrupt``; a second
+        Ctrl-C does not wait.
 
         Args:
             num_learning_iterations: iterations to add.
@@ -117,7 +117,7 @@ class Runner:
                     obs = self._iterate(obs, last)
                     if self.current_learning_iteration % self.config.ppo.save_interval == 0:
                         self._save_checkpoint()
-            self._save_checkpoint()
+                self._save_checkpoint()
         finally:
             for hook in self.end_hooks:
                 hook()
@@ -332,30 +332,31 @@ class Runner:
 
     @contextlib.contextmanager
     def _interrupts_noted(self) -> Iterator[None]:
-        """Turn the first Ctrl-C or SIGTERM into a flag; the second of its kind acts as always.
+        """Turn the first Ctrl-C, SIGTERM or SIGHUP into a flag; only a second Ctrl-C acts as always.
 
-        Outside the main thread nothing changes, nor does SIGTERM where others handle it.
+        Outside the main thread nothing changes, nor do SIGTERM and SIGHUP where others handle or ignore them.
         """
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        before = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
-        if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-            before[signal.SIGTERM] = signal.SIG_DFL
+        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+        noted = [number for number, handler in before.items() if number == signal.SIGINT or handler is signal.SIG_DFL]
 
-        def note(signum: int, frame: object) -> None:
-            signal.signal(signum, before[signal.Signals(signum)])
+        def note(number: int, _: object) -> None:
+            if number == signal.SIGINT:
+                signal.signal(number, before[signal.SIGINT])
             if not self._interrupted:
                 self._interrupted = True
-                self.logger.say("interrupted: finishing this iteration, then saving (Ctrl-C again stops at once)")
+                with contextlib.suppress(RuntimeError):  # it was printing
+                    self.logger.say("interrupted: finishing this iteration, then saving (Ctrl-C again stops at once)")
 
-        for number in before:
+        for number in noted:
             signal.signal(number, note)
         try:
             yield
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+            for number in noted:
+                signal.signal(number, before[number])
 
 
 def _without_streams(state: dict) -> dict:

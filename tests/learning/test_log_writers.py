@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import os
 import sqlite3
 import sys
 
@@ -129,3 +130,14 @@ class TestProgressLine:
         line.show("two")
         line.end()
         assert plain.getvalue() == "one\ntwo\n"
+
+    def test_nobody_who_reads_ends_nothing(self, monkeypatch):
+        """As when Ctrl-C ends `tee`, too, and the training still has to save."""
+        read, write = os.pipe()
+        os.close(read)
+        with open(write, "w") as pipe:
+            monkeypatch.setattr(sys, "stdout", pipe)
+            for text in ("one", "two"):
+                progress.ProgressLine().show(text)
+            assert sys.stdout is not pipe
+            os.dup2(os.open(os.devnull, os.O_WRONLY), write)  # for what is left in it

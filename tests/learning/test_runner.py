@@ -253,14 +253,15 @@ class TestLearn:
         hours, minutes, seconds = capsys.readouterr().out.strip().partition("ETA ")[2].partition(" |")[0].split(":")
         return 3600 * int(hours) + 60 * int(minutes) + int(seconds)
 
-    @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+    @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
     def test_interrupt_saves_and_leaves(self, tmp_path, sent):
         runner = runner_for(tmp_path)
         update = runner.alg.update
 
         def update_then_interrupt():
             if runner.current_learning_iteration == 1:
-                os.kill(os.getpid(), sent)
+                for _ in range(1 if sent == signal.SIGINT else 2):  # from a group's end, and from who started it
+                    os.kill(os.getpid(), sent)
             return update()
 
         runner.alg.update = update_then_interrupt
