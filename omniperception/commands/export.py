@@ -37,6 +37,8 @@ def main(arguments: Arguments) -> None:
     """Exports, and prints what was written."""
     run_dir = config.find_run(arguments.run)
     folder = arguments.out or run_dir / FOLDER
+    if folder.exists() and not folder.is_dir():
+        raise config.ConfigError(f"out={folder} is a file; give a folder")
     described = export(run_dir, folder, arguments.formats, arguments.trust)
     inputs = ", ".join(f"{name} {list(shape)}" for name, shape in described.inputs.items())
     print(f"{described.provenance['checkpoint']}: {inputs} -> {len(described.joints.names)} actions")

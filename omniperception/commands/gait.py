@@ -17,7 +17,7 @@ from pathlib import Path
 
 from omniperception import build, config
 from omniperception.cli import RESULTS, Command, argument, refuse_arguments, refuse_overrides, trust
-from omniperception.common.figures import PlotsUnavailable
+from omniperception.common.figures import PlotsUnavailable, new_figure
 from omniperception.common.tables import markdown
 from omniperception.evaluation import robustness
 from omniperception.evaluation.footfall import COMMANDS, SETTLES_S, SHOWN_S, Footfall, draw_footfall, watch
@@ -47,7 +47,7 @@ class Arguments:
     factors: tuple[float, ...] = argument((0.5, 1.0, 1.5, 2.0, 2.5, 3.0), "multiples of the ranges")
     preset: str = argument("robot", "preset of randomization that has the ranges")
     trials: int = argument(200, "trials of each row and factor", least=1)
-    speeds: tuple[float, ...] = argument((0.5, 1.0, 1.5, 2.0), "sizes of the kicks (m/s)")
+    speeds: tuple[float, ...] = argument((0.5, 1.0, 1.5, 2.0), "sizes of the kicks (m/s)", positive=True)
     bearings: int = argument(16, "directions of the kicks, evenly around", least=1)
     repeats: int = argument(16, "kicks of each size and direction", least=1)
     condition: str | None = argument("robot", "preset of conf/condition for kicks (without its pushes) and feet")
@@ -63,6 +63,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     run_dir = config.find_run(arguments.run)
     picture = run_dir / FOLDER / f"gait-{arguments.what}.png"
     picture.parent.mkdir(exist_ok=True)
+    new_figure(1.0, 1.0)  # refuses now what would fail after all is measured
     if arguments.what == "kicks":
         results = kicked(arguments, run_dir, overrides)
         print(kicks_table(results, arguments.speeds))
@@ -73,7 +74,12 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         print(feet_table(footfall))
     else:
         evaluation = Evaluation(
-            [run_dir], [World("walk")], trials=arguments.trials, overrides=tuple(overrides), trust=arguments.trust
+            [run_dir],
+            [World("walk")],
+            trials=arguments.trials,
+            overrides=tuple(overrides),
+            out=arguments.out,
+            trust=arguments.trust,
         )
         folders = config.search_path(overrides, config.read(run_dir))
         rows = arguments.rows or robustness.rows_of_the_robot(arguments.preset, folders)

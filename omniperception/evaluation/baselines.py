@@ -45,6 +45,9 @@ Steering = Callable[[], torch.Tensor]
 """Velocity (num_envs, 2) (m/s, yaw-aligned frame) that a gait is commanded now."""
 
 
+_NO_LIDAR = "this policy needs a LiDAR, but the run has none; use lidar=mid360"
+
+
 def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvConfig:
     """The task in which a policy can be tried, without what nobody reads: rewards, and frames for a blind network.
 
@@ -54,11 +57,16 @@ def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvCon
         name: of any policy.
         config: the task, of the run or of the walker.
         lidar: the run's.
+
+    Raises:
+        ValueError: there is none, and the policy reads clouds.
     """
     config = replace(config, rewards=replace(config.rewards, terms={}), shows_frames=name not in BASELINES)
     if isinstance(config.commands, VelocityCommandConfig):
         config = replace(config, read_besides=(FOOT_FORCE,))  # for the figures of a gait
     if name in ("stop", "histogram"):
+        if lidar is None:
+            raise ValueError(_NO_LIDAR)
         config = replace(config, lidar=lidar, read_besides=(*config.read_besides, MEASURED_CLOUD))
     return config
 
@@ -158,7 +166,7 @@ class _Clouds:
 
     def __init__(self, env: OmniEnv) -> None:
         if env.sensing is None:
-            raise ValueError("this policy needs a LiDAR, but the run has none; use lidar=mid360")
+            raise ValueError(_NO_LIDAR)
         if env.sensing.carrier != env.sensing.base:
             raise ValueError(
                 f"this policy needs the LiDAR on the base, but lidar.mount has it on {env.sensing.config.mount_body}"

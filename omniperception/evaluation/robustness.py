@@ -27,6 +27,8 @@ BOUNDS = {
     "ground_friction": (0.05, math.inf),
     "ground_restitution": (0.0, 1.0),
     "motor_strength": (0.0, math.inf),
+    "velocity_scale": (0.0, math.inf),
+    "frames_lost": (0.0, 0.99),
 }
 """Values beyond which a range cannot be stretched."""
 SIZES = {"pushes": "speed", "velocity_drift": "sd"}
@@ -48,11 +50,11 @@ def stretched(row: str, value: object, factor: float) -> str:
         size = SIZES[row]
         settings = ", ".join(f"{k}: {float(v) * factor if k == size else v}" for k, v in value.items())
         return f"randomization.{row}={{{settings}}}"
+    least, most = BOUNDS.get(row, (-math.inf, math.inf))
     if isinstance(value, float | int) and not isinstance(value, bool):
-        return f"randomization.{row}={value * factor:.6g}"
+        return f"randomization.{row}={min(value * factor, most):.6g}"
     if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2:
         neutral = NEUTRAL.get(row, 0.0)
-        least, most = BOUNDS.get(row, (-math.inf, math.inf))
         ends = [min(max(neutral + factor * (end - neutral), least), most) for end in value]
         return f"randomization.{row}=[{ends[0]:.6g},{ends[1]:.6g}]"
     raise ConfigError(f"randomization.{row}={value} has no range to stretch; choose other rows")
@@ -122,7 +124,13 @@ def rows_of_the_robot(preset: str, folders: Sequence[Path] = ()) -> tuple[str, .
 
 
 def measure(measurements: Sequence[Stretch]) -> list[tuple[Stretch, Record]]:
-    """A record for each measurement; what has been measured before is kept."""
+    """A record for each measurement; what has been measured before is kept.
+
+    Raises:
+        ConfigError: a row cannot be stretched so far, such as a mass that would be negative.
+    """
+    for widest in {stretch.row: stretch for stretch in measurements}.values():
+        widest.task.check()
     return list(zip(measurements, measure_all([one.task for one in measurements]), strict=True))
 
 

@@ -141,7 +141,10 @@ def suite_worlds(name: str, folders: Sequence[Path] = ()) -> list[World]:
         raise ConfigError(f"{path} is no suite: {one_line(error)}") from None
     if not isinstance(worlds, dict) or not all(isinstance(terrains, list) for terrains in worlds.values()):
         raise ConfigError(f"{path} must have 'worlds: {{scenario: [terrain, ...]}}'")
-    return [World(scenario, terrain) for scenario, terrains in worlds.items() for terrain in terrains]
+    found = [World(scenario, terrain) for scenario, terrains in worlds.items() for terrain in terrains]
+    if not found:
+        raise ConfigError(f"{path} names no world; it must have 'worlds: {{scenario: [terrain, ...]}}'")
+    return found
 
 
 def held_out_scenarios() -> tuple[str, ...]:
@@ -300,13 +303,18 @@ class Task:
             build.check_version(self.walker, self.evaluation.trust)
             raise
 
+    def check(self) -> None:
+        """Builds it with one environment, so that what cannot be built is refused before hours of other tasks."""
+        run = self.assembled()
+        load_policy(replace(run, env=replace(run.env, num_envs=1)), self.walker)
+
     def _contender(self) -> TrainedPolicy:
         """The policy in a fresh environment of the world."""
         run = self.assembled()
-        prepared_env = prepared(self.policy, run.env, self._own.lidar)
-        trained = load_policy(replace(run, env=prepared_env), self.walker)
-        env, policy, checkpoint = trained.env, trained.policy, trained.checkpoint
         try:
+            prepared_env = prepared(self.policy, run.env, self._own.lidar)
+            trained = load_policy(replace(run, env=prepared_env), self.walker)
+            env, policy, checkpoint = trained.env, trained.policy, trained.checkpoint
             if self.policy in BASELINES:
                 policy = baseline(self.policy, env, policy, self._own.rewards.avoidance, self._limits())
             if self.policy == "exported":
@@ -438,6 +446,9 @@ def _check_tasks(tasks: Sequence[Task]) -> None:
             _exported(run_dir, weights[run_dir])
         except ValueError as error:
             raise ConfigError(f"policy=exported: {error}") from None
+    for walker in dict.fromkeys(task.walker for task in tasks if task.policy == "blind"):
+        if build.load_run(walker, trust=tasks[0].evaluation.trust).perception is None:
+            raise ConfigError(f"policy=blind: {walker} does not look at the LiDAR, it is blind already; leave it out")
     out = tasks[0].evaluation.out
     if out is not None and out.exists():
         read(out)

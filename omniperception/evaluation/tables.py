@@ -48,6 +48,8 @@ def rendered(text: str, data: Path) -> str:
 def _filled(what: str, data: Path) -> str:
     name, *settings = what.split()
     given = dict(setting.partition("=")[::2] for setting in settings)
+    if len(given) < len(settings):
+        raise ConfigError(f"<!-- table: {what} --> gives a setting twice; list its values after one another: a,b")
     view = given.pop("view", "all")
     if view not in VIEWS:
         raise ConfigError(f"<!-- table: {what} -->: view={view} is unknown; {suggest(view, tuple(VIEWS))}")
@@ -55,7 +57,12 @@ def _filled(what: str, data: Path) -> str:
     for key, value in given.items():
         if key not in _FILTERS:
             raise ConfigError(f"<!-- table: {what} -->: {key} is unknown; {suggest(key, _FILTERS)}")
-        records = [record for record in records if getattr(record, key) in value.split(",")]
+        wanted, there = value.split(","), {str(getattr(record, key)): None for record in records}
+        if unknown := [one for one in wanted if one not in there]:
+            raise ConfigError(
+                f"<!-- table: {what} -->: {key}={unknown[0]} shows nothing; {suggest(unknown[0], tuple(there))}"
+            )
+        records = [record for record in records if getattr(record, key) in wanted]
     if not records:
         raise ConfigError(f"<!-- table: {what} --> shows nothing: no result in {name} is like that")
     return f"<!-- table: {what} -->\n\n{VIEWS[view](records).strip()}\n\n{source(records)}\n\n<!-- end -->"

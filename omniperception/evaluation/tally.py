@@ -50,6 +50,7 @@ class Tally:
         device, double = env.device, torch.float64
         n, filed = (env.num_envs,), (num_trials,)
         self._sums = torch.zeros(*n, len(_SUMS), dtype=double, device=device)
+        self._is_contact = torch.tensor([name == "contacts" for name in _SUMS], device=device)
         self._filed = torch.zeros(*filed, len(_SUMS), dtype=double, device=device)
         self._outcome = torch.zeros(filed, dtype=torch.int64, device=device)
         self._first_contact = torch.full(n, math.inf, dtype=double, device=device)
@@ -104,7 +105,8 @@ class Tally:
             "energy": (env.state.joint_torque * kinematics.joint_vel).abs().sum(1) * dt,
             "path": kinematics.base_lin_vel_yaw.norm(dim=1) * dt,
         }
-        self._sums += torch.where(env.healthy[:, None], torch.stack([step[name].double() for name in _SUMS], 1), 0.0)
+        counted = env.healthy[:, None] | self._is_contact  # what physics diverges from is touched all the same
+        self._sums += torch.where(counted, torch.stack([step[name].double() for name in _SUMS], 1), 0.0)
         time = self._sums[:, 0] * dt
         self._first_contact = torch.where(began, torch.minimum(self._first_contact, time), self._first_contact)
         if self._clearance is not None:

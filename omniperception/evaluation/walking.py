@@ -125,8 +125,8 @@ class WalkingTally:
             "contact": down.sum(1),
             "slip": (state.foot_vel_w[..., :2].norm(dim=-1) * down).sum(1),
             "landings": landed.sum(1),
-            "swing_height": (rise * landed).sum(1),
-            "impact": (force * landed).sum(1),
+            "swing_height": torch.where(landed, rise, 0.0).sum(1),
+            "impact": torch.where(landed, force, 0.0).sum(1),
         }
 
     def _file_ended(self) -> None:

@@ -48,6 +48,18 @@ def test_contacts_are_counted_when_they_begin(make_env):
     assert episodes.ended("time_out")[2] and episodes.success[2]
 
 
+def test_a_touch_that_physics_diverges_from_counts(make_env):
+    env = make_env(*BLIND, SHORT, "num_envs=2")
+
+    def diverge():
+        if int(env.episode_length_buf[0]) == 5:
+            env.contacts, env.healthy = torch.tensor([True, False]), torch.tensor([False, False])
+
+    env.step_hooks.append(diverge)
+    episodes = run_episodes(env, stand, 2)
+    assert episodes.contacts.tolist() == [1, 0] and episodes.collided.tolist() == [True, False]
+
+
 def test_time_with_nothing_near_excludes_the_moments_with_an_obstacle(make_env):
     env = make_env("obstacles=moving", SHORT, "num_envs=4")
     free = []

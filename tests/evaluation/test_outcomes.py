@@ -180,7 +180,8 @@ def test_a_table_has_a_row_for_each_policy_and_the_difference_trial_by_trial():
 
 
 def test_the_difference_over_all_worlds_is_that_of_their_trials():
-    """Two worlds of 8 trials each: 1 more untouched in one of them, as many in the other; other trials do not count."""
+    """Two worlds of 8 trials each: 1 more untouched in one of them, as many in the other. Of some worlds alone it would
+    stand beside means over all of them."""
     never = torch.zeros(8, dtype=torch.int64)
     here = [record(contacts=never), record(policy="histogram")]
     there = [replace(one, world="moving") for one in (record(), record(policy="histogram"))]
@@ -190,7 +191,9 @@ def test_the_difference_over_all_worlds_is_that_of_their_trials():
     assert pooled.startswith("+6.2 [") and pooled != cells(table(here))[3][2]
     other = [replace(one, seed=one.seed + 1) for one in there[1:]]
     rows = {row[1]: row for row in cells(table([*here, there[0], *other])) if row[0] == "mean of 2"}
-    assert rows["run: difference to histogram"][2] == cells(table(here))[3][2]
+    assert rows["run: difference to histogram"][2] == "not the same trials"
+    rows = {row[1]: row for row in cells(table([*here, there[0]])) if row[0].startswith("mean")}
+    assert rows["run: difference to histogram"][2] == "not the same trials"
 
 
 def test_seeds_are_pooled_and_their_spread_is_shown():
@@ -219,3 +222,9 @@ def test_a_mean_over_worlds_is_of_those_that_have_the_figure():
 def test_other_trials_have_no_paired_difference():
     assert difference([record()], [record(seed=6)]) == "not the same trials"
     assert difference([record()], [record(run="runs/b")]) == "not the same trials"
+    assert difference([record()], [replace(record(), split="test")]) == "not the same trials"
+    changed = record()
+    changed = replace(changed, facts={**changed.facts, "overrides": ["obstacles=mixed"]})
+    assert difference([record()], [changed]) == "not the same trials"
+    walks = replace(changed, facts={**changed.facts, "walker": "b"})
+    assert difference([changed], [walks]).startswith("+0.0")

@@ -10,7 +10,7 @@ from omniperception import config
 from omniperception.commands.gait import kicks_table
 from omniperception.config import ConfigError
 from omniperception.evaluation.kicks import AFTER_S, KickResults, Kicks
-from omniperception.evaluation.robustness import rows_of_the_robot, stretched, stretches
+from omniperception.evaluation.robustness import measure, rows_of_the_robot, stretched, stretches
 from omniperception.evaluation.suite import Evaluation, World
 from omniperception.scene.build import FOOT_FORCE
 
@@ -27,7 +27,9 @@ from omniperception.scene.build import FOOT_FORCE
         ("velocity_scale", [0.95, 1.05], 3.0, [0.85, 1.15]),
         ("pushes", {"every_s": [5.0, 10.0], "speed": 0.5}, 2.0, {"every_s": [5.0, 10.0], "speed": 1.0}),
         ("velocity_drift", {"sd": 0.05, "time_s": 10.0}, 3.0, {"sd": 0.15, "time_s": 10.0}),
+        ("velocity_scale", [0.95, 1.05], 25.0, [0.0, 2.25]),  # nor a factor on what is measured
         ("frames_lost", 0.05, 2.0, 0.1),
+        ("frames_lost", 0.05, 25.0, 0.99),
     ],
 )
 def test_a_range_is_stretched_about_what_is_normal(row, value, factor, expected):
@@ -57,6 +59,12 @@ def test_a_range_that_ends_where_it_did_is_not_measured_again():
     ]
     with pytest.raises(ConfigError, match="factors=-1,2 must not be negative"):
         stretches(evaluation, "robot", ("ground_friction",), (-1.0, 2.0))
+
+
+def test_what_cannot_be_stretched_so_far_is_refused_before_anything_is_measured():
+    evaluation = Evaluation(runs=[config.find_run("pretrained/gait")], worlds=[World("walk")], trials=2)
+    with pytest.raises(ConfigError, match="must keep a positive mass"):
+        measure(stretches(evaluation, "robot", ("ground_friction", "added_mass"), (1.0, 20.0)))
 
 
 def test_rows_of_the_robot_are_the_papers_and_the_robots_without_the_lidars():

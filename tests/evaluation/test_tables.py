@@ -119,7 +119,9 @@ def test_several_seeds_have_their_spread_in_every_view(data):
         ("second", "has no second.json.gz"),
         ("first view=pie", "view=pie is unknown"),
         ("first colour=red", "colour is unknown"),
-        ("first policy=magic", "shows nothing"),
+        ("first policy=magic", "policy=magic shows nothing"),
+        ("first policy=run,magic", "policy=magic shows nothing"),
+        ("first policy=run policy=blind", "gives a setting twice"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(data, what, message):
