@@ -72,7 +72,9 @@ class Arguments:
     jobs: int | None = argument(
         None, "worlds at a time, in a process of one thread each; null: as many as cores", least=1
     )
-    walker: str | None = argument(None, "run directory of experiment=walk, whose gait stop, histogram and oracle drive")
+    walker: str | None = argument(
+        None, "run directory of experiment=walk or gait, whose gait stop, histogram and oracle drive"
+    )
     plots: bool = argument(False, "whether the worlds are drawn from above, with the ways")
     again: bool = argument(False, "whether to measure again what has been measured before")
     out: Path | None = argument(None, "file that the results are added to, for tables", suffixes=RESULTS)

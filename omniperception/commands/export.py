@@ -19,6 +19,7 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.cli import Command, argument, trust
+from omniperception.deploy.deploy_yaml import FILE as DEPLOY_YAML
 from omniperception.deploy.export import FOLDER, FORMATS, export
 from omniperception.learning import CheckpointError
 
@@ -44,7 +45,8 @@ def main(arguments: Arguments) -> None:
     print(f"{described.provenance['checkpoint']}: {inputs} -> {len(described.joints.names)} actions")
     lidar = f"LiDAR {1 / described.lidar.period_s:g} Hz" if described.lidar else "blind"
     print(f"control {1 / described.control_period_s:g} Hz, {lidar}")
-    print(f"wrote {', '.join(str(folder / name) for name in [*described.files.values(), 'policy.json'])}")
+    written = [*described.files.values(), "policy.json", *([DEPLOY_YAML] if (folder / DEPLOY_YAML).is_file() else [])]
+    print(f"wrote {', '.join(str(folder / name) for name in written)}")
 
 
 command = Command(main, Arguments, __doc__, errors=(CheckpointError,))

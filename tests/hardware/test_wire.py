@@ -652,6 +652,7 @@ class TestDds:
         assert before[3] & termios.ECHO and termios.tcgetattr(stdin) == before
         os.close(terminal), os.close(stdin)
 
+    @pytest.mark.slow
     def test_three_processes_whose_policy_is_killed(self, exported, tmp_path):
         """Whatever else the machine does, the robot stands up and lies at the end; how well it walks is for a quiet
         one."""
