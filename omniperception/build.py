@@ -140,7 +140,10 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     hints = types_of(EnvConfig)
     task = {key: make(hints[key], composed[key], key, trusted) for key in _TASK}
     if task["obstacles"].split == "test":
-        task["obstacles"] = held_out(task["obstacles"])
+        try:
+            task["obstacles"] = held_out(task["obstacles"])
+        except ValueError as error:
+            raise ConfigError(one_line(error)) from None
     ppo = make(PPOConfig, composed["ppo"], "ppo", trusted)
     perception = make(PerceptionConfig | None, composed["perception"] or None, "perception", trusted)
     seen = {}

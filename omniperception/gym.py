@@ -228,6 +228,8 @@ def make(*overrides: str, num_envs: int | None = None, arrays: Arrays = "numpy",
     Raises:
         ConfigError: one line that says what to change.
     """
+    if num_envs is not None and any(text.partition("=")[0].lstrip("+") == "num_envs" for text in overrides):
+        raise ConfigError(f"num_envs is given twice, as an override and as num_envs={num_envs}; leave the override out")
     given = (*overrides, *(() if num_envs is None else (f"num_envs={num_envs}",)))
     vector, _ = gymnasium_classes()
     run = build.assemble(config.compose(given))

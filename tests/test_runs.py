@@ -6,7 +6,7 @@ import pytest
 
 from omniperception import config
 from omniperception.commands import main
-from omniperception.learning.progress import save_progress
+from omniperception.learning.progress import PROGRESS_FILE, save_progress
 
 
 def run_dir(folder, name, age_s):
@@ -19,7 +19,7 @@ def run_dir(folder, name, age_s):
 def test_runs_are_listed_with_what_is_known_of_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     new, old = run_dir(tmp_path, "new", 10), run_dir(tmp_path, "a/old", 1000)
-    run_dir(tmp_path, "begun", 1)
+    (run_dir(tmp_path, "begun", 1) / PROGRESS_FILE).write_text('{"iterations": 3}')  # of another program
     config.save_recipe(["experiment=walk", "hydra.run.dir=outputs/new", "seed=3"], new)
     save_progress(new, 12, 300, {"velocity_error": 0.25, "reward": 1.5})
     (old / "checkpoints").mkdir()

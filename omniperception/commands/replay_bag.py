@@ -44,11 +44,12 @@ class Arguments:
 
 def main(arguments: Arguments) -> None:
     """Replays, prints and draws."""
+    recording = arguments.file.resolve()  # a folder may be ".", or have a dot in its name
+    path = arguments.out or recording.with_name(f"{recording.name if recording.is_dir() else recording.stem}.png")
     policy = ExportedPolicy.load(arguments.policy)
     topics = Topics(arguments.joints, arguments.points, arguments.imu, arguments.commands)
     replayed = replay(policy, events(arguments.file, topics), _command(arguments.command))
     print(replayed)
-    path = arguments.out or arguments.file.with_suffix(".png")
     draw(replayed, policy, path)
     print(f"written: {path}")
 

@@ -58,6 +58,10 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Simulates, and prints what became of the robot."""
+    for name in ("point_to", "steer_to"):
+        port = getattr(arguments, name)
+        if port is not None and not 0 < port < 65536:
+            raise config.ConfigError(f"{name}={port} must be a port, 1 to 65535")
     env = world(config.find_run(arguments.run), overrides, arguments.trust)
     wire = SimulatedConfig(
         interface=arguments.interface,

@@ -32,7 +32,7 @@ def main(arguments: Arguments) -> None:
     if not runs:
         what = "holds no run" if arguments.folder.is_dir() else "does not exist"
         raise config.ConfigError(f"folder={arguments.folder} {what}; give a folder of run directories")
-    progress = [load_progress(run) or {"rates": {}} for run in runs]
+    progress = [{"rates": {}} | (load_progress(run) or {}) for run in runs]
     names = [name for name in ("reward", *CONSOLE_METRICS) if any(name in made["rates"] for made in progress)]
     rows = [
         (str(run), config.recipe(run), _iterations(run, made), *(made["rates"].get(name) for name in names))
@@ -43,7 +43,7 @@ def main(arguments: Arguments) -> None:
 
 def _iterations(run: Path, made: dict) -> str | None:
     """Completed iterations, and of how many; those of the newest checkpoint where nothing else tells."""
-    if "total" in made:
+    if {"iterations", "total"} <= made.keys():
         return f"{made['iterations']}/{made['total']}"
     checkpoints = list_checkpoints(run)
     return checkpoints[-1].stem.removeprefix("model_") if checkpoints else None

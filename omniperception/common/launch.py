@@ -27,8 +27,11 @@ def view(tensor: torch.Tensor, dtype: type) -> wp.array:
 
     The view is described by address, shape and strides alone and owns nothing: it is valid while the caller
     holds the tensor. A vector ``dtype`` takes the tensor's last dimension, which must then be contiguous.
+
+    Raises:
+        ValueError: the tensor's numbers are of another kind or size.
     """
-    key = (tensor.data_ptr(), tensor.shape, tensor.stride(), dtype, tensor.device)
+    key = (tensor.data_ptr(), tensor.shape, tensor.stride(), dtype, tensor.dtype, tensor.device)
     cached = _views.get(key)
     if cached is not None:
         _views.move_to_end(key)
@@ -42,6 +45,10 @@ def view(tensor: torch.Tensor, dtype: type) -> wp.array:
             f"a {dtype.__name__} view needs contiguous last dimensions {inner}, got shape {tuple(tensor.shape)}"
             f" with strides {tensor.stride()}; pass tensor.contiguous()"
         )
+    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
+    is_float = scalar in (wp.float16, wp.bfloat16, wp.float32, wp.float64)
+    if tensor.element_size() != wp.types.type_size_in_bytes(scalar) or tensor.is_floating_point() != is_float:
+        raise ValueError(f"a {dtype.__name__} view needs {scalar.__name__}, got {tensor.dtype}; convert the tensor")
     cached = wp.array(
         ptr=tensor.data_ptr(),
         dtype=dtype,

@@ -162,7 +162,12 @@ class ExportedPolicy:
             (num_rays, 3), zeros where a ray hit nothing or its point is lacking.
         """
         lidar = self._perception()[0]
+        points = np.asarray(points)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
         if offsets_s is None:
+            if len(points) > 1.05 * lidar.points_per_frame:
+                raise DeployError(f"points: a frame of {lidar.points_per_frame} was expected, {len(points)} given")
             if len(points) < 0.95 * lidar.points_per_frame:
                 raise DeployError(
                     f"points: a whole frame of {lidar.points_per_frame} was expected, {len(points)} given; where misses"
@@ -170,7 +175,17 @@ class ExportedPolicy:
                 )
             numbers = np.arange(len(points))
         else:
-            numbers = np.rint(np.asarray(offsets_s) * (lidar.points_per_frame / lidar.period_s)).astype(np.int64)
+            offsets = np.asarray(offsets_s, np.float64)
+            if offsets.shape != (len(points),):
+                raise DeployError(
+                    f"offsets_s: shape ({len(points)},) was expected, one for each point, {offsets.shape} given"
+                )
+            if not (np.abs(offsets) <= 2.0 * lidar.period_s).all():
+                raise DeployError(
+                    f"offsets_s: seconds since the frame began, 0 to {lidar.period_s:g}, were expected,"
+                    f" {offsets.min():g} to {offsets.max():g} given"
+                )
+            numbers = np.rint(offsets * (lidar.points_per_frame / lidar.period_s)).astype(np.int64)
             order = np.argsort(numbers, kind="stable")  # those of one time are of lasers that fire together, in order
             numbers[order] += np.arange(len(numbers)) - np.searchsorted(numbers[order], numbers[order])
         rays = self._rays
@@ -313,7 +328,10 @@ class ExportedPolicy:
     def _velocity(self, state: RobotState) -> np.ndarray:
         """(3,) m/s, base frame: estimated at the step before, or measured."""
         if not self.description.estimated:
-            return _vector("base_lin_vel")(self, state, ())
+            velocity = _vector("base_lin_vel")(self, state, ())
+            if velocity.shape != (3,):
+                raise DeployError(f"base_lin_vel: shape (3,) was expected, {velocity.shape} given")
+            return velocity
         return np.zeros(3, np.float32) if self.base_lin_vel is None else self.base_lin_vel
 
     def _observe(self, state: RobotState, command: ArrayLike) -> np.ndarray:

@@ -20,6 +20,7 @@ from omniperception.deploy import DeployError, ExportedPolicy, RobotState, Safet
 from omniperception.deploy.description import FILE, Description
 from omniperception.deploy.go2 import MOTORS, RANGES
 from omniperception.deploy.odometry import Odometry
+from omniperception.deploy.runtime import QUANTITIES
 from omniperception.deploy.sampling import down
 from omniperception.hardware.clouds import Frame, Points
 from omniperception.hardware.dds import LOW_STATE_TOPIC, Network
@@ -29,7 +30,7 @@ from omniperception.hardware.lidar import Frames, LidarSource
 from omniperception.hardware.machine import DRIVEN, MachineConfig, Mode, Request
 from omniperception.hardware.messages import LOW_STATE, remote
 from omniperception.hardware.operator import Goal, Operator, make_operator
-from omniperception.hardware.recording import Recorder, Step
+from omniperception.hardware.recording import Recorder, Step, make_folder
 from omniperception.hardware.switcher import ensure_released
 
 
@@ -87,7 +88,6 @@ class Report:
 
     def write(self, path: Path) -> None:
         """As JSON."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         parts = {"begin_ms": self.begin_ms.round(3).tolist(), "step_ms": self.step_ms.round(3).tolist()}
         parts |= {"period_ms": self.period_ms, "frames": self.frames, "counts": self.counts}
         path.write_text(json.dumps(parts))
@@ -128,7 +128,8 @@ def machine_config(description: Description) -> MachineConfig:
     """The guard's machine for a policy: its gains, its default pose to stand in, its limits, in the motors' order.
 
     Raises:
-        DeployError: the policy moves another robot, or a joint has no limits to keep targets within.
+        DeployError: the policy moves another robot, acts too seldom, observes what no robot measures, or a joint has no
+            limits to keep targets within.
     """
     joints, motors = description.joints, motor_order(description)
     ranges = zip(joints.names, joints.lower, joints.upper, strict=True)
@@ -138,6 +139,17 @@ def machine_config(description: Description) -> MachineConfig:
             f"joints without limits in the policy's {FILE}: {', '.join(free)}; the guard keeps targets within limits:"
             " give these joints a range in the robot's file (robot.file) and export again"
         )
+
+    slowest_s = 0.5 * MachineConfig.silence_s
+    if description.control_period_s > slowest_s + 1e-9:
+        raise DeployError(
+            f"the policy acts every {1e3 * description.control_period_s:g} ms, at most every {1e3 * slowest_s:g} was"
+            " expected, since the guard damps motors that nobody commands; train with a shorter control step"
+            " (sim.timestep x sim.decimation)"
+        )
+    terms = [term for group in description.observations for term in group.terms if term.frequency is None]
+    if own := [term.quantity for term in terms if term.quantity not in QUANTITIES]:
+        raise DeployError(f"the policy observes {', '.join(own)}, which this robot's messages do not hold")
 
     def in_motors_order(values: object) -> list[float]:
         ordered = np.zeros(len(MOTORS))
@@ -332,6 +344,8 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
     policy = ExportedPolicy.load(config.policy)
     description = policy.description
     machine = machine_config(description)
+    if config.report is not None:
+        make_folder(config.report, "report")
     with interruptible(), contextlib.ExitStack() as closing:  # whatever ends it, the terminal is left as it was found
         operator = make_operator(config.steer, description.command)
         closing.callback(operator.close)
@@ -367,7 +381,10 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         number = 0 if frames is None else frames.number
         report = Report(np.array(begins), np.array(times), 1e3 * description.control_period_s, number, counts)
         if config.report is not None:
-            report.write(config.report)
+            try:
+                report.write(config.report)
+            except OSError as error:  # what it would hold is printed all the same
+                print(f"report={config.report} cannot be written: {error.strerror}", file=sys.stderr, flush=True)
     return report
 
 

@@ -58,6 +58,10 @@ class Source(Protocol):
         """Ends it."""
 
 
+POINTS_PER_SECOND = 200_000
+"""Of a Mid-360, hits and misses."""
+
+
 class Frames:
     """Frames of a sensor, cut to the policy's period.
 
@@ -71,6 +75,12 @@ class Frames:
         if source.kind not in KINDS:
             raise DeployError(f"points={source.kind}: one of {', '.join(KINDS)} was expected")
         is_topic = source.kind in ("PointCloud2", "CustomMsg")
+        measured = round(POINTS_PER_SECOND * lidar.period_s)
+        if not is_topic and lidar.points_per_frame != measured:
+            raise DeployError(
+                f"points={source.kind}: a Mid-360 measures {measured} points in {lidar.period_s:g} s, the policy was"
+                f" trained with a LiDAR of {lidar.points_per_frame}; train with lidar=mid360, or give its own points="
+            )
         self._source: Source = _Topic(source, network) if is_topic else _Packets(source)
         self._cutter, self._extrinsic = FrameCutter(lidar.period_s), source.extrinsic
         self.received: list[Points] = []

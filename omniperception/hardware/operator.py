@@ -45,7 +45,7 @@ def make_operator(text: str, ranges: Mapping[str, Sequence[float]]) -> Operator:
         return Sticks(ranges)
     if text == "keyboard":
         return Keyboard(ranges)
-    if text.startswith("udp:") and text[4:].isdigit():
+    if text.startswith("udp:") and text[4:].isdecimal() and int(text[4:]) > 0:
         return Datagrams(int(text[4:]))
     with contextlib.suppress(ValueError):
         numbers = [float(part) for part in text.removeprefix("goal:").split(",")]

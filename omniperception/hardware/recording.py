@@ -161,6 +161,16 @@ def levelled(
     return (points @ rotation_matrix(mount_quat).T + np.asarray(mount_pos)) @ turn.T
 
 
+def make_folder(path: Path, argument: str) -> None:
+    """Makes the folder of a file; `argument`: that names it."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DeployError(f"{argument}={path}: its folder cannot be made: {error.strerror}") from None
+    if path.is_dir():
+        raise DeployError(f"{argument}={path} is a folder; give a file")
+
+
 class Recorder:
     """Writes an MCAP file, in a thread of its own."""
 
@@ -172,11 +182,13 @@ class Recorder:
             raise DeployError("record= needs mcap-ros2-support: pip install 'omniperception[robot]'") from None
         if path.suffix != ".mcap":
             raise DeployError(f"record={path}: a file ending in .mcap was expected")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path, "record")
         try:
             self._file = path.open("xb")
         except FileExistsError:
             raise DeployError(f"record={path} exists; give another name") from None
+        except OSError as error:
+            raise DeployError(f"record={path} cannot be written: {error.strerror}") from None
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
         kinds = set(TOPICS.values())
         schemas = {kind: self._writer.register_msgdef(kind, definition(kind)) for kind in sorted(kinds)}

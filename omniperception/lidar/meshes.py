@@ -1,5 +1,6 @@
 """Triangle meshes, from arrays or from files, and the trees in which rays look for their triangles."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -49,7 +50,9 @@ class TriangleMesh:
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
         self.vertices = np.array(vertices, dtype=np.float32, order="C")  # its own: what follows from it is kept
-        triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+        given, triangles = np.asarray(triangles), np.ascontiguousarray(triangles, dtype=np.int64)
+        if given.dtype.kind not in "iu" and not np.array_equal(given, triangles):
+            raise ValueError("mesh.triangles must be whole numbers, of vertices")
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
             raise ValueError(
                 f"mesh needs vertices (V, 3), triangles (T, 3); got {self.vertices.shape}, {triangles.shape}"
@@ -76,7 +79,7 @@ class TriangleMesh:
         Raises:
             FileNotFoundError: There is no such file.
             ImportError: trimesh is not installed.
-            ValueError: It is no mesh.
+            ValueError: It is no mesh, none of its triangles has area, or ``scale`` is not above 0.
         """
         try:
             import trimesh
@@ -90,7 +93,12 @@ class TriangleMesh:
             raise ValueError(f"mesh {path} cannot be read: {str(error).splitlines()[0]}") from error
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             raise ValueError(f"mesh {path} holds no triangles")
-        return cls(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces)
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise ValueError(f"scale={scale} of mesh {path} must be above 0")
+        found = cls(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces)
+        if not len(found.triangles):
+            raise ValueError(f"mesh {path}, {scale} times as large, holds no triangle with area")
+        return found
 
     @cached_property
     def is_closed(self) -> bool:

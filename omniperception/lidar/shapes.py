@@ -83,6 +83,10 @@ class Shape:
         norm = math.hypot(*self.quat)
         if abs(norm - 1.0) > 1e-3:
             raise ValueError(f"shape.quat={self.quat} must be a unit quaternion (w, x, y, z); its norm is {norm:.6g}")
+        for field in ("body", "class_id"):
+            value = getattr(self, field)
+            if not hasattr(value, "__index__"):
+                raise ValueError(f"shape.{field}={value} must be a whole number")
         if self.body < -1:
             raise ValueError(f"shape.body={self.body} must be a body index >= 0, or -1 for a fixed shape")
         if self.class_id < 0:

@@ -42,6 +42,11 @@ def _others(name: str, group: ObstacleGroup, larger_first: bool, clearance: floa
         raise ValueError(
             f"obstacles: {name} has files={list(group.files)}, of which there are no held-out ones; use split=dev"
         )
+    if group.kind == COMPOUND and any(part.kind == "mesh" for part in group.parts_of(0).values()):
+        raise ValueError(
+            f"obstacles: {name} has a mesh among its parts, whose size cannot vary, so there are no held-out ones; use"
+            " split=dev"
+        )
     sorts = []
     for count, changes in ((new, True), (group.count - new, False)):
         first, larger_now = (count + 1) // 2, larger_first == changes

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
+from zipfile import BadZipFile
 
 import mujoco
 import numpy as np
@@ -329,7 +330,9 @@ def read_image(file: str) -> np.ndarray:
             deep = image.mode.startswith("I")  # 16 bit
             grey = image if deep else _on_white(image).convert("L")
             values = np.asarray(grey, dtype=np.float64)
-    except OSError as error:
+            if deep and isinstance(image.info.get("transparency"), int):
+                values = np.where(values == image.info["transparency"], 65535.0, values)
+    except (OSError, Image.DecompressionBombError) as error:
         raise ValueError(f"terrain.file={file} is no picture that can be read ({str(error).splitlines()[0]})") from None
     return values[::-1] / (65535.0 if deep else 255.0)
 
@@ -344,7 +347,7 @@ def read_array(file: str) -> np.ndarray:
     """(rows, cols) float64 heights (m) of a NumPy file; a ValueError of one line if it holds something else."""
     try:
         heights = np.load(file, allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise ValueError(f"terrain.file={file} is no NumPy array ({str(error).splitlines()[0]})") from None
     if not isinstance(heights, np.ndarray) or heights.ndim != 2 or heights.dtype.kind not in "fiu":
         shape = getattr(heights, "shape", "several arrays")

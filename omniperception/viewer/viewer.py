@@ -236,17 +236,27 @@ class Viewer:
         self.say(f"{kind} (obstacle {number}) stands {PUSH_AHEAD_M:g} m ahead; drag it, shift-click takes it away")
 
     def _obstacle_dragged(self, part: int, phase: str, xy: tuple[float, float]) -> None:
+        session = self.session
+
         def request() -> None:
-            obstacle = self.session.obstacle_of(part)
+            if session is not self.session:  # it was on the page while another task was built
+                return
+            obstacle = session.obstacle_of(part)
             if phase == "end":
-                self.session.let_go(obstacle)
+                session.let_go(obstacle)
             else:
-                self.session.hold(obstacle, xy)
+                session.hold(obstacle, xy)
 
         self.ask(request)
 
     def _obstacle_taken(self, part: int) -> None:
-        self.ask(lambda: self.session.take_away(self.session.obstacle_of(part)))
+        session = self.session
+
+        def request() -> None:
+            if session is self.session:
+                session.take_away(session.obstacle_of(part))
+
+        self.ask(request)
 
     # ---- switching ---------------------------------------------------------------------------------------------------
 
@@ -289,6 +299,7 @@ class Viewer:
             session.show_cloud(self.panels.num_rays)
         self.stage.show(session)
         self.panels.show_choices(choices, session)
+        self.clock.dt = session.env.control_dt
         self.clock.start()
         self._draw_again()
         actor = session.checkpoint if shown.policy == "run" else f"policy={shown.policy}"

@@ -89,7 +89,18 @@ def test_a_robot_whose_terminal_is_gone_stops_and_lies_down(monkeypatch, is_an_e
 def test_one_command_for_good_and_wrong_words():
     assert make_operator("0.5,0,-0.1", RANGES).poll(0.0, CENTRED, START)[0].tolist() == [0.5, 0.0, -0.1]
     expected = r"remote, keyboard, udp:PORT, goal:X,Y\[,SPEED\] or V_X,V_Y,YAW_RATE"
-    for text in ("joystick", "1,2", "udp:x", "goal:1", "goal:1,x", "goal:1,2,-1", "nan,0,0", "udp:99999"):
+    for text in (
+        "joystick",
+        "1,2",
+        "udp:x",
+        "goal:1",
+        "goal:1,x",
+        "goal:1,2,-1",
+        "nan,0,0",
+        "udp:0",
+        "udp:²",
+        "udp:99999",
+    ):
         expected = "the port cannot be listened to" if text == "udp:99999" else expected
         with pytest.raises(DeployError, match=f"steer={text}: {expected}"):
             make_operator(text, RANGES)

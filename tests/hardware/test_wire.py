@@ -31,9 +31,10 @@ from omniperception.hardware.bags import Topics, events
 from omniperception.hardware.control import machine_config, motor_order
 from omniperception.hardware.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, Network
 from omniperception.hardware.faults import FAULTS, SENSORS
-from omniperception.hardware.lidar import LidarSource
+from omniperception.hardware.lidar import Frames, LidarSource
 from omniperception.hardware.machine import Mode, Request
 from omniperception.hardware.messages import LOW_CMD, LOW_STATE, crc, low_cmd, sealed
+from omniperception.hardware.recording import make_folder
 from omniperception.hardware.replay import draw, replay
 from omniperception.hardware.trials import results
 
@@ -409,6 +410,38 @@ def test_arguments_that_say_nothing_of_these_points_are_refused(points, unread, 
             main(["robot", f"points={points}", word])
         said = f"{word.partition('=')[0]}= would mean nothing: it is not read for points={points}; leave it out"
         assert said in capsys.readouterr().err
+
+
+def test_a_policy_that_acts_too_seldom_for_the_guard_is_refused(exported):
+    described = replace(Description.read(exported), control_period_s=0.025)
+    with pytest.raises(DeployError, match="acts every 25 ms, at most every 20 was expected"):
+        machine_config(described)
+
+
+def test_what_no_message_of_the_robot_holds_is_named_before_it_moves(exported):
+    described = Description.read(exported)
+    first, *rest = described.observations
+    own = replace(first.terms[0], quantity="foot_load")
+    described = replace(described, observations=[replace(first, terms=[own, *first.terms[1:]]), *rest])
+    with pytest.raises(DeployError, match="the policy observes foot_load, which this robot's messages do not hold"):
+        machine_config(described)
+
+
+def test_packets_of_a_mid360_are_not_for_another_lidar(exported):
+    lidar = Description.read(exported).lidar
+    other = replace(lidar, points_per_frame=30_000)
+    with pytest.raises(DeployError, match="a Mid-360 measures 20000 points in 0.1 s, the policy was trained .* 30000"):
+        Frames(LidarSource(), other, None)
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_files_that_cannot_be_written_are_one_line(tmp_path, taken):
+    (tmp_path / "file").write_text("")
+    path, message = tmp_path / "file" / "x.json", "its folder cannot be made"
+    if taken:
+        path, message = tmp_path, "is a folder; give a file"
+    with pytest.raises(DeployError, match=f"report=.*{message}"):
+        make_folder(path, "report")
 
 
 def test_joints_without_limits_are_named(exported):

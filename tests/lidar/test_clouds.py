@@ -179,6 +179,10 @@ def test_a_recording_holds_many_frames(tmp_path):
         read_points(tmp_path / "run.mcap", index=4)
     with pytest.raises(ValueError, match=r"has topics /points .* /other is none of them"):
         read_points(tmp_path / "run.mcap", topic="/other")
+    with pytest.raises(ValueError, match="MCAP keeps times from 0"):
+        write_scans(tmp_path / "run.mcap", [tables[0], replace(tables[0], time_s=-1.0)])
+    assert len(list(read_scans(tmp_path / "run.mcap"))) == 4  # what was there stays
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
 
 
 def test_a_bag_of_ros_is_read(tmp_path):
@@ -218,6 +222,8 @@ XYZ = "".join(f"property int {axis}\n" for axis in "xyz")
         ("a.ply", f"{PLY}property list int int x\nend_header\n", "expected a number"),
         ("a.ply", f"{PLY}{XYZ}end_header\n1 2 3\n", "ends after 1 of 2 points"),
         ("a.ply", f"{PLY}property int\nend_header\n1\n2\n", "a.ply is broken: IndexError"),
+        ("a.ply", f"{PLY}end_header\n1\n2\n", "a vertex has no properties"),
+        ("a.ply", f"{PLY}comment time_s now\n{XYZ}end_header\n1 2 3\n1 2 3\n", "a.ply: its comment says time_s now"),
         ("a.npz", "", "a.npz is broken: EOFError"),
         ("a.npz", "PK\x03\x04", "a.npz is broken: BadZipFile"),
         ("a.ply", f"{PLY}property int x\nend_header\n1\n2\n", "need columns x, y and z"),
@@ -228,6 +234,17 @@ def test_what_cannot_be_read_is_one_line(tmp_path, name, content, message):
     with pytest.raises(ValueError, match=message) as error:
         read_points(tmp_path / name)
     assert "\n" not in str(error.value)
+
+
+def test_a_single_array_and_numbers_that_a_format_lacks_are_one_line(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((3, 3)))
+    (tmp_path / "a.npy").rename(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match="a.npz holds a single array"):
+        read_points(tmp_path / "a.npz")
+    pytest.importorskip("pypcd4")
+    half = table_of({**{a: np.zeros(3, np.float32) for a in "xyz"}, "weight": np.zeros(3, np.float16)})
+    with pytest.raises(ValueError, match="PCD has no type for column weight of float16"):
+        write_points(tmp_path / "a.pcd", half)
 
 
 def test_a_broken_pcd_and_a_bag_that_is_none(tmp_path):

@@ -119,6 +119,7 @@ def test_grazing_the_ground(height, angle):
         ((17, (1.0,)), "must be one of ShapeKind"),
         ((K.SPHERE, (float("nan"),)), "must be finite"),
         ((K.SPHERE, (1.0,), -2), "shape.body=-2"),
+        ((K.SPHERE, (1.0,), 0.9), "shape.body=0.9 must be a whole number"),
         ((K.SPHERE, (1.0,), -1, (0, 0, 0), (1, 1, 0, 0)), "unit quaternion"),
         ((K.SPHERE, (1.0,), -1, (0, 0, 0), (1, 0, 0, 0), -1), "class_id=-1"),
         ((K.MESH,), "shape.asset=NoneType of a mesh must be a TriangleMesh"),

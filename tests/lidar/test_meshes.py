@@ -185,6 +185,11 @@ def test_files_are_read_through_trimesh(tmp_path):
     (tmp_path / "cube.obj").write_text("\n".join(lines))
     mesh = TriangleMesh.from_file(tmp_path / "cube.obj", scale=2.0)
     assert len(mesh.triangles) == 12 and one([Shape(ShapeKind.MESH, asset=mesh)], (-3, 0, 0.1), (1, 0, 0)) == 1.0
+    for scale, message in ((0.0, "scale=0.0 of mesh .* must be above 0"), (1e-60, "holds no triangle with area")):
+        with pytest.raises(ValueError, match=message):
+            TriangleMesh.from_file(tmp_path / "cube.obj", scale=scale)
+    with pytest.raises(ValueError, match="must be whole numbers"):
+        TriangleMesh(CUBE, np.array([[0, 1.5, 2]]))
 
 
 def test_a_missing_trimesh_names_its_extra(monkeypatch):

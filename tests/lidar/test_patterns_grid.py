@@ -84,6 +84,7 @@ def test_a_users_table(tmp_path, name, header, rows):
         ("scan.csv", "nan,nan\n1,1\n", "rad", r"row 0 is \[nan, nan\], expected two numbers"),
         ("scan.csv", '"10","20"\n1,1\n', "rad", r"row 0 is \[nan, nan\], expected two numbers"),
         ("scan.csv", "", "rad", "cannot be read as numbers: it is empty"),
+        ("scan.csv", "Elevation,Azimuth\n0.1,0.2\n", "rad", "its columns are elevation, azimuth; azimuth, elevation"),
         ("scan.csv", "0,30\n", "rad", "elevation of 30 rad is beyond a right angle.*may have to be deg"),
         ("scan.csv", "0,100\n", "deg", "elevation of 100 deg is beyond a right angle"),
         ("scan.csv", "0,0\n", "turns", "lidar.pattern.unit='turns' must be deg or rad"),

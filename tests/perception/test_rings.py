@@ -126,3 +126,13 @@ def test_a_turned_world_gives_turned_motion():
 def test_sizes_that_do_not_fit(arguments, options, message):
     with pytest.raises(ValueError, match=message):
         RingPath(*arguments, **options)
+
+
+@pytest.mark.parametrize("wrong", [torch.float64, torch.float16])
+def test_numbers_that_the_kernel_would_misread_are_refused(wrong):
+    shape = RingShape(SECTORS, 2, DECAY, (1.0,))
+    cells, moved = torch.zeros(1, 2, BANDS * SECTORS, 3), torch.zeros(1, 2, 3)
+    rings = moved_rings(cells, moved, torch.ones(1, 1, dtype=torch.int32), shape)
+    assert torch.equal(rings, moved_rings(cells, moved, torch.ones(1, 1, dtype=torch.int64), shape))
+    with pytest.raises(ValueError, match=f"needs float32, got {wrong}"):
+        moved_rings(cells.to(wrong), moved, torch.ones(1, 1, dtype=torch.int64), shape)

@@ -166,3 +166,20 @@ def test_going_on_with_a_run_refuses_it(tmp_path):
 def test_another_split_is_unknown():
     with pytest.raises(ValueError, match=r"obstacles.split=train must be dev or test"):
         ObstaclesConfig(split="train")
+
+
+def test_what_has_no_held_out_kind_is_one_line(tmp_path):
+    """Through the whole configuration, as users meet it."""
+    cabinet = tmp_path / "cabinet.xml"
+    cabinet.write_text(
+        '<mujoco><asset><mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/></asset><worldbody><body>'
+        '<geom name="a" type="mesh" mesh="wedge"/><geom name="b" type="box" size="0.1 0.1 0.1"/></body></worldbody>'
+        "</mujoco>"
+    )
+    for group, message in (
+        (f"kind:compound,count:1,file:'{cabinet}'", "c has a mesh among its parts, .* use split=dev"),
+        ("kind:mesh,count:2,files:[rock,wedge]", "c has files=.*, of which there are no held-out ones; use split=dev"),
+    ):
+        given = ("experiment=quickstart", f"obstacles.groups={{c:{{{group}}}}}", "obstacles.split=test")
+        with pytest.raises(ConfigError, match=message):
+            build.assemble(config.compose(given))

@@ -15,6 +15,7 @@ from omniperception.scene.map_terrain import (
     StartsConfig,
     connected,
     free_places,
+    read_image,
 )
 
 CELL = 0.1
@@ -225,6 +226,8 @@ PLAN, PLACE = ("terrain=plan",), ("terrain=place",)
         ((*PLAN, "terrain.file=none.png"), "terrain.file=none.png does not exist"),
         ((*PLAN, "terrain.file=plan.jpg"), "terrain.file=plan.jpg must end with .png"),
         ((*PLAN, "terrain.file=text.png"), "terrain.file=text.png is no picture that can be read"),
+        ((*PLAN, "terrain.file=huge.png"), "terrain.file=huge.png is no picture that can be read"),
+        (("terrain=heights", "terrain.file=empty.npy", "terrain.heights=null"), "empty.npy is no NumPy array"),
         ((*PLAN, "terrain.file=small.png"), "has 5 x 5 points 0.1 m apart; 11 x 11"),
         ((*PLAN, "terrain.file=black.png"), "has no place to start: nowhere is ground level"),
         (
@@ -253,9 +256,19 @@ def test_what_is_wrong_with_a_file_is_said_in_one_line(files, make_env, override
         (files / name).write_text("no such thing")
     Image.fromarray(np.full((5, 5), 255, np.uint8)).save("small.png")
     Image.fromarray(np.full((60, 60), 0, np.uint8)).save("black.png")
+    Image.new("1", (20_000, 20_000)).save("huge.png")
+    (files / "empty.npy").write_bytes(b"")
     np.save("cube.npy", np.zeros((2, 3, 4)))
     preset = overrides[0].partition("=")[2]
     given = (overrides[0], f"terrain.file={root}/conf/terrain/{examples[preset]}", *overrides[1:])
     with pytest.raises((ConfigError, ValueError), match=message) as error:
         make_env(*given, *BLIND, num_envs=1)
     assert "\n" not in str(error.value)
+
+
+def test_what_is_transparent_is_white_at_16_bits_too(tmp_path):
+    values = np.full((4, 4), 30_000, np.uint16)
+    values[0] = 0
+    Image.fromarray(values).save(tmp_path / "deep.png", transparency=0)
+    brightness = read_image(str(tmp_path / "deep.png"))
+    assert (brightness[-1] == 1.0).all() and np.allclose(brightness[:-1], 30_000 / 65_535)

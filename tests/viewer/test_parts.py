@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import queue
 import socket
 
 import numpy as np
@@ -17,6 +18,7 @@ from omniperception.viewer.drive import Stick
 from omniperception.viewer.meshes import grid_surface, triangles
 from omniperception.viewer.panels import _runs
 from omniperception.viewer.stage import on_level, sector_lines, turned
+from omniperception.viewer.viewer import Viewer
 
 
 class Time:
@@ -153,3 +155,31 @@ def test_an_address_that_is_not_here_is_told_from_a_port(host):
 
     with pytest.raises(ViewerError, match=r"give another, such as host=127\.0\.0\.1$"):
         open_page(PageOptions(host, 18299), "none")
+
+
+class Held:
+    """A session that notes which obstacles are held and taken away."""
+
+    def __init__(self):
+        self.done = []
+
+    def obstacle_of(self, part):
+        return part
+
+    def hold(self, obstacle, xy):
+        self.done.append(("hold", obstacle))
+
+    def take_away(self, obstacle):
+        self.done.append(("take away", obstacle))
+
+
+@pytest.mark.parametrize("rebuilt", [False, True])
+def test_an_obstacle_of_a_task_that_is_gone_is_not_another_one_now(rebuilt):
+    viewer = Viewer.__new__(Viewer)
+    viewer._requests, viewer.session = queue.Queue(), Held()
+    viewer._obstacle_dragged(3, "begin", (0.0, 0.0))
+    viewer._obstacle_taken(3)
+    if rebuilt:
+        viewer.session = Held()
+    viewer._serve_requests()
+    assert viewer.session.done == ([] if rebuilt else [("hold", 3), ("take away", 3)])

@@ -119,6 +119,7 @@ def _with_robot(
     bodies = tuple(dict.fromkeys((*found.body_ids, *range(1, model.nbody))))
     data = mujoco.MjData(model)
     data.qpos[:3] = np.add(at, (0.0, 0.0, robot.base_height))
+    data.qpos[3:7] = 1.0, 0.0, 0.0, 0.0  # upright, however the file has it
     for name, angle in robot.default_joint_pos.items():
         data.joint(name).qpos = angle
     mujoco.mj_kinematics(model, data)

@@ -30,13 +30,18 @@ def read(path: Path, topic: str | None) -> Iterator[PointTable]:
 
 
 def write(path: Path, tables: Sequence[PointTable]) -> None:
-    """Writes the tables as messages on ``TOPIC``, each at its own time."""
+    """Writes the tables as messages on ``TOPIC``, each at its own time; where that fails, an older file stays."""
     from mcap_ros2.writer import Writer
 
-    with path.open("wb") as file, Writer(file) as writer:
-        schema = writer.register_msgdef(MESSAGE, DEFINITION)
-        for table in tables:
-            if table.time_s < 0.0:
-                raise ValueError(f"{path}: MCAP keeps times from 0, and time_s={table.time_s} was given")
-            now = round(table.time_s * 1e9)
-            writer.write_message(TOPIC, schema, message_from_table(table), log_time=now, publish_time=now)
+    half = path.with_name(f".{path.name}.tmp")
+    try:
+        with half.open("wb") as file, Writer(file) as writer:
+            schema = writer.register_msgdef(MESSAGE, DEFINITION)
+            for table in tables:
+                if table.time_s < 0.0:
+                    raise ValueError(f"{path}: MCAP keeps times from 0, and time_s={table.time_s} was given")
+                now = round(table.time_s * 1e9)
+                writer.write_message(TOPIC, schema, message_from_table(table), log_time=now, publish_time=now)
+        half.replace(path)
+    finally:
+        half.unlink(missing_ok=True)

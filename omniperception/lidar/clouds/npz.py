@@ -12,7 +12,10 @@ ABOUT = {"frame": "frame", "time_s": "stamp_s"}
 
 def read(path: Path) -> PointTable:
     """Every one-dimensional array of a file, as a column."""
-    with np.load(path) as file:
+    loaded = np.load(path)
+    if not isinstance(loaded, np.lib.npyio.NpzFile):
+        raise ValueError(f"{path} holds a single array; an array for each column was expected")
+    with loaded as file:
         columns = {name: file[name] for name in file.files if file[name].ndim == 1}
         about = {key: file[name].item() for key, name in ABOUT.items() if name in file.files}
     return table_of(columns, **about)

@@ -31,6 +31,9 @@ def write(path: Path, table: PointTable) -> None:
     from pypcd4 import Encoding, PointCloud
 
     types = [table.points.dtype[name] for name in table.names]
+    for name, dtype in zip(table.names, types, strict=True):
+        if dtype.kind not in "fiu" or (dtype.kind == "f" and dtype.itemsize < 4):
+            raise ValueError(f"{path}: PCD has no type for column {name} of {dtype}; use whole numbers or float32")
     cloud = PointCloud.from_points([table.points[name] for name in table.names], table.names, types)
     cloud.save(path, encoding=Encoding.BINARY)
     _, _, rest = path.read_bytes().partition(b"\n")

@@ -34,6 +34,8 @@ def read(path: Path) -> PointTable:
     unknown = [" ".join(line) for line in properties if line[1] not in TYPES]
     if unknown:
         raise ValueError(f"{path}: a vertex has {unknown[0]!r}, expected a number")
+    if not properties:
+        raise ValueError(f"{path}: a vertex has no properties")
     dtype = np.dtype([(line[2], ORDERS[order] + TYPES[line[1]]) for line in properties])
     count = int(lines[elements[0]][2])
     body = body.partition(b"\n")[2]
@@ -46,7 +48,11 @@ def read(path: Path) -> PointTable:
         raise ValueError(f"{path} ends after {len(points)} of {count} points")
     comments = [text.removeprefix("comment ").partition(" ") for text in texts if text.startswith("comment ")]
     said = {word: rest for word, _, rest in comments if rest}
-    return PointTable(points, said.get(FRAME, ""), float(said.get(TIME, 0.0)))
+    try:
+        time_s = float(said.get(TIME, 0.0))
+    except ValueError:
+        raise ValueError(f"{path}: its comment says {TIME} {said[TIME]}, a number of seconds was expected") from None
+    return PointTable(points, said.get(FRAME, ""), time_s)
 
 
 def write(path: Path, table: PointTable) -> None:

@@ -63,7 +63,11 @@ def _read(path: Path) -> np.ndarray:
                 lines = file.readlines()
             if not lines:
                 raise ValueError("it is empty")
-            return np.genfromtxt(lines[_has_header(lines) :], delimiter=",", dtype=np.float64, ndmin=2)
+            has_header = _has_header(lines)
+            names = [cell.strip().lower() for cell in lines[0].split(",")] if has_header else []
+            if names[:1] and (names[0].startswith("elev") or (names[1:2] and names[1].startswith("azim"))):
+                raise ValueError(f"its columns are {', '.join(names[:2])}; azimuth, elevation were expected")
+            return np.genfromtxt(lines[has_header:], delimiter=",", dtype=np.float64, ndmin=2)
     except (ValueError, EOFError) as error:
         raise ValueError(f"lidar.pattern.path={path} cannot be read as numbers: {str(error).splitlines()[0]}") from None
     raise ValueError(f"lidar.pattern.path={path} must end in .npy or .csv")

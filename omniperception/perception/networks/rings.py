@@ -50,7 +50,7 @@ def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, s
     batch, windows = count.shape
     bands = cells.shape[2] // shape.num_sectors
     rings = cells.new_zeros(batch, windows, shape.history * bands * shape.channels, shape.num_sectors)
-    cells, count = cells.contiguous(), count.contiguous()
+    cells, count = cells.contiguous(), count.long().contiguous()
     origin, yaw = _poses(moved)
     scratch = cells.new_empty(batch, bands, shape.num_sectors)
     decays = constant(shape.decays, cells.device)
