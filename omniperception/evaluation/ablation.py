@@ -201,8 +201,9 @@ def _ended_with_this_process() -> Iterator[list[subprocess.Popen]]:
         try:
             try:
                 yield running
-            finally:
+            except Exception:  # one has failed; the others go on to their end
                 wait()
+                raise
         except KeyboardInterrupt:
             for process in running:
                 process.terminate()
