@@ -162,9 +162,7 @@ class ExportedPolicy:
             (num_rays, 3), zeros where a ray hit nothing or its point is lacking.
         """
         lidar = self._perception()[0]
-        points = np.asarray(points)
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
+        points = _cloud(points)
         if offsets_s is None:
             if len(points) > 1.05 * lidar.points_per_frame:
                 raise DeployError(f"points: a frame of {lidar.points_per_frame} was expected, {len(points)} given")
@@ -192,7 +190,7 @@ class ExportedPolicy:
         inside = (numbers >= 0) & (numbers < len(rays))
         rows = rays[numbers[inside]]
         kept = np.zeros((lidar.num_rays, 3), np.float32)
-        kept[rows[rows >= 0]] = np.asarray(points, np.float32)[inside][rows >= 0]
+        kept[rows[rows >= 0]] = points[inside][rows >= 0]
         return kept
 
     def see(self, points: np.ndarray, base_quat: ArrayLike, joint_pos: ArrayLike | None = None) -> None:
@@ -204,10 +202,7 @@ class ExportedPolicy:
             joint_pos: (num_joints,) rad at that moment; needed where `description.lidar.carried_by` names joints.
         """
         lidar, sampler, frames = self._perception()
-        points = np.asarray(points, np.float32)
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise DeployError(f"points: shape (n, 3) was expected, {points.shape} given")
-        points = _without_nearer(points, lidar.min_range)
+        points = _without_nearer(_cloud(points), lidar.min_range)
         if self.safety is not None and not self.safety.frame_is_good(points):
             return self.miss()
         attitude = Attitude(self._carrier_quat(lidar, base_quat, joint_pos), lidar.mount_pos, lidar.mount_quat)
@@ -423,6 +418,14 @@ def _without_nearer(points: np.ndarray, min_range: float) -> np.ndarray:
 
 Quantity = Callable[[ExportedPolicy, RobotState, ArrayLike], np.ndarray]
 """Observations of a policy, from the robot's state and the command."""
+
+
+def _cloud(points: ArrayLike) -> np.ndarray:
+    """(n, 3) float32 points; another shape is refused."""
+    cloud = np.asarray(points, np.float32)
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise DeployError(f"points: shape (n, 3) was expected, {cloud.shape} given")
+    return cloud
 
 
 def _vector(name: str) -> Quantity:

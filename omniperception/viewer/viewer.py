@@ -236,27 +236,22 @@ class Viewer:
         self.say(f"{kind} (obstacle {number}) stands {PUSH_AHEAD_M:g} m ahead; drag it, shift-click takes it away")
 
     def _obstacle_dragged(self, part: int, phase: str, xy: tuple[float, float]) -> None:
-        session = self.session
-
-        def request() -> None:
-            if session is not self.session:  # it was on the page while another task was built
-                return
+        def request(session: Session) -> None:
             obstacle = session.obstacle_of(part)
             if phase == "end":
                 session.let_go(obstacle)
             else:
                 session.hold(obstacle, xy)
 
-        self.ask(request)
+        self._ask_of_session(request)
 
     def _obstacle_taken(self, part: int) -> None:
+        self._ask_of_session(lambda session: session.take_away(session.obstacle_of(part)))
+
+    def _ask_of_session(self, request: Callable[[Session], None]) -> None:
+        """As `ask`, unless another task is shown by then: its parts are others."""
         session = self.session
-
-        def request() -> None:
-            if session is self.session:
-                session.take_away(session.obstacle_of(part))
-
-        self.ask(request)
+        self.ask(lambda: request(session) if session is self.session else None)
 
     # ---- switching ---------------------------------------------------------------------------------------------------
 

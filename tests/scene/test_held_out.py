@@ -169,7 +169,7 @@ def test_another_split_is_unknown():
 
 
 def test_what_has_no_held_out_kind_is_one_line(tmp_path):
-    """Through the whole configuration, as users meet it."""
+    """Through the whole configuration, as from a command line."""
     cabinet = tmp_path / "cabinet.xml"
     cabinet.write_text(
         '<mujoco><asset><mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/></asset><worldbody><body>'
