@@ -8,8 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
+from omniperception.common.coverage import NUM_SECTORS
+
 FORMAT = "omniperception-policy"
-VERSION = 7
+VERSION = 8
 FILE = "policy.json"
 FINGERPRINT = "omniperception-description"
 """Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
@@ -127,6 +129,7 @@ class Lidar:
         num_rays: rays of a frame that training used.
         points_per_frame: points that the device measures in a frame.
         keep_every: training used every keep_every-th point of a frame; None where it chose otherwise.
+        least_bins: answered bins of elevation that cover each azimuth sector, see `coverage`; 0: it always counts.
         carried_by: the joints that turn the link that carries it against the base; none: the base carries it.
     """
 
@@ -138,6 +141,7 @@ class Lidar:
     num_rays: int
     points_per_frame: int
     keep_every: int | None
+    least_bins: Sequence[int] = (0,) * NUM_SECTORS
     carried_by: Sequence[Turn] = ()
 
 

@@ -56,9 +56,9 @@ class ExportedPolicy:
     finite or zero are misses, and so are points nearer or farther than training's sensor measures.
 
     Unless `safety` is None, commands are limited to the ranges of training and targets to the limits and a rate of the
-    joints;
-    without good frames the robot slows down and stands, blind; and :meth:`step` raises :class:`SafetyStop` when it
-    leans too far, a joint or torque is where it cannot be, or a number is not finite.
+    joints; without good frames the robot slows down and stands, blind, and it does not go where frames lack points; and
+    :meth:`step` raises :class:`SafetyStop` when it leans too far, a joint or torque is where it cannot be, or a number
+    is not finite.
 
     Attributes:
         description: names, scales and rates.
@@ -203,9 +203,9 @@ class ExportedPolicy:
         """
         lidar, sampler, frames = self._perception()
         points = _without_nearer(_cloud(points), lidar.min_range)
-        if self.safety is not None and not self.safety.frame_is_good(points):
-            return self.miss()
         attitude = Attitude(self._carrier_quat(lidar, base_quat, joint_pos), lidar.mount_pos, lidar.mount_quat)
+        if self.safety is not None and not self.safety.frame_is_good(points, attitude):
+            return self.miss()
         frames[:-1] = frames[1:]
         frames[-1, : sampler.num_points] = sampler(points, attitude)
         if self._odometry is not None:
@@ -236,6 +236,8 @@ class ExportedPolicy:
         Training does the same (`randomization.frames_lost`); the motion of the next frame spans both periods.
         """
         frames = self._perception()[2]
+        if self.safety is not None:
+            self.safety.miss_frame()
         if not self.frame_count:
             return
         frames[:-1] = frames[1:]
