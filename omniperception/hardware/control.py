@@ -8,7 +8,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -31,6 +31,7 @@ from omniperception.hardware.machine import DRIVEN, MachineConfig, Mode, Request
 from omniperception.hardware.messages import LOW_STATE, remote
 from omniperception.hardware.operator import Goal, Operator, make_operator
 from omniperception.hardware.recording import Recorder, Step, make_folder
+from omniperception.hardware.saying import say
 from omniperception.hardware.switcher import ensure_released
 
 
@@ -93,10 +94,12 @@ class Report:
         path.write_text(json.dumps(parts))
 
     def __str__(self) -> str:
-        if not len(self.step_ms):
-            return "no state has come from the robot"
-        p50, p99 = np.percentile(self.step_ms, (50, 99))
         counts = ", ".join(f"{value} {name}" for name, value in self.counts.items() if value) or "nothing else to tell"
+        if "LiDAR messages" in self.counts:
+            counts = f"{self.frames} frames; {counts}"
+        if not len(self.step_ms):
+            return f"no state has come from the robot; {counts}"
+        p50, p99 = np.percentile(self.step_ms, (50, 99))
         return f"{len(self.step_ms)} steps, {self.late} late; p50 {p50:.2f} ms, p99 {p99:.2f} ms; {counts}"
 
 
@@ -179,6 +182,35 @@ class FrameSource(Protocol):
 
     def new(self) -> list[Frame]:
         """Complete since the call before."""
+
+
+class Awaited(Protocol):
+    """What is to come again and again."""
+
+    came: int
+
+    def why_silent(self) -> str:
+        """What is known of why nothing has come since the call before."""
+
+
+class Waiting:
+    """Says every few seconds what does not come, and what comes instead."""
+
+    SAY_EVERY_S = 3.0
+
+    def __init__(self, awaited: Mapping[str, Awaited]) -> None:
+        """Args: awaited: by name."""
+        self._awaited, self._came = awaited, dict.fromkeys(awaited, 0)
+        self._due = dict.fromkeys(awaited, math.inf)
+
+    def look(self, now: float) -> None:
+        """Once per control step."""
+        for name, one in self._awaited.items():
+            if one.came != self._came[name] or self._due[name] == math.inf:
+                self._came[name], self._due[name] = one.came, now + self.SAY_EVERY_S
+            elif now >= self._due[name]:
+                self._due[name] = now + self.SAY_EVERY_S
+                say(f"waiting for {name}: {one.why_silent()}")
 
 
 class GuardLink(Protocol):
@@ -288,8 +320,7 @@ class Control:
             targets = self.policy.step(state, command, points)
         except SafetyStop as stop:
             if self._mode in DRIVEN or str(stop) != self._stopped:
-                with contextlib.suppress(OSError):  # without a terminal it damps all the same
-                    print(f"stop: {stop}", file=sys.stderr, flush=True)
+                say(f"stop: {stop}")
             self._stopped = str(stop)
             if self._mode in DRIVEN:
                 self._link.ask(Request.DAMP)
@@ -368,14 +399,17 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
         closing.callback(link.close)
         control = Control(policy, states, frames, operator, link, recorder)
-        begins, times, skipped = drive(control, link, description.control_period_s, config.seconds, should_end)
+        awaited: dict[str, Awaited] = {"states of the robot": states} | ({"LiDAR frames": frames} if frames else {})
+        period_s, waiting = description.control_period_s, Waiting(awaited)
+        begins, times, skipped = drive(control, link, period_s, config.seconds, should_end, waiting.look)
         if link.is_closed:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 guard.wait(1.0)
             if guard.returncode != 0:
                 raise DeployError("the guard has ended; its message stands above")
         counts = {} if policy.safety is None else dict(policy.safety.counts)
-        counts |= {"steps skipped": skipped, "states refused": states.refused, "states repeated": states.repeated}
+        counts |= {"steps skipped": skipped, "states": states.came}
+        counts |= {"states refused": states.refused, "states repeated": states.repeated}
         if frames is not None:
             counts |= {"frames missed": control.missed} | frames.counts()
         number = 0 if frames is None else frames.number
@@ -394,10 +428,11 @@ def drive(
     period_s: float,
     seconds: float | None = None,
     should_end: Callable[[], bool] = lambda: False,
+    after_step: Callable[[float], None] = lambda now: None,
 ) -> tuple[list[float], list[float], int]:
     """Steps in real time, and then lies down; what `_loop` gives."""
     try:
-        return _loop(control, link, period_s, seconds, should_end)
+        return _loop(control, link, period_s, seconds, should_end, after_step)
     finally:
         if link.mode in (Mode.STANDING, Mode.STANDING_UP, *DRIVEN):
             link.ask(Request.LIE)
@@ -406,7 +441,12 @@ def drive(
 
 
 def _loop(
-    control: Control, link: Link, period_s: float, seconds: float | None, should_end: Callable[[], bool]
+    control: Control,
+    link: Link,
+    period_s: float,
+    seconds: float | None,
+    should_end: Callable[[], bool],
+    after_step: Callable[[float], None] = lambda now: None,
 ) -> tuple[list[float], list[float], int]:
     """How long after their time the steps began, how long they took, ms, and how many a stall has cost."""
     begin = due = time.monotonic()
@@ -419,11 +459,11 @@ def _loop(
             if control.step(now):
                 begins.append(1e3 * (now - due))
                 times.append(1e3 * (time.monotonic() - now))
+            after_step(now)
             due += period_s
             missed = max(0, math.ceil((time.monotonic() - due) / period_s) - 1)  # a stall's steps are not made up for
             due, skipped = due + missed * period_s, skipped + missed
             time.sleep(max(0.0, due - time.monotonic()))
     except KeyboardInterrupt:
-        with contextlib.suppress(OSError):  # the terminal may be what has gone
-            print("ended: the guard lays the robot down", file=sys.stderr, flush=True)
+        say("ended: the guard lays the robot down")
     return begins, times, skipped
