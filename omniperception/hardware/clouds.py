@@ -130,11 +130,12 @@ class FrameCutter:
         """
         if not len(given.times_ns):
             return []
-        if now is not None:
-            given = Points(given.points, self.clock.read(given.times_ns, now))
-            if self.clock.is_changed:
-                self._restart()
         first, last = int(given.times_ns.min()), int(given.times_ns.max())
+        times_ns = given.times_ns if now is None else self.clock.read(given.times_ns, first, last, now)
+        if times_ns is not given.times_ns:
+            given, first, last = Points(given.points, times_ns), int(times_ns.min()), int(times_ns.max())
+        if self.clock.is_changed:
+            self._restart()
         if self._start is not None and self._jumps(first, last, self._start):
             if not self.jumps:
                 say(f"LiDAR: the points' time jumps by {1e-9 * (first - self._start):.3g} s: a new frame begins")

@@ -94,13 +94,15 @@ class Report:
         path.write_text(json.dumps(parts))
 
     def __str__(self) -> str:
-        counts = ", ".join(f"{value} {name}" for name, value in self.counts.items() if value) or "nothing else to tell"
-        if "LiDAR messages" in self.counts:
-            counts = f"{self.frames} frames; {counts}"
-        if not len(self.step_ms):
-            return f"no state has come from the robot; {counts}"
-        p50, p99 = np.percentile(self.step_ms, (50, 99))
-        return f"{len(self.step_ms)} steps, {self.late} late; p50 {p50:.2f} ms, p99 {p99:.2f} ms; {counts}"
+        counts, parts = dict(self.counts), ["no state has come from the robot"]
+        if len(self.step_ms):
+            p50, p99 = np.percentile(self.step_ms, (50, 99))
+            parts = [f"{len(self.step_ms)} steps, {self.late} late", f"p50 {p50:.2f} ms, p99 {p99:.2f} ms"]
+        if "LiDAR messages" in counts:
+            points, messages = counts.pop("LiDAR points"), counts.pop("LiDAR messages")
+            parts.append(f"{self.frames} frames of {points} points in {messages} LiDAR messages")
+        parts.append(", ".join(f"{value} {name}" for name, value in counts.items() if value) or "nothing else to tell")
+        return "; ".join(parts)
 
 
 _ROUNDING = 1e-3
@@ -371,7 +373,11 @@ class Control:
 
 
 def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> Report:
-    """Runs a policy on a robot until `should_end`, an interrupt, SIGTERM, SIGHUP, or the guard's end."""
+    """Runs a policy on a robot until `should_end`, an interrupt, SIGTERM, SIGHUP, or the guard's end.
+
+    Raises:
+        DeployError: what was asked for cannot be done, or no state has come from the robot.
+    """
     policy = ExportedPolicy.load(config.policy)
     description = policy.description
     machine = machine_config(description)
@@ -419,6 +425,8 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
                 report.write(config.report)
             except OSError as error:  # what it would hold is printed all the same
                 print(f"report={config.report} cannot be written: {error.strerror}", file=sys.stderr, flush=True)
+        if not begins:
+            raise DeployError(str(report))
     return report
 
 

@@ -11,6 +11,7 @@ while somebody at the topic says so.
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterable
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -62,11 +63,14 @@ class Network:
         from cyclonedds.domain import Domain, DomainParticipant
 
         self.interface, self.domain = interface, domain
+        there = [name for _, name in socket.if_nameindex()]
+        if interface not in there:
+            raise DeployError(f"interface={interface}: one of this machine's was expected, {', '.join(there)}")
         try:
             self._domain = Domain(domain, _LOOPBACK if interface == "lo" else _NETWORK.format(interface))
             self.participant: DomainParticipant = DomainParticipant(domain)
-        except DDSException as error:
-            raise DeployError(f"interface={interface}: CycloneDDS cannot use it ({error})") from None
+        except DDSException:
+            raise DeployError(f"interface={interface}: CycloneDDS cannot use it; is it up, with an address?") from None
 
     def reader(self, topic: str, kind: Struct | str, depth: int = 1) -> Reader:
         """What others write on a topic; kind: its type."""

@@ -99,7 +99,8 @@ class Frames:
         self.received, now = self._in_the_sensor(self._source.read()), time.monotonic()
         frames = [frame for points in self.received for frame in self._cutter.add(points, now)]
         self.number += len(frames)
-        self.came += sum(bool(frame.points.any()) for frame in frames)
+        if seen := sum(bool(frame.points.any()) for frame in frames):
+            self.came, self._told = self.came + seen, self._all()
         return frames
 
     def _in_the_sensor(self, given: list[Points]) -> list[Points]:
@@ -117,9 +118,12 @@ class Frames:
         came = {f"LiDAR {what}": count for what, count in self._of_all.items()}
         return came | self._source.counts() | self._cutter.counts()
 
+    def _all(self) -> Counter[str]:
+        return Counter(self.counts()) + Counter(frames=self.number)
+
     def why_silent(self) -> str:
-        """What has come since the call before, in place of frames with points."""
-        now = Counter(self.counts()) + Counter({"frames": self.number})
+        """What has come since the newest frame with points, or the call before."""
+        now = self._all()
         new, self._told = now - self._told, now
         came = ", ".join(f"{count} {what}" for what, count in new.items()) or "nothing"
         if new["LiDAR points"]:

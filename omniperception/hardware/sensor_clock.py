@@ -47,9 +47,15 @@ class SensorClock:
         self._since = self._at = now
         self._newest, self._moved, self._spans, self._messages, self._jumps = newest, 0, 0, 0, 0
 
-    def read(self, times_ns: np.ndarray, now: float) -> np.ndarray:
-        """(n,) ns at which the points of a message were measured, of those that it says; now: when it came, s."""
-        self.is_changed, first, last = False, int(times_ns.min()), int(times_ns.max())
+    def read(self, times_ns: np.ndarray, first: int, last: int, now: float) -> np.ndarray:
+        """(n,) ns at which the points of a message were measured.
+
+        Args:
+            times_ns: (n,) that it says; itself given back where they are right.
+            first, last: of them.
+            now: when it came, s.
+        """
+        self.is_changed = False
         self._watch(first, last, len(times_ns), now)
         have_one_time = self._flat or first == last or self._scale is None
         if self._scale is None:

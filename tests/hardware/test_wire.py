@@ -578,10 +578,13 @@ def test_a_robot_that_hears_nothing_says_so_and_how_many_of_each_came(exported, 
 
     points = LidarSource(kind="packets", host="127.0.0.1", point_port=port)
     config = control.RobotConfig(exported, lidar=points, steer="0,0,0", sport_mode="ignore", seconds=1.0)
-    report, said = str(control.run(config, should_end)), capsys.readouterr().err
+    with pytest.raises(DeployError) as error:
+        control.run(config, should_end)
+    said = capsys.readouterr().err
     assert "waiting for states of the robot: nobody writes rt/lowstate at interface=lo domain=7\n" in said
     assert "waiting for LiDAR frames: " in said and "packets of the IMU came; a Mid-360 that samples" in said
-    assert report == "no state has come from the robot; 0 frames; 20 packets of the IMU"
+    counted = "0 frames of 0 points in 0 LiDAR messages; 20 packets of the IMU"
+    assert str(error.value) == f"no state has come from the robot; {counted}"
     sender.close()
 
 

@@ -17,6 +17,7 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.topic import Topic
 
+from omniperception.deploy import DeployError
 from omniperception.hardware import dds, lidar
 from omniperception.hardware.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, REQUEST, Network
 from omniperception.hardware.lidar import LidarSource
@@ -164,6 +165,11 @@ def test_a_writer_that_does_not_fit_is_named(other):
     expected = "another layout of unitree_go::msg::dds_::LowState_ or other settings (QoS, CDR 2)"
     assert why(reader) == f"who writes rt/lowstate has {expected}"
     del writer
+
+
+def test_an_interface_that_is_none_is_named():
+    with pytest.raises(DeployError, match="interface=eth9: one of this machine's was expected, .*lo"):
+        Network("eth9")
 
 
 @pytest.mark.parametrize(

@@ -164,6 +164,20 @@ def test_points_that_are_all_misses_are_named(listening):
     assert frames.why_silent() == "250 LiDAR messages, 24000 LiDAR misses, 1 frames came; every point is a miss"
 
 
+def test_what_has_come_is_counted_from_the_newest_frame_on(listening):
+    """120 ms of points, which close a frame of 100; two packets more, and then the IMU's."""
+    frames, send, _ = listening
+    points = b"".join(struct.pack("<iiiBB", 1000, 0, 0, 7, 0) for _ in range(96))
+    for number in range(250):
+        send(datagram(1, points, 96, 10**9 + number * 480_000, number))
+        frames.new()
+    assert frames.came == 1
+    send(datagram(0, bytes(24), 1))
+    frames.new()
+    left = 250 - 213  # the packet of number 212 is the first 2 ms after 100 ms
+    assert frames.why_silent() == f"{left} LiDAR messages, {96 * left} LiDAR points, 1 packets of the IMU came"
+
+
 def of(times_ns, count=5000):
     """A message of points numbered by x, at times from a function of the point's number."""
 
