@@ -47,9 +47,13 @@ _REFUSALS = {
 """Meaning of an answer's code, of Livox's "Communication Protocol--Mid360"."""
 _COMMAND = struct.Struct("<BBHIHBB6sHI")
 _POINTS = struct.Struct("<BHHHHBBB12sIQ")
+HEADER = _POINTS.size
+"""Bytes of a packet before its points."""
+POINT = np.dtype([("xyz", "<i4", 3), ("reflectivity", "u1"), ("tag", "u1")])
+"""Of a packet of Cartesian points, mm."""
 _DETECTION = struct.Struct("<BB16s4sH")
 _KINDS = {
-    _CARTESIAN_MM: (np.dtype([("xyz", "<i4", 3), ("reflectivity", "u1"), ("tag", "u1")]), 1e-3),
+    _CARTESIAN_MM: (POINT, 1e-3),
     _CARTESIAN_CM: (np.dtype([("xyz", "<i2", 3), ("reflectivity", "u1"), ("tag", "u1")]), 1e-2),
     _SPHERICAL: (np.dtype([("depth", "<u4"), ("angles", "<u2", 2), ("reflectivity", "u1"), ("tag", "u1")]), 1e-3),
 }
