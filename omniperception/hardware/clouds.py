@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omniperception.common import point_fields
+from omniperception.common import custom_msg, point_fields
 from omniperception.deploy.description import DeployError
 from omniperception.deploy.sampling import rotation_matrix
 from omniperception.hardware.saying import say
@@ -212,15 +212,6 @@ class _Cdr:
 _TIME_FIELDS = ("timestamp", "offset_time", "time", "t")
 LATEST_NS = 2**62
 """146 years; no clock of a sensor is there, and the sum of two such times fits int64."""
-_CUSTOM_POINT = np.dtype(
-    {
-        "names": ["offset_time", "xyz", "tag"],
-        "formats": ["<u4", ("<f4", 3), "u1"],
-        "offsets": [0, 4, 17],
-        "itemsize": 20,
-    }
-)
-"""A point of livox_ros_driver2's CustomMsg in CDR: reflectivity, tag and line follow xyz."""
 
 
 def read_point_cloud2(data: bytes) -> Points:
@@ -293,19 +284,13 @@ def _point_cloud2(data: bytes) -> Points:
 
 
 def read_custom_msg(data: bytes) -> Points:
-    """Points of a livox_ros_driver2/CustomMsg."""
+    """Points of Livox's CustomMsg."""
     try:
-        cdr = _Cdr(data, "CustomMsg")
-        cdr.read("i"), cdr.read("I"), cdr.text()
-        base = cdr.read("Q")
-        cdr.read("I")
-        cdr.at += 4  # lidar_id, rsvd[3]
-        count = cdr.read("I")
-        part = bytes(cdr.data[cdr.at :])
-        if len(part) < 20 * count - 1:
-            raise DeployError("CustomMsg: cut off")
-        rows = np.frombuffer(part.ljust(20 * count, b"\0"), _CUSTOM_POINT, count)
-        times_ns = base + rows["offset_time"].astype(np.int64)
-    except (struct.error, ValueError, OverflowError) as error:
-        raise DeployError(f"CustomMsg: {error}") from None
-    return Points(without_noise(rows["xyz"].astype(np.float32), rows["tag"]), times_ns)
+        given = custom_msg.read(data)
+    except ValueError as error:
+        raise DeployError(str(error)) from None
+    if given.base_ns >= LATEST_NS:
+        raise DeployError(f"CustomMsg: a timebase in nanoseconds was expected, {given.base_ns} given")
+    points = np.stack([given.points[axis] for axis in "xyz"], 1)
+    times_ns = given.base_ns + given.points["offset_time"].astype(np.int64)
+    return Points(without_noise(points, given.points["tag"]), times_ns)
