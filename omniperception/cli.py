@@ -27,20 +27,29 @@ line, too, and exit code 130.
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
+import io
 import math
+import os
+import re
+import select
 import sys
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omniperception.common.errors import ConfigError, UnknownKey, one_line
+from omniperception.common.errors import ConfigError, UnknownKey, of_a_disk, one_line
 
-INTERRUPTED = 130  # as of a shell: 128 + SIGINT
+INTERRUPTED, UNREAD = 130, 141  # as of a shell: 128 + SIGINT, 128 + SIGPIPE
+_SIMPLER, _SIGNS = "omniperception.simpler", {"–": "-", "…": "..."}
 
+_COMMA = re.compile(r',(?=(?:[^"]*"[^"]*")*[^"]*$)')
+"""A comma outside of double quotes."""
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
@@ -103,7 +112,10 @@ class Command:
 
     def __call__(self, argv: Sequence[str] | None = None, name: str | None = None) -> None:
         """Runs the command line `argv`, by default the process's."""
-        argv = list(sys.argv[1:] if argv is None else argv)
+        with terminal():
+            self._run(list(sys.argv[1:] if argv is None else argv), name)
+
+    def _run(self, argv: list[str], name: str | None) -> None:
         if {"-h", "--help"} & set(argv):
             print(self.help(name or f"python {sys.argv[0]}"))
             return
@@ -113,7 +125,7 @@ class Command:
             self.main(arguments, overrides) if self.overrides else self.main(arguments)
         except UnknownKey as error:
             own = () if "." in error.given else [field.name for field in dataclasses.fields(self.arguments)]
-            fail(UnknownKey(error.given, (*error.known, *own), error.name))
+            fail(UnknownKey(error.given, dict.fromkeys((*error.known, *own)), error.name))
         except for_the_user as error:
             fail(error)
         except KeyboardInterrupt as error:  # Ctrl-C
@@ -126,7 +138,7 @@ class Command:
         hints = typing.get_type_hints(self.arguments)
         given, keys, overrides = {}, set(), []
         for k, text in enumerate(self._without_flags(argv)):
-            if k == 0 and self.first and "=" not in text and not text.startswith("~"):
+            if k == 0 and self.first and (Path(text).exists() or not ("=" in text or text.startswith("~"))):
                 text = f"{self.first}={text}"
             key, separator, value = text.partition("=")
             if not separator and not text.startswith("~") and text not in self.flags:
@@ -153,9 +165,10 @@ class Command:
             flag, _, value = word.partition("=")
             if self.overrides and flag in ("--config-dir", "-cd"):
                 folder = value or next(words, "")
-                if not folder or not Path(folder).is_dir():
+                path = os.path.realpath(os.path.expanduser(folder))
+                if not folder or not os.path.isdir(path):
                     raise ConfigError(f"{flag} {folder}: there is no such folder")
-                folders.append(f"'file://{Path(folder).resolve()}'")
+                folders.append("'file://{}'".format(path.replace("'", r"\'")))
             elif word in self.flags:
                 rest.append(word)
             elif word.startswith("-"):
@@ -185,6 +198,51 @@ class Command:
                 "--config-dir DIR adds a folder of presets of your own.",
             ]
         return "\n".join(lines)
+
+
+@contextmanager
+def terminal() -> Iterator[None]:
+    """Prints to whatever reads it: signs that a terminal lacks become others, and where nobody reads any more, as in a
+    pipe into head, the process ends without a word. What a disk refuses is one line."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors=_SIMPLER)
+    try:
+        try:
+            yield
+        finally:
+            if sys.stdout is not None:  # as with >&-
+                sys.stdout.flush()
+    except OSError as error:
+        closed = [stream for stream in (sys.stdout, sys.stderr) if stream is not None and _is_closed(stream)]
+        for stream in closed:  # Python would try, and complain, once more at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        if closed and isinstance(error, BrokenPipeError):
+            sys.exit(UNREAD)
+        if not (refused := of_a_disk(error)):
+            raise
+        fail(OSError(f"{os.fsdecode(error.filename or 'a file, or what is printed')}: {refused}"))
+
+
+def _is_closed(stream: typing.TextIO) -> bool:
+    """Tell whether nobody reads what is printed, or it cannot be written."""
+    poll = select.poll()
+    try:
+        poll.register(stream.fileno(), 0)
+        stream.flush()
+    except io.UnsupportedOperation:  # it is kept in memory
+        return False
+    except OSError:
+        return True
+    return bool(poll.poll(0))
+
+
+def _simpler(error: UnicodeError) -> tuple[str, int]:
+    """Signs in place of those that an encoding lacks."""
+    assert isinstance(error, UnicodeEncodeError)
+    return "".join(_SIGNS.get(sign, ascii(sign)[1:-1]) for sign in error.object[error.start : error.end]), error.end
+
+
+codecs.register_error(_SIMPLER, _simpler)
 
 
 def refuse_overrides(overrides: Sequence[str], own: Mapping[str, object]) -> None:
@@ -218,15 +276,19 @@ def _value(field: dataclasses.Field, hint: Any, text: str) -> Any:
             return None
     if typing.get_origin(hint) is not tuple:
         return _single(field, hint, text)
-    parts = text.strip("[]").split(",")
+    if hint.__args__[0] is Path and Path(text).exists():
+        return (Path(text),)  # one whose name has commas, too
+    parts = _COMMA.split(text[1:-1] if text[0] + text[-1] == "[]" else text)
     values = tuple(_single(field, hint.__args__[0], part.strip(), ", or several with commas between") for part in parts)
-    if hint.__args__[0] is str and len(set(values)) < len(values):
+    if hint.__args__[0] in (str, Path) and len(set(values)) < len(values):
         raise ConfigError(f"{field.name}={text} names one twice")
     return values
 
 
 def _single(field: dataclasses.Field, kind: type, text: str, several: str = "") -> Any:
     limits = field.metadata
+    if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"":  # as Hydra's grammar has text
+        text = text[1:-1]
     if limits["choices"] and text not in limits["choices"]:
         raise ConfigError(f"{field.name}={text} must be one of {', '.join(limits['choices'])}")
     if limits["suffixes"] and (not text.endswith(limits["suffixes"]) or Path(text).is_dir()):
@@ -236,7 +298,7 @@ def _single(field: dataclasses.Field, kind: type, text: str, several: str = "") 
             raise ConfigError(f"{field.name}={text} must be true or false")
         return text == "true"
     if kind not in (int, float):
-        return kind(text)
+        return Path(os.path.expanduser(text)) if kind is Path else kind(text)
     bound = " above 0" if limits["positive"] else f" >= {limits['least']:g}" if limits["least"] is not None else ""
     try:
         value = kind(text)

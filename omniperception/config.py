@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,7 @@ from hydra import initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.override_parser.types import ChoiceSweep, Override, OverrideType, Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -46,6 +48,8 @@ OPTIONAL_GROUPS = ("experiment", "scenario", "condition")
 SUITES, STUDIES = "suite", "study"
 """Folders of what evaluate and ablate read; no groups of a configuration."""
 _EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
+_PATHS = ("dir", "file", "files", "init", "path", "searchpath", "subdir", "teacher")
+"""Last words of the keys whose values are paths."""
 
 
 def _device_figure(name: str, figure: str) -> float:
@@ -181,17 +185,48 @@ def _check_keys(config: DictConfig) -> None:
 
 def parse(overrides: Sequence[str]) -> list[Override]:
     """Overrides by Hydra's grammar; a sweep over several values is a ConfigError."""
-    parsed = []
-    for text in overrides:
-        try:
-            (override,) = OverridesParser.create().parse_overrides([text])
-        except HydraException as error:
-            why = f": {one_line(error).partition(' See https')[0]}" if "=" in text else ""
-            raise ConfigError(f"'{text}' is not of the form key=value{why}") from None
+    parsed = [parse_one(text) for text in overrides]
+    for override in parsed:
         if override.is_sweep_override():
-            raise ConfigError(f"{text} has several values, which only train -m runs; lists are [a,b]")
-        parsed.append(override)
+            raise ConfigError(f"{override.input_line} has several values, which only train -m runs; lists are [a,b]")
     return parsed
+
+
+def parse_one(text: str, sweeps: bool = False) -> Override:
+    """An override by Hydra's grammar, in which = # ( [ , and others mean something; in a path they do not.
+
+    Args:
+        text: the override.
+        sweeps: whether paths with commas between them are several.
+    """
+    key, separator, value = text.partition("=")
+    is_path = key.rpartition(".")[2].lstrip("+") in _PATHS and value != ""
+    try:
+        (override,) = OverridesParser.create().parse_overrides([text])
+        means_something_else = bool | int | float if sweeps else bool | int | float | ChoiceSweep
+        if not (is_path and (isinstance(override._value, means_something_else) or value != value.strip())):
+            return override
+    except HydraException:
+        if not separator:
+            raise ConfigError(f"'{text}' is not of the form key=value") from None
+        if not is_path:
+            raise ConfigError(
+                f"{text}: a value is a number, a word, [a,b] or {{a:b}}; text with other signs is quoted, in a shell"
+                f" {shlex.quote(f'{key}={quoted(value)}')}"
+            ) from None
+    return OverridesParser.create().parse_overrides([f"{key}={_quoted_path(value, sweeps)}"])[0]
+
+
+def _quoted_path(value: str, several: bool) -> str:
+    """A path, or several with commas between them, in Hydra's grammar."""
+    if value[0] + value[-1] == "[]":
+        return f"[{_quoted_path(value[1:-1], True)}]"
+    return ",".join(quoted(os.path.expanduser(path)) for path in (value.split(",") if several else [value]))
+
+
+def quoted(text: str) -> str:
+    """Text as Hydra's grammar takes it, whatever signs it holds."""
+    return QuotedString(text, Quote.double).with_quotes()
 
 
 def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
@@ -331,7 +366,7 @@ def _folder(entry: str) -> Path:
 
 def as_override(folders: Sequence[Path]) -> list[str]:
     """The override that puts folders on Hydra's search path."""
-    return [f"hydra.searchpath=[{','.join(repr(f'file://{folder}') for folder in folders)}]"] if folders else []
+    return [f"hydra.searchpath=[{','.join(quoted(f'file://{folder}') for folder in folders)}]"] if folders else []
 
 
 def remember(config: DictConfig, folders: Sequence[Path]) -> None:
@@ -434,7 +469,7 @@ def find_run(name: str, key: str = "run") -> Path:
     Outside a checkout, too, pretrained/avoider and its like are those that come with the package.
     """
     if name != "latest":
-        path = Path(name)
+        path = Path(os.path.expanduser(name))
         if not path.is_dir() and path.parts[:1] == (SHIPPED_RUNS.name,):
             path = SHIPPED_RUNS.parent / path
         if not path.is_dir():

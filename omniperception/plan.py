@@ -16,6 +16,7 @@ import torch
 import yaml
 from tensordict import TensorDictBase
 
+from omniperception.common.files import write_whole
 from omniperception.env.env import OmniEnv
 from omniperception.learning import Runner
 
@@ -57,7 +58,7 @@ class Plan:
 
     def save(self, run_dir: Path) -> None:
         """Writes the plan beside the run's configuration."""
-        (run_dir / PLAN_FILE).write_text(yaml.safe_dump(asdict(self), sort_keys=False, width=120))
+        write_whole(run_dir / PLAN_FILE, yaml.safe_dump(asdict(self), sort_keys=False, width=120))
 
     def text(self, fuller: Plan | None = None, most: int = 12) -> str:
         """For a terminal: + what exists, - what only `fuller` has; at most so many buffers and modules each."""

@@ -6,6 +6,8 @@ import importlib
 import sys
 from collections.abc import Sequence
 
+from omniperception.cli import terminal
+
 COMMANDS = {
     "demo": "shows the published policy among moving obstacles, in the browser or as a film",
     "train": "trains a policy, or goes on with a run",
@@ -52,7 +54,12 @@ EXTRAS = {
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs `omniperception <command> [key=value ...]`."""
-    name, *rest = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    with terminal():
+        _run(list(sys.argv[1:] if argv is None else argv))
+
+
+def _run(argv: list[str]) -> None:
+    name, *rest = argv or ["--help"]
     if name in ("-h", "--help"):
         width = max(map(len, COMMANDS))
         lines = (f"  {command:<{width}}  {what}" for command, what in COMMANDS.items())

@@ -59,7 +59,7 @@ MEASURED = ("trials", "num_envs", "jobs", "plots", "again", "out", "log")
 class Arguments:
     """The command's own arguments."""
 
-    run: tuple[str, ...] = argument(("latest",), "run directories, or latest for the newest under outputs/")
+    run: tuple[Path, ...] = argument((Path("latest"),), "run directories, or latest for the newest under outputs/")
     suite: str | None = argument(None, "file of conf/suite, such as held_out: many worlds")
     scenario: tuple[str, ...] = argument(
         (), "scenarios in place of a suite, or all of held_out; corridor without either"
@@ -89,7 +89,7 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Evaluates, prints the table and writes the runs' evaluation folders."""
-    runs = [config.find_run(name) for name in arguments.run]
+    runs = [config.find_run(str(name)) for name in arguments.run]
     folders = config.search_path(overrides, config.read(runs[0]))
     worlds = _worlds(arguments, folders, any(o.split("=", 1)[0] == "terrain" for o in overrides))
     if arguments.viewer == "web":

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from omniperception import build, config
 from omniperception.cli import Command, argument, refuse_arguments, refuse_overrides, trust
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
+from omniperception.common.files import write_whole
 from omniperception.common.provenance import provenance
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.report import summary_table, times_line
@@ -80,7 +81,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         **summary,
         **provenance(trained.env.device),
     }
-    (run_dir / f"{stem}.json").write_text(json.dumps(report, indent=2) + "\n")
+    write_whole(run_dir / f"{stem}.json", json.dumps(report, indent=2) + "\n")
     written = [run_dir / f"{stem}.{kind}" for kind in ("json", *(("mp4", "png") if films else ()))]
     print(f"wrote {', '.join(map(str, written))}")
 

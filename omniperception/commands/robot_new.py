@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception.cli import Command, argument
+from omniperception.common.files import write_whole
 from omniperception.config import ConfigError
 from omniperception.robots.guess import Wishes, guess
 from omniperception.robots.preset import table_of, text_of
@@ -54,7 +55,7 @@ def main(arguments: Arguments) -> None:
     )
     found = guess(arguments.file, str(arguments.file), wishes)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text_of(found, arguments.file))
+    write_whole(path, text_of(found, arguments.file))
     print(table_of(found))
     stands = "stands" if found.standing.steady else "DOES NOT STAND"
     print(f"after 2 s it {stands}: base at {found.standing.height:.3f} m, inclined by {found.standing.tilt:.3f} rad")

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception.cli import Command, argument
+from omniperception.common.files import write_whole
 from omniperception.config import ConfigError
 from omniperception.evaluation.tables import rendered
 
@@ -35,7 +36,7 @@ def main(arguments: Arguments) -> None:
     """Writes the pages, or refuses those that differ."""
     different = []
     for page in _pages(arguments.pages):
-        text = page.read_text()
+        text = page.read_text("utf-8")
         try:
             new = rendered(text, arguments.data)
         except ConfigError as error:
@@ -43,7 +44,7 @@ def main(arguments: Arguments) -> None:
         if new != text:
             different.append(str(page))
             if not arguments.check:
-                page.write_text(new)
+                write_whole(page, new)
     if arguments.check and different:
         raise ConfigError(f"{', '.join(different)} differ from the files of results; run tables and commit")
     print(f"wrote {', '.join(different)}" if different else "all tables are those of the files of results")

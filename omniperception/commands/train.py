@@ -23,7 +23,6 @@ import hydra
 import torch
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -43,6 +42,7 @@ from omniperception.learning import (
 )
 from omniperception.learning.log_writers import LoggerError
 from omniperception.learning.ppo import check_rollout
+from omniperception.learning.progress import say
 from omniperception.plan import Plan, Watch
 
 ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
@@ -154,7 +154,7 @@ def _alone_in(run_dir: Path) -> Iterator[None]:
         checkpoints.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise config.ConfigError(
-            f"{run_dir} cannot be written: {one_line(error)}; choose another hydra.run.dir"
+            f"{run_dir} cannot be written: {error.strerror}; choose another hydra.run.dir"
         ) from None
     with held(checkpoints) as alone:
         if not alone:
@@ -279,7 +279,7 @@ def _changes(before: DictConfig, now: DictConfig) -> str:
 def report(text: str) -> None:
     """Prints a line, once however many processes learn."""
     if distributed.rank() == 0:
-        print(text)
+        say(text)
 
 
 def sweep(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
@@ -307,8 +307,11 @@ def sweep(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
             failed.append(run_dir)
 
     before, sys.argv = sys.argv, [sys.argv[0], "-m", *(text for text in given.values() if text is not None)]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # or it prints a traceback of what this program says in one line
     try:
         hydra.main(config_path=str(config.CONFIG_DIR), config_name="config", version_base="1.3")(job)()
+    except HydraException as error:
+        raise config.ConfigError(one_line(error)) from None
     finally:
         sys.argv = before
     if failed:
@@ -323,10 +326,7 @@ def _as_given(text: str, added: set[str]) -> str:
 
 def check_jobs(overrides: Sequence[str]) -> list[Override]:
     """Composes and validates every job of a sweep before the first is started; the overrides as Hydra reads them."""
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except HydraException as error:
-        raise config.ConfigError(config.one_line(error)) from None
+    parsed = [config.parse_one(text, sweeps=True) for text in overrides]
     for override in parsed:
         several = override.is_sweep_override() and override.key_or_group in config.OPTIONAL_GROUPS
         if several and "null" in override.sweep_string_iterator():

@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 import difflib
+import errno
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+_OF_A_DISK = {
+    "make room there, or write elsewhere": ("ENOSPC", "EDQUOT", "EFBIG"),
+    "choose a place that you may read and write": ("EACCES", "EPERM", "EROFS"),
+    "choose another place": ("ENOENT", "EEXIST", "ENOTDIR", "EISDIR", "ENAMETOOLONG", "ELOOP"),
+}
+"""What mends an error of a file system, by names of its number."""
 
 
 class ConfigError(ValueError):
@@ -59,3 +69,19 @@ def one_line(error: BaseException) -> str:
     """The message of an error without line breaks."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines) or type(error).__name__
+
+
+def of_a_disk(error: OSError) -> str:
+    """What a file system refuses, and what mends it; empty for errors of other kinds."""
+    name = errno.errorcode.get(error.errno or 0)
+    return next((f"{error.strerror}; {remedy}" for remedy, names in _OF_A_DISK.items() if name in names), "")
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Says in errors of the system which file is written: those of a full disk do not."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = str(path)
+        raise

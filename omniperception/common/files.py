@@ -8,12 +8,42 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from omniperception.common.errors import naming
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file; whoever reads it meanwhile, or after a stop, sees the old one or the new one."""
+
+def write_whole(path: Path, content: str | bytes | memoryview, durable: bool = False) -> None:
+    """Writes a file; whoever reads it meanwhile, or after a stop, sees the old one or the new one.
+
+    Args:
+        path: of the file.
+        content: its bytes, or its text.
+        durable: whether it is on the disk, its name included, when this returns.
+
+    Raises:
+        OSError: it cannot be written; the error names it, and the old one stays.
+    """
     half = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    half.write_bytes(content)
-    os.replace(half, path)
+    try:
+        with naming(path):
+            with open(half, "wb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                if durable:
+                    file.flush()
+                    os.fsync(file.fileno())
+            os.replace(half, path)
+    finally:
+        half.unlink(missing_ok=True)
+    if durable:
+        _sync(path.parent)
+
+
+def _sync(folder: Path) -> None:
+    """Makes a rename durable."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 @contextmanager

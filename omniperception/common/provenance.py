@@ -16,6 +16,8 @@ from pathlib import Path
 
 import torch
 
+from omniperception.common.files import write_whole
+
 ROOT = Path(__file__).resolve().parents[2]
 """The checkout, or the folder that the package is installed in."""
 FILE = "provenance.json"
@@ -51,7 +53,7 @@ def provenance(device: object = "cpu", libraries: tuple[str, ...] = LIBRARIES, *
 
 def write(run_dir: Path, facts: Mapping) -> None:
     """Writes where a run comes from into its directory."""
-    (run_dir / FILE).write_text(json.dumps(facts, indent=2) + "\n")
+    write_whole(run_dir / FILE, json.dumps(facts, indent=2) + "\n")
 
 
 def read(run_dir: Path) -> dict:

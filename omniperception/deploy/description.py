@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 from omniperception.common.coverage import NUM_SECTORS
+from omniperception.common.errors import naming
 
 FORMAT = "omniperception-policy"
 VERSION = 8
@@ -237,7 +238,8 @@ class Description:
         outputs = {name: ["batch", size] for name, size in self.outputs.items()}
         network = {"inputs": shapes, "outputs": outputs}
         content = {"format": FORMAT, "version": VERSION, "network": network, **asdict(self)}
-        (folder / FILE).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        with naming(folder / FILE):
+            (folder / FILE).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
     @classmethod
     def read(cls, folder: Path) -> Description:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +21,8 @@ from torch import nn
 from omniperception import build
 from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
 from omniperception.build import RunConfig
+from omniperception.common.errors import naming
+from omniperception.common.files import write_whole
 from omniperception.common.provenance import provenance
 from omniperception.common.vectors import moved_towards
 from omniperception.config import ConfigError
@@ -113,7 +116,7 @@ def export(
     if text is None:
         (folder / DEPLOY_YAML).unlink(missing_ok=True)
     else:
-        (folder / DEPLOY_YAML).write_text(text)
+        write_whole(folder / DEPLOY_YAML, text)
     return described
 
 
@@ -123,7 +126,7 @@ def _stamp(path: Path, fingerprint: str) -> None:
 
     model = onnx.load(str(path))
     onnx.helper.set_model_props(model, {FINGERPRINT: fingerprint})
-    onnx.save(model, str(path))
+    write_whole(path, model.SerializeToString())
 
 
 def describe(run: RunConfig, env: OmniEnv) -> Description:
@@ -404,7 +407,8 @@ def write_torchscript(network: BlindNetwork, path: Path) -> tuple[Path, Callable
     """Write the network as TorchScript, for any batch size; returns the path and what it runs as."""
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that tracing is deprecated, and that checks of shapes are not traced
-        torch.jit.trace(network, network.examples(2), check_trace=False).save(str(path))
+        torch.jit.save(torch.jit.trace(network, network.examples(2), check_trace=False), content := io.BytesIO())
+    write_whole(path, content.getbuffer())  # torch itself ends the process where the disk is full
     return path, torch.jit.load(str(path))
 
 
@@ -420,7 +424,7 @@ def write_onnx(network: BlindNetwork, path: Path) -> tuple[Path, Callable | None
             "ONNX export needs onnx: pip install 'omniperception[export]', or give formats=torchscript"
         ) from None
     names = list(network.input_names)
-    with torch.no_grad(), warnings.catch_warnings(), _plain_scatter():
+    with torch.no_grad(), warnings.catch_warnings(), _plain_scatter(), naming(path):
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,

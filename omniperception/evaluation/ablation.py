@@ -13,6 +13,7 @@ import yaml
 
 from omniperception import build, config
 from omniperception.common.errors import check_known, one_line
+from omniperception.common.files import write_whole
 from omniperception.common.signals import interruptible
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record, read, write
@@ -218,7 +219,7 @@ def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:
         *(sys.executable, "-m", "omniperception", "train", "-m"),
         *_training(ablation, name, variant),
         f"seed={','.join(map(str, study.seeds))}",
-        f"hydra.sweep.dir={ablation.out}",
+        f"hydra.sweep.dir={config.quoted(str(ablation.out))}",
         f"hydra.sweep.subdir={name}/{variant}/seed${{seed}}",
         *([f"trust={','.join(ablation.trust)}"] if ablation.trust else []),
     ]
@@ -227,7 +228,8 @@ def _sweep(ablation: Ablation, name: str, variant: str) -> list[str]:
 def _training(ablation: Ablation, name: str, variant: str) -> list[str]:
     """What an arm says of a variant's trainings: the study's overrides, then the arm's, then the command line's."""
     study, arm = ablation.study, ablation.study.arms[name]
-    after = [] if arm.after is None else [f"init='{ablation.out}/{arm.after}/{variant}/seed${{seed}}'"]
+    before = config.quoted(f"{ablation.out}/{arm.after}/{variant}/seed${{seed}}")
+    after = [] if arm.after is None else [f"init={before}"]
     chosen: dict[str, str] = {}
     for texts in (study.overrides, after, arm.overrides, ablation.overrides):  # the later ones win
         for override in config.parse(texts):
@@ -296,7 +298,7 @@ def write_tables(ablation: Ablation) -> str:
     if ablation.study.suite is not None:
         text = f"{by_training(records)}\n\n{text}"
     write(ablation.out / RESULTS, records)
-    (ablation.out / "ablation.md").write_text(text)
+    write_whole(ablation.out / "ablation.md", text)
     return text
 
 

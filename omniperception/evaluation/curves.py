@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from omniperception import config
 from omniperception.common.errors import ConfigError
-from omniperception.common.figures import new_figure
+from omniperception.common.figures import new_figure, save_figure
 from omniperception.evaluation.records import training_of
 
 MAY_DIFFER = ("seed", "logger", config.SEARCH_PATH)
@@ -137,4 +137,4 @@ def draw_curves(path: Path, curves: Mapping[str, Sequence[Curve]], smooth: int) 
         axis.grid(alpha=0.3)
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", fontsize=7, frameon=False)
     figure.suptitle(f"mean of the last {smooth} iterations; band: least to greatest of the trainings", fontsize=9)
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path, dpi=120)

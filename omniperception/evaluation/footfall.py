@@ -10,7 +10,7 @@ import torch
 
 from omniperception.avoidance.velocity import COMMAND
 from omniperception.common.errors import ConfigError
-from omniperception.common.figures import new_figure
+from omniperception.common.figures import new_figure, save_figure
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.commands import VelocityCommand, VelocityCommandConfig
 from omniperception.evaluation.episodes import Policy
@@ -125,7 +125,7 @@ def draw_footfall(footfall: Footfall, path: Path) -> None:
         axis.set_axis_off()
     for axis in axes[-columns:]:
         axis.set_xlabel("time (s)", fontsize=8)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def _name(forward: float, aside: float, turn: float) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 import torch
 
-from omniperception.common.figures import new_figure
+from omniperception.common.figures import new_figure, save_figure
 from omniperception.common.rotations import rotate_yaw
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.episodes import Policy, run_episodes
@@ -116,4 +116,4 @@ def draw_kicks(results: KickResults, speeds: Sequence[float], num_bearings: int,
     axis.set_xticks([k * math.pi / 2 for k in range(4)], ["ahead", "left", "back", "right"])
     axis.set_title("kicks survived, %, by direction of the change of velocity", fontsize=9)
     axis.legend(loc="lower left", fontsize=7)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from omniperception.common.figures import new_figure
+from omniperception.common.figures import new_figure, save_figure
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.report import rate_cell
 from omniperception.evaluation.tracks import Tracks
@@ -54,7 +54,7 @@ def draw_worlds(path: Path, records: Sequence[Record]) -> None:
     key = "thick: the first trial, obstacles where they were at its start (dashed: moving)"
     figure.suptitle(f"{what}\n{key}; thin: {ways - 1} more", fontsize=9)
     figure.legend(handles=_legend(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def _same_shape(areas: Sequence[tuple[float, ...]]) -> list[tuple[float, float, float, float]]:

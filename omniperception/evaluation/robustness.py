@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from omniperception import config
-from omniperception.common.figures import new_figure
+from omniperception.common.figures import new_figure, save_figure
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record
@@ -175,7 +175,7 @@ def draw(measured: Sequence[tuple[Stretch, Record]], path: Path) -> None:
     for axis in axes[len(rows) :]:
         axis.set_axis_off()
     figure.suptitle("falls, % (red) and velocity error, m/s (blue) over multiples of each row's range", fontsize=9)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def _part(record: Record) -> Part:

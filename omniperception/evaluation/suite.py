@@ -19,7 +19,7 @@ from omegaconf import OmegaConf, open_dict
 
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
-from omniperception.common.errors import check_known, one_line
+from omniperception.common.errors import check_known, naming, one_line
 from omniperception.common.figures import new_figure
 from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
@@ -537,7 +537,7 @@ def note(log: Path, record: Record) -> None:
     if not log.exists():
         log.parent.mkdir(parents=True, exist_ok=True)
         print(f"evaluations with split=test are noted in {log}", flush=True)
-    with open(log, "a") as file:
+    with naming(log), open(log, "a") as file:
         file.write(json.dumps(line) + "\n")
 
 

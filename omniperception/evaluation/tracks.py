@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from omniperception.common.errors import naming
 from omniperception.common.random import TrialRandom
 from omniperception.env.env import OmniEnv
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
@@ -40,7 +41,7 @@ class Tracks:
         arrays = {"points": torch.cat(self.xy), "counts": torch.tensor([len(way) for way in self.xy])}
         arrays |= {"contact": self.contact, "parts": self.parts} | ({} if self.goal is None else {"goal": self.goal})
         plain = {name: value.numpy() for name, value in arrays.items()}
-        with open(path, "wb") as file:
+        with naming(path), open(path, "wb") as file:
             np.savez_compressed(file, **plain)  # type: ignore[arg-type]  # keywords are arrays
 
     @classmethod

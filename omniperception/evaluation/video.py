@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import torch
 from PIL import Image
 from torch import nn
 
+from omniperception.common.errors import naming
 from omniperception.common.rotations import rotate, rotate_yaw
 from omniperception.env.env import OmniEnv
 from omniperception.env.sensing import split_elevation
@@ -89,8 +92,16 @@ class Recorder:
         self._blind_until = dict.fromkeys(ids, 0)
         self._best: tuple[float, list[Moment]] | None = None
         width, height = self._options.size
+        self._begun, self._path = False, path.resolve()  # a relative one may look like an option of ffmpeg, or a URL
+        with open(path, "ab"):  # ffmpeg would not say why it cannot be
+            pass
         self._writer = imageio_ffmpeg.write_frames(
-            str(path), (width, height), fps=1 / dt, codec="libx264", quality=6, macro_block_size=2
+            *(str(self._path), (width, height)),
+            fps=1 / dt,
+            codec="libx264",
+            quality=6,
+            macro_block_size=2,
+            ffmpeg_log_level="fatal",
         )
         self._writer.send(None)
 
@@ -108,16 +119,30 @@ class Recorder:
         interest = sum(self._interest(k) for k in self._cameras)
         if self._best is None or interest > self._best[0]:
             self._best = interest, moments
-        self._writer.send(self._picture(self._renderer, moments).tobytes())
+        self._begun = True
+        with contextlib.suppress(OSError):  # ffmpeg has ended, which close tells
+            return self._writer.send(self._picture(self._renderer, moments).tobytes())
+        self.close()
 
     def close(self) -> None:
-        """Completes the video file."""
+        """Completes the video file.
+
+        Raises:
+            OSError: it is not whole.
+        """
         self._writer.close()
+        try:
+            if self._begun:
+                imageio_ffmpeg.count_frames_and_secs(str(self._path))
+        except RuntimeError:
+            why = "ffmpeg could not write a whole video, as where no space is left"
+            raise OSError(errno.ENOSPC, why, str(self._path)) from None
 
     def write_still(self, path: Path) -> None:
         """Writes the most telling moment so far as a PNG of the video's size."""
         if self._best is not None:
-            self._picture(self._build_renderer(samples=2), self._best[1]).save(path)
+            with naming(path):
+                self._picture(self._build_renderer(samples=2), self._best[1]).save(path)
 
     def _build_renderer(self, samples: int) -> Renderer:
         threads = self._env.config.sim.num_threads or None

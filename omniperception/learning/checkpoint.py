@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
 import random
@@ -14,6 +15,8 @@ import numpy as np
 import torch
 
 from omniperception.common.checkpoints import checkpoint_path, list_checkpoints
+from omniperception.common.errors import of_a_disk
+from omniperception.common.files import write_whole
 
 FORMAT = "omniperception-checkpoint"
 VERSION = 1
@@ -43,21 +46,21 @@ def prune_checkpoints(run_dir: str | os.PathLike, keep: int) -> None:
 
 
 def save_checkpoint(path: str | os.PathLike, state: Mapping) -> None:
-    """Write ``state`` so that ``path`` is always either absent, the old file or the complete new one."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    content = {"format": FORMAT, "version": VERSION, **portable(state)}
+    """Write ``state`` so that ``path`` is always either absent, the old file or the complete new one.
+
+    Raises:
+        CheckpointError: it cannot be written, as on a full disk; the older ones are named.
+    """
+    path, content = Path(path), io.BytesIO()
+    torch.save({"format": FORMAT, "version": VERSION, **portable(state)}, content)  # whose error on a disk says nothing
     try:
-        with open(temporary, "wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    if os.name == "posix":
-        _sync_directory(path.parent)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, content.getbuffer(), durable=True)
+    except OSError as error:
+        run_dir = path.parent.parent
+        older = ", ".join(found.name for found in list_checkpoints(run_dir)[-3:])
+        goes_on = f"; older ones are whole, and train run={run_dir} goes on from the last of {older}" if older else ""
+        raise CheckpointError(f"{path} cannot be written: {of_a_disk(error) or error}{goes_on}") from None
 
 
 def load_checkpoint(path: str | os.PathLike, map_location: str | torch.device | None = None) -> dict:
@@ -174,12 +177,3 @@ def set_rng_state(state: dict) -> None:
     np.random.set_state((name, keys.cpu().numpy().astype(np.uint32), position, has_gauss, gauss))
     version, internal, gauss_next = state["python"]
     random.setstate((version, tuple(internal), gauss_next))
-
-
-def _sync_directory(folder: Path) -> None:
-    """Make a rename durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -118,13 +118,22 @@ class Runner:
                     if self.current_learning_iteration % self.config.ppo.save_interval == 0:
                         self._save_checkpoint()
                 self._save_checkpoint()
-        finally:
-            for hook in self.end_hooks:
-                hook()
-            self.logger.close()
+        except BaseException as error:
+            if isinstance(error, OSError):
+                error.filename = error.filename or str(self.logger.log_dir)
+            with contextlib.suppress(OSError):  # a log that a full disk does not take would hide what has failed
+                self._end()
+            raise
+        self._end()
         if self._interrupted:
             self._interrupted = False
             raise KeyboardInterrupt(f"interrupted after {self.current_learning_iteration} iterations, checkpoint saved")
+
+    def _end(self) -> None:
+        """Completes videos and closes the log."""
+        for hook in self.end_hooks:
+            hook()
+        self.logger.close()
 
     def step(self, obs: TensorDict) -> TensorDict:
         """Act, step the environments, store the transition; returns the next observations."""

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from omniperception.common.errors import naming
 from omniperception.env.sensing import SensorConfig
 from omniperception.evaluation.render import Renderer, View
 from omniperception.lidar import Lidar, RayScene
@@ -80,7 +81,8 @@ def draw(
     points, on_robot = nothing if sight is None else (sight.points_w.float(), sight.on_robot)
     picture = Renderer(shapes, width, height, samples=2).render(View(eye, target, pos, quat, points, on_robot))
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(picture.numpy()).save(path)
+    with naming(path):
+        Image.fromarray(picture.numpy()).save(path)
 
 
 def _poses(shapes: RayShapes, data: mujoco.MjData) -> tuple[torch.Tensor, torch.Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.resources
+import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -357,7 +358,7 @@ class RobotConfig:
         if self.file.startswith(SCHEME):
             return fetched(self.file)
         asset = importlib.resources.files("omniperception.scene") / "assets" / self.file
-        path = Path(str(asset)) if asset.is_file() else Path(self.file).expanduser()
+        path = Path(str(asset)) if asset.is_file() else Path(os.path.expanduser(self.file))
         if not path.is_file():
             raise ValueError(f"robot.file={self.file} is neither a packaged asset nor a file")
         return path

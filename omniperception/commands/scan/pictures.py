@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene
-from omniperception.common.figures import new_figure
+from omniperception.common.figures import new_figure, save_figure
 from omniperception.common.rotations import rotate
 from omniperception.env.sensing import SensorConfig
 from omniperception.lidar import Lidar, ScanPattern, write_points
@@ -156,7 +156,7 @@ def draw_pattern(name: str, pattern: ScanPattern, path: Path) -> None:
     axes[0].set_ylabel(labels[1])
     figure.colorbar(marks, ax=axes, label="time of the point / time shown", pad=0.01)
     figure.suptitle(f"{name}: scan pattern, {pattern.points_per_second:,.0f} points/s")
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def _coordinates(pattern: ScanPattern) -> tuple[np.ndarray, np.ndarray, tuple[str, str]]:
@@ -183,7 +183,7 @@ def draw_scan(scan: Scan, demo: DemoScene, path: Path) -> None:
     figure.suptitle(
         f"{scan.name}: one scan of {scan.seconds:g} s, {len(scan.ranges):,} of {scan.num_rays:,} rays hit", fontsize=14
     )
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def draw_comparison(scans: Sequence[Scan], demo: DemoScene, path: Path) -> None:
@@ -201,7 +201,7 @@ def draw_comparison(scans: Sequence[Scan], demo: DemoScene, path: Path) -> None:
         axis.set_title(f"{scan.name}, {scan.seconds:g} s: {len(scan.ranges):,} of {scan.num_rays:,} rays hit")
     for axis in panels[len(scans) :]:
         axis.set_axis_off()
-    figure.savefig(path, dpi=100)
+    save_figure(figure, path, dpi=100)
 
 
 def _draw_outside(axis, scan: Scan, demo: DemoScene, picture: np.ndarray, mark_area: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,18 @@ class TensorBoardWriter(SummaryWriter, LogWriter):
     def stop(self) -> None:
         """Closes the file."""
         self.close()
+
+
+_say = threading.excepthook
+
+
+def _leave_to_the_writer(failed: threading.ExceptHookArgs) -> None:
+    """What TensorBoard's thread cannot write, its writer raises at the next call; of other threads as before."""
+    if not (isinstance(failed.exc_value, OSError) and type(failed.thread).__module__.startswith("tensorboard.")):
+        _say(failed)
+
+
+threading.excepthook = _leave_to_the_writer
 
 
 def begin(writer: SummaryWriter, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> None:
