@@ -1,4 +1,4 @@
-"""A new machine: what a command says comes next is run, from inside and from outside of a checkout."""
+"""A new machine: nothing leans on caches, and what a command says comes next is run, in a checkout and elsewhere."""
 
 import ast
 import hashlib
@@ -21,6 +21,7 @@ from omniperception.commands import COMMANDS, main
 from omniperception.commands import evaluate as evaluate_command
 from omniperception.commands import robot_fetch as robot_fetch_command
 from omniperception.common.errors import ConfigError
+from omniperception.common.figures import check_figures
 from omniperception.common.shell import command_line
 from omniperception.deploy import DeployError, Description, ExportedPolicy
 from omniperception.evaluation import walking_report
@@ -127,6 +128,14 @@ def refused(capsys, words):
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     return error
+
+
+def test_asking_for_matplotlib_does_not_import_it(monkeypatch):
+    """Its first import on a machine starts `fc-list`."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    check_figures()
+    assert not [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]
 
 
 # --- robots -----------------------------------------------------------------------------------------------------------
