@@ -51,6 +51,7 @@ CALLS = {
     "omniperception/deploy/description.py": 1,
     "omniperception/evaluation/tables.py": 1,
     "omniperception/evaluation/walking_report.py": 1,
+    "omniperception/hardware/trials.py": 1,
     "omniperception/robots/fetch.py": 1,
     "omniperception/scene/fetched.py": 1,
 }
@@ -311,6 +312,15 @@ def test_a_policy_that_is_missing_is_exported_by_what_is_shown(of_a_run, place, 
         assert isinstance(ExportedPolicy.load(folder).description, Description)
         if kind == "nothing":
             (folder / "policy.onnx").unlink()
+
+
+def test_trials_on_the_wire_name_what_exports_their_policy(place, a_run, run, capsys):
+    pytest.importorskip("onnx", reason="extra export")
+    policy = place / "exported"
+    (words,) = commands_in(refused(capsys, ["robot-trials", f"run={a_run}", f"policy={policy}", "scenario=static"]))
+    assert words == ["export", f"run={a_run}", f"out={policy}"]
+    run(words)
+    assert (policy / "policy.json").is_file()
 
 
 def test_tables_are_written_by_what_their_check_shows(place, run, capsys):
