@@ -4,6 +4,7 @@ import ast
 import hashlib
 import importlib.metadata
 import os
+import random
 import re
 import shlex
 import shutil
@@ -14,7 +15,9 @@ import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 
 from omniperception import config
 from omniperception.commands import COMMANDS, main
@@ -137,6 +140,13 @@ def test_asking_for_matplotlib_does_not_import_it(monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     check_figures()
     assert not [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]
+
+
+def test_numbers_that_a_test_draws_are_the_same_in_any_order():
+    """The order of the tests is another each time, and must not decide what they compare."""
+    assert torch.equal(torch.rand(3), torch.rand(3, generator=torch.Generator().manual_seed(0)))
+    assert np.array_equal(np.random.rand(3), np.random.RandomState(0).rand(3))
+    assert random.random() == random.Random(0).random()
 
 
 # --- robots -----------------------------------------------------------------------------------------------------------
