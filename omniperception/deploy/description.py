@@ -10,6 +10,7 @@ from pathlib import Path
 
 from omniperception.common.coverage import NUM_SECTORS
 from omniperception.common.errors import naming
+from omniperception.common.shell import command_line
 
 FORMAT = "omniperception-policy"
 VERSION = 8
@@ -20,6 +21,12 @@ FINGERPRINT = "omniperception-description"
 
 class DeployError(ValueError):
     """An exported policy cannot be read or was given something else than it expects; the message is one line."""
+
+
+def export_line(folder: Path) -> str:
+    """The command that writes an exported policy there: of the run that the folder lies in, or of the newest."""
+    of_run = [f"run={folder.parent}"] if (folder.parent / "config.yaml").is_file() else []
+    return command_line("export", *of_run, f"out={folder}")
 
 
 @dataclass(frozen=True)
@@ -246,7 +253,7 @@ class Description:
         """Read policy.json from a folder."""
         path = Path(folder) / FILE
         if not path.is_file():
-            raise DeployError(f"{folder} holds no exported policy ({FILE}); write it: scripts/export.py run=...")
+            raise DeployError(f"{folder} holds no exported policy ({FILE}); write it: {export_line(folder)}")
         try:
             content = json.loads(path.read_text())
         except ValueError as error:

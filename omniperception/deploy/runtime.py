@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from omniperception.deploy.description import FILE, FINGERPRINT, DeployError, Description, Group, Lidar, checksum
+from omniperception.deploy.description import (
+    FILE,
+    FINGERPRINT,
+    DeployError,
+    Description,
+    Group,
+    Lidar,
+    checksum,
+    export_line,
+)
 from omniperception.deploy.odometry import Odometry
 from omniperception.deploy.safety import Safety, SafetyConfig, SafetyStop, Sight
 from omniperception.deploy.sampling import Attitude, CloudSampler, down, make_sampler
@@ -97,7 +106,7 @@ class ExportedPolicy:
     def load(
         cls, folder: str | Path, num_threads: int = 1, safety: SafetyConfig | None = DEFAULT_SAFETY
     ) -> ExportedPolicy:
-        """The policy in a folder that `scripts/export.py` wrote.
+        """The policy in a folder that `omniperception export` wrote.
 
         Args:
             folder: with policy.json and the ONNX file.
@@ -113,7 +122,7 @@ class ExportedPolicy:
                 "running an exported policy needs onnxruntime: pip install 'omniperception[deploy]'"
             ) from None
         if "onnx" not in description.files or not (folder / description.files["onnx"]).is_file():
-            raise DeployError(f"{folder} has no ONNX file; write it: python scripts/export.py run=... formats=onnx")
+            raise DeployError(f"{folder} has no ONNX file; write it: {export_line(folder)}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = num_threads, 1
         path = folder / description.files["onnx"]
