@@ -848,7 +848,8 @@ def test_the_replay_command_says_what_it_cannot_read(tmp_path, capsys, monkeypat
     assert re.search(said, capsys.readouterr().err.splitlines()[-1])
 
 
-def test_real_scans_reads_what_is_left_of_a_recording(tmp_path, capsys):
+def test_real_scans_reads_what_is_left_of_a_recording(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(real_scans, "PLANES", 5)
     a_db3(tmp_path / "a.db3", [("/livox", CUSTOM, k, custom(k + 1)) for k in range(30)]).close()
     whole = (tmp_path / "a.db3").read_bytes()
     (tmp_path / "a.db3").write_bytes(whole[: int(0.6 * len(whole))])
