@@ -109,7 +109,10 @@ def events(path: Path, wanted: Topics) -> Iterator[Event]:
     with _one_line(path):
         recording = Recording(path)
         inputs = {topic: kind for topic, kind in recording.topics.items() if not topic.startswith(OUTPUTS)}
-        read = _inputs(path, inputs, wanted)
+        try:
+            read = _inputs(path, inputs, wanted)
+        except DeployError as error:
+            raise DeployError(f"{error}{recording.missing}") from None
         print(
             f"{path}: " + ", ".join(f"{what} from {topic or 'no topic'}" for what, topic in read.items()),
             file=sys.stderr,

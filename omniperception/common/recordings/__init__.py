@@ -49,8 +49,13 @@ class Recording:
         self._faults: list[str] = []
         self._counts: Counter[str] = Counter()
         self._files = [file for file in self._parts() if self._survey(file)]
-        if not self._files:
-            raise ValueError("; ".join(self._faults))
+        if not self._files or (self._faults and not self.topics):
+            raise ValueError(f"{'; '.join(self._faults)}; no message can be read")
+
+    @property
+    def missing(self) -> str:
+        """What is, to be put behind an error; empty where nothing is known to be."""
+        return "".join(f"; {fault}" for fault in self._faults)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """Messages of these topics; None: of all. What is missing is said at first, or when it is met."""

@@ -91,7 +91,10 @@ class _Rows:
     def like(self, *types: type) -> Iterator[tuple[int, list[Any]]]:
         """Numbers and values of the whole rows that begin with values of these types."""
         for number, start, size in self._cells:
-            length, kinds = self._kinds(start)
+            try:
+                length, kinds = self._kinds(start)
+            except IndexError:  # behind the cut
+                continue
             if tuple(map(_type, kinds[: len(types)])) == types and len(content := self._payload(start, size)) == size:
                 yield number, _values(content[length:], kinds)
 

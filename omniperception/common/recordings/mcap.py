@@ -80,20 +80,16 @@ def messages(path: Path, faults: list[str]) -> Iterator[Message]:
     channels, damaged, ended = _Channels(), 0, False
     with path.open("rb") as file:
         file.seek(len(MAGIC))
-        for kind, content, whole in _records(file):
-            part = _chunk(content, whole) if kind == CHUNK else None
-            damaged += kind == CHUNK and part is None
-            for inner, inner_content, inner_whole in (
-                [(kind, content, whole)] if part is None else _records(BytesIO(part))
-            ):
-                try:
-                    message = channels.take(inner, inner_content) if inner_whole else None
-                except (struct.error, KeyError, UnicodeDecodeError):
-                    damaged += 1
-                    continue
-                if message is not None:
-                    yield message
-            if kind == FOOTER and whole:
+        for kind, content, whole in _opened(file):
+            try:
+                message = channels.take(kind, content) if whole else None
+            except (struct.error, KeyError, UnicodeDecodeError):
+                message, damaged = None, damaged + 1
+            if message is not None:
+                yield message
+            elif kind == CHUNK:
+                damaged += 1
+            elif kind == FOOTER and whole:
                 ended = True
                 if not any(content[:8]):
                     faults.append("has no summary, the index that a recorder writes when it ends")
@@ -101,6 +97,16 @@ def messages(path: Path, faults: list[str]) -> Iterator[Message]:
             faults.append(f"is cut off after {file.tell()} bytes, as a killed recorder leaves it")
     if damaged:
         faults.append(f"has {damaged} damaged records, which are left out")
+
+
+def _opened(file: IO[bytes]) -> Iterator[tuple[int, bytes, bool]]:
+    """As ``_records``, with those in chunks; a chunk that is damaged remains."""
+    for kind, content, whole in _records(file):
+        part = _chunk(content, whole) if kind == CHUNK else None
+        if part is None:
+            yield kind, content, whole
+        else:
+            yield from _records(BytesIO(part))
 
 
 def _records(file: IO[bytes]) -> Iterator[tuple[int, bytes, bool]]:
@@ -116,11 +122,12 @@ def _records(file: IO[bytes]) -> Iterator[tuple[int, bytes, bool]]:
 
 def _chunk(content: bytes, whole: bool) -> bytes | None:
     """The records in a chunk, or as much of them as is there; None: they are damaged."""
-    if len(content) < 40:
-        return b""
-    checksum, name_length = struct.unpack_from("<II", content, 24)
-    (how,) = _texts(content, 28, 1)
-    part = unpacked(content[32 + name_length + 8 :], how)
+    try:
+        checksum, name_length = struct.unpack_from("<II", content, 24)
+        (how,) = _texts(content, 28, 1)
+    except (struct.error, UnicodeDecodeError):
+        return None if whole else b""
+    part = unpacked(content[40 + name_length :], how)
     return None if part is None or (whole and checksum and zlib.crc32(part) != checksum) else part
 
 

@@ -60,10 +60,9 @@ class Message:
         Raises:
             ValueError: It is damaged.
         """
-        raw = (unpacked(self.raw, "zstd") or b"") if self.raw.startswith(ZSTD) else self.raw
-        if self.channel.encoding != "ros1":
-            return raw
-        return bytes(self._with(_to_cdr, raw))
+        if self.channel.encoding == "ros1":
+            return bytes(self._with(_to_cdr, self.raw))
+        return (unpacked(self.raw, "zstd") or b"") if self.raw.startswith(ZSTD) else self.raw
 
     def decode(self) -> Any:
         """An object with the type's fields.
@@ -89,16 +88,15 @@ def as_in_ros_2(kind: str) -> str:
 
 def unpacked(data: bytes, how: str) -> bytes | None:
     """A part of a file that is packed by "lz4", "zstd", "bz2" or not at all, as far as it goes; None: it is damaged."""
+    if how in ("", "none"):
+        return data
     import zstandard
     from lz4.frame import LZ4FrameDecompressor
 
+    made = {"zstd": zstandard.ZstdDecompressor().decompressobj, "lz4": LZ4FrameDecompressor, "bz2": bz2.BZ2Decompressor}
     try:
-        if how == "zstd":
-            return zstandard.ZstdDecompressor().decompressobj().decompress(data)
-        if how == "lz4":
-            return LZ4FrameDecompressor().decompress(data)
-        return bz2.BZ2Decompressor().decompress(data) if how == "bz2" else data
-    except (zstandard.ZstdError, RuntimeError, OSError):  # RuntimeError is lz4's, OSError bz2's
+        return made[how]().decompress(data)
+    except (KeyError, zstandard.ZstdError, RuntimeError, OSError):  # RuntimeError is lz4's, OSError bz2's
         return None
 
 
@@ -124,10 +122,19 @@ def _to_cdr(channel: Channel) -> Callable[[bytes], Any]:
 
 def _types(channel: Channel) -> Any:
     """ROS's own types and those of a definition."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys import get_types_from_msg
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = _own_types()
     if channel.kind not in store.types and channel.definition:
         given = get_types_from_msg(channel.definition, channel.kind)
+        store = _own_types.__wrapped__()  # a new one, as another file may mean something else by this name
         store.register({kind: fields for kind, fields in given.items() if kind not in store.types})
     return store
+
+
+@cache
+def _own_types() -> Any:
+    """ROS's own types, which take a while to make."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)

@@ -73,19 +73,15 @@ def messages(path: Path, faults: list[str]) -> Iterator[Message]:
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         index_at = _index_at(file)
-        for fields, content, whole in _records(file):
-            part = None
-            if fields.get(b"op") == CHUNK:  # one whose length was to be written when it was full goes on to the end
-                part = unpacked(content or file.read(), fields.get(b"compression", b"").decode())
-                damaged += part is None
-            for inner, inner_content, inner_whole in _records(BytesIO(part)) if part else [(fields, content, whole)]:
-                try:
-                    message = channels.take(inner, inner_content) if inner_whole else None
-                except (struct.error, KeyError, UnicodeDecodeError):
-                    damaged += 1
-                    continue
-                if message is not None:
-                    yield message
+        for fields, content, whole in _opened(file):
+            try:
+                message = channels.take(fields, content) if whole else None
+            except (struct.error, KeyError, UnicodeDecodeError):
+                message, damaged = None, damaged + 1
+            if message is not None:
+                yield message
+            elif fields.get(b"op") == CHUNK:
+                damaged += 1
         end = file.tell()
     if not index_at:
         faults.append("has no index, as a killed recorder leaves it (rosbag reindex writes one)")
@@ -93,6 +89,19 @@ def messages(path: Path, faults: list[str]) -> Iterator[Message]:
         faults.append(f"is cut off after {end} bytes")
     if damaged:
         faults.append(f"has {damaged} damaged records, which are left out")
+
+
+def _opened(file: IO[bytes]) -> Iterator[tuple[Fields, bytes, bool]]:
+    """As ``_records``, with those in chunks; a chunk that is damaged remains."""
+    for fields, content, whole in _records(file):
+        part = None
+        if fields.get(b"op") == CHUNK:  # one whose length was to be written when it was full goes on to the end
+            how = fields.get(b"compression", b"").decode("utf-8", "replace")
+            part = unpacked(content or file.read(), how)
+        if part is None:
+            yield fields, content, whole
+        else:
+            yield from _records(BytesIO(part))
 
 
 def _index_at(file: IO[bytes]) -> int:

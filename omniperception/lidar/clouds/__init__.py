@@ -16,8 +16,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from omniperception.common.pointers import refuse_pointer
-
 from .table import PointTable, table_of
 
 __all__ = ["PointTable", "read_points", "read_scans", "table_of", "write_points", "write_scans"]
@@ -60,6 +58,8 @@ def read_scans(path: str | Path, topic: str | None = None) -> Iterator[PointTabl
         ModuleNotFoundError: The library for this format is not installed.
         ValueError: The format is unknown, the file is broken, or the topic has to be named.
     """
+    from omniperception.common.pointers import refuse_pointer
+
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give a file of points: {', '.join(FORMATS)}")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .table import PointTable, held, table_of
+from .table import PointTable, column_names, held, table_of
 
 SCALE = 1e-4
 """Metres to which coordinates are kept."""
@@ -34,7 +34,9 @@ def read(path: Path) -> PointTable:
     for name in (name for name in file.point_format.dimension_names if name not in ("X", "Y", "Z", "withheld")):
         values = np.asarray(file[name])
         if name in extra or values.any():
-            columns[name.removesuffix(SUFFIX) if name in extra else name] = values
+            rows = values.T if values.ndim > 1 else values[None]  # an extra dimension may have two or three numbers
+            names = column_names(name.removesuffix(SUFFIX) if name in extra else name, len(rows))
+            columns |= dict(zip(names, rows, strict=True))
     times = np.unique(file["gps_time"] if "gps_time" in file.point_format.dimension_names else np.zeros(1))
     if len(times) == 1 and "gps_time" + SUFFIX not in extra:
         columns.pop("gps_time", None)

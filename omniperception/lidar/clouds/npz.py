@@ -22,7 +22,7 @@ def read(path: Path) -> PointTable:
             arrays = {name: file[name] for name in file.files}
     except TypeError:
         raise ValueError(f"{path} holds a single array; an array for each column was expected") from None
-    except (ValueError, EOFError, BadZipFile, zlib.error, OSError) as error:
+    except (ValueError, EOFError, BadZipFile, NotImplementedError, OSError, zlib.error) as error:
         raise ValueError(f"{path} is broken, or no .npz file of numbers: save it again with np.savez") from error
     about = {key: arrays[name].item() for key, name in ABOUT.items() if name in arrays}
     return table_of({name: values for name, values in arrays.items() if values.ndim == 1}, **about)

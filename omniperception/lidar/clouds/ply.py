@@ -92,7 +92,7 @@ def _elements(path: Path, lines: list[list[str]], order: str) -> list[_Element]:
     for line in lines:
         try:
             match line:
-                case ["element", name, count]:
+                case ["element", name, count] if count.isdecimal():
                     elements.append(_Element(name, int(count), []))
                 case ["property", "list", length, kind, name]:
                     made = _Property(name, np.dtype(order + TYPES[kind]), np.dtype(order + TYPES[length]))

@@ -53,22 +53,19 @@ def table_from_message(message: Any) -> PointTable:
         ValueError: The message is cut off, or its fields have no layout.
     """
     order = ">" if message.is_bigendian else "<"
+    height, width, step = message.height, message.width, message.point_step
     names, formats, offsets = [], [], []
-    for field in message.fields:
-        if field.name in PADDING:
-            continue
+    for field in (field for field in message.fields if field.name not in PADDING):
         if field.datatype not in TYPES:
             raise ValueError(f"PointCloud2: field {field.name} is of type {field.datatype}, expected {list(TYPES)}")
-        kind = np.dtype(order + TYPES[field.datatype])
-        names += column_names(field.name, max(field.count, 1))
-        formats += [kind] * max(field.count, 1)
-        offsets += [field.offset + kind.itemsize * k for k in range(max(field.count, 1))]
-    height, width, step = message.height, message.width, message.point_step
-    ends = [offset + kind.itemsize for offset, kind in zip(offsets, formats, strict=True)]
-    if len(set(names)) < len(names) or max(ends, default=0) > step:
-        raise ValueError(
-            f"PointCloud2: fields {', '.join(names)} do not fit into points of {step} bytes, each by itself"
-        )
+        kind, count = np.dtype(order + TYPES[field.datatype]), max(field.count, 1)
+        if field.offset + kind.itemsize * count > step or field.name in names:
+            raise ValueError(
+                f"PointCloud2: field {field.name} is there twice, or ends behind the {step} bytes of a point"
+            )
+        names += column_names(field.name, count)
+        formats += [kind] * count
+        offsets += [field.offset + kind.itemsize * k for k in range(count)]
     row_step = message.row_step if height > 1 and message.row_step > width * step else width * step
     data, needed = bytes(message.data), (height - 1) * row_step + width * step if height and width else 0
     if len(data) < needed:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from omniperception.common import custom_msg
@@ -17,7 +17,7 @@ TOPIC = "/points"
 def read(path: Path, topic: str | None) -> Iterator[PointTable]:
     """The clouds of a topic, in the order of the recording."""
     recording = Recording(path)
-    for message in recording.messages([_chosen(path, recording.topics, topic)]):
+    for message in recording.messages([_chosen(recording, topic)]):
         yield _table(message)
 
 
@@ -28,8 +28,9 @@ def _table(message: Message) -> PointTable:
     return PointTable(given.points, given.frame, 1e-9 * given.stamp_ns)
 
 
-def _chosen(path: Path, topics: Mapping[str, str], topic: str | None) -> str:
+def _chosen(recording: Recording, topic: str | None) -> str:
     """The topic to read among those with point clouds."""
+    path, topics, missing = recording.path, recording.topics, recording.missing
     of_clouds = [name for name, kind in topics.items() if kind == MESSAGE or custom_msg.KIND.fullmatch(kind)]
     if topic is None and len(of_clouds) == 1:
         return of_clouds[0]
@@ -38,10 +39,10 @@ def _chosen(path: Path, topics: Mapping[str, str], topic: str | None) -> str:
     if not of_clouds:
         there = ", ".join(f"{name} ({kind})" for name, kind in topics.items()) or "none"
         raise ValueError(
-            f"{path} has no topic of type {MESSAGE} or Livox's CustomMsg with messages; its topics: {there}"
+            f"{path} has no topic of type {MESSAGE} or Livox's CustomMsg with messages; its topics: {there}{missing}"
         )
     asked = "" if topic is None else f"{topic} is none of them; "
-    raise ValueError(f"{path} has topics {', '.join(of_clouds)} with clouds; {asked}name one with topic=...")
+    raise ValueError(f"{path} has topics {', '.join(of_clouds)} with clouds; {asked}name one with topic=...{missing}")
 
 
 def write(path: Path, tables: Sequence[PointTable]) -> None:
