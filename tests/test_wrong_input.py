@@ -92,7 +92,7 @@ LINES = [
     ("train seed=abc", "seed=abc must be a whole number"),
     ("train num_envs=2.5", "num_envs=2.5 must be a whole number"),
     ("train num_envs=true", "num_envs=true must be a whole number"),
-    ("train init=3", "init=3 must be a run directory, a list of them, or null"),
+    ("train init=3", "init=3 does not exist; give a run directory or init=latest"),
     ("train ppo.learning_rate=fast", "ppo.learning_rate=fast must be a number"),
     ("train ppo.hidden_dims=64", "ppo.hidden_dims=64"),
     ("train ppo.hidden_dims=[a]", "ppo.hidden_dims=[a]"),

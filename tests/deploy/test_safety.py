@@ -338,7 +338,7 @@ class TestFramesInPart:
         assert not robot.safety.counts and not caplog.records
 
     def test_it_does_not_go_where_nobody_looked_and_says_so_once(self, caplog):
-        """100 degrees ahead are lost: commands into it are 0 from the second frame on, after 0.1 s; back and turns stay."""
+        """100 degrees ahead are lost: commands there are 0 from the second frame on, after 0.1 s; others stay."""
         robot, kept = self.robot(), abs(self.azimuth) > 45
         self.walk(robot, [1.0, 0.0, 0.5], self.azimuth < 999, 1)
         fed = self.walk(robot, [1.0, 0.0, 0.5], kept)

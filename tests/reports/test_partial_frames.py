@@ -113,7 +113,7 @@ def dome(step_deg=3.0):
 
 class TestCoverage:
     def test_flat_ground_says_what_is_normal(self):
-        """A dome 0.5 m above the ground sees it within 2 m from 14.5 degrees down on: 13 bins, from -12 down; half are 7."""
+        """A dome 0.5 m above the ground sees it within 2 m from 14.5 degrees down on: 13 bins; half of them are 7."""
         rays, _, _ = dome()
         level = torch.tensor([1.0, 0.0, 0.0, 0.0])
         assert least_bins(rays, level, 0.5, 2.0).tolist() == [7] * NUM_SECTORS
