@@ -608,7 +608,7 @@ def test_a_link_without_inertia_is_among_the_guesses(tmp_path, capsys):
     before, link, after = text.partition('<link name="left_front_femur">')
     path = tmp_path / "spider.urdf"
     path.write_text(before + link + after.partition("</inertial>")[2])
-    main(["robot-new", str(path), f"out={tmp_path / "robot"}"])
+    main(["robot-new", str(path), f"out={tmp_path / 'robot'}"])
     (said,) = [line for line in capsys.readouterr().out.splitlines() if line.split()[:1] == ["masses"]]
     foot = 1000.0 * 4 / 3 * np.pi * 0.02**3
     assert (
