@@ -147,7 +147,7 @@ def test_an_arm_says_more_than_its_study_and_the_command_line_more_than_both(tmp
     ablation = Ablation(replace(STUDY, arms=arms, overrides=shared), tmp_path, ("ppo.gamma=0.99",))
     first, then = (_training(ablation, arm, "fps_gru") for arm in arms)
     settings = [text for text in then if text.startswith(("ppo.", "init="))]
-    begins = f"init='{tmp_path}/first/fps_gru/seed${{seed}}'"
+    begins = f'init="{tmp_path}/first/fps_gru/seed${{seed}}"'
     assert sorted(settings) == [begins, "ppo.clip_param=0.3", "ppo.gamma=0.99", "ppo.lam=0.9"]
     assert "init=pretrained/gait" in first and "ppo.lam=0.8" in first
     check_trainings(ablation)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import mujoco
 import numpy as np
+
+from omniperception.scene.urdf_check import check_urdf, expanding
 
 FRAME = "frame:"
 """Prefix of the sites that mark the frames of fixed links, which are still found when they are fused into others."""
@@ -50,15 +53,22 @@ def read_robot(path: Path) -> mujoco.MjSpec:
 
 def parse(path: Path) -> mujoco.MjSpec:
     """Everything that a file says. A URDF's links keep their visual shapes; its fixed joints fuse them."""
+    content = path.read_bytes()
     try:
-        root = ElementTree.parse(path).getroot()
+        declared = content.lstrip().startswith(b"<?xml")  # after what precedes it, too
+        root = ElementTree.fromstring(content.lstrip() if declared else content)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"robot.file={path} {_no_xml(content, error, path)}") from None
+    for element in root.iter():  # MuJoCo knows no namespaces
+        own, _, name = str(element.tag).rpartition("}")
+        element.tag = element.tag if "xacro" in own else name
+    try:
         if root.tag == "robot":
             return _parse_urdf(root, path)
+        _check_mjcf(root, content, path)
         spec = mujoco.MjSpec.from_file(str(path))
         _check_written_ranges(root, path)  # later, so that what is no number has been told by MuJoCo
         return spec
-    except ElementTree.ParseError as error:
-        raise ValueError(f"robot.file={path} is not XML: {error}") from None
     except ValueError as error:
         raise _of(path, error) from None
 
@@ -192,17 +202,48 @@ def rigid_geoms(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:
 
 
 def _of(path: str | Path, error: ValueError) -> ValueError:
-    text = " ".join(str(error).split())
+    """What MuJoCo says, with the file's name and what to do."""
+    text = " ".join(str(error).split()).partition(" The static bodies of the spec")[0]
     if text.startswith("robot."):
         return error
-    hint = ""
-    if "mass and inertia of moving bodies" in text:
-        hint = "; give that link a mass and an inertia (<inertial>), or fix its joint"
-    elif "could not open" in text.lower() or "Error opening file" in text:
-        hint = "; put the mesh where the file says, or name another place there"
-    elif "repeated name" in text:
-        hint = "; rename one of the two"
-    return ValueError(f"robot.file={path}: {text}{hint}")
+    hint = next((f"; {hint}" for phrase, hint in _HINTS.items() if re.search(phrase, text, re.IGNORECASE)), "")
+    text = _ELEMENT.sub(lambda at: f" ({at['name'] or '<' + (at['tag'] or '') + '>'}{at['line'] or ''})", text)
+    return ValueError(f"robot.file={path}: {_HEAD.sub('', text)}{hint}")
+
+
+_HEAD = re.compile("^(XML )?Error: |Schema violation: ")
+_ELEMENT = re.compile(r" Element (name '(?P<name>[^']*)', id \d+|'(?P<tag>[^']*)')(?P<line>, line \d+)?")
+_HINTS = {
+    "mass and inertia of moving bodies": "give that link a mass and an inertia (<inertial>), or fix its joint",
+    "Element 'include'": "put that file there, or take <include> out",
+    "could not open|Error opening file": "put the mesh where the file says, or name another place there",
+    "repeated name": "rename one of the two",
+    "bad format|enough data|too much data": "give numbers, as many as belong there, with spaces between",
+    "must be positive": "give it a size, or take it out",
+    "inertia must": "give that link the inertia of a body, or take its <inertial> out",
+}
+"""What to do, by what MuJoCo says."""
+
+
+def _no_xml(content: bytes, error: ElementTree.ParseError, path: Path) -> str:
+    """Why a file is no XML, and what to do."""
+    line, column = error.position
+    if content.startswith(b"version https://git-lfs"):
+        return "is a pointer of Git LFS to the file; fetch it: git lfs pull"
+    if "prefix" in str(error) and b"<xacro:" in content:
+        return f"is xacro; {expanding(path)}"
+    if not _is_utf8(content):
+        return f"is not UTF-8 (line {line}); save it as UTF-8, or have its first line say its encoding"
+    ends = ": it ends too early" if "no element" in str(error) else ""
+    return f"is not XML{ends} (line {line}, column {column}); give an MJCF or a URDF"
+
+
+def _is_utf8(content: bytes) -> bool:
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 # --- MJCF and URDF ----------------------------------------------------------------------------------------------------
@@ -232,7 +273,7 @@ def _check(spec: mujoco.MjSpec, path: Path) -> None:
             )
     for joint in spec.joints:
         low, high = joint.range
-        if low > high or (low == high != 0):
+        if not (low < high or low == high == 0) or not math.isfinite(high - low):
             raise ValueError(
                 f"robot.file={path}: joint {joint.name} has a range from {low:g} to {high:g}; give it a low and a high"
                 " end, or take it out"
@@ -244,6 +285,20 @@ def _check(spec: mujoco.MjSpec, path: Path) -> None:
             f"robot.file={path}: no body floats (bodies with a free joint: none); put <freejoint/> into the body of the"
             f" base: {roots}"
         )
+
+
+def _check_mjcf(root: ElementTree.Element, content: bytes, path: Path) -> None:
+    """Refuses what MuJoCo cannot read, and numbers that are none, with which it goes on."""
+    if root.tag != "mujoco":
+        raise ValueError(f"its root is <{root.tag}>; give an MJCF, <mujoco>, or a URDF, <robot>")
+    if path.suffix != ".xml":
+        raise ValueError(f"MuJoCo reads an MJCF from names that end in .xml; call it {path.stem}.xml")
+    if not _is_utf8(content):
+        raise ValueError("it is not UTF-8, as MuJoCo reads it; save it as UTF-8")
+    for element in root.iter():
+        for key, text in element.items():
+            if key != "name" and "nan" in text.lower().split():
+                raise ValueError(f'<{element.tag}> {element.get("name", "")} has {key}="{text}"; give numbers')
 
 
 def _check_written_ranges(root: ElementTree.Element, path: Path) -> None:
@@ -288,6 +343,7 @@ def _name(stem: str, things: Iterable, taken: set[str] | None = None) -> None:
 
 def _parse_urdf(robot: ElementTree.Element, path: Path) -> mujoco.MjSpec:
     """A URDF whose meshes are found, whose visual shapes stay and whose root link floats."""
+    check_urdf(robot, path)
     _check_ranges(robot, path)
     _drop_unreadable_visuals(robot)
     for mesh in robot.iter("mesh"):
