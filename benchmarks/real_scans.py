@@ -106,7 +106,13 @@ def _ouster(path: Path) -> Iterator[PointTable]:
         from ouster.sdk import core, open_source
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"{path} needs ouster-sdk: pip install 'ouster-sdk>=1'", name=error.name) from None
-    source = open_source(str(path))
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist")
+    try:
+        source = open_source(str(path))
+    except Exception as error:  # its errors have no common class
+        need = "the sensor's .json of the same name beside it" if path.suffix == ".pcap" else "a whole recording"
+        raise ValueError(f"{path} cannot be opened: {path.suffix} needs {need}") from error
     info = source.sensor_info[0]
     place = core.XYZLut(info)
     for scans in source:

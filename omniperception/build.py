@@ -18,6 +18,7 @@ from omniperception import config as configs
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET
 from omniperception.common.errors import DoesNotFit
 from omniperception.common.provenance import made_at
+from omniperception.common.shell import command_line
 from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
@@ -34,7 +35,7 @@ from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.memory import check_fits
 from omniperception.scene import Mount, RobotConfig, SteppingConfig
 from omniperception.scene.held_out import held_out
-from omniperception.schema import ANYTHING, make, types_of
+from omniperception.schema import ANYTHING, make, types_of, words_of
 
 if TYPE_CHECKING:
     from omniperception.env.sensing import SensorConfig
@@ -263,16 +264,22 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
         raise ConfigError(str(error)) from error
 
 
-def check_split(run: RunConfig, what: str) -> None:
+def check_split(run: RunConfig, what: str, run_dir: Path | None = None) -> None:
     """Refuses to show or train on obstacles of the test split, by which nothing may be chosen.
+
+    Args:
+        run: the configuration.
+        what: would see them.
+        run_dir: of a run that can be evaluated instead; None: the newest.
 
     Raises:
         ConfigError: it has them.
     """
     if run.env.obstacles.split != "dev":
+        line = command_line("evaluate", "split=test", *(words_of(run_dir, run.composed) if run_dir else ()))
         raise ConfigError(
-            f"obstacles.split={run.env.obstacles.split} is for reports, by evaluate split=test, and no {what} may see"
-            " it; use obstacles.split=dev"
+            f"obstacles.split={run.env.obstacles.split} is for reports, and no {what} may see it; use"
+            f" obstacles.split=dev, or for a report: {line}"
         )
 
 

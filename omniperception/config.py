@@ -25,6 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 from omniperception.common.checkpoints import list_checkpoints
 from omniperception.common.errors import ConfigError, UnknownKey, one_line, suggest
 from omniperception.common.files import write_whole
+from omniperception.common.shell import command_line
 
 _SHIPPED = Path(__file__).resolve().parent / "conf"
 CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"
@@ -283,7 +284,7 @@ def _split(overrides: Sequence[Override], folders: Sequence[Path]) -> tuple[list
     for override in overrides:
         group = override.key_or_group
         if group not in (SUITES, STUDIES) and presets(group, folders):
-            _check_preset(override, presets(group, folders))
+            _check_preset(override, folders)
             chosen.append(override)
         elif group != "hydra.searchpath":
             (chosen if override.is_hydra_override() else values).append(override)
@@ -319,21 +320,29 @@ def _chooses_none(override: Override) -> bool:
     return override.value() is None and override.key_or_group in OPTIONAL_GROUPS
 
 
-def _check_preset(override: Override, known: Sequence[str]) -> None:
-    """Refuses a preset that does not exist."""
+def _check_preset(override: Override, folders: Sequence[Path]) -> None:
+    """Refuses a preset that does not exist, or that would hide the user's own of the same name."""
     value, group = override.value(), override.key_or_group
+    known = presets(group, folders)
     if _chooses_none(override):
         return
     for name in value if isinstance(value, list) and value else [value]:
         if override.is_delete() or not isinstance(name, str):
             raise ConfigError(f"{override.input_line}: {group} names a preset; known: {', '.join(known)}")
         if name not in known:
-            own = (
-                "; presets of your own are found with --config-dir conf"
-                if Path("conf", group, f"{name}.yaml").is_file()
-                else ""
-            )
-            raise ConfigError(f"{group}={name} is unknown; {suggest(name, known, and_all=True)}{own}")
+            raise ConfigError(f"{group}={name} is unknown; {suggest(name, known, and_all=True)}{_own(group, name)}")
+        shipped, *others = (folder / group / f"{name}.yaml" for folder in (CONFIG_DIR, *folders))
+        for own in others:
+            if shipped.is_file() and own.is_file() and own.read_bytes() != shipped.read_bytes():
+                raise ConfigError(
+                    f"{group}={name} comes with the package and would hide {own}; give yours another name"
+                )
+
+
+def _own(group: str, name: str) -> str:
+    """What finds a preset of the user's own, where it lies in conf/ of the working directory; else nothing."""
+    found = Path("conf", group, f"{name}.yaml").is_file()
+    return "; presets of your own are found with --config-dir conf" if found else ""
 
 
 def search_path(overrides: Sequence[Override | str], config: DictConfig | None = None) -> list[Path]:
@@ -390,7 +399,7 @@ def listed(folder: str, name: str, folders: Sequence[Path] = ()) -> Path:
     """
     known = presets(folder, folders)
     if name not in known:
-        raise ConfigError(f"{folder}={name} is unknown; {suggest(name, known)}")
+        raise ConfigError(f"{folder}={name} is unknown; {suggest(name, known)}{_own(folder, name)}")
     paths = (parent / folder / f"{name}.yaml" for parent in (*folders, CONFIG_DIR))
     return next(path for path in paths if path.is_file())
 
@@ -455,10 +464,13 @@ def is_begun(run_dir: Path, composed: dict) -> bool:
     if not path.is_file() or not list_checkpoints(run_dir):
         return False
     read(run_dir)  # a damaged one is refused
-    if yaml.safe_load(path.read_text()) != yaml.safe_load(yaml.safe_dump(composed)):
+    saved = yaml.safe_load(path.read_text())
+    if saved != yaml.safe_load(yaml.safe_dump(composed)):
+        from omniperception.schema import words_of  # brings PyTorch, which what lists runs does without
+
+        line = command_line("train", *words_of(run_dir, saved))
         raise ConfigError(
-            f"{run_dir} holds a run of another configuration; go on with it by train run={run_dir}, or choose"
-            " another hydra.run.dir"
+            f"{run_dir} holds a run of another configuration; choose another hydra.run.dir, or go on with it: {line}"
         )
     return True
 

@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -187,7 +188,7 @@ def look_up(kind: Kind, name: str, key: str, trust: Sequence[str] | None = ()) -
     if trust is not ANYTHING and not any(name.startswith(f"{prefix}.") for prefix in trust):
         raise ConfigError(
             f"{key}={name} is not built: a run's file names it, and it is outside of this package; if you trust it, add"
-            f" trust={name.partition('.')[0]}"
+            f" trust={','.join((*trust, name.partition('.')[0]))}"
         )
     return _imported(name, key)
 
@@ -223,6 +224,26 @@ def _reward(kind: Kind, target: Callable, values: dict[str, object], key: str, t
 
 def _bound(target: Callable, keywords: dict[str, Any]) -> Callable:
     return partial(target, **keywords) if keywords else target
+
+
+def packages_of_own(composed: Mapping[str, Any], key: str = "") -> set[str]:
+    """Packages of the user's own that a configuration names, as `trust` takes them."""
+    found = set()
+    for name, value in composed.items():
+        path = f"{key}.{name}" if key else str(name)
+        if isinstance(value, Mapping):
+            kind = _kind(path)
+            named = value.get(kind.tag) if kind else None
+            if kind and isinstance(named, str) and "." in named and named not in _names(kind).values():
+                found.add(named.partition(".")[0])
+            found |= packages_of_own(value, path)
+    return found
+
+
+def words_of(run_dir: Path, composed: Mapping[str, Any]) -> list[str]:
+    """`run=` of a command line that reads this run, with the `trust=` that its configuration needs."""
+    own = sorted(packages_of_own(composed))
+    return [f"run={run_dir}", *([f"trust={','.join(own)}"] if own else [])]
 
 
 def _kind(key: str) -> Kind | None:

@@ -12,6 +12,26 @@ BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
 """Overrides of a run without LiDAR."""
 
 
+def pytest_configure(config):
+    config.option.randomly_reset_seed = False  # the order is drawn, numbers are the same in any: see below
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    build.seed_everything(0)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_call(item):
+    build.seed_everything(0)
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    seed = getattr(config.option, "randomly_seed", None)  # of pytest-randomly
+    if seed is not None:
+        terminalreporter.line(f'the order was drawn; the same again: make test ARGS="--randomly-seed={seed}"')
+
+
 @pytest.fixture(scope="session")
 def make_env():
     """Builds a real environment from overrides on the command line; `blind=True` leaves the LiDAR out."""

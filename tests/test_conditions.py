@@ -1,4 +1,4 @@
-"""The three conditions: their frozen values, how they are chosen, and what a run records."""
+"""The conditions: their frozen values, how they are chosen, and what a run records."""
 
 from dataclasses import asdict
 
@@ -39,6 +39,7 @@ NOTHING = {
     "joint_vel_noise": None,
     "frames_lost": None,
     "frames_late_s": None,
+    "partial_frames": None,
     "pushes": None,
     "curriculum": None,
 }
@@ -71,7 +72,16 @@ ROBOT = PAPER | {
     "frames_late_s": (0.0, 0.1),
     "pushes": {"every_s": (5.0, 10.0), "speed": 0.5},
 }
-FROZEN = {"ideal": (1, NOTHING), "paper": (2, PAPER), "robot": (2, ROBOT)}
+FAULTS = ROBOT | {
+    "partial_frames": {
+        "every_s": (2.0, 6.0),
+        "lasts_s": (0.2, 2.0),
+        "kinds": ("sector", "thin", "slice", "wedge"),
+        "width_deg": (40.0, 180.0),
+        "keep": 0.1,
+    }
+}
+FROZEN = {"ideal": (1, NOTHING), "paper": (2, PAPER), "robot": (2, ROBOT), "faults": (1, FAULTS)}
 """Version and values of each condition. Results under one name and version are compared with each other."""
 
 

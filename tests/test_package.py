@@ -116,9 +116,9 @@ def test_the_wheel_trains_and_plays_in_an_empty_folder(tmp_path):
 @pytest.mark.parametrize(
     ("modules", "use", "extra"),
     [
-        (("trimesh",), lambda: TriangleMesh.from_file("rock.stl"), "meshes"),
+        (("trimesh",), lambda: TriangleMesh.from_file("rock.glb"), "meshes"),
         (("mujoco_lidar",), lambda: mid360("table"), "tables"),
-        (("matplotlib", "matplotlib.figure"), lambda: new_figure(1.0, 1.0), "plots"),
+        (("matplotlib",), lambda: new_figure(1.0, 1.0), "plots"),
     ],
 )
 def test_a_missing_library_names_its_extra(monkeypatch, modules, use, extra):

@@ -282,7 +282,7 @@ def test_a_robot_that_was_not_fetched_is_one_line(tmp_path, monkeypatch, capsys)
     with pytest.raises(SystemExit, match="2"):
         main(["robot-check", "g1"])
     error = capsys.readouterr().err
-    assert "run: omniperception robot-fetch" in error and error.count("\n") == 1
+    assert "omniperception robot-fetch" in error and error.count("\n") == 1
 
 
 def test_the_command_leaves_what_is_there(package, monkeypatch, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,6 +13,7 @@ from pathlib import Path
 from benchmarks.harness.pareto import Choice, Study
 from benchmarks.harness.timing import paired_timings
 from omniperception import build, config
+from omniperception.common.shell import command_line
 from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.env import OmniEnv
@@ -27,6 +29,8 @@ COST = "CPU time of a control step, exported (us)"
 FAILED = "trials without success or with a touch (%)"
 RECORDED = 50
 """Control steps whose readings are used for timing, a multiple of a frame's."""
+AS_IT_STANDS = re.compile(r"dev-ideal-.*-run-(?P<trials>\d+)\.json")
+"""Files of `evaluate` without overrides, a hash of which would stand before the number of trials."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +63,13 @@ class TrainedRun:
 
     def scenarios(self) -> dict[str, Episodes]:
         """What scripts/evaluate.py measured of the run's own policy as it stands, on split=dev, by world."""
-        files = sorted((self.path / EVALUATION).glob("dev-ideal-*-run.json"))
-        found = {record.place: record.episodes for path in files for record in read(path)}
+        named = {path: AS_IT_STANDS.fullmatch(path.name) for path in (self.path / EVALUATION).glob("*.json")}
+        files = sorted((int(match["trials"]), path) for path, match in named.items() if match)  # the most trials last
+        found = {record.place: record.episodes for _, path in files for record in read(path)}
         if not found:
             raise config.ConfigError(
-                f"runs: {self.path} has not been evaluated; python scripts/evaluate.py run={self.path} scenario=all"
+                f"runs: {self.path} has not been evaluated; first:"
+                f" {command_line('evaluate', f'run={self.path}', 'scenario=all')}"
             )
         return found
 
@@ -73,7 +79,7 @@ class TrainedRun:
         folder = self.path / EXPORTED
         if not folder.is_dir():
             raise config.ConfigError(
-                f"runs: {self.path} has not been exported; python scripts/export.py run={self.path}"
+                f"runs: {self.path} has not been exported; first: {command_line('export', f'run={self.path}')}"
             )
         return ExportedPolicy.load(folder, safety=None)
 
@@ -123,8 +129,8 @@ def measure(names: Sequence[str], sizes: Sizes, default: str = "") -> Iterator[S
     runs = trained_runs(names or evaluated_runs())
     if not runs:
         raise config.ConfigError(
-            "runs= names no run, and outputs/ has none that is evaluated and exported; python scripts/evaluate.py and"
-            " scripts/export.py prepare one"
+            "runs= names no run, and outputs/ has none that is evaluated and exported; first:"
+            f" {command_line('evaluate', 'scenario=all')}; then: {command_line('export')}"
         )
     reports, facts = {run.name: run.scenarios() for run in runs}, {run.name: run.facts() for run in runs}
     timings = paired_timings({run.name: run.stepper() for run in runs}, sizes.rounds, block_s=sizes.block_s)

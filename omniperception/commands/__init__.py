@@ -44,7 +44,7 @@ EXTRAS = {
     "onnx": "export",
     "onnxruntime": "deploy",
     "cyclonedds": "robot",
-    "trimesh": "meshes",
+    **dict.fromkeys(("collada", "trimesh"), "meshes"),
     "viser": "viewer",
     **{name: name for name in ("mlflow", "trackio", "wandb")},
     **dict.fromkeys(("laspy", "mcap", "mcap_ros2", "pypcd4", "rosbags"), "clouds"),

@@ -88,7 +88,9 @@ def _ablation(name: str, arguments: Arguments, overrides: list[str]) -> Ablation
     if arguments.arms is not None:
         study = _with_arms(study, arguments.arms)
     if arguments.stage == "all" and "exported" in study.policies:
-        raise config.ConfigError("policies=exported: no run is exported yet; train, export, then give stage=evaluate")
+        raise config.ConfigError(
+            "policies=exported: no run is exported yet; give stage=train, export each run, then give stage=evaluate"
+        )
     return Ablation(study, arguments.out or config.OUTPUTS / name, tuple(overrides), arguments.trust)
 
 

@@ -57,7 +57,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     if arguments.viewer == "video":
         refuse_arguments(arguments, (*PAGE, "stop_after_s"), "viewer=video has no page")
     run = build.load_run(run_dir, [*overrides, f"num_envs={num_envs}"])
-    build.check_split(run, "film")
+    build.check_split(run, "film", run_dir)
     trained = build.load_policy(run, run_dir)
     with film(arguments, trained.env, trained.policy, path) as recorder, torch.no_grad():
         observations = trained.env.get_observations()

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from omniperception import build, config
 from omniperception.cli import RESULTS, Command, argument, refuse_arguments, refuse_overrides, trust
-from omniperception.common.figures import PlotsUnavailable, new_figure
+from omniperception.common.figures import PlotsUnavailable, check_figures
 from omniperception.common.tables import markdown
 from omniperception.evaluation import robustness
 from omniperception.evaluation.footfall import COMMANDS, SETTLES_S, SHOWN_S, Footfall, draw_footfall, watch
@@ -63,7 +63,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     run_dir = config.find_run(arguments.run)
     picture = run_dir / FOLDER / f"gait-{arguments.what}.png"
     picture.parent.mkdir(exist_ok=True)
-    new_figure(1.0, 1.0)  # refuses now what would fail after all is measured
+    check_figures()
     if arguments.what == "kicks":
         results = kicked(arguments, run_dir, overrides)
         print(kicks_table(results, arguments.speeds))
@@ -109,7 +109,7 @@ def policy_on_free_ground(arguments: Arguments, run_dir: Path, overrides: list[s
     given = {} if arguments.condition is None else {"condition": arguments.condition}
     own = [f"{key}={value}" for key, value in (OWN[arguments.what] | given).items()]
     run = build.load_run(run_dir, [*own, *overrides], arguments.trust)
-    build.check_split(run, "picture")
+    build.check_split(run, "picture", run_dir)
     calm = replace(run.env.randomization, pushes=None)
     return build.load_policy(
         replace(run, env=replace(run.env, randomization=calm, read_besides=(FOOT_FORCE,))), run_dir

@@ -57,7 +57,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         refuse_arguments(arguments, FILM, "viewer=none films nothing")
     video, stem = arguments.video, file_stem("replay", overrides)
     run = build.load_run(run_dir, overrides, arguments.trust)
-    build.check_split(run, "replay")
+    build.check_split(run, "replay", run_dir)
     if not any(override.startswith("num_envs=") for override in overrides):
         run = replace(run, env=replace(run.env, num_envs=min(run.env.num_envs, arguments.trials)))
     films = arguments.viewer == "video"

@@ -2,7 +2,7 @@
 
     robot policy=exported record=run.mcap ...
     replay-bag run.mcap policy=exported                      # a recording of ours
-    replay-bag bags/walk command=0.5,0,0 points=/livox/lidar # a ROS 2 bag: its folder, or its .db3 file
+    replay-bag bags/walk command=0.5,0,0 points=/livox/lidar # a bag of ROS 2, its folder or a .db3 file, or of ROS 1
 
 A recording needs the robot's joints and the base's orientation (unitree_go LowState, or JointState with a Go2's names
 and Imu), and clouds whose points have times (PointCloud2 or Livox CustomMsg) if the policy sees. Commands are read from
@@ -30,7 +30,7 @@ from omniperception.hardware.replay import draw, replay
 class Arguments:
     """The command's arguments."""
 
-    file: Path = argument(doc=".mcap file, .db3 file, or folder of a ROS 2 bag")
+    file: Path = argument(doc=".mcap, .db3 or .bag file, or folder of a ROS 2 bag")
     policy: Path = argument(Path("exported"), "folder that export has written")
     joints: str | None = argument(
         None, "topic of the joints, LowState or JointState; null: the only one, LowState first"
@@ -47,7 +47,8 @@ def main(arguments: Arguments) -> None:
     recording = arguments.file.resolve()  # a folder may be ".", or have a dot in its name
     path = arguments.out or recording.with_name(f"{recording.name if recording.is_dir() else recording.stem}.png")
     policy = ExportedPolicy.load(arguments.policy)
-    topics = Topics(arguments.joints, arguments.points, arguments.imu, arguments.commands)
+    sees = policy.description.perception is not None and policy.description.lidar is not None
+    topics = Topics(arguments.joints, arguments.points, arguments.imu, arguments.commands, sees)
     replayed = replay(policy, events(arguments.file, topics), _command(arguments.command))
     print(replayed)
     draw(replayed, policy, path)

@@ -5,7 +5,7 @@
 
 They come from the wheel of mjlab 1.6.0 (Apache-2.0), which pip downloads without its dependencies and does not install;
 its SHA-256 is checked. MJCF files, meshes and the licence are unpacked into $XDG_CACHE_HOME/omniperception/robots, or
-~/.cache/omniperception/robots. Then: robot-check g1.
+~/.cache/omniperception/robots. Then: omniperception robot-check g1.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception.cli import Command, argument, refuse_arguments
+from omniperception.common.shell import command_line
 from omniperception.robots.fetch import MJLAB, fetch
 
 
@@ -32,7 +33,8 @@ def main(arguments: Arguments) -> None:
         refuse_arguments(arguments, ("wheel",), f"{MJLAB.folder} is there already, and again=true writes over it")
     folder = MJLAB.folder if there else fetch(MJLAB, arguments.wheel)
     print(f"{'already there' if there else 'written'}: {folder} ({MJLAB.name} {MJLAB.version}, {MJLAB.licence})")
-    print("next: " + ", ".join(f"omniperception robot-check {name}" for name in MJLAB.robots))
+    for name in MJLAB.robots:
+        print(f"next: {command_line('robot-check', name)}")
 
 
 command = Command(main, Arguments, __doc__)

@@ -90,7 +90,7 @@ def world(run_dir: Path, overrides: list[str], trust: Sequence[str] = ()) -> Omn
     if OmegaConf.select(config.read(run_dir), "sim.type") == own["sim"]:  # with settings of the run's
         del own["sim"]
     run = build.load_run(run_dir, [*overrides, *(f"{key}={value}" for key, value in own.items())], trust)
-    build.check_split(run, "trial on the wire")
+    build.check_split(run, "trial on the wire", run_dir)
     return OmniEnv(replace(run.env, full_level=True, trials=True))
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from omniperception.cli import Command, argument
 from omniperception.common.files import write_whole
+from omniperception.common.shell import command_line
 from omniperception.config import ConfigError
 from omniperception.evaluation.tables import rendered
 
@@ -46,7 +47,8 @@ def main(arguments: Arguments) -> None:
             if not arguments.check:
                 write_whole(page, new)
     if arguments.check and different:
-        raise ConfigError(f"{', '.join(different)} differ from the files of results; run tables and commit")
+        again = command_line("tables", f"pages={','.join(map(str, arguments.pages))}", f"data={arguments.data}")
+        raise ConfigError(f"{', '.join(different)} differ from the files of results; commit what this writes: {again}")
     print(f"wrote {', '.join(different)}" if different else "all tables are those of the files of results")
 
 

@@ -33,6 +33,7 @@ from omniperception.common import provenance
 from omniperception.common.checkpoints import checkpoint_path
 from omniperception.common.errors import one_line
 from omniperception.common.files import held
+from omniperception.common.shell import command_line
 from omniperception.learning import (
     CheckpointError,
     RolloutTooSmall,
@@ -44,6 +45,7 @@ from omniperception.learning.log_writers import LoggerError
 from omniperception.learning.ppo import check_rollout
 from omniperception.learning.progress import say
 from omniperception.plan import Plan, Watch
+from omniperception.schema import words_of
 
 ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
 _OF_A_BEGINNING = ("seed", "init", "ppo.critic_warmup", "ppo.init_std", "ppo.start_std")
@@ -224,7 +226,8 @@ def learn(
             runner.step_hooks.append(videos.step)
             runner.end_hooks.append(videos.close)
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
-    report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; python play.py run={run_dir}")
+    play = command_line("play", *words_of(run_dir, run.composed))
+    report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; next: {play}")
     distributed.disconnect()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,16 +16,26 @@ class PlotsUnavailable(ImportError):
     """matplotlib is not installed."""
 
 
+def check_figures() -> None:
+    """Refuses at once what would fail after all is measured; imports nothing, since matplotlib's first import on a
+    machine looks through its fonts for seconds.
+
+    Raises:
+        PlotsUnavailable: matplotlib is not installed.
+    """
+    if find_spec("matplotlib") is None:
+        raise PlotsUnavailable("pictures need matplotlib: pip install 'omniperception[plots]'")
+
+
 def new_figure(width: float, height: float) -> Figure:
     """A figure of a given size in inches that is drawn to a file only.
 
     Raises:
         PlotsUnavailable: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise PlotsUnavailable("pictures need matplotlib: pip install 'omniperception[plots]'") from None
+    check_figures()
+    from matplotlib.figure import Figure
+
     return Figure(figsize=(width, height), layout="constrained")
 
 

@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
+from omniperception.common.coverage import NUM_SECTORS
 from omniperception.common.errors import naming
+from omniperception.common.shell import command_line
 
 FORMAT = "omniperception-policy"
-VERSION = 7
+VERSION = 8
 FILE = "policy.json"
 FINGERPRINT = "omniperception-description"
 """Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
@@ -19,6 +21,12 @@ FINGERPRINT = "omniperception-description"
 
 class DeployError(ValueError):
     """An exported policy cannot be read or was given something else than it expects; the message is one line."""
+
+
+def export_line(folder: Path) -> str:
+    """The command that writes an exported policy there: of the run that the folder lies in, or of the newest."""
+    of_run = [f"run={folder.parent}"] if (folder.parent / "config.yaml").is_file() else []
+    return command_line("export", *of_run, f"out={folder}")
 
 
 @dataclass(frozen=True)
@@ -129,6 +137,7 @@ class Lidar:
         num_rays: rays of a frame that training used.
         points_per_frame: points that the device measures in a frame.
         keep_every: training used every keep_every-th point of a frame; None where it chose otherwise.
+        least_bins: answered bins of elevation that cover each azimuth sector, see `coverage`; 0: it always counts.
         carried_by: the joints that turn the link that carries it against the base; none: the base carries it.
     """
 
@@ -140,6 +149,7 @@ class Lidar:
     num_rays: int
     points_per_frame: int
     keep_every: int | None
+    least_bins: Sequence[int] = (0,) * NUM_SECTORS
     carried_by: Sequence[Turn] = ()
 
 
@@ -243,7 +253,7 @@ class Description:
         """Read policy.json from a folder."""
         path = Path(folder) / FILE
         if not path.is_file():
-            raise DeployError(f"{folder} holds no exported policy ({FILE}); write it: scripts/export.py run=...")
+            raise DeployError(f"{folder} holds no exported policy ({FILE}); write it: {export_line(folder)}")
         try:
             content = json.loads(path.read_text())
         except ValueError as error:

@@ -42,7 +42,7 @@ from omniperception.deploy.description import (
 from omniperception.env.env import MAX_ACTION, OmniEnv
 from omniperception.env.mdp import observations
 from omniperception.env.mdp.commands import VelocityCommandConfig
-from omniperception.env.sensing import SensorConfig
+from omniperception.env.sensing import SensorConfig, least_bins_of
 from omniperception.learning.checkpoint import load_checkpoint
 from omniperception.learning.config import PerceptionConfig
 from omniperception.learning.estimator import estimates_velocity
@@ -233,6 +233,7 @@ def _lidar(sensor: SensorConfig, robot: RobotConfig) -> Lidar:
         num_rays=sensor.num_rays,
         points_per_frame=pattern.points_per_frame(sensor.period_s),
         keep_every=pattern.stride(sensor.period_s, sensor.num_rays) if every_kth else None,
+        least_bins=least_bins_of(sensor, robot).tolist(),
         carried_by=() if sensor.mount_body is None else _turns(robot, sensor.mount_body),
     )
 

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from omniperception.deploy.description import FILE, FINGERPRINT, DeployError, Description, Group, Lidar, checksum
+from omniperception.deploy.description import (
+    FILE,
+    FINGERPRINT,
+    DeployError,
+    Description,
+    Group,
+    Lidar,
+    checksum,
+    export_line,
+)
 from omniperception.deploy.odometry import Odometry
 from omniperception.deploy.safety import Safety, SafetyConfig, SafetyStop, Sight
 from omniperception.deploy.sampling import Attitude, CloudSampler, down, make_sampler
@@ -56,9 +65,9 @@ class ExportedPolicy:
     finite or zero are misses, and so are points nearer or farther than training's sensor measures.
 
     Unless `safety` is None, commands are limited to the ranges of training and targets to the limits and a rate of the
-    joints;
-    without good frames the robot slows down and stands, blind; and :meth:`step` raises :class:`SafetyStop` when it
-    leans too far, a joint or torque is where it cannot be, or a number is not finite.
+    joints; without good frames the robot slows down and stands, blind, and it does not go where frames lack points; and
+    :meth:`step` raises :class:`SafetyStop` when it leans too far, a joint or torque is where it cannot be, or a number
+    is not finite.
 
     Attributes:
         description: names, scales and rates.
@@ -97,7 +106,7 @@ class ExportedPolicy:
     def load(
         cls, folder: str | Path, num_threads: int = 1, safety: SafetyConfig | None = DEFAULT_SAFETY
     ) -> ExportedPolicy:
-        """The policy in a folder that `scripts/export.py` wrote.
+        """The policy in a folder that `omniperception export` wrote.
 
         Args:
             folder: with policy.json and the ONNX file.
@@ -113,7 +122,7 @@ class ExportedPolicy:
                 "running an exported policy needs onnxruntime: pip install 'omniperception[deploy]'"
             ) from None
         if "onnx" not in description.files or not (folder / description.files["onnx"]).is_file():
-            raise DeployError(f"{folder} has no ONNX file; write it: python scripts/export.py run=... formats=onnx")
+            raise DeployError(f"{folder} has no ONNX file; write it: {export_line(folder)}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = num_threads, 1
         path = folder / description.files["onnx"]
@@ -203,9 +212,9 @@ class ExportedPolicy:
         """
         lidar, sampler, frames = self._perception()
         points = _without_nearer(_cloud(points), lidar.min_range)
-        if self.safety is not None and not self.safety.frame_is_good(points):
-            return self.miss()
         attitude = Attitude(self._carrier_quat(lidar, base_quat, joint_pos), lidar.mount_pos, lidar.mount_quat)
+        if self.safety is not None and not self.safety.frame_is_good(points, attitude):
+            return self.miss()
         frames[:-1] = frames[1:]
         frames[-1, : sampler.num_points] = sampler(points, attitude)
         if self._odometry is not None:
@@ -236,6 +245,8 @@ class ExportedPolicy:
         Training does the same (`randomization.frames_lost`); the motion of the next frame spans both periods.
         """
         frames = self._perception()[2]
+        if self.safety is not None:
+            self.safety.miss_frame()
         if not self.frame_count:
             return
         frames[:-1] = frames[1:]

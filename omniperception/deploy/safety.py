@@ -11,7 +11,9 @@ from enum import StrEnum
 
 import numpy as np
 
+from omniperception.deploy.coverage import Coverage
 from omniperception.deploy.description import DeployError, Description
+from omniperception.deploy.sampling import Attitude
 
 log = logging.getLogger("omniperception.deploy")
 
@@ -67,6 +69,7 @@ class Safety:
         config: the limits.
         counts: how often each limit has acted since the start, by name.
         sight: whether frames are fresh; always for a blind policy.
+        coverage: directions that the newest frames cover; None for a blind policy.
     """
 
     def __init__(self, description: Description, config: SafetyConfig) -> None:
@@ -81,6 +84,7 @@ class Safety:
         self._sees = lidar is not None and description.perception is not None
         self._min_hits = config.min_hits * lidar.num_rays if lidar is not None else 0.0
         self._max_range = lidar.max_range if lidar is not None else 0.0
+        self.coverage = Coverage(lidar.least_bins, lidar.max_range) if self._sees and lidar is not None else None
         self.counts: Counter[str] = Counter()
         self.reset()
 
@@ -88,7 +92,9 @@ class Safety:
         """As at the start of an episode; the counts stay."""
         self.sight, self._age, self._pace = Sight.FRESH, 0.0, 1.0
         self._targets: np.ndarray | None = None
-        self._strained = np.zeros(len(self._names), np.int64)
+        self._strained, self._lacks = np.zeros(len(self._names), np.int64), False
+        if self.coverage is not None:
+            self.coverage.reset()
 
     def await_frame(self) -> None:
         """Holds a policy that sees at a command of 0 until a good frame comes; training begins without that wait."""
@@ -96,20 +102,28 @@ class Safety:
             self.sight, self._age, self._pace = Sight.STOPPED, math.inf, 0.0
             log.warning("standing until a good frame comes")
 
-    def frame_is_good(self, points: np.ndarray) -> bool:
-        """Whether a frame (n, 3), m, holds enough hits; counts and names it otherwise."""
+    def frame_is_good(self, points: np.ndarray, attitude: Attitude) -> bool:
+        """Takes in a frame (n, 3), m; whether it holds enough hits. Counts and names it otherwise."""
         square = np.einsum("ij,ij->i", points, points)
         hits = int(np.count_nonzero((square > 0.0) & (square <= self._max_range**2)))
         if hits >= self._min_hits and hits:
             self._age = 0.0
+            if self.coverage is not None:
+                self.coverage.see(points, attitude)
             return True
         self._count(
             logging.WARNING, "frames refused", f"a frame has {hits} hits, at least {self._min_hits:.0f} were expected"
         )
         return False
 
+    def miss_frame(self) -> None:
+        """Takes in that a frame was due and none, or none that is good, came."""
+        if self.coverage is not None:
+            self.coverage.miss()
+
     def limit_command(self, command: np.ndarray) -> np.ndarray:
-        """(3,) the command within training's ranges and 0, slowed down while no good frame comes; once per step.
+        """(3,) the command within training's ranges and 0, slowed down while no good frame comes and where it leads to
+        directions that frames lack; once per step.
 
         To stand is always allowed, also where training's ranges leave 0 out.
         """
@@ -119,7 +133,14 @@ class Safety:
                 logging.INFO, "commands limited", f"command {command.tolist()} is beyond training's: {limited.tolist()}"
             )
         self._look()
-        return limited * np.float32(self._pace)
+        limited = limited * np.float32(self._pace)
+        if self.coverage is None or self.coverage.covered.all():
+            self._lacks = False
+            return limited
+        if not self._lacks:
+            self._lacks = True
+            self._count(logging.WARNING, "frames in part", f"no points from {self.coverage.lacking()}: not going there")
+        return np.concatenate((self.coverage.kept_to_covered(limited[:2]), limited[2:]))
 
     def check_state(self, cos_tilt: float, joint_pos: np.ndarray, joint_vel: np.ndarray) -> None:
         """Raises SafetyStop where the robot has fallen or its joints are where they cannot be.

@@ -150,7 +150,7 @@ class PdSampler(CloudSampler):
 
 
 class ProximitySampler(PdSampler):
-    """Proximal points as above; the distal half as proximities around the levelled base, as in training."""
+    """Proximal points as above; the distal half as proximities around the without_heading base, as in training."""
 
     def __init__(
         self,
@@ -183,7 +183,7 @@ class ProximitySampler(PdSampler):
 
     def _write_distal(self, out: np.ndarray, points: np.ndarray, near: np.ndarray, attitude: Attitude) -> None:
         points = points[~near]
-        level = _levelled(rotation_matrix(attitude.base_quat))
+        level = without_heading(rotation_matrix(attitude.base_quat))
         turn = (level @ rotation_matrix(attitude.mount_quat)).astype(np.float32)
         offset = (level @ np.asarray(attitude.mount_pos, np.float64)).astype(np.float32)
         at = points[np.linalg.norm(points, axis=1) >= np.float32(self.blind)] @ turn.T + offset
@@ -220,7 +220,7 @@ class StandingSampler(CloudSampler):
     def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
         """See :meth:`CloudSampler.__call__`."""
         points = points[self._is_hit(points)]
-        mount, level = rotation_matrix(attitude.mount_quat), _levelled(rotation_matrix(attitude.base_quat))
+        mount, level = rotation_matrix(attitude.mount_quat), without_heading(rotation_matrix(attitude.base_quat))
         sensor = np.asarray(attitude.mount_pos, np.float64)
         in_base = points @ mount.T.astype(np.float32) + sensor.astype(np.float32)
         places, height = standing(in_base, np.linalg.norm(points, axis=1), level, sensor, self.geometry)
@@ -327,7 +327,7 @@ def down(quat: np.ndarray) -> np.ndarray:
     return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1])
 
 
-def _levelled(base: np.ndarray) -> np.ndarray:
+def without_heading(base: np.ndarray) -> np.ndarray:
     """The base's rotation without its heading."""
     yaw = math.atan2(base[1, 0], base[0, 0])
     cos, sin = math.cos(yaw), math.sin(yaw)

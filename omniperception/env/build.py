@@ -90,14 +90,19 @@ def build_avoidance(config: EnvConfig, field: ObstacleField | None, device: torc
 
 
 def build_delivery(config: EnvConfig, random: EnvRandom) -> FrameDelivery | None:
-    """How LiDAR frames come, where they are lost or late."""
-    rows = config.randomization
-    if rows.frames_lost is None and rows.frames_late_s is None:
+    """How LiDAR frames come, where they are lost, late or partial."""
+    rows, sensor = config.randomization, config.lidar
+    if sensor is None or (rows.frames_lost, rows.frames_late_s, rows.partial_frames) == (None, None, None):
         return None
     from omniperception.env.frame_delivery import FrameDelivery
+    from omniperception.env.partial_frames import PartialFrames
 
+    partial, branch = None, random.branch("frames")
+    if rows.partial_frames is not None:
+        spells = random.branch("partial_frames")
+        partial = PartialFrames(rows.partial_frames, sensor.period_s, sensor.num_rays, config.num_envs, spells)
     late_s = None if rows.frames_late_s is None else (rows.frames_late_s[0], rows.frames_late_s[1])
-    return FrameDelivery(rows.frames_lost, late_s, config.sim.control_dt, config.num_envs, random.branch("frames"))
+    return FrameDelivery(rows.frames_lost, late_s, config.sim.control_dt, config.num_envs, branch, partial)
 
 
 LOWEST_BAND = 0.05

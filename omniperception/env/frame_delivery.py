@@ -1,10 +1,11 @@
-"""How LiDAR frames come: some are lost, and what the others show is some time ago."""
+"""How LiDAR frames come: some are lost, some lack points, and what they show is some time ago."""
 
 from __future__ import annotations
 
 import torch
 
 from omniperception.common.random import Branch
+from omniperception.env.partial_frames import PartialFrames
 
 
 class FrameDelivery:
@@ -14,6 +15,7 @@ class FrameDelivery:
         fresh: (num_envs,) bool: whose newest frame came.
         late_steps: (num_envs,) int64 control steps by which the scene that it shows is older than the moment it comes.
         max_late_steps: the largest of them.
+        partial: takes points away; None: all frames are whole.
     """
 
     def __init__(
@@ -23,6 +25,7 @@ class FrameDelivery:
         control_dt: float,
         num_envs: int,
         random: Branch,
+        partial: PartialFrames | None = None,
     ) -> None:
         """
         Args:
@@ -31,7 +34,9 @@ class FrameDelivery:
             control_dt: s.
             num_envs: environments.
             random: streams to draw from, and nobody else.
+            partial: takes points away; None: nothing does.
         """
+        self.partial = partial
         self._lost, (self._low, high) = lost or 0.0, late_s or (0.0, 0.0)
         self._span, self._dt, self._random = high - self._low, control_dt, random
         device = random.counter.device
@@ -43,6 +48,8 @@ class FrameDelivery:
     def reset(self, env_ids: torch.Tensor) -> None:
         """Episodes begin in environments (n,)."""
         self._random.start_episode(env_ids)
+        if self.partial is not None:
+            self.partial.reset(env_ids)
 
     def draw(self) -> None:
         """Draws for the next frame."""
@@ -50,13 +57,18 @@ class FrameDelivery:
         torch.ge(lost, self._lost, out=self.fresh)
         steps = ((self._low + self._span * late) / self._dt).round()
         self.late_steps.copy_(steps.clamp(max=self.max_late_steps))  # float32 rounds half steps anyhow
+        if self.partial is not None:
+            self.partial.draw()
 
     def state_dict(self) -> dict:
-        return {"fresh": self.fresh.clone(), "late_steps": self.late_steps.clone()}
+        partial = None if self.partial is None else self.partial.state_dict()
+        return {"fresh": self.fresh.clone(), "late_steps": self.late_steps.clone(), "partial": partial}
 
     def load_state_dict(self, state: dict) -> None:
         self.fresh.copy_(state["fresh"])
         self.late_steps.copy_(state["late_steps"])
+        if self.partial is not None:
+            self.partial.load_state_dict(state["partial"])
 
 
 class PastPoses:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from omniperception.avoidance.coverage import Coverage, kept_to_covered, least_bins, levelled
 from omniperception.common.launch import constant
 from omniperception.common.rotations import multiply
 from omniperception.common.timing import StageTimer
@@ -27,6 +28,7 @@ from omniperception.lidar import (
     ray_bytes,
 )
 from omniperception.perception import Attitude, Sampler
+from omniperception.scene import RobotConfig
 from omniperception.scene.rays import HitClass, ray_shapes
 from omniperception.sim import Simulator
 
@@ -101,6 +103,7 @@ class LidarSensing:
             sampler.
         frame_count: (num_envs, 1) int64 how many of the newest frames are valid.
         frame_tick: (num_envs, 1) int64 number of the newest frame, the same for all environments.
+        coverage: directions that the newest frames cover; None where frames are always whole, or nobody looks.
         fresh: (num_envs,) bool whose frame came at the newest tick; clouds of the others are not to be looked at.
         unseen: (num_envs, O) int64 frames of the history since a ray last hit each of `obstacles`; None without any.
     """
@@ -188,6 +191,9 @@ class LidarSensing:
         self._delivery = delivery
         self._past = PastPoses(late + 1, n, len(self._bodies), device) if late else None
         self.fresh = torch.ones(n, dtype=torch.bool, device=device) if delivery is None else delivery.fresh
+        self.coverage: Coverage | None = None
+        if delivery is not None and delivery.partial is not None and (sampled or measured):
+            self.coverage = Coverage(n, least_bins_of(config, sim.world.robot).to(device))
         self.tick, self._is_cast = 0, False
         self.frame_count, self.frame_tick = torch.zeros(2, n, 1, dtype=torch.int64, device=device).unbind(0)
         self.frames: torch.Tensor | None = None
@@ -269,11 +275,14 @@ class LidarSensing:
             if self._delivery is not None:
                 self._delivery.draw()
             self.place_bodies()
+            if self.coverage is not None:
+                self.coverage.begin_frame()
         attitude = self._attitude(base_quat)
         slices = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
             with timer.stage("rays"):
                 envs, frame = next(slices)
+                self._lose_points(envs, frame, attitude)
                 if self.unseen is not None:
                     self._note_sightings(envs, frame)
                 for cap, mean in self._distal_range.items():
@@ -309,6 +318,22 @@ class LidarSensing:
             pos, quat = self._past.at(self._delivery.late_steps)
         self.scene.body_pos.copy_(pos)
         self.scene.body_quat.copy_(quat)
+
+    def _lose_points(self, envs: slice, frame: LidarFrame, attitude: torch.Tensor) -> None:
+        """Takes points away from frames that are partial, and notes which directions the rest covers."""
+        if self.coverage is None:
+            return
+        assert self._delivery is not None and self._delivery.partial is not None
+        assert frame.ranges is not None and frame.directions_s is not None
+        self._delivery.partial.take_away(frame.ranges, frame.directions_s, envs)
+        directions_l = levelled(frame.directions_s, attitude[envs], constant(self.config.quat, attitude.device))
+        self.coverage.see(frame.ranges, directions_l, self.fresh[envs], envs)
+
+    def known_to_be_free(self, command: torch.Tensor) -> torch.Tensor:
+        """(num_envs, 3) the commanded v_x, v_y (m/s) and yaw rate (rad/s), slowed down where nobody looked."""
+        if self.coverage is None:
+            return command
+        return torch.cat((kept_to_covered(command[:, :2], self.coverage.covered), command[:, 2:]), 1)
 
     def _note_sightings(self, envs: slice, frame: LidarFrame) -> None:
         assert self.unseen is not None and frame.shape_id is not None
@@ -367,6 +392,7 @@ class LidarSensing:
             "odometry": self.odometry.state_dict() if self.odometry is not None else None,
             "delivery": self._delivery.state_dict() if self._delivery is not None else None,
             "past": self._past.state_dict() if self._past is not None else None,
+            "coverage": self.coverage.state_dict() if self.coverage is not None else None,
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -388,6 +414,8 @@ class LidarSensing:
             self._delivery.load_state_dict(state["delivery"])
         if self._past is not None:
             self._past.load_state_dict(state["past"])
+        if self.coverage is not None:
+            self.coverage.load_state_dict(state["coverage"])
         self._distal_range = {float(key): value.clone() for key, value in state["distal_range"].items()}
 
     def reset(self, env_ids: torch.Tensor, measured: Kinematics, seeds: torch.Tensor | None = None) -> None:
@@ -405,6 +433,8 @@ class LidarSensing:
         if self._past is not None:
             self._past.reset(env_ids, *self._sim.body_poses(self._bodies))
         self.lidar.reset(env_ids, seeds)
+        if self.coverage is not None:
+            self.coverage.reset(env_ids)
         self.frame_count.index_fill_(0, env_ids, 0)
         if self.frames is not None:
             self.frames = self.frames.index_fill(0, env_ids, 0.0)  # observations keep the tensor of before
@@ -436,6 +466,12 @@ class LidarSensing:
             )
             launches.append(launch)
         return launches
+
+
+def least_bins_of(config: SensorConfig, robot: RobotConfig) -> torch.Tensor:
+    """(NUM_SECTORS,) what covers each direction around a sensor, see `least_bins`."""
+    height = robot.height_of(config.mount_body) + config.mount_pos[2]
+    return least_bins(config.scan_pattern().directions_s.cpu(), torch.tensor(config.quat), height, config.max_range)
 
 
 def _outputs(

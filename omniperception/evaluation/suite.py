@@ -20,7 +20,7 @@ from omegaconf import OmegaConf, open_dict
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
 from omniperception.common.errors import check_known, naming, one_line
-from omniperception.common.figures import new_figure
+from omniperception.common.figures import check_figures
 from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
 from omniperception.deploy import ExportedPolicy
@@ -402,7 +402,7 @@ def evaluate(evaluation: Evaluation) -> list[Record]:
         A record for each task.
     """
     if evaluation.plots:
-        new_figure(1.0, 1.0)  # refuses now what would fail after hours
+        check_figures()
     tasks = evaluation.tasks()
     _check_names(tasks)
     ordered = measure_all(tasks)

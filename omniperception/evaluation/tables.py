@@ -21,6 +21,7 @@ from pathlib import Path
 
 import torch
 
+from omniperception.common.shell import command_line
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.records import Record, read, training_of
@@ -72,7 +73,8 @@ def data_file(name: str, data: Path) -> Path:
     """The file of a name: compressed, or not."""
     found = [path for suffix in (".json.gz", ".json") if (path := data / f"{name}{suffix}").is_file()]
     if not found:
-        raise ConfigError(f"{data} has no {name}.json.gz and no {name}.json; evaluate ... out={data / name}.json.gz")
+        line = command_line("evaluate", f"out={data / name}.json.gz")
+        raise ConfigError(f"{data} has no {name}.json.gz and no {name}.json; what writes it: {line}")
     return found[0]
 
 

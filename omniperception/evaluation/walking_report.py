@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from omniperception.common.shell import command_line
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes
@@ -160,5 +161,6 @@ def figures(parts: Sequence[Part]) -> list[str]:
 def _walking(record: Record) -> dict[str, torch.Tensor]:
     walking = record.episodes.walking
     if walking is None:
-        raise ConfigError(f"{record.world}: no figures of a gait; evaluate suite=walking")
+        line = command_line("evaluate", f"run={record.run}", "suite=walking")
+        raise ConfigError(f"{record.world}: no figures of a gait; what measures them: {line}")
     return walking

@@ -1,50 +1,30 @@
-"""Recordings as a robot's messages, in order of time: an .mcap file, or a bag of ROS 2."""
+"""Recordings as a robot's messages, in the order in which they were written: .mcap files, bags of ROS 2 and 1."""
 
 from __future__ import annotations
 
-import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from omniperception.common import custom_msg
+from omniperception.common.recordings import Message, Recording
 from omniperception.deploy.description import DeployError
 from omniperception.deploy.go2 import MOTORS
-from omniperception.hardware.clouds import Points, read_custom_msg, read_point_cloud2
+from omniperception.hardware.clouds import Points, in_one_time, read_custom_msg, read_point_cloud2
 from omniperception.hardware.machine import Mode
 from omniperception.hardware.messages import LOW_STATE
 
-_CLOUDS: dict[str, Callable[[bytes], Points]] = {
-    "sensor_msgs/msg/PointCloud2": read_point_cloud2,
-    "livox_ros_driver2/msg/CustomMsg": read_custom_msg,
-}
+_POINT_CLOUD2, _CUSTOM_MSG = "sensor_msgs/msg/PointCloud2", "livox_ros_driver2/msg/CustomMsg"
 _LOW_STATE, _JOINTS, _IMU = "unitree_go/msg/LowState", "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
 _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
 _MODE, _MODES = "std_msgs/msg/String", tuple(Mode)
 OUTPUTS = "/policy/"
 """Topics that begin so are what a policy has said."""
-
-
-@dataclass(frozen=True)
-class Message:
-    """One of a recording.
-
-    Attributes:
-        topic: its name.
-        kind: its type, such as sensor_msgs/msg/Imu.
-        time_ns: when it was recorded.
-        data: CDR.
-        decode: gives an object with the type's fields.
-    """
-
-    topic: str
-    kind: str
-    time_ns: int
-    data: bytes
-    decode: Callable[[], Any]
 
 
 @dataclass(frozen=True)
@@ -56,12 +36,14 @@ class Topics:
         points: PointCloud2 or Livox CustomMsg.
         imu: of the base; not needed with LowState.
         command: Twist or TwistStamped.
+        sees: whether points are needed.
     """
 
     joints: str | None = None
     points: str | None = None
     imu: str | None = None
     command: str | None = None
+    sees: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,7 +51,7 @@ class Event:
     """What a robot has heard, one of them.
 
     Attributes:
-        time_s: since the recording began.
+        time_s: since the first message that is read.
         state: () LOW_STATE.
         points: of the LiDAR.
         command: (3,) m/s, m/s, rad/s.
@@ -91,105 +73,112 @@ def messages(path: Path) -> Iterator[Message]:
     Raises:
         DeployError: there is none, it cannot be read, or a library is missing.
     """
+    with _one_line(path):
+        yield from Recording(path).messages()
+
+
+@contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    """What is wrong with a recording, as a DeployError."""
     if not path.exists():
         raise DeployError(
-            f"{path} does not exist; an .mcap file, a .db3 file or the folder of a ROS 2 bag was expected"
+            f"{path} does not exist; an .mcap, .db3 or .bag file or the folder of a ROS 2 bag was expected"
         )
-    read = _of_mcap if path.suffix == ".mcap" else _of_bag
     try:
-        yield from read(path)
+        yield
     except ModuleNotFoundError as error:
-        extra = "robot" if path.suffix == ".mcap" else "clouds"
-        raise DeployError(f"{path} needs {error.name}: pip install 'omniperception[{extra}]'") from None
-
-
-def _of_mcap(path: Path) -> Iterator[Message]:
-    import zstandard
-    from mcap.exceptions import EndOfFile, McapError
-    from mcap.reader import NonSeekingReader
-    from mcap_ros2.decoder import DecoderFactory
-
-    factory = DecoderFactory()
-    with path.open("rb") as file:
-        try:
-            for schema, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
-                if schema is not None:
-                    decoder = factory.decoder_for(channel.message_encoding, schema)
-                    data = message.data
-
-                    def decode(decoder: Any = decoder, data: bytes = data) -> Any:
-                        return decoder(data)
-
-                    yield Message(channel.topic, schema.name, message.log_time, data, decode)
-        except (EndOfFile, struct.error):
-            print(f"{path} is cut off, as a killed process leaves it; read up to there", file=sys.stderr)
-        except (McapError, zstandard.ZstdError, RuntimeError) as error:  # RuntimeError: lz4's
-            raise DeployError(f"{path} is not a readable MCAP file: {error}") from None
-
-
-def _of_bag(path: Path) -> Iterator[Message]:
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.typesys import Stores, get_typestore
-
-    folder = path.parent if path.suffix == ".db3" else path
-    try:
-        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
-            if not bag.is2:
-                raise DeployError(f"{path} is a bag of ROS 1; convert it: rosbags-convert --src {path} --dst FOLDER")
-            for connection, time_ns, raw in bag.messages():
-
-                def decode(kind: str = connection.msgtype, raw: bytes = bytes(raw)) -> Any:
-                    return bag.deserialize(raw, kind)
-
-                yield Message(connection.topic, connection.msgtype, time_ns, bytes(raw), decode)
-    except (AnyReaderError, FileNotFoundError) as error:
-        raise DeployError(f"{path} is not a readable bag: {str(error).splitlines()[0]}") from None
+        library = (error.name or "").partition(".")[0]
+        extra = "robot" if library.startswith("mcap") else "clouds"
+        raise DeployError(f"{path} needs {library}: pip install 'omniperception[{extra}]'") from None
+    except ValueError as error:
+        raise DeployError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+    except OSError as error:
+        raise DeployError(f"{path} cannot be read: {error.strerror}") from None
 
 
 def events(path: Path, wanted: Topics) -> Iterator[Event]:
-    """What a robot has heard, in order of the recording.
+    """What a robot has heard, in the order of the recording.
+
+    A message of points that cannot be read, or whose points were measured more than a second apart, is left out, as on
+    the robot; one line on standard error says so.
 
     Raises:
-        DeployError: the recording lacks joints, their positions or velocities, or the base's orientation; or a topic
-            has to be named.
+        DeployError: the recording lacks joints, their positions or velocities, the base's orientation, or points where
+            they are needed; or a topic has to be named.
     """
-    kinds = {message.topic: message.kind for message in messages(path)}
-    inputs = {topic: kind for topic, kind in kinds.items() if not topic.startswith(OUTPUTS)}
-    states = [kind for kind in (_LOW_STATE, _JOINTS) if kind in inputs.values()]
+    with _one_line(path):
+        recording = Recording(path)
+        inputs = {topic: kind for topic, kind in recording.topics.items() if not topic.startswith(OUTPUTS)}
+        try:
+            read = _inputs(path, inputs, wanted)
+        except DeployError as error:
+            raise DeployError(f"{error}{recording.missing}") from None
+        print(
+            f"{path}: " + ", ".join(f"{what} from {topic or 'no topic'}" for what, topic in read.items()),
+            file=sys.stderr,
+        )
+        yield from _events(path, recording, read, wanted.sees)
+
+
+def _inputs(path: Path, topics: dict[str, str], wanted: Topics) -> dict[str, str | None]:
+    """The topic of each input, None where there is none."""
+    states = [kind for kind in (_LOW_STATE, _JOINTS) if kind in topics.values()]
     if not states:
         raise DeployError(f"{path}: joints were expected, a topic of type {_JOINTS} or {_LOW_STATE}; none is there")
-    joints = _chosen(path, inputs, tuple(states if wanted.joints else states[:1]), wanted.joints, "joints")
-    low = joints if joints is not None and inputs[joints] == _LOW_STATE else None
-    imu = None if low else _chosen(path, inputs, (_IMU,), wanted.imu, "imu")
+    joints = _chosen(path, topics, tuple(states if wanted.joints else states[:1]), wanted.joints, "joints")
+    low = joints if joints is not None and topics[joints] == _LOW_STATE else None
+    imu = None if low else _chosen(path, topics, (_IMU,), wanted.imu, "imu")
     if low is None and imu is None:
         raise DeployError(f"{path}: the base's orientation was expected, a topic of type {_IMU}; none is there")
-    points = _chosen(path, inputs, tuple(_CLOUDS), wanted.points, "points")
-    command = _chosen(path, inputs, _TWISTS, wanted.command, "commands")
-    read = {"joints": joints, "orientation": low or imu, "points": points, "commands": command}
-    print(
-        f"{path}: " + ", ".join(f"{what} from {topic or 'no topic'}" for what, topic in read.items()), file=sys.stderr
-    )
+    of_livox = (kind for kind in topics.values() if custom_msg.KIND.fullmatch(kind))
+    clouds = tuple(dict.fromkeys((_POINT_CLOUD2, _CUSTOM_MSG, *of_livox)))
+    points = _chosen(path, topics, clouds, wanted.points, "points")
+    if points is None and wanted.sees:
+        there = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
+        raise DeployError(
+            f"{path}: the policy needs points, a topic of type {_POINT_CLOUD2} or Livox's CustomMsg; there are {there}"
+        )
+    command = _chosen(path, topics, _TWISTS, wanted.command, "commands")
+    return {"joints": joints, "orientation": low or imu, "points": points, "commands": command}
+
+
+def _events(path: Path, recording: Recording, read: dict[str, str | None], sees: bool) -> Iterator[Event]:
     assembled, begin, has_imu = LOW_STATE.zeros(), None, False
-    for message in messages(path):
+    refused: list[str] = []
+    clouds, targets = 0, f"{OUTPUTS}joint_targets"
+    for message in recording.messages([*filter(None, read.values()), "/mode", targets]):
         begin = message.time_ns if begin is None else begin
         now, topic = 1e-9 * (message.time_ns - begin), message.topic
-        if topic == low:
+        if topic == read["joints"] == read["orientation"]:
             yield Event(now, state=LOW_STATE.from_cdr(message.data))
-        elif topic == imu:
+        elif topic == read["orientation"]:
             _take_imu(path, assembled, message.decode())
             has_imu = True
-        elif topic == joints:
+        elif topic == read["joints"]:
             _take_joints(path, assembled, message.decode())
             if has_imu:
                 yield Event(now, state=assembled.copy())
-        elif topic == points:
-            yield Event(now, points=_CLOUDS[message.kind](message.data))
-        elif topic == command:
+        elif topic == read["points"]:
+            clouds += 1
+            try:
+                yield Event(now, points=_points(message))
+            except DeployError as error:
+                refused.append(str(error))
+        elif topic == read["commands"]:
             yield Event(now, command=_command(message.decode()))
         elif topic == "/mode" and message.kind == _MODE and (mode := message.decode().data).partition(":")[0] in _MODES:
             yield Event(now, mode=mode)
-        elif topic == f"{OUTPUTS}joint_targets":
+        elif topic == targets:
             yield Event(now, targets=_in_motors_order(path, message.decode(), "position"))
+    if refused:
+        said = f"{path}: {len(refused)} of {clouds} messages of {read['points']} refused, the first: {refused[0]}"
+        if sees and len(refused) == clouds:
+            raise DeployError(said)
+        print(said, file=sys.stderr)
+
+
+def _points(message: Message) -> Points:
+    return in_one_time((read_point_cloud2 if message.kind == _POINT_CLOUD2 else read_custom_msg)(message.data))
 
 
 def _chosen(path: Path, topics: dict[str, str], kinds: tuple[str, ...], name: str | None, key: str) -> str | None:

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omniperception.common import point_fields
+from omniperception.common import custom_msg, point_fields
 from omniperception.deploy.description import DeployError
 from omniperception.deploy.sampling import rotation_matrix
+from omniperception.hardware.saying import say
+from omniperception.hardware.sensor_clock import BACK_NS, SensorClock
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,18 @@ def without_noise(points: np.ndarray, tags: np.ndarray) -> np.ndarray:
     return np.where(noise[:, None], np.float32(0.0), points)
 
 
+def in_one_time(message: Points) -> Points:
+    """The message, whose points were measured within a second of each other; a DeployError otherwise."""
+    span_s = 1e-9 * float(np.ptp(message.times_ns)) if len(message.times_ns) else 0.0
+    if span_s > 1.0:
+        raise DeployError(f"a message's points span {span_s:.3g} s, at most 1 s was expected; see the driver's times")
+    return message
+
+
+MOST_HELD = 1_000_000
+"""Points that wait for their frame's end; a Mid-360 measures so many in 5 s."""
+
+
 class FrameCutter:
     """Cuts frames out of points by their times, whatever the messages are in which they come.
 
@@ -87,33 +101,71 @@ class FrameCutter:
     each other by as much. Where time jumps, cutting starts again.
 
     Attributes:
+        clock: what has become of times that are wrong, where it is known when messages came.
         late: points that came after their frame had been given out.
         jumps: how often the time of points jumped, backwards or ahead by more than a second.
+        dropped: points of frames that such a jump, or times that do not go on, left unfinished.
     """
 
     def __init__(self, period_s: float, slack_s: float = 0.002) -> None:
         """Args: period_s: of a frame; slack_s: by which messages may be out of order."""
         self._period, self._slack = round(period_s * 1e9), round(slack_s * 1e9)
-        self.late = self.jumps = 0
+        self.clock = SensorClock()
+        self.late = self.jumps = self.dropped = self._waiting = 0
+        self._has_said = False
+        self._restart()
+
+    def _restart(self) -> None:
+        self.dropped += self._waiting
         self._start: int | None = None
         self._held: list[Points] = []
+        self._waiting = 0
 
-    def add(self, given: Points) -> list[Frame]:
-        """Frames that are complete, oldest first; periods without any point give none."""
+    def add(self, given: Points, now: float | None = None) -> list[Frame]:
+        """Frames that are complete, oldest first; periods without any point give none.
+
+        Args:
+            given: a message's points.
+            now: when it came, s, on a clock that goes on evenly; None: its times are believed.
+        """
         if not len(given.times_ns):
             return []
         first, last = int(given.times_ns.min()), int(given.times_ns.max())
-        if self._start is not None and not self._start - 10**9 < first <= last < self._start + self._period + 10**9:
+        times_ns = given.times_ns if now is None else self.clock.read(given.times_ns, first, last, now)
+        if times_ns is not given.times_ns:
+            given, first, last = Points(given.points, times_ns), int(times_ns.min()), int(times_ns.max())
+        if self.clock.is_changed:
+            self._restart()
+        if self._start is not None and self._jumps(first, last, self._start):
+            if not self.jumps:
+                say(f"LiDAR: the points' time jumps by {1e-9 * (first - self._start):.3g} s: a new frame begins")
             self.jumps += 1
-            self._start, self._held = None, []
+            self._restart()
         if self._start is None:
             self._start = first
         self.late += int((given.times_ns < self._start).sum())
         self._held.append(given)
+        self._waiting += len(given.points)
         frames = []
         while last >= self._start + self._period + self._slack:
             frames += self._cut()
+        if self._waiting > MOST_HELD:
+            if not self._has_said:
+                self._has_said = True
+                passed_s = 1e-9 * (last - self._start)
+                say(f"LiDAR: the points' times went on by {passed_s:g} s in {self._waiting} points, which are dropped")
+            self._restart()
         return frames
+
+    def counts(self) -> dict[str, int]:
+        """What went wrong so far, by name."""
+        counts = {"late points": self.late, "points dropped": self.dropped, "jumps of time": self.jumps}
+        return counts | {"messages timed by their arrival": self.clock.untimed}
+
+    def _jumps(self, first: int, last: int, start: int) -> bool:
+        """Whether a message from first to last, ns, is none of the frame that began at `start` or of those near it."""
+        is_behind = last < start - BACK_NS or first <= start - 10**9
+        return is_behind or last >= start + self._period + 10**9
 
     def _cut(self) -> list[Frame]:
         assert self._start is not None
@@ -123,7 +175,7 @@ class FrameCutter:
         now, rest = (times >= start) & (times < end), times >= end
         if not now.any():  # empty periods are passed over at once
             end += (int(times[rest].min()) - end) // self._period * self._period
-        self._start, self._held = end, [Points(points[rest], times[rest])]
+        self._start, self._held, self._waiting = end, [Points(points[rest], times[rest])], int(rest.sum())
         if not now.any():
             return []
         order = np.argsort(times[now], kind="stable")
@@ -160,15 +212,6 @@ class _Cdr:
 _TIME_FIELDS = ("timestamp", "offset_time", "time", "t")
 LATEST_NS = 2**62
 """146 years; no clock of a sensor is there, and the sum of two such times fits int64."""
-_CUSTOM_POINT = np.dtype(
-    {
-        "names": ["offset_time", "xyz", "tag"],
-        "formats": ["<u4", ("<f4", 3), "u1"],
-        "offsets": [0, 4, 17],
-        "itemsize": 20,
-    }
-)
-"""A point of livox_ros_driver2's CustomMsg in CDR: reflectivity, tag and line follow xyz."""
 
 
 def read_point_cloud2(data: bytes) -> Points:
@@ -241,19 +284,13 @@ def _point_cloud2(data: bytes) -> Points:
 
 
 def read_custom_msg(data: bytes) -> Points:
-    """Points of a livox_ros_driver2/CustomMsg."""
+    """Points of Livox's CustomMsg."""
     try:
-        cdr = _Cdr(data, "CustomMsg")
-        cdr.read("i"), cdr.read("I"), cdr.text()
-        base = cdr.read("Q")
-        cdr.read("I")
-        cdr.at += 4  # lidar_id, rsvd[3]
-        count = cdr.read("I")
-        part = bytes(cdr.data[cdr.at :])
-        if len(part) < 20 * count - 1:
-            raise DeployError("CustomMsg: cut off")
-        rows = np.frombuffer(part.ljust(20 * count, b"\0"), _CUSTOM_POINT, count)
-        times_ns = base + rows["offset_time"].astype(np.int64)
-    except (struct.error, ValueError, OverflowError) as error:
-        raise DeployError(f"CustomMsg: {error}") from None
-    return Points(without_noise(rows["xyz"].astype(np.float32), rows["tag"]), times_ns)
+        given = custom_msg.read(data)
+    except ValueError as error:
+        raise DeployError(str(error)) from None
+    if given.base_ns >= LATEST_NS:
+        raise DeployError(f"CustomMsg: a timebase in nanoseconds was expected, {given.base_ns} given")
+    points = np.stack([given.points[axis] for axis in "xyz"], 1)
+    times_ns = given.base_ns + given.points["offset_time"].astype(np.int64)
+    return Points(without_noise(points, given.points["tag"]), times_ns)

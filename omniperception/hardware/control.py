@@ -8,7 +8,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -31,6 +31,7 @@ from omniperception.hardware.machine import DRIVEN, MachineConfig, Mode, Request
 from omniperception.hardware.messages import LOW_STATE, remote
 from omniperception.hardware.operator import Goal, Operator, make_operator
 from omniperception.hardware.recording import Recorder, Step, make_folder
+from omniperception.hardware.saying import say
 from omniperception.hardware.switcher import ensure_released
 
 
@@ -93,11 +94,15 @@ class Report:
         path.write_text(json.dumps(parts))
 
     def __str__(self) -> str:
-        if not len(self.step_ms):
-            return "no state has come from the robot"
-        p50, p99 = np.percentile(self.step_ms, (50, 99))
-        counts = ", ".join(f"{value} {name}" for name, value in self.counts.items() if value) or "nothing else to tell"
-        return f"{len(self.step_ms)} steps, {self.late} late; p50 {p50:.2f} ms, p99 {p99:.2f} ms; {counts}"
+        counts, parts = dict(self.counts), ["no state has come from the robot"]
+        if len(self.step_ms):
+            p50, p99 = np.percentile(self.step_ms, (50, 99))
+            parts = [f"{len(self.step_ms)} steps, {self.late} late", f"p50 {p50:.2f} ms, p99 {p99:.2f} ms"]
+        if "LiDAR messages" in counts:
+            points, messages = counts.pop("LiDAR points"), counts.pop("LiDAR messages")
+            parts.append(f"{self.frames} frames of {points} points in {messages} LiDAR messages")
+        parts.append(", ".join(f"{value} {name}" for name, value in counts.items() if value) or "nothing else to tell")
+        return "; ".join(parts)
 
 
 _ROUNDING = 1e-3
@@ -179,6 +184,35 @@ class FrameSource(Protocol):
 
     def new(self) -> list[Frame]:
         """Complete since the call before."""
+
+
+class Awaited(Protocol):
+    """What is to come again and again."""
+
+    came: int
+
+    def why_silent(self) -> str:
+        """What is known of why nothing has come since the call before."""
+
+
+class Waiting:
+    """Says every few seconds what does not come, and what comes instead."""
+
+    SAY_EVERY_S = 3.0
+
+    def __init__(self, awaited: Mapping[str, Awaited]) -> None:
+        """Args: awaited: by name."""
+        self._awaited, self._came = awaited, dict.fromkeys(awaited, 0)
+        self._due = dict.fromkeys(awaited, math.inf)
+
+    def look(self, now: float) -> None:
+        """Once per control step."""
+        for name, one in self._awaited.items():
+            if one.came != self._came[name] or self._due[name] == math.inf:
+                self._came[name], self._due[name] = one.came, now + self.SAY_EVERY_S
+            elif now >= self._due[name]:
+                self._due[name] = now + self.SAY_EVERY_S
+                say(f"waiting for {name}: {one.why_silent()}")
 
 
 class GuardLink(Protocol):
@@ -288,8 +322,7 @@ class Control:
             targets = self.policy.step(state, command, points)
         except SafetyStop as stop:
             if self._mode in DRIVEN or str(stop) != self._stopped:
-                with contextlib.suppress(OSError):  # without a terminal it damps all the same
-                    print(f"stop: {stop}", file=sys.stderr, flush=True)
+                say(f"stop: {stop}")
             self._stopped = str(stop)
             if self._mode in DRIVEN:
                 self._link.ask(Request.DAMP)
@@ -340,7 +373,11 @@ class Control:
 
 
 def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> Report:
-    """Runs a policy on a robot until `should_end`, an interrupt, SIGTERM, SIGHUP, or the guard's end."""
+    """Runs a policy on a robot until `should_end`, an interrupt, SIGTERM, SIGHUP, or the guard's end.
+
+    Raises:
+        DeployError: what was asked for cannot be done, or no state has come from the robot.
+    """
     policy = ExportedPolicy.load(config.policy)
     description = policy.description
     machine = machine_config(description)
@@ -368,14 +405,17 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
         closing.callback(link.close)
         control = Control(policy, states, frames, operator, link, recorder)
-        begins, times, skipped = drive(control, link, description.control_period_s, config.seconds, should_end)
+        awaited: dict[str, Awaited] = {"states of the robot": states} | ({"LiDAR frames": frames} if frames else {})
+        period_s, waiting = description.control_period_s, Waiting(awaited)
+        begins, times, skipped = drive(control, link, period_s, config.seconds, should_end, waiting.look)
         if link.is_closed:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 guard.wait(1.0)
             if guard.returncode != 0:
                 raise DeployError("the guard has ended; its message stands above")
         counts = {} if policy.safety is None else dict(policy.safety.counts)
-        counts |= {"steps skipped": skipped, "states refused": states.refused, "states repeated": states.repeated}
+        counts |= {"steps skipped": skipped, "states": states.came}
+        counts |= {"states refused": states.refused, "states repeated": states.repeated}
         if frames is not None:
             counts |= {"frames missed": control.missed} | frames.counts()
         number = 0 if frames is None else frames.number
@@ -385,6 +425,8 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
                 report.write(config.report)
             except OSError as error:  # what it would hold is printed all the same
                 print(f"report={config.report} cannot be written: {error.strerror}", file=sys.stderr, flush=True)
+        if not begins:
+            raise DeployError(str(report))
     return report
 
 
@@ -394,10 +436,11 @@ def drive(
     period_s: float,
     seconds: float | None = None,
     should_end: Callable[[], bool] = lambda: False,
+    after_step: Callable[[float], None] = lambda now: None,
 ) -> tuple[list[float], list[float], int]:
     """Steps in real time, and then lies down; what `_loop` gives."""
     try:
-        return _loop(control, link, period_s, seconds, should_end)
+        return _loop(control, link, period_s, seconds, should_end, after_step)
     finally:
         if link.mode in (Mode.STANDING, Mode.STANDING_UP, *DRIVEN):
             link.ask(Request.LIE)
@@ -406,7 +449,12 @@ def drive(
 
 
 def _loop(
-    control: Control, link: Link, period_s: float, seconds: float | None, should_end: Callable[[], bool]
+    control: Control,
+    link: Link,
+    period_s: float,
+    seconds: float | None,
+    should_end: Callable[[], bool],
+    after_step: Callable[[float], None] = lambda now: None,
 ) -> tuple[list[float], list[float], int]:
     """How long after their time the steps began, how long they took, ms, and how many a stall has cost."""
     begin = due = time.monotonic()
@@ -419,11 +467,11 @@ def _loop(
             if control.step(now):
                 begins.append(1e3 * (now - due))
                 times.append(1e3 * (time.monotonic() - now))
+            after_step(now)
             due += period_s
             missed = max(0, math.ceil((time.monotonic() - due) / period_s) - 1)  # a stall's steps are not made up for
             due, skipped = due + missed * period_s, skipped + missed
             time.sleep(max(0.0, due - time.monotonic()))
     except KeyboardInterrupt:
-        with contextlib.suppress(OSError):  # the terminal may be what has gone
-            print("ended: the guard lays the robot down", file=sys.stderr, flush=True)
+        say("ended: the guard lays the robot down")
     return begins, times, skipped

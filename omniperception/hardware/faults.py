@@ -7,6 +7,7 @@ import struct
 import numpy as np
 
 from omniperception.deploy.description import DeployError
+from omniperception.hardware.livox import HEADER, POINT
 from omniperception.hardware.messages import LOW_STATE, sealed
 
 FAULTS = {
@@ -14,14 +15,19 @@ FAULTS = {
     "drop": "three of ten LiDAR packets are lost",
     "double": "every LiDAR packet comes twice",
     "shuffle": "LiDAR packets come eight at a time, the last first",
+    "thin": "one of ten LiDAR packets comes",
+    "slice": "of each tenth of a second the packets of the first hundredth come",
+    "wedge": "a tenth of the circle has points, another one in each tenth of a second",
+    "covered": "half of the circle has no points",
     "clock": "the LiDAR's clock jumps ahead by an hour, and back at the end",
     "crc": "states have a wrong checksum",
     "nan": "the IMU's orientation is not a number",
     "silence": "no state comes",
 }
-SENSORS = ("unplug", "drop", "double", "shuffle", "clock")
+SENSORS = ("unplug", "drop", "double", "shuffle", "thin", "slice", "wedge", "covered", "clock")
 """Faults of the LiDAR, after which the robot should walk on."""
 _DROPPED, _TOGETHER, _JUMP_NS = 0.3, 8, 3600 * 10**9
+_KEPT, _FRAME_NS = 0.1, 10**8
 _TIME = struct.Struct("<Q")
 _TIME_AT = 28
 """Of a packet's timestamp."""
@@ -62,6 +68,14 @@ class Faults:
             return []
         if self._is(now, "drop"):
             return [packet for packet in packets if self._random.random() >= _DROPPED]
+        if self._is(now, "thin"):
+            return [packet for packet in packets if self._random.random() < _KEPT]
+        if self._is(now, "slice"):
+            return [packet for packet in packets if _time(packet) % _FRAME_NS < _KEPT * _FRAME_NS]
+        if self._is(now, "wedge"):
+            return [_within(packet, _time(packet) // _FRAME_NS * 0.37, _KEPT) for packet in packets]
+        if self._is(now, "covered"):
+            return [_within(packet, 0.0, 0.5) for packet in packets]
         if self._is(now, "double"):
             return [packet for packet in packets for _ in range(2)]
         if self._is(now, "clock"):
@@ -88,5 +102,17 @@ class Faults:
 
 def _later(packet: bytes, by_ns: int) -> bytes:
     """A LiDAR packet with another timestamp."""
-    (time_ns,) = _TIME.unpack_from(packet, _TIME_AT)
-    return packet[:_TIME_AT] + _TIME.pack(time_ns + by_ns) + packet[_TIME_AT + _TIME.size :]
+    return packet[:_TIME_AT] + _TIME.pack(_time(packet) + by_ns) + packet[_TIME_AT + _TIME.size :]
+
+
+def _time(packet: bytes) -> int:
+    """Of a LiDAR packet, ns."""
+    return _TIME.unpack_from(packet, _TIME_AT)[0]
+
+
+def _within(packet: bytes, begin: float, width: float) -> bytes:
+    """A LiDAR packet whose points outside a part of the circle, in turns, are misses."""
+    rows = np.frombuffer(bytearray(packet[HEADER:]), POINT)
+    turns = np.arctan2(rows["xyz"][:, 1], rows["xyz"][:, 0]) / (2.0 * np.pi)
+    rows["xyz"][(turns - begin) % 1.0 >= width] = 0
+    return packet[:HEADER] + rows.tobytes()

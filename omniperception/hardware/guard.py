@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import select
 import signal
 import socket
 import struct
@@ -27,6 +26,7 @@ from omniperception.deploy.description import DeployError
 from omniperception.hardware.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network, Reader
 from omniperception.hardware.machine import DRIVEN, Drive, Machine, MachineConfig, Mode, Request, Sensed
 from omniperception.hardware.messages import LOW_CMD, LOW_STATE, crc, low_cmd, remote, sealed
+from omniperception.hardware.saying import say
 
 PERIOD_S = 0.002
 _RESTART_MS = 1000
@@ -81,6 +81,7 @@ class StateReader:
     """Newest valid state of the robot.
 
     Attributes:
+        came: valid states.
         refused: states whose length or checksum was wrong.
         repeated: states that were not newer than the one before, by their own clock.
     """
@@ -89,8 +90,9 @@ class StateReader:
         """Args: reader: of rt/lowstate; check_crc: whether checksums matter: simulators that fill none need false, and
         their states may be without a clock, too, which is then 0 in all of them."""
         self._reader, self._check_crc = reader, check_crc
-        self.refused = self.repeated = 0
+        self.came = self.refused = self.repeated = 0
         self._tick: int | None = None
+        self._why = ""
 
     def newest(self) -> np.ndarray | None:
         """() LOW_STATE that has come since the call before; None without a valid one."""
@@ -98,16 +100,25 @@ class StateReader:
         for data in self._reader.take():
             try:
                 state = LOW_STATE.from_cdr(data)
-            except DeployError:
-                self.refused += 1
+            except DeployError as error:
+                self.refused, self._why = self.refused + 1, str(error)
                 continue
             if self._check_crc and crc(state) != state["crc"]:
                 self.refused += 1
+                self._why = "its checksum is wrong; crc=false is for simulators that fill none"
             elif not self._is_newer(int(state["tick"])):
                 self.repeated += 1
+                self._why = f"it is not newer than the one before, by its tick of {state['tick']}"
             else:
-                newest = state
+                newest, self.came = state, self.came + 1
         return newest
+
+    def why_silent(self) -> str:
+        """What has come since the call before, in place of valid states."""
+        why, self._why = self._why, ""
+        if not why:
+            return self._reader.why_silent()
+        return f"{self.refused} were refused, {self.repeated} repeated so far; the newest: {why}"
 
     def _is_newer(self, tick: int) -> bool:
         """Whether a state's clock (ms) has gone on, or began again; always where simulators fill none."""
@@ -243,7 +254,7 @@ class Guard:
                 self.tick(time.monotonic())
             except Exception as error:  # whatever it is: damped joints are better than joints left alone
                 self.machine.ask(time.monotonic(), Request.STOP)
-                _say(f"guard: e-stop: {type(error).__name__}: {error}")
+                say(f"guard: e-stop: {type(error).__name__}: {error}")
                 with contextlib.suppress(Exception):  # the next period tries again
                     self._drive(time.monotonic())
             due = max(due + PERIOD_S, time.monotonic() - PERIOD_S)  # what was missed is not made up for
@@ -293,11 +304,11 @@ class Guard:
         """Says its mode when it has changed, and once that commands do not reach the network."""
         if self._writer.unsent and not self._has_said_unsent:
             self._has_said_unsent = True
-            _say(f"guard: {LOW_CMD_TOPIC}: the network has not taken a command: a reader is behind, or it is gone")
+            say(f"guard: {LOW_CMD_TOPIC}: the network has not taken a command: a reader is behind, or it is gone")
         said = bytes([MODES.index(self.machine.mode)]) + self.machine.reason.encode()[:200]
         if said != self._said:
             self._said = said
-            _say(f"guard: {self.machine.mode}: {self.machine.reason}")
+            say(f"guard: {self.machine.mode}: {self.machine.reason}")
             with contextlib.suppress(OSError):  # nobody listens any more
                 self._link.send(said)
 
@@ -309,13 +320,6 @@ class Guard:
                 self.machine.ask(now, Request.LIE)
             self._gone_since = now
         return now - self._gone_since > self._config.linger_s
-
-
-def _say(text: str) -> None:
-    """A line to the terminal, or nothing where that is gone or stopped: the motors must not wait for it."""
-    with contextlib.suppress(OSError):
-        if select.select([], [sys.stderr], [], 0.0)[1]:
-            print(text, file=sys.stderr, flush=True)
 
 
 def main(argv: list[str], exit_with: Callable[[int], None] = sys.exit) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import sys
+import time
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -14,12 +15,14 @@ from omniperception.hardware.clouds import (
     Frame,
     FrameCutter,
     Points,
+    in_one_time,
     read_custom_msg,
     read_point_cloud2,
     without_noise,
 )
 from omniperception.hardware.dds import CUSTOM_MSG, POINT_CLOUD2, Network, Reader
 from omniperception.hardware.livox import HOST_POINT_PORT, Mid360
+from omniperception.hardware.saying import say
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,9 @@ class Source(Protocol):
     def counts(self) -> dict[str, int]:
         """What went wrong, by name."""
 
+    def why_silent(self) -> str:
+        """What is known of why no points have come since the call before."""
+
     def close(self) -> None:
         """Ends it."""
 
@@ -67,6 +73,7 @@ class Frames:
 
     Attributes:
         number: of frames so far.
+        came: of those that hold a point.
         received: points that the newest call of `new` has read, message by message, in the sensor's own frame.
     """
 
@@ -84,13 +91,16 @@ class Frames:
         self._source: Source = _Topic(source, network) if is_topic else _Packets(source)
         self._cutter, self._extrinsic = FrameCutter(lidar.period_s), source.extrinsic
         self.received: list[Points] = []
-        self.number = 0
+        self.number = self.came = 0
+        self._of_all, self._told = Counter(messages=0, points=0, misses=0), Counter[str]()
 
     def new(self) -> list[Frame]:
         """Frames that have become complete since the call before, oldest first, in the sensor's own frame."""
-        self.received = self._in_the_sensor(self._source.read())
-        frames = [frame for points in self.received for frame in self._cutter.add(points)]
+        self.received, now = self._in_the_sensor(self._source.read()), time.monotonic()
+        frames = [frame for points in self.received for frame in self._cutter.add(points, now)]
         self.number += len(frames)
+        if seen := sum(bool(frame.points.any()) for frame in frames):
+            self.came, self._told = self.came + seen, self._all()
         return frames
 
     def _in_the_sensor(self, given: list[Points]) -> list[Points]:
@@ -98,12 +108,27 @@ class Frames:
         if not given:
             return []
         own = self._extrinsic.undo(np.concatenate([message.points for message in given]))
+        hits = int(own.any(axis=1).sum())
+        self._of_all.update(messages=len(given), points=hits, misses=len(own) - hits)
         ends = np.cumsum([len(message.points) for message in given])
         return [Points(part, m.times_ns) for part, m in zip(np.split(own, ends[:-1]), given, strict=True)]
 
     def counts(self) -> dict[str, int]:
-        """What went wrong so far, by name."""
-        return self._source.counts() | {"late points": self._cutter.late, "jumps of time": self._cutter.jumps}
+        """What has come, and what went wrong, so far, by name."""
+        came = {f"LiDAR {what}": count for what, count in self._of_all.items()}
+        return came | self._source.counts() | self._cutter.counts()
+
+    def _all(self) -> Counter[str]:
+        return Counter(self.counts()) + Counter(frames=self.number)
+
+    def why_silent(self) -> str:
+        """What has come since the newest frame with points, or the call before."""
+        now = self._all()
+        new, self._told = now - self._told, now
+        came = ", ".join(f"{count} {what}" for what, count in new.items()) or "nothing"
+        if new["LiDAR points"]:
+            return f"{came} came"
+        return f"{came} came; {'every point is a miss' if new['LiDAR messages'] else self._source.why_silent()}"
 
     def close(self) -> None:
         """Ends it."""
@@ -123,18 +148,16 @@ class _Packets:
 
     def counts(self) -> dict[str, int]:
         mid360 = self._mid360
-        return {"packets lost": mid360.lost, "packets doubled": mid360.doubled, "other datagrams": mid360.other}
+        return {"packets lost": mid360.lost, "packets doubled": mid360.doubled, **mid360.others}
+
+    def why_silent(self) -> str:
+        sensor, here = self._mid360.sensor, f"{self._mid360.host}:{self._mid360.point_port}"
+        if sensor is None:
+            return f"a Mid-360 that samples was expected to send points to {here}; points=mid360 tells it to"
+        return f"the {sensor} at {sensor.address} was told to send points to {here}"
 
     def close(self) -> None:
         self._mid360.close()
-
-
-def _in_one_time(message: Points) -> Points:
-    """The message, whose points were measured within a second of each other; a DeployError otherwise."""
-    span_s = 1e-9 * float(np.ptp(message.times_ns)) if len(message.times_ns) else 0.0
-    if span_s > 1.0:
-        raise DeployError(f"a message's points span {span_s:.3g} s, at most 1 s was expected; see the driver's times")
-    return message
 
 
 class _Topic:
@@ -144,21 +167,29 @@ class _Topic:
         custom = source.kind == "CustomMsg"
         self._reader: Reader = network.reader(source.topic, CUSTOM_MSG if custom else POINT_CLOUD2, 16)
         self._decode = read_custom_msg if custom else read_point_cloud2
-        self._refused = 0
+        self._other = "PointCloud2" if custom else "CustomMsg"
+        self._refused, self._why = 0, ""
 
     def read(self) -> list[Points]:
         read = []
         for data in self._reader.take():
             try:
-                read.append(_in_one_time(self._decode(data)))
+                read.append(in_one_time(self._decode(data)))
             except DeployError as error:
-                self._refused += 1
+                self._refused, self._why = self._refused + 1, str(error)
                 if self._refused == 1:  # the robot stands without frames; this is why
-                    print(f"refused: {error}", file=sys.stderr, flush=True)
+                    say(f"refused: {error}")
         return read
 
     def counts(self) -> dict[str, int]:
         return {"messages refused": self._refused}
+
+    def why_silent(self) -> str:
+        if self._why:
+            why, self._why = f"the newest was refused: {self._why}", ""
+            return why
+        why = self._reader.why_silent()
+        return f"{why}; points={self._other} reads it" if f"::{self._other}_" in why else why
 
     def close(self) -> None:
         """The network ends it."""

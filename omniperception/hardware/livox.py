@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import binascii
 import contextlib
+import errno
 import ipaddress
 import select
 import socket
 import struct
 import time
 import zlib
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -27,19 +28,36 @@ DETECTION_PORT, POINT_PORT = 56000, 56300
 """Of the sensor: discovery, and where points come from."""
 HOST_COMMAND_PORT, HOST_POINT_PORT = 56101, 56301
 """Of this machine: where answers and points go to."""
-MID360 = 9
-"""Device type."""
+MID360, MID360S = 9, 35
+"""Device types that speak this protocol and measure alike."""
+_DEVICES = {
+    **{0: "Hub", 1: "Mid-40", 2: "Tele-15", 3: "Horizon", 6: "Mid-70", 7: "Avia", MID360: "Mid-360", 10: "HAP"},
+    **{15: "HAP", 16: "PA", MID360S: "Mid-360S", 40: "Avia 2"},
+}
 POINTS_PER_PACKET = 96
 SEARCH, CONFIGURE = 0x0000, 0x0100
 _POINT_TYPE_KEY, _POINT_HOST_KEY, _WORK_MODE_KEY = 0x0000, 0x0006, 0x001A
-_CARTESIAN_MM, _CARTESIAN_CM, _SAMPLING = 1, 2, 1
+_CARTESIAN_MM, _CARTESIAN_CM, _SPHERICAL, _SAMPLING = 1, 2, 3, 1
+_IMU, _DOUBLE_ECHO = 0, 0x11
+_NOT_NOW = 0x02
+_REFUSALS = {
+    **{0x01: "it has failed", _NOT_NOW: "not in its present state", 0x03: "out of range", 0x20: "unknown to it"},
+    **{0x21: "stored, until it is switched off and on", 0x22: "read-only", 0x23: "wrong length", 0x24: "wrong number"},
+}
+"""Meaning of an answer's code, of Livox's "Communication Protocol--Mid360"."""
 _COMMAND = struct.Struct("<BBHIHBB6sHI")
 _POINTS = struct.Struct("<BHHHHBBB12sIQ")
+HEADER = _POINTS.size
+"""Bytes of a packet before its points."""
+POINT = np.dtype([("xyz", "<i4", 3), ("reflectivity", "u1"), ("tag", "u1")])
+"""Of a packet of Cartesian points, mm."""
 _DETECTION = struct.Struct("<BB16s4sH")
 _KINDS = {
-    _CARTESIAN_MM: (np.dtype([("xyz", "<i4", 3), ("reflectivity", "u1"), ("tag", "u1")]), 1e-3),
+    _CARTESIAN_MM: (POINT, 1e-3),
     _CARTESIAN_CM: (np.dtype([("xyz", "<i2", 3), ("reflectivity", "u1"), ("tag", "u1")]), 1e-2),
+    _SPHERICAL: (np.dtype([("depth", "<u4"), ("angles", "<u2", 2), ("reflectivity", "u1"), ("tag", "u1")]), 1e-3),
 }
+"""Layout of a point, and metres of its unit of length."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +78,7 @@ class Packet:
 
 
 def read_points(data: bytes) -> Packet | None:
-    """A packet of points; None for what is none of Cartesian points, is cut off, or is from `LATEST_NS` or later."""
+    """A packet of points; None for what is none of points, is cut off, or is from `LATEST_NS` or later."""
     if len(data) < _POINTS.size:
         return None
     _, length, interval, count, number, _, kind, _, _, _, time_ns = _POINTS.unpack_from(data)
@@ -71,7 +89,26 @@ def read_points(data: bytes) -> Packet | None:
         return None
     rows = np.frombuffer(data, dtype, count, _POINTS.size)
     times = time_ns + np.arange(count, dtype=np.int64) * (interval * 100) // count
-    return Packet((rows["xyz"] * metres).astype(np.float32), times, rows["tag"], number)
+    points = _cartesian(rows) if kind == _SPHERICAL else rows["xyz"]
+    return Packet((points * metres).astype(np.float32), times, rows["tag"], number)
+
+
+def _cartesian(rows: np.ndarray) -> np.ndarray:
+    """(n, 3) of depths and, in hundredths of a degree, angles from the z axis and about it."""
+    theta, phi = np.radians(0.01 * rows["angles"].T)
+    directions = np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), 1)
+    return rows["depth"][:, None] * directions
+
+
+def what_else(data: bytes) -> str:
+    """What a datagram is of which `read_points` makes nothing."""
+    if len(data) >= _POINTS.size:
+        _, length, *_, kind, _, _, _, time_ns = _POINTS.unpack_from(data)
+        if length == len(data) and kind in (_IMU, _DOUBLE_ECHO):
+            return "packets of the IMU" if kind == _IMU else "packets of double echoes"
+        if length == len(data) and kind in _KINDS and time_ns >= LATEST_NS:
+            return "packets with a time that no clock shows"
+    return "other datagrams"
 
 
 def write_points(points: np.ndarray, time_ns: int, number: int, interval_ns: int) -> bytes:
@@ -130,28 +167,37 @@ def read_message(data: bytes) -> Message | None:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A Mid-360 that has answered: address, port of its control, serial number."""
+    """A sensor that has answered: address, port of its control, serial number, device type."""
 
     address: str
     command_port: int
     serial: str
+    kind: int = MID360
+
+    @property
+    def name(self) -> str:
+        """Of its type."""
+        return _DEVICES.get(self.kind, "device unknown here")
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.serial}"
 
 
 def discovery_answer(sensor: Sensor, number: int) -> Message:
     """What a sensor answers to SEARCH."""
     packed = ipaddress.IPv4Address(sensor.address).packed
-    data = _DETECTION.pack(0, MID360, sensor.serial.encode()[:15], packed, sensor.command_port)
+    data = _DETECTION.pack(0, sensor.kind, sensor.serial.encode()[:15], packed, sensor.command_port)
     return Message(SEARCH, number, True, data)
 
 
 def read_discovery(message: Message) -> Sensor | None:
-    """The Mid-360 that has answered; None for another device or command."""
+    """The sensor that has answered; None for another command."""
     if message.command != SEARCH or not message.is_answer or len(message.data) < _DETECTION.size:
         return None
     failed, kind, serial, address, port = _DETECTION.unpack_from(message.data)
-    if failed or kind != MID360:
+    if failed:
         return None
-    return Sensor(str(ipaddress.IPv4Address(address)), port, serial.rstrip(b"\0").decode("ascii", "replace"))
+    return Sensor(str(ipaddress.IPv4Address(address)), port, serial.rstrip(b"\0").decode("ascii", "replace"), kind)
 
 
 def configuration(host: str, point_port: int = HOST_POINT_PORT) -> bytes:
@@ -179,24 +225,30 @@ def read_configuration(data: bytes) -> dict[int, bytes]:
 
 
 class Mid360:
-    """A Mid-360 on the network; :meth:`packets` gives what has come since the call before.
+    """A Mid-360 or Mid-360S on the network; :meth:`packets` gives what has come since the call before.
 
     Attributes:
         sensor: which one has answered; None where it was configured before and only listened to.
         lost: packets that never came, by their numbers.
         doubled: packets that came twice.
-        other: datagrams that were no packets of points.
+        others: datagrams that were no packets of points, by what they were.
     """
 
     def __init__(self, host: str, point_port: int = HOST_POINT_PORT) -> None:
         """Args: host: this machine's address in the sensor's network; point_port: where points come to."""
         self.host = host
         self.sensor: Sensor | None = None
-        self.lost = self.doubled = self.other = 0
+        self.lost = self.doubled = 0
+        self.others: Counter[str] = Counter()
         self._recent: deque[tuple[int, int]] = deque(maxlen=64)
         self._newest: tuple[int, int] | None = None
         self._socket = _socket(host, point_port)
         self.point_port = self._socket.getsockname()[1]
+
+    @property
+    def other(self) -> int:
+        """Datagrams that were no packets of points."""
+        return self.others.total()
 
     def find(self, broadcast: str = "255.255.255.255", port: int = DETECTION_PORT, timeout_s: float = 5.0) -> Sensor:
         """Search, and point the first Mid-360 that answers at this machine.
@@ -204,7 +256,7 @@ class Mid360:
         Raises:
             DeployError: none has answered, or it has refused.
         """
-        is_real = port == DETECTION_PORT
+        is_real, unfit = port == DETECTION_PORT, dict[str, str]()
         with contextlib.ExitStack() as open_sockets:
             own = open_sockets.enter_context(_socket(self.host, DETECTION_PORT if is_real else 0, shared=True))
             own.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -212,10 +264,14 @@ class Mid360:
             everybody = open_sockets.enter_context(_socket("0.0.0.0", own.getsockname()[1], shared=True))
             for answer in _ask((own, everybody), Message(SEARCH, 1, False, b""), (broadcast, port), timeout_s):
                 sensor = read_discovery(answer)
-                if sensor is not None:
+                if sensor is not None and sensor.kind in (MID360, MID360S):
                     self._configure(sensor, HOST_COMMAND_PORT if is_real else 0, timeout_s)
                     self.sensor = sensor
                     return sensor
+                if sensor is not None:
+                    unfit[sensor.address] = f"a {sensor.name}, type {sensor.kind}, answered at {sensor.address}"
+        if unfit:
+            raise DeployError(f"{', '.join(unfit.values())}; points=mid360 drives Mid-360 and Mid-360S")
         raise DeployError(
             f"no Mid-360 has answered at {broadcast} within {timeout_s:g} s; host={self.host} must be this machine's"
             " address in the sensor's network (usually 192.168.1.x)"
@@ -223,14 +279,20 @@ class Mid360:
 
     def _configure(self, sensor: Sensor, port: int, timeout_s: float) -> None:
         request = Message(CONFIGURE, 2, False, configuration(self.host, self.point_port))
+        why = (
+            f"at {sensor.address} has not answered to its configuration; it and host={self.host} must be in one network"
+        )
         with _socket(self.host, port) as own:
             for answer in _ask((own,), request, (sensor.address, sensor.command_port), timeout_s):
                 if answer.command == CONFIGURE and answer.is_answer and len(answer.data) >= 3:
                     failed, key = struct.unpack_from("<BH", answer.data)
-                    if failed:
-                        raise DeployError(f"the Mid-360 {sensor.serial} refuses key 0x{key:04x} (code {failed})")
-                    return
-        raise DeployError(f"the Mid-360 {sensor.serial} at {sensor.address} has not answered to its configuration")
+                    if not failed:
+                        return
+                    meaning = _REFUSALS.get(failed, "unknown here")
+                    why = f"refuses key 0x{key:04x} (code 0x{failed:02x}: {meaning})"
+                    if failed != _NOT_NOW:  # it may be about to start
+                        break
+        raise DeployError(f"the {sensor} {why}")
 
     def packets(self) -> Iterator[Packet]:
         """Every packet that waits, in the order of arrival, doubled ones left out."""
@@ -241,7 +303,7 @@ class Mid360:
                 return
             packet = read_points(data)
             if packet is None:
-                self.other += 1
+                self.others[what_else(data)] += 1
             elif (which := (packet.number, int(packet.times_ns[0]))) in self._recent:
                 self.doubled += 1
             else:
@@ -277,8 +339,19 @@ def _socket(host: str, port: int, shared: bool = False) -> socket.socket:
         made.bind((host, port))
     except (OSError, OverflowError) as error:
         made.close()
-        raise DeployError(f"host={host}: port {port} cannot be listened to ({error})") from None
+        raise DeployError(f"host={host}: port {port} cannot be listened to: {_why_not(error)}") from None
     return made
+
+
+def _why_not(error: OSError | OverflowError) -> str:
+    if isinstance(error, socket.gaierror):
+        return "an address such as 192.168.1.50 was expected"
+    if isinstance(error, OverflowError):
+        return "a port is at most 65535"
+    return {
+        errno.EADDRNOTAVAIL: "this machine has no such address; give the one that it has in the sensor's network",
+        errno.EADDRINUSE: "another program listens there, such as a driver of the sensor",
+    }.get(error.errno or 0, str(error.strerror))
 
 
 def _ask(heard: Sequence[socket.socket], request: Message, to: tuple[str, int], timeout_s: float) -> Iterator[Message]:

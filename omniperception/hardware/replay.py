@@ -76,10 +76,10 @@ class _Recorded:
         self._frames: list[Frame] = []
         self._cutter = None if period_s is None else FrameCutter(period_s)
 
-    def take(self, points: Points) -> None:
+    def take(self, points: Points, now: float) -> None:
         """Points as they came."""
         if self._cutter is not None:
-            self._frames += self._cutter.add(points)
+            self._frames += self._cutter.add(points, now)
 
     def newest(self) -> np.ndarray | None:
         return self.state
@@ -90,7 +90,7 @@ class _Recorded:
 
     def counts(self) -> dict[str, int]:
         """What went wrong with points, by name."""
-        return {} if self._cutter is None else {"late points": self._cutter.late, "jumps of time": self._cutter.jumps}
+        return {} if self._cutter is None else self._cutter.counts()
 
     def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         return self.command, []
@@ -156,7 +156,7 @@ def replay(policy: ExportedPolicy, events: Iterable[Event], command: np.ndarray 
     period, due = described.control_period_s, -np.inf
     for event in events:
         if event.points is not None:
-            ends.take(event.points)
+            ends.take(event.points, event.time_s)
         if event.command is not None and command is None:
             ends.command = event.command
         if event.mode is not None:

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from omniperception.common.files import write_whole
+from omniperception.common.shell import command_line
 from omniperception.deploy.description import FILE, DeployError, checksum
 from omniperception.evaluation.statistics import wilson
 from omniperception.hardware.faults import FAULTS, SENSORS
@@ -71,7 +72,8 @@ class TrialsConfig:
         if unknown:
             raise DeployError(f"faults={unknown[0]}: {', '.join(KNOWN_FAULTS)} were expected")
         if not (self.policy / FILE).is_file():
-            raise DeployError(f"policy={self.policy}: a folder that export has written was expected")
+            line = command_line("export", f"run={self.run}", f"out={self.policy}")
+            raise DeployError(f"policy={self.policy}: a folder that export has written was expected; write it: {line}")
 
     @property
     def made_with(self) -> dict:

@@ -47,6 +47,12 @@ class HeightField:
             raise ValueError(f"half_x={half_x}, half_y={half_y} and scale={scale} must be positive and finite")
         if not (self.base >= 0.0 and np.isfinite(self.base)):
             raise ValueError(f"base={base} must be >= 0 and finite")
+        low, high = float(self.heights.min()), float(self.heights.max())
+        if self.scale * np.abs(self.heights - np.asarray(heights, np.float64)).max() > 1e-3 and high - low < high / 8.0:
+            raise ValueError(
+                f"heights go from {low:.10g} to {high:.10g}, where float32 loses millimetres: subtract the lowest in"
+                " float64 and put it in shape.pos"
+            )
 
     @property
     def half_extents(self) -> tuple[float, float, float]:

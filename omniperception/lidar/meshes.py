@@ -1,6 +1,7 @@
 """Triangle meshes, from arrays or from files, and the trees in which rays look for their triangles."""
 
-import math
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +11,7 @@ import warp as wp
 
 from .kernels.mesh import STACK_SIZE
 from .kernels.tree import NUM_BINS, split_triangles, widen_tree
+from .mesh_files import far_origin, far_said, read_mesh, unit_said
 
 HEURISTIC_DEPTH = 48
 """Below this depth of the binary tree, ranges of triangles are halved: no input makes a descent too deep."""
@@ -45,7 +47,8 @@ class TriangleMesh:
         num_degenerate: How many triangles were left out.
 
     Raises:
-        ValueError: A shape is wrong, an index names no vertex, or a vertex that a triangle uses is not finite.
+        ValueError: A shape is wrong, an index names no vertex, a vertex that a triangle uses is not finite, or all lie
+            so far from the origin that float32 loses millimetres.
     """
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
@@ -67,35 +70,50 @@ class TriangleMesh:
         if broken.any():
             first = int(np.flatnonzero(broken)[0])
             raise ValueError(f"mesh.vertices of {broken.sum()} triangles are not finite, the first is triangle {first}")
+        far = far_origin(corners)
+        if far is not None:
+            raise ValueError(
+                f"mesh.vertices: the mesh {far_said(corners)}: subtract an origin in float64 first, such as"
+                f" {tuple(far.tolist())}, and add it to shape.pos"
+            )
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         has_area = (normal != 0.0).any(axis=1)
         self.triangles = triangles[has_area].astype(np.int32)
         self.num_degenerate = int((~has_area).sum())
 
     @classmethod
-    def from_file(cls, path: str | Path, scale: float = 1.0) -> "TriangleMesh":
-        """A mesh in any format that trimesh reads (extra ``meshes``), all its parts together, times ``scale``.
+    def from_file(
+        cls,
+        path: str | Path,
+        scale: float = 1.0,
+        up: str | None = None,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> "TriangleMesh":
+        """A mesh from a file, all its parts together, in metres, z up; see ``read_mesh``.
+
+        Args:
+            path: .stl, .obj or .ply; with the extra ``meshes`` .glb, .gltf, .dae and what else trimesh reads.
+            scale: What coordinates are multiplied by, beside the unit that the format states.
+            up: Axis of the file that points up, "z", "y" or "x"; None: as its format says, z where it says nothing.
+            origin: Place that becomes the mesh's origin, metres, z up: for files in coordinates of a map.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ImportError: trimesh is not installed.
-            ValueError: It is no mesh, none of its triangles has area, or ``scale`` is not above 0.
+            ImportError: What reads it is not installed.
+            ValueError: It is no mesh, none of its triangles has area, it lies far from its origin, or an argument is
+                wrong.
         """
-        try:
-            import trimesh
-        except ImportError:
-            raise ImportError(f"reading {path} needs trimesh: pip install 'omniperception[meshes]'") from None
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"mesh {path} does not exist")
-        try:
-            mesh = trimesh.load(path, force="mesh", process=False)
-        except Exception as error:  # trimesh raises whatever its parsers meet
-            raise ValueError(f"mesh {path} cannot be read: {str(error).splitlines()[0]}") from error
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-            raise ValueError(f"mesh {path} holds no triangles")
-        if not (math.isfinite(scale) and scale > 0.0):
-            raise ValueError(f"scale={scale} of mesh {path} must be above 0")
-        found = cls(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces)
+        vertices, triangles = read_mesh(path, scale, up)
+        if said := unit_said(path, vertices[triangles], scale):
+            warnings.warn(said, stacklevel=2)
+        vertices = vertices - np.asarray(origin, np.float64)
+        far = far_origin(vertices[triangles])
+        if far is not None:
+            near = tuple((far + origin).tolist())
+            raise ValueError(
+                f"mesh {path} {far_said(vertices[triangles])}: give origin={near}, and add it to shape.pos"
+            )
+        found = cls(vertices, triangles)
         if not len(found.triangles):
             raise ValueError(f"mesh {path}, {scale} times as large, holds no triangle with area")
         return found

@@ -11,7 +11,7 @@ import torch
 
 from .heightfield import HeightField
 from .meshes import TriangleMesh
-from .scene import RayScene
+from .scene import RayScene, check_kept
 from .shapes import SIZE_NAMES, Shape, ShapeKind
 
 if TYPE_CHECKING:
@@ -133,6 +133,8 @@ class MujocoScene(RayScene):
                     f"{name} must be ({self._nbody}, {width}) or ({self.num_envs}, {self._nbody}, {width}),"
                     f" got {tuple(rows.shape)}"
                 )
+            if name == "xpos":
+                check_kept(rows, own.dtype)
             own.copy_(rows[..., self._rows, :])
 
     def copy_data(self, data: mujoco.MjData) -> None:

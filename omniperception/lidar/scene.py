@@ -131,6 +131,17 @@ class PlacedShapes:
         return launches
 
 
+def check_kept(pos: torch.Tensor, dtype: torch.dtype) -> None:
+    """Refuses positions in float64 of which float32 would lose millimetres; on a GPU nobody looks."""
+    if pos.is_cpu and pos.dtype == torch.float64 and dtype == torch.float32 and pos.numel():
+        lost = float((pos - pos.float()).abs().max())
+        if lost > 1e-3:
+            raise ValueError(
+                f"pos goes up to {float(pos.abs().max()):.10g} m, of which float32 loses {lost:.2g} m: make the scene"
+                " with pose_dtype=torch.float64, or subtract each environment's origin"
+            )
+
+
 def empty_slots(scene: "RayScene", exclude_shapes: Sequence[int], view: View) -> tuple[Slots, list[int]]:
     """Slots for the shapes of a scene that are not excluded, and the indices of these shapes."""
     excluded = scene.check_shape_ids(exclude_shapes)
@@ -284,6 +295,7 @@ class RayScene:
         for name, given, own in (("pos", pos, self.body_pos), ("quat", quat, self.body_quat)):
             if given.shape not in (own.shape, own.shape[1:]):
                 raise ValueError(f"{name} {tuple(given.shape)} must be {tuple(own.shape)} or {tuple(own.shape[1:])}")
+        check_kept(pos, self.body_pos.dtype)
         self.body_pos.copy_(pos)
         if order == "wxyz":
             self.body_quat.copy_(quat)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception.common.errors import ConfigError
+from omniperception.common.shell import command_line
 from omniperception.scene.fetched import cache
 
 
@@ -87,7 +88,7 @@ def _download(package: Package, folder: Path) -> Path:
         said = [line for line in done.stderr.splitlines() if line.strip()] or ["it said nothing"]
         raise ConfigError(
             f"pip could not download {package.name}=={package.version} ({said[-1].strip()}); with a copy from"
-            f" elsewhere: robot-fetch wheel={package.wheel}"
+            f" elsewhere: {command_line('robot-fetch', f'wheel={package.wheel}')}"
         )
     return folder / package.wheel
 

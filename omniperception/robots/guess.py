@@ -15,7 +15,7 @@ from omniperception.robots.gains import REACH, SAG, Gains, gains_of
 from omniperception.robots.pose import BENT, Foot, feet_of, first_pose, standing_pose
 from omniperception.robots.stand import Standing, flat_world, stand
 from omniperception.scene import RobotConfig
-from omniperception.scene.robot_file import FRAME, compile_robot, drop_unseen, parse, read_robot
+from omniperception.scene.robot_file import FRAME, compile_robot, drop_unseen, parse, read_robot, weighs_as_water
 from omniperception.schema import make
 
 SURE, LIKELY, GUESSED = "sure", "likely", "guess"
@@ -280,6 +280,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
     rate, ratio = draft.wishes.frequency, draft.wishes.damping_ratio
     findings = [
         Finding("base", SURE, "the body with the free joint"),
+        _on_masses(draft),
         Finding("foot_geoms", SURE if named else LIKELY, f"what reaches down as far as the lowest; {len(feet)} feet"),
         Finding("penalized_geoms", LIKELY, "all other geoms that collide"),
         Finding("base_height", LIKELY, "the lowest point of the default pose"),
@@ -332,6 +333,17 @@ def _pace(feet: int, height: float) -> dict[str, object]:
     x = [-round(back * natural, 1), round(ahead * natural, 1)]
     y = round(aside * natural, 1)
     return {"lift": lift, "lin_vel_x": x, "lin_vel_y": [-y, y], "ang_vel_z": [-turn, turn]}
+
+
+def _on_masses(draft: _Draft) -> Finding:
+    spec = read_robot(draft.file)
+    guessed = [link.name for link in spec.bodies if any(weighs_as_water(spec, geom) for geom in link.geoms)]
+    if not guessed:
+        return Finding("masses", SURE, "the file's")
+    spec.compiler.fusestatic = False  # or some links are gone
+    model = compile_robot(spec, draft.file)
+    masses = ", ".join(f"{name} {model.body(name).mass[0]:.3g} kg" for name in guessed)
+    return Finding("masses", GUESSED, f"without <inertial> the volume times 1000 kg/m3, of water: {masses}")
 
 
 def _on_self_collision(draft: _Draft, pairs: list[tuple[str, str]]) -> Finding:

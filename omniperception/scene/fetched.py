@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from omniperception.common.shell import command_line
+
 SCHEME = "fetched:"
 """Begins the `robot.file` of a robot that is downloaded; the rest is its place in the cache."""
 
@@ -26,6 +28,6 @@ def fetched(file: str) -> Path:
     path = cache() / file.removeprefix(SCHEME)
     if not path.is_file():
         raise ValueError(
-            f"robot.file={file} is downloaded, not shipped, and is not in {cache()}; run: omniperception robot-fetch"
+            f"robot.file={file} is downloaded, not shipped, and is not in {cache()}; run: {command_line('robot-fetch')}"
         )
     return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
+from omniperception.lidar.mesh_files import AXES, read_mesh, unit_said, up_of
 from omniperception.scene.height_field import EDGE, add_height_field
 from omniperception.scene.terrain import check_contact
 
@@ -167,8 +169,12 @@ class MapTerrainConfig:
         return ("map",)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Adds the height field on a kinematic body, so that every environment can have a place of its own."""
-        add_height_field(spec, self.height_map(), self.cell, self.friction, self.restitution)
+        """Adds the height field on a kinematic body, so that every environment can have a place of its own.
+
+        Its lowest point is at 0: heights above the sea would lose millimetres where they are float32.
+        """
+        heights = self.height_map()
+        add_height_field(spec, heights - heights.min(), self.cell, self.friction, self.restitution)
 
 
 @dataclass(frozen=True)
@@ -240,11 +246,11 @@ class PlaceConfig(MapTerrainConfig):
     out, and below a table's top it is solid. x and y are the mesh's.
 
     Attributes:
-        scale: metres per unit of the file.
-        up: axis of the file that points up, 'z' or 'y'; with 'y' its -z is y here. None: y of a GLB, whose format says
-            so, z of the others, unless the mesh looks as if it were y.
+        scale: metres per unit of the file, beside the unit that its format states.
+        up: axis of the file that points up, one of `AXES`; with 'y' its -z is y here. None: as the format says (y of
+            glTF, COLLADA's <up_axis>), else z, unless the mesh looks as if it were y.
         ceiling: height (m) in the file's frame above which nothing counts; a wall that goes on above ends there, if
-            its faces are wound as those of a solid are, outwards.
+            its faces are wound as those of a solid are, outwards. Where the ground's face down, all are turned round.
         outside: height (m) where there is nothing; None: that of the lowest point.
     """
 
@@ -253,38 +259,41 @@ class PlaceConfig(MapTerrainConfig):
     ceiling: float | None = None
     outside: float | None = None
 
-    suffixes: ClassVar[tuple[str, ...]] = (".stl", ".obj", ".ply", ".glb")
+    suffixes: ClassVar[tuple[str, ...]] = (".stl", ".obj", ".ply", ".glb", ".gltf", ".dae")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.up not in ("z", "y", None):
-            raise ValueError(f"terrain.up={self.up} must be z, y or null")
-        if not self.scale > 0:
+        if self.up not in (*AXES, None):
+            raise ValueError(f"terrain.up={self.up} must be {', '.join(AXES)} or null")
+        if not 0 < self.scale < math.inf:
             raise ValueError(f"terrain.scale={self.scale} must be positive")
 
     def read(self) -> tuple[np.ndarray, tuple[float, float]]:
-        from omniperception.lidar.meshes import TriangleMesh
-
-        mesh = TriangleMesh.from_file(self.file, self.scale)
-        corners = mesh.vertices.astype(np.float64)[mesh.triangles]
-        if self._up == "y":
-            corners = np.stack((corners[..., 0], -corners[..., 2], corners[..., 1]), -1)
+        vertices, triangles = read_mesh(self.file, self.scale, self.up)
+        corners = vertices[triangles]
         if self.up is None:
             self._check_upright(corners)
+        said = unit_said(self.file, corners, self.scale, "terrain.scale")
         low, high = corners.min((0, 1)), corners.max((0, 1))
         cols, rows = (int((high[k] - low[k]) / self.cell + 1e-6) + 1 for k in (0, 1))
         if cols * rows > MAX_POINTS:
             raise ValueError(
                 f"terrain.file={self.file} is {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, too large for"
-                f" terrain.cell={self.cell}; change it or terrain.scale={self.scale}"
+                f" terrain.cell={self.cell}; {said or f'change it or terrain.scale={self.scale}'}"
             )
         if min(cols, rows) < 2:
             raise ValueError(
                 f"terrain.file={self.file} is {high[0] - low[0]:.2g} x {high[1] - low[1]:.2g} m, smaller than"
-                f" terrain.cell={self.cell}; change it or terrain.scale={self.scale}"
+                f" terrain.cell={self.cell}; {said or f'change it or terrain.scale={self.scale}'}"
             )
+        if said:
+            warnings.warn(said, stacklevel=2)
         x, y = (low[k] + self.cell * np.arange(num) for k, num in ((0, cols), (1, rows)))
-        heights = seen_from_above(corners, x, y, self.ceiling)
+        heights, upside_down = seen_from_above(corners, x, y, self.ceiling)
+        if upside_down and self.ceiling is not None:
+            said = f"terrain.file={self.file} is wound inside out, its ground faces down: its triangles are turned over"
+            warnings.warn(said, stacklevel=2)
+            heights, _ = seen_from_above(corners[:, ::-1], x, y, self.ceiling)
         empty = np.isneginf(heights)
         if empty.all():
             raise ValueError(f"terrain.file={self.file} has nothing below terrain.ceiling={self.ceiling}")
@@ -294,16 +303,13 @@ class PlaceConfig(MapTerrainConfig):
     def floor(self, heights: np.ndarray) -> np.ndarray:
         return heights < (math.inf if self.ceiling is None else self.ceiling)  # not where walls are cut
 
-    @property
-    def _up(self) -> str:
-        return self.up or ("y" if Path(self.file).suffix.lower() == ".glb" else "z")
-
     def _check_upright(self, corners: np.ndarray) -> None:
         """Refuses a mesh (T, 3, 3) m, z up, that is higher than deep and has more of its area upright than level."""
         width, depth, height = np.ptp(corners, (0, 1))
         area = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).sum(0)
         if height > depth and area[1] > area[2]:
-            taken, other = ("y", "z") if self._up == "y" else ("z", "y")
+            taken = up_of(self.file)
+            other = "y" if taken == "z" else "z"
             raise ValueError(
                 f"terrain.file={self.file} would be {width:.1f} x {depth:.1f} m and {height:.1f} m high with its"
                 f" {taken} up, and more of its surfaces would be walls than ground; give terrain.up={other} or,"
@@ -355,8 +361,12 @@ def read_array(file: str) -> np.ndarray:
     return heights.astype(np.float64)
 
 
-def seen_from_above(corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: float | None) -> np.ndarray:
+def seen_from_above(
+    corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: float | None
+) -> tuple[np.ndarray, bool]:
     """Heights (R, C) of the highest surface of a mesh above points x (C,), y (R,), evenly spaced; -inf above nothing.
+
+    And whether most of these surfaces face down, as they do where a mesh is wound inside out.
 
     With a ceiling, surfaces above it do not count. Where an odd number of them is above a point and the lowest of them
     faces up, the point is within a solid that goes through the ceiling: there the height is the ceiling's. (A single
@@ -369,6 +379,7 @@ def seen_from_above(corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: 
     """
     heights, within = np.full((len(y), len(x)), -np.inf), np.zeros((len(y), len(x)), bool)
     lowest, faces_up = np.full_like(heights, np.inf), np.zeros_like(within)
+    upside_down = np.zeros_like(within)
     spacing = x[1] - x[0], y[1] - y[0]
     x, y = (at + share * step for at, share, step in zip((x, y), _OFF_LINE, spacing, strict=True))
     low, high = corners.min(1), corners.max(1)
@@ -385,11 +396,16 @@ def seen_from_above(corners: np.ndarray, x: np.ndarray, y: np.ndarray, ceiling: 
         inside = (u >= 0) & (v >= 0) & (u + v <= 1)
         z = a[k, 2] + u * ab[k, 2] + v * ac[k, 2]
         above = inside & (z > ceiling) if ceiling is not None else np.zeros_like(inside)
-        heights[window] = np.where(inside & ~above, np.maximum(heights[window], z), heights[window])
+        highest = inside & ~above & (z > heights[window])
+        upside_down[window] = np.where(highest, area[k] < 0.0, upside_down[window])
+        heights[window] = np.where(highest, z, heights[window])
         within[window] ^= above
         faces_up[window] = np.where(above & (z < lowest[window]), area[k] > 0.0, faces_up[window])
         lowest[window] = np.where(above, np.minimum(lowest[window], z), lowest[window])
-    return heights if ceiling is None else np.where(within & faces_up, ceiling, heights)
+    solid = within & faces_up
+    ground = ~solid & np.isfinite(heights)
+    heights = heights if ceiling is None else np.where(solid, ceiling, heights)
+    return heights, bool(upside_down[ground].sum() * 2 > ground.sum())
 
 
 def free_places(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+
+from omniperception.lidar.mesh_files import read_mesh, unit_said
 
 
 def _prism(corners: np.ndarray) -> np.ndarray:
@@ -55,13 +58,21 @@ def check_mesh(file: str) -> None:
         raise ValueError(f"obstacles: file={file} is neither a packaged mesh ({', '.join(MESHES)}) nor a file")
 
 
+def own_size(file: str) -> tuple[float, float, float]:
+    """Half extents (m) of a mesh as its file has it; warns where they are probably in another unit."""
+    half = mesh_points(file)[1]
+    if file not in MESHES and (said := unit_said(file, np.array((np.negative(half), half)), 1.0)):
+        warnings.warn(f"obstacles: {said}: an obstacle takes half of each as its size", stacklevel=2)
+    return half
+
+
 @cache
 def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
     """Points of a mesh, whose convex hull is meant.
 
     Args:
-        file: name of a packaged mesh, path of a file in any format that trimesh reads (extra `meshes`), or the path of
-            an MJCF or URDF and, after `#`, the name of a mesh in it.
+        file: name of a packaged mesh, path of a mesh file (see `read_mesh`), or the path of an MJCF or URDF and, after
+            `#`, the name of a mesh in it.
 
     Returns:
         Vertices (V, 3) that fill the box from -1 to 1, and the half extents (m) of the mesh as it is; packaged ones are
@@ -74,13 +85,11 @@ def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
 
         points, unit = mesh_vertices(*file.split("#", 1)), None
     else:
-        from omniperception.lidar.meshes import TriangleMesh
-
-        mesh = TriangleMesh.from_file(file)
-        points, unit = np.unique(mesh.vertices[mesh.triangles.flatten()].astype(np.float64), axis=0), None
+        vertices, triangles = read_mesh(file)
+        points, unit = np.unique(vertices[triangles.flatten()], axis=0), None
     low, high = points.min(0), points.max(0)
     half = (high - low) / 2
-    if np.linalg.matrix_rank(points - points.mean(0), tol=1e-6 * np.ptp(points)) < 3:
+    if np.linalg.matrix_rank(points - points.mean(0), tol=1e-6 * half.max()) < 3:
         raise ValueError(f"obstacles: file={file} is flat; a mesh needs a volume")
     x, y, z = half if unit is None else (unit, unit, unit)
     return (points - (low + high) / 2) / half, (float(x), float(y), float(z))

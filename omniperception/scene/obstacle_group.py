@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from omniperception.scene.layouts import Layout
-from omniperception.scene.meshes import mesh_points
+from omniperception.scene.meshes import own_size
 from omniperception.scene.part_shapes import reach
 from omniperception.scene.parts import SIZES, Part, PartConfig, check_kind, check_sizes
 from omniperception.scene.thing_file import SUFFIXES, is_thing, parts_of
@@ -241,7 +241,7 @@ class ObstacleGroup:
         if file is None:
             return tuple((low, high) for low, high in self.size)
         if not self.size:
-            return tuple((half, half) for half in mesh_points(file)[1])
+            return tuple((half, half) for half in own_size(file))
         share = index / max(self.count - 1, 1)
         return tuple((low + share * (high - low),) * 2 for low, high in self.size)
 

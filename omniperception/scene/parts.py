@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 
-from omniperception.scene.meshes import check_mesh, mesh_points
+from omniperception.scene.meshes import check_mesh, mesh_points, own_size
 
 if TYPE_CHECKING:
     from omniperception.scene.obstacles import ObstacleGroup
@@ -104,7 +104,7 @@ class PartConfig:
             object.__setattr__(self, key, tuple(float(x) for x in value))
         size = tuple(float(x) for x in self.size)
         if self.file is not None and not size:
-            size = mesh_points(self.file)[1]
+            size = own_size(self.file)
         object.__setattr__(self, "size", size)
         if len(size) != len(SIZES[self.kind]) or min(size) <= 0:
             raise ValueError(f"obstacles: size={list(size)} of a {self.kind} must be positive: {_names(self.kind)}")

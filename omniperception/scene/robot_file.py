@@ -183,6 +183,11 @@ def _has_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
     return inferred and not weightless
 
 
+def weighs_as_water(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
+    """Tell whether the compiler takes mass from a geom to which the file gives neither mass nor density."""
+    return _has_mass(spec, geom) and math.isnan(geom.mass) and geom.density == 1000.0
+
+
 def carrier(body: mujoco.MjsBody) -> str:
     """Name of the moving link that a body is fixed to, or of the body that moves."""
     while not body.joints and body.parent is not None and body.parent.name != "world":

@@ -69,7 +69,7 @@ class Session:
         """
         self.shown = shown
         run = build.load_run(shown.run_dir, [*shown.overrides, "num_envs=1"], shown.trust)
-        build.check_split(run, "page")
+        build.check_split(run, "page", shown.run_dir)
         if shown.policy != "run" and shown.policy not in BASELINES:
             raise ConfigError(f"policy={shown.policy} is unknown; known: run, {', '.join(BASELINES)}")
         self._runner: Runner = build.build_runner(replace(run, env=_watched(run.env, shown.policy)), None)

@@ -188,18 +188,18 @@ def record(outcome: list[int], contacts: list[int], world: str = "corridor") -> 
 
 def test_policies_are_judged_by_what_evaluation_wrote(tmp_path):
     run = policy.TrainedRun(tmp_path, "run")
-    with pytest.raises(ConfigError, match=r"has not been evaluated; python scripts/evaluate.py run="):
+    with pytest.raises(ConfigError, match=r"has not been evaluated; first: .*omniperception evaluate .*run="):
         run.scenarios()
     outcome = [OUTCOMES.index(name) for name in ["goal"] * 18 + ["fall", "time_out"]]
     write(
-        tmp_path / "evaluation" / "dev-ideal-corridor-own-run.json",
+        tmp_path / "evaluation" / "dev-ideal-corridor-own-run-20.json",
         [record(outcome, contacts=[0] * 14 + [1] * 5 + [0])],
     )
     errors = policy.rates_of(run.scenarios()["corridor"])
     assert errors[policy.FAILED] == pytest.approx(30.0) and errors["collision (%)"] == pytest.approx(25.0)
     assert errors["low (%)"] == pytest.approx(100 - 85.45, abs=0.01)  # Wilson, 14 of 20
     assert errors["high (%)"] == pytest.approx(100 - 48.10, abs=0.01)
-    with pytest.raises(ConfigError, match=r"has not been exported; python scripts/export.py run="):
+    with pytest.raises(ConfigError, match=r"has not been exported; first: .*omniperception export .*run="):
         _ = run.exported
 
 
@@ -210,7 +210,7 @@ def test_trained_policies_are_timed_as_they_were_exported(tmp_path, capsys):
     export([f"run={run}", "formats=onnx"])
     outcome = [OUTCOMES.index(name) for name in ("goal", "goal", "time_out", "fall")]
     write(
-        run / "evaluation" / "dev-ideal-static-own-run.json", [record(outcome, contacts=[0, 0, 0, 0], world="static")]
+        run / "evaluation" / "dev-ideal-static-own-run-4.json", [record(outcome, contacts=[0, 0, 0, 0], world="static")]
     )
     command(["subject=policy", f"runs={run}", f"default={run}", "size=small", f"out={tmp_path / 'out'}"])
     assert "The default, gait, is on it, alone." in capsys.readouterr().out

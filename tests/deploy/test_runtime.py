@@ -424,7 +424,7 @@ def test_wrong_points_are_named(exported_run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 99}, "format version 99, this program reads 7"),
+        ({"version": 99}, "format version 99, this program reads 8"),
         ({"format": "something"}, "describes no exported policy"),
         ({"joints": None}, "is incomplete"),
         ({"control_period_s": 0.03}, "policy.onnx and policy.json are not from the same export"),

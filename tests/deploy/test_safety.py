@@ -302,3 +302,70 @@ def test_the_published_policy_stands_half_a_second_after_it_slows_down(tmp_path)
     assert np.mean(speeds[50:100]) > 0.5
     assert np.mean(speeds[blind_from + 25 : blind_from + 50]) < 0.15 and np.mean(speeds[200:]) < 0.1
     assert not env.done.any() and robot.safety.sight is Sight.STOPPED
+
+
+class TestFramesInPart:
+    """A sensor with rays in all directions, 6 degrees apart; ground, or what stands on it, answers below the horizon.
+
+    Four bins of elevation cover a sector.
+    """
+
+    azimuth, elevation = (grid.ravel() for grid in np.meshgrid(np.arange(-177, 180, 6), np.arange(-57, 60, 6)))
+    a, e = np.radians(azimuth), np.radians(elevation)
+    rays = 2.0 * np.stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), 1)
+
+    def robot(self):
+        count = len(self.rays)
+        lidar = Lidar(0.1, [0.0] * 3, UPRIGHT, 0.1, 6.0, count, count, 1, (4,) * 36)
+        return policy(
+            lidar=lidar,
+            perception=Perception(2, count, {"kind": "raw", "num_points": count, "max_range": 6.0}),
+            command={"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-1.0, 1.0], "ang_vel_z": [-1.0, 1.0]},
+        )
+
+    def walk(self, robot, command, kept, frames=5):
+        """Commands (steps, 3) that the network is fed while frames hold the rays that are `kept`."""
+        fed = []
+        for step in range(5 * frames):
+            cloud = self.rays * (kept & (self.elevation < 0))[:, None]
+            robot.step(state(), command, cloud if step % 5 == 0 else None)
+            fed.append(fed_command(robot))
+        return np.array(fed)
+
+    def test_whole_frames_change_nothing(self, caplog):
+        robot = self.robot()
+        assert (self.walk(robot, [0.9, -0.4, 0.2], self.azimuth < 999) == np.float32([0.9, -0.4, 0.2])).all()
+        assert not robot.safety.counts and not caplog.records
+
+    def test_it_does_not_go_where_nobody_looked_and_says_so_once(self, caplog):
+        """100 degrees ahead are lost: commands there are 0 from the second frame on, after 0.1 s; others stay."""
+        robot, kept = self.robot(), abs(self.azimuth) > 45
+        self.walk(robot, [1.0, 0.0, 0.5], self.azimuth < 999, 1)
+        fed = self.walk(robot, [1.0, 0.0, 0.5], kept)
+        assert (fed[:5, 0] == 1.0).all() and not fed[5:, 0].any() and (fed[:, 2] == 0.5).all()
+        assert (self.walk(robot, [-1.0, 0.0, 0.0], kept)[:, 0] == -1.0).all()
+        assert not self.walk(robot, [0.5, 0.5, 0.0], kept)[:, :2].any()
+        sideways = self.walk(robot, [0.0, 1.0, 0.0], kept)[:, 1]  # 45 degrees from the last sector that is lost
+        assert sideways == pytest.approx((0.8660 - 0.7071) / (0.8660 - 0.5), abs=1e-3)
+        self.walk(robot, [1.0, 0.0, 0.0], self.azimuth < 999)
+        assert fed_command(robot)[0] == 1.0
+        self.walk(robot, [1.0, 0.0, 0.0], kept)
+        assert robot.safety.counts["frames in part"] == 2
+        said = [record.message for record in caplog.records]
+        assert len(said) == 1 and "no points from 10 of 36 directions (ahead, ahead left, ahead right)" in said[0]
+
+    @pytest.mark.parametrize("what", ["a narrow band", "another tenth of the circle each time"])
+    def test_it_stands_where_a_tenth_of_the_points_says_little(self, what):
+        robot = self.robot()
+        self.walk(robot, [1.0, 0.0, 0.0], self.azimuth < 999, 1)
+        for frame in range(10):
+            turned = (self.azimuth - 100 * frame) % 360 < 36
+            kept = abs(self.elevation + 12) < 9 if what == "a narrow band" else turned
+            fed = self.walk(robot, [1.0, 0.0, 0.0], kept, 1)
+            assert frame < 2 or not fed.any()
+
+    def test_points_that_are_thin_everywhere_are_enough(self):
+        robot, random = self.robot(), np.random.default_rng(0)
+        for _ in range(10):
+            fed = self.walk(robot, [1.0, 0.0, 0.0], random.random(len(self.azimuth)) < 0.7, 1)
+        assert (fed[:, 0] == 1.0).all()

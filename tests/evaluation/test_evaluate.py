@@ -344,7 +344,7 @@ def test_what_does_not_fit_the_run_is_refused(walker, capsys):
 
 
 def test_missing_matplotlib_is_refused_first(walker, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(PlotsUnavailable, match=r"pip install 'omniperception\[plots\]'"):
         evaluate(evaluation(walker, "static", plots=True))
 

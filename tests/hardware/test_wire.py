@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import itertools
 import os
 import pty
 import signal
@@ -535,6 +536,56 @@ def test_a_guard_whose_commands_are_not_sent_says_so_once(exported, capfd):
         unheard._writer.unsent = unsent
         unheard.tick(0.002 * unsent)
     assert capfd.readouterr().err.count(said) == 1
+
+
+class Silence:
+    """Stands in for `dds.Network`: nobody is there."""
+
+    def reader(self, *_):
+        return self
+
+    def take(self):
+        return []
+
+    def why_silent(self):
+        return "nobody writes rt/lowstate at interface=lo domain=7"
+
+
+class IdleLink:
+    """Of a guard that does nothing."""
+
+    mode, reason, is_closed = Mode.DAMPING, "start", False
+
+    def __getattr__(self, name):
+        return lambda *_: None
+
+
+def test_a_robot_that_hears_nothing_says_so_and_how_many_of_each_came(exported, monkeypatch, capsys):
+    """And a sensor that sends the packets of its IMU only: 60 bytes, of data type 0."""
+    monkeypatch.setattr(control, "Network", lambda *_: Silence())
+    monkeypatch.setattr(control, "start", lambda config: (IdleLink(), None))
+    monkeypatch.setattr(control.Waiting, "SAY_EVERY_S", 0.2)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
+        found.bind(("127.0.0.1", 0))
+        port = found.getsockname()[1]
+    sender, numbers = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), iter(range(20))
+
+    def should_end():
+        for number in itertools.islice(numbers, 1):
+            head = struct.pack("<BHHHHBBB12xIQ", 0, 60, 0, 1, number, 0, 0, 0, 0, 10**9)
+            sender.sendto(head + bytes(24), ("127.0.0.1", port))
+        return False
+
+    points = LidarSource(kind="packets", host="127.0.0.1", point_port=port)
+    config = control.RobotConfig(exported, lidar=points, steer="0,0,0", sport_mode="ignore", seconds=1.0)
+    with pytest.raises(DeployError) as error:
+        control.run(config, should_end)
+    said = capsys.readouterr().err
+    assert "waiting for states of the robot: nobody writes rt/lowstate at interface=lo domain=7\n" in said
+    assert "waiting for LiDAR frames: " in said and "packets of the IMU came; a Mid-360 that samples" in said
+    counted = "0 frames of 0 points in 0 LiDAR messages; 20 packets of the IMU"
+    assert str(error.value) == f"no state has come from the robot; {counted}"
+    sender.close()
 
 
 class TestDds:

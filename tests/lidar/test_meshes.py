@@ -179,8 +179,8 @@ def test_wrong_meshes_are_refused(vertices, triangles, message):
         TriangleMesh(vertices, np.array(triangles))
 
 
-def test_files_are_read_through_trimesh(tmp_path):
-    pytest.importorskip("trimesh")
+@pytest.mark.filterwarnings("ignore:mesh .* large")
+def test_files_are_read(tmp_path):
     lines = [f"v {x} {y} {z}" for x, y, z in CUBE] + [f"f {a} {b} {c}" for a, b, c in CUBE_FACES + 1]
     (tmp_path / "cube.obj").write_text("\n".join(lines))
     mesh = TriangleMesh.from_file(tmp_path / "cube.obj", scale=2.0)
@@ -195,7 +195,7 @@ def test_files_are_read_through_trimesh(tmp_path):
 def test_a_missing_trimesh_names_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(ImportError, match=r"omniperception\[meshes\]"):
-        TriangleMesh.from_file("cube.obj")
+        TriangleMesh.from_file("cube.glb")
 
 
 # --- deformable ------------------------------------------------------------------------------------------------

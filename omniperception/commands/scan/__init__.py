@@ -2,19 +2,22 @@
 
     scan lidar=avia rays=20000 lidar.max_range=30
     scan lidar=mid360,avia,os0_128,vlp16        # each of them, and comparison.png
-    scan mesh=hall.stl scale=0.001 at=12,3,0    # in a mesh of your own, z up
+    scan mesh=hall.stl scale=0.001 at=12,3,0    # in a mesh of your own, in coordinates of a map too
     scan lidar=mid360 viewer=web                # the scan lab: in the browser, among people, with sliders
 
 The room holds people, thin rods, a shelf without legs, a rock, rubble and the robot, which carries the sensor. Writes
-pattern.png, scan.png and the points; the pictures need the extra `plots`, a mesh `meshes`, other files than .ply and
-.npz `clouds`.
+pattern.png, scan.png and the points; the pictures need the extra `plots`, meshes other than .stl, .obj and .ply
+`meshes`, other files of points than .ply and .npz `clouds`.
 """
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from omniperception import build, config
 from omniperception.cli import Command, argument, refuse_arguments
@@ -24,12 +27,15 @@ from omniperception.common.figures import PlotsUnavailable
 from omniperception.env.config import EnvConfig
 from omniperception.env.sensing import SensorConfig
 from omniperception.lidar import DEVICES, TriangleMesh
+from omniperception.lidar.mesh_files import AXES, read_mesh, unit_said
 from omniperception.scene import RobotConfig
 from omniperception.viewer import PageOptions, ViewerError, serve_lab
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT, Room
 
 NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
 """A sensor is looked at, no task is run."""
+BESIDE = 1000.0
+"""How far (m) beside a mesh a robot may stand."""
 WALKERS = 4
 """People who walk about in the scan lab."""
 
@@ -45,9 +51,12 @@ class Arguments:
     seconds: float | None = argument(None, "how long the sensor measures; null: one frame of the preset", positive=True)
     colour: str = argument("class", "of the points in the file", choices=("class", "height"))
     cloud: str = argument("ply", "format of the points' file", choices=("ply", "pcd", "las", "npz", "mcap"))
-    mesh: Path | None = argument(None, "file of a mesh in place of the demonstration room, z up; null: the room")
+    mesh: Path | None = argument(None, "file of a mesh in place of the demonstration room; null: the room")
     scale: float = argument(1.0, "metres to which a unit of the mesh corresponds", positive=True)
-    at: tuple[float, ...] = argument((0.0, 0.0, 0.0), "where in the mesh the robot's feet stand (m)")
+    up: str | None = argument(
+        None, "axis of the mesh that points up; null: as its format says, or z", choices=tuple(AXES)
+    )
+    at: tuple[float, ...] = argument((0.0, 0.0, 0.0), "where in the mesh the robot's feet stand (m, z up)")
     viewer: str = argument("none", "web: the scan lab in the browser", choices=("none", "web"))
     host: str = argument(
         LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
@@ -136,12 +145,29 @@ def _given(overrides: list[str]) -> set[str]:
 
 def _surroundings(arguments: Arguments, robot: RobotConfig, walkers: int = 0) -> DemoScene:
     if arguments.mesh is None:
-        refuse_arguments(arguments, ("at", "scale"), "without mesh= there is no mesh to stand in")
+        refuse_arguments(arguments, ("at", "scale", "up"), "without mesh= there is no mesh to stand in")
         return demo_scene(robot, walkers=walkers)
     if len(arguments.at) != 3:
         raise config.ConfigError(f"at={','.join(map(str, arguments.at))} must be three numbers, x,y,z in metres")
-    x, y, z = arguments.at
-    return mesh_scene(robot, TriangleMesh.from_file(arguments.mesh, arguments.scale), (x, y, z), walkers)
+    vertices, triangles = read_mesh(arguments.mesh, arguments.scale, arguments.up)
+    at, low, high = np.array(arguments.at), vertices[triangles].min((0, 1)), vertices[triangles].max((0, 1))
+    said = unit_said(arguments.mesh, vertices[triangles], arguments.scale)
+    beside = float(np.linalg.norm(np.maximum(low - at, at - high).clip(min=0.0)))
+    if beside > BESIDE:
+        spans = ", ".join(f"{axis} {a:.10g} to {b:.10g}" for axis, a, b in zip("xyz", low, high, strict=True))
+        raise config.ConfigError(
+            f"at={','.join(f'{x:.10g}' for x in at)} is {beside:.0f} m beside mesh={arguments.mesh}, {spans} m;"
+            f" {said or 'name a place in it'}"
+        )
+    if said:
+        print(f"warning: {said}", file=sys.stderr)
+    origin = np.round(at, -4)
+    if origin.any():
+        print(f"pictures show coordinates less {','.join(f'{x:.10g}' for x in origin)} m")
+    mesh = TriangleMesh(vertices - origin, triangles)
+    if not len(mesh.triangles):
+        raise config.ConfigError(f"mesh={arguments.mesh} holds no triangle with area")
+    return mesh_scene(robot, mesh, (at - origin).tolist(), walkers, origin)
 
 
 command = Command(

@@ -119,7 +119,8 @@ def write_scan(
     draw_pattern(scan.name, sensor.scan_pattern(), out / "pattern.png")
     draw_scan(scan, demo, out / "scan.png")
     rgb = _class_colours(scan) if colour == "class" else _height_colours(scan, demo)
-    columns = dict(zip("xyz", scan.points_w.T, strict=True))
+    points = scan.points_w + demo.origin if demo.origin.any() else scan.points_w  # float32 where it keeps millimetres
+    columns = dict(zip("xyz", points.T, strict=True))
     columns |= dict(zip(("red", "green", "blue"), (255.0 * rgb).round().astype(np.uint8).T, strict=True))
     columns |= {"class_id": scan.class_id, "intensity": scan.intensity, "time_s": scan.time_s}
     write_points(out / f"scan.{suffix}", table_of(columns, "points_w"))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import mujoco
@@ -72,6 +73,7 @@ class DemoScene:
         extent: Of the room or the mesh along x and y, and its highest point, metres.
         mesh: The mesh; None: it is the room.
         movers: Bodies of the scene beside the robot's that walk about, after all of its own.
+        origin: Where the scene's origin is in the mesh's file, metres, (3,) float64.
     """
 
     scene: RayScene
@@ -82,6 +84,7 @@ class DemoScene:
     extent: tuple[tuple[float, float], tuple[float, float], float]
     mesh: TriangleMesh | None = None
     movers: tuple[int, ...] = ()
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def demo_scene(robot: RobotConfig, num_threads: int | None = None, walkers: int = 0) -> DemoScene:
@@ -95,19 +98,26 @@ def demo_scene(robot: RobotConfig, num_threads: int | None = None, walkers: int 
     return _with_robot(shapes, robot, (0.0, 0.0, 0.0), removed, ROOM, num_threads=num_threads, walkers=walkers)
 
 
-def mesh_scene(robot: RobotConfig, mesh: TriangleMesh, at: Vector = (0.0, 0.0, 0.0), walkers: int = 0) -> DemoScene:
+def mesh_scene(
+    robot: RobotConfig,
+    mesh: TriangleMesh,
+    at: Sequence[float] = (0.0, 0.0, 0.0),
+    walkers: int = 0,
+    origin: np.ndarray | None = None,
+) -> DemoScene:
     """A mesh with a robot in its default pose whose feet stand ``at`` a place of it, metres, z up; see `demo_scene`."""
     corners = mesh.vertices[mesh.triangles].reshape(-1, 3).astype(float)
     low, high = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
     shape = Shape(ShapeKind.MESH, asset=mesh, class_id=DemoClass.MESH)
     extent = ((low[0], high[0]), (low[1], high[1]), high[2])
-    return _with_robot([shape], robot, at, (), extent, mesh, walkers=walkers)
+    demo = _with_robot([shape], robot, at, (), extent, mesh, walkers=walkers)
+    return demo if origin is None else replace(demo, origin=origin)
 
 
 def _with_robot(
     shapes: list[Shape],
     robot: RobotConfig,
-    at: Vector,
+    at: Sequence[float],
     open_side: tuple[int, ...],
     extent: tuple[tuple[float, float], tuple[float, float], float],
     mesh: TriangleMesh | None = None,

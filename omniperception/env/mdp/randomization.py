@@ -11,6 +11,7 @@ import torch
 
 from omniperception.common.random import EnvRandom
 from omniperception.env.mdp.curriculum import FULL, Curriculum, CurriculumConfig
+from omniperception.env.partial_frames import PartialFramesConfig
 from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.scene.terrain import ground_solrefs
 from omniperception.sim import Simulator
@@ -149,6 +150,7 @@ class RandomizationConfig:
         frames_lost: share of the LiDAR frames that never come, in each environment on its own.
         frames_late_s: age (s) of the scene that a LiDAR frame shows when it comes, drawn for every frame, rounded to
             control steps.
+        partial_frames: spells in which frames lack a part of their points.
         pushes: of the base.
         curriculum: of the share of the ranges, but for the LiDAR's, about what is there without randomization; None:
             the whole ranges from the first step.
@@ -184,6 +186,7 @@ class RandomizationConfig:
     joint_vel_noise: Range = None
     frames_lost: float | None = None
     frames_late_s: Range = None
+    partial_frames: PartialFramesConfig | None = None
     pushes: PushesConfig | None = None
     curriculum: CurriculumConfig | None = None
 

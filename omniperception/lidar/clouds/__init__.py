@@ -1,12 +1,13 @@
 """Point clouds in files: tables of named columns, read and written as PCD, PLY, LAS, npz and ROS 2 messages in MCAP.
 
-Libraries of the extra `clouds` do the work where a format is more than a table: pypcd4 for PCD, laspy for LAS, mcap
-for MCAP, rosbags for bags of ROS 1 and 2, which are read only.
+Libraries of the extra `clouds` do the work where a format is more than a table: pypcd4 to write PCD, laspy for
+LAS, mcap for MCAP, rosbags for bags of ROS 1 and 2, which are read only.
+
+Of a file that is cut off or damaged, what can be read is; one line on standard error says what is missing.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,6 @@ from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 from .table import PointTable, table_of
 
@@ -37,10 +37,11 @@ FORMATS = {
     ".ply": _Format("ply"),
     ".las": _Format("las", "laspy"),
     ".npz": _Format("npz"),
-    ".mcap": _Format("mcap", "mcap_ros2", many=True),
-    ".bag": _Format("bag", "rosbags", many=True, writes=False),
-    ".db3": _Format("bag", "rosbags", many=True, writes=False),
-    "folder": _Format("bag", "rosbags", many=True, writes=False),
+    ".mcap": _Format("recording", "mcap_ros2", many=True),
+    ".laz": _Format("las", "laspy"),
+    **dict.fromkeys(
+        (".bag", ".active", ".db3", ".zstd", "folder"), _Format("recording", "rosbags", many=True, writes=False)
+    ),
 }
 WRITTEN = tuple(suffix for suffix, form in FORMATS.items() if form.writes)
 
@@ -49,7 +50,7 @@ def read_scans(path: str | Path, topic: str | None = None) -> Iterator[PointTabl
     """Frames of a file, one after the other; a file of a single cloud is one frame.
 
     Args:
-        path: .pcd, .ply, .las, .npz, .mcap, .bag, .db3, or the folder of a ROS 2 bag.
+        path: .pcd, .ply, .las, .laz, .npz, .mcap, .bag (or .bag.active), .db3, or the folder of a ROS 2 bag.
         topic: Of a recording with several topics of point clouds, the one that is read.
 
     Raises:
@@ -57,6 +58,8 @@ def read_scans(path: str | Path, topic: str | None = None) -> Iterator[PointTabl
         ModuleNotFoundError: The library for this format is not installed.
         ValueError: The format is unknown, the file is broken, or the topic has to be named.
     """
+    from omniperception.common.pointers import refuse_pointer
+
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give a file of points: {', '.join(FORMATS)}")
@@ -66,9 +69,12 @@ def read_scans(path: str | Path, topic: str | None = None) -> Iterator[PointTabl
             if form.many:
                 yield from module.read(path, topic)
             else:
+                refuse_pointer(path)
                 yield module.read(path)
-        except (EOFError, LookupError, BadZipFile, zlib.error) as error:
-            raise ValueError(f"{path} is broken: {error!r}") from error
+        except ValueError as error:  # of what is read, such as a table without x; named where it is not
+            raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
+        except OSError as error:
+            raise ValueError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def read_points(path: str | Path, index: int = 0, topic: str | None = None) -> PointTable:
@@ -121,6 +127,7 @@ def _needing(form: _Format, path: Path) -> Iterator[None]:
     except ModuleNotFoundError as error:
         if not form.library:
             raise
+        library = (error.name or form.library).partition(".")[0]
         raise ModuleNotFoundError(
-            f"{path} needs {form.library}: pip install 'omniperception[clouds]'", name=error.name
+            f"{path} needs {library}: pip install 'omniperception[clouds]'", name=error.name
         ) from None

@@ -1,10 +1,17 @@
-"""Point clouds as .las files, of surveying programs; columns that LAS does not know are its "extra dimensions"."""
+"""Point clouds as .las files, of surveying programs; columns that LAS does not know are its "extra dimensions".
 
+.laz is the same, packed, where lazrs is installed.
+"""
+
+from __future__ import annotations
+
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from .table import PointTable, table_of
+from .table import PointTable, column_names, held, table_of
 
 SCALE = 1e-4
 """Metres to which coordinates are kept."""
@@ -17,31 +24,65 @@ SUFFIX = "_value"
 def read(path: Path) -> PointTable:
     """The points of a file, withheld ones with coordinates that are not a number.
 
-    Columns of LAS's own that are zero throughout are left out. A ``gps_time`` that all points share is the frame's.
+    Columns of LAS's own that are zero throughout are left out. A ``gps_time`` that all points share is the frame's. A
+    file that is cut off is read up to there, and one line on standard error says so.
     """
-    import laspy
-
-    try:
-        file = laspy.read(path)
-    except laspy.errors.LaspyException as error:
-        raise ValueError(f"{path} is not a LAS file: {error}") from error
+    file = _read(path)
     shown = np.where(np.asarray(file.withheld, bool), np.nan, 1.0)
     columns = {axis: np.asarray(file[axis], np.float64) * shown for axis in "xyz"}
     extra = set(file.point_format.extra_dimension_names)
     for name in (name for name in file.point_format.dimension_names if name not in ("X", "Y", "Z", "withheld")):
         values = np.asarray(file[name])
         if name in extra or values.any():
-            columns[name.removesuffix(SUFFIX) if name in extra else name] = values
+            rows = values.T if values.ndim > 1 else values[None]  # an extra dimension may have two or three numbers
+            names = column_names(name.removesuffix(SUFFIX) if name in extra else name, len(rows))
+            columns |= dict(zip(names, rows, strict=True))
     times = np.unique(file["gps_time"] if "gps_time" in file.point_format.dimension_names else np.zeros(1))
     if len(times) == 1 and "gps_time" + SUFFIX not in extra:
         columns.pop("gps_time", None)
-    return table_of(columns, file.header.system_identifier.rstrip("\0"), float(times[0]) if len(times) == 1 else 0.0)
+    frame = file.header.system_identifier  # bytes where they are no ASCII
+    frame = frame.rstrip("\0") if isinstance(frame, str) else ""
+    return table_of(columns, frame if frame.isprintable() else "", float(times[0]) if len(times) == 1 else 0.0)
+
+
+def _read(path: Path) -> Any:
+    """As much of a file as is there."""
+    import laspy
+
+    try:
+        reader = laspy.open(path, read_evlrs=False)
+    except Exception as error:  # laspy raises whatever its parsing meets
+        raise ValueError(f"{path} is not a LAS file, or ends within its header") from error
+    with reader:
+        header = reader.header
+        there = (path.stat().st_size - header.offset_to_point_data) // header.point_format.size
+        if header.are_points_compressed:
+            _check_laz(path)
+        elif not header.point_count and there > 0 and not header.number_of_evlrs:
+            print(f"{path} says that it has no points, as a killed program leaves it: read {there}", file=sys.stderr)
+            header.point_count = there
+        else:
+            header.point_count = held(path, max(there, 0), header.point_count)
+        try:
+            return laspy.LasData(header, reader.read_points(header.point_count))
+        except Exception as error:
+            raise ValueError(f"{path} is damaged or cut off: its points cannot be read") from error
+
+
+def _check_laz(path: Path) -> None:
+    """Names what packs and unpacks LAZ, where it is missing."""
+    import laspy
+
+    if not laspy.LazBackend.detect_available():
+        raise ValueError(f"{path} is LAZ, which needs lazrs: pip install lazrs (or convert it to .las)")
 
 
 def write(path: Path, table: PointTable) -> None:
-    """Writes LAS 1.4, coordinates to ``SCALE``."""
+    """Writes LAS 1.4, coordinates to ``SCALE``; packed where the name ends in .laz."""
     import laspy
 
+    if path.suffix.lower() == ".laz":
+        _check_laz(path)
     if not table.frame.isascii() or len(table.frame) > FRAME_BYTES:
         raise ValueError(f"{path}: LAS keeps a frame's name of at most {FRAME_BYTES} ASCII characters: {table.frame!r}")
     header = laspy.LasHeader(version="1.4", point_format=6)

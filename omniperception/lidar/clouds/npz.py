@@ -1,6 +1,8 @@
 """Point clouds as .npz: an array for each column."""
 
+import zlib
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -12,13 +14,18 @@ ABOUT = {"frame": "frame", "time_s": "stamp_s"}
 
 def read(path: Path) -> PointTable:
     """Every one-dimensional array of a file, as a column."""
-    loaded = np.load(path)
-    if not isinstance(loaded, np.lib.npyio.NpzFile):
-        raise ValueError(f"{path} holds a single array; an array for each column was expected")
-    with loaded as file:
-        columns = {name: file[name] for name in file.files if file[name].ndim == 1}
-        about = {key: file[name].item() for key, name in ABOUT.items() if name in file.files}
-    return table_of(columns, **about)
+    try:
+        loaded = np.load(path)
+        if not isinstance(loaded, np.lib.npyio.NpzFile):
+            raise TypeError
+        with loaded as file:
+            arrays = {name: file[name] for name in file.files}
+    except TypeError:
+        raise ValueError(f"{path} holds a single array; an array for each column was expected") from None
+    except (ValueError, EOFError, BadZipFile, NotImplementedError, OSError, zlib.error) as error:
+        raise ValueError(f"{path} is broken, or no .npz file of numbers: save it again with np.savez") from error
+    about = {key: arrays[name].item() for key, name in ABOUT.items() if name in arrays}
+    return table_of({name: values for name, values in arrays.items() if values.ndim == 1}, **about)
 
 
 def write(path: Path, table: PointTable) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from omniperception.common.point_fields import CODES, TYPES
 
-from .table import PointTable
+from .table import PADDING, PointTable, column_names
 
 MESSAGE = "sensor_msgs/msg/PointCloud2"
 DEFINITION = """\
@@ -47,23 +47,33 @@ uint32 count
 
 
 def table_from_message(message: Any) -> PointTable:
-    """The points of a message in ROS's own order of rows; fields of several numbers are left out."""
+    """The points of a message in ROS's own order of rows; ``name__0000``, ... of a field of several numbers.
+
+    Raises:
+        ValueError: The message is cut off, or its fields have no layout.
+    """
     order = ">" if message.is_bigendian else "<"
-    fields = [field for field in message.fields if field.count <= 1]
-    dtype = np.dtype(
-        {
-            "names": [field.name for field in fields],
-            "formats": [order + TYPES[field.datatype] for field in fields],
-            "offsets": [field.offset for field in fields],
-            "itemsize": message.point_step,
-        }
-    )
-    used = message.width * message.point_step
-    data = np.frombuffer(bytes(message.data), np.uint8)
-    rows = data.reshape(message.height, -1)[:, :used] if message.height else data.reshape(0, used)
+    height, width, step = message.height, message.width, message.point_step
+    names, formats, offsets = [], [], []
+    for field in (field for field in message.fields if field.name not in PADDING):
+        if field.datatype not in TYPES:
+            raise ValueError(f"PointCloud2: field {field.name} is of type {field.datatype}, expected {list(TYPES)}")
+        kind, count = np.dtype(order + TYPES[field.datatype]), max(field.count, 1)
+        if field.offset + kind.itemsize * count > step or field.name in names:
+            raise ValueError(
+                f"PointCloud2: field {field.name} is there twice, or ends behind the {step} bytes of a point"
+            )
+        names += column_names(field.name, count)
+        formats += [kind] * count
+        offsets += [field.offset + kind.itemsize * k for k in range(count)]
+    row_step = message.row_step if height > 1 and message.row_step > width * step else width * step
+    data, needed = bytes(message.data), (height - 1) * row_step + width * step if height and width else 0
+    if len(data) < needed:
+        raise ValueError(f"PointCloud2: {needed} bytes of {height} x {width} points were expected, {len(data)} given")
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    points = np.ndarray((height, width), dtype, data, strides=(row_step, step)).reshape(-1)
     stamp = message.header.stamp
-    time_s = stamp.sec + 1e-9 * stamp.nanosec
-    return PointTable(np.ascontiguousarray(rows).reshape(-1).view(dtype), message.header.frame_id, time_s)
+    return PointTable(points, message.header.frame_id, stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def message_from_table(table: PointTable) -> dict:
@@ -92,15 +102,3 @@ def message_from_table(table: PointTable) -> dict:
         "data": table.points.astype(dtype).tobytes(),
         "is_dense": bool(np.isfinite(table.xyz).all()),
     }
-
-
-def chosen_topic(path: object, topics: list[str], topic: str | None) -> str:
-    """The topic to read among those with point clouds."""
-    if topic is None and len(topics) == 1:
-        return topics[0]
-    if topic in topics:
-        return str(topic)
-    if not topics:
-        raise ValueError(f"{path} has no topic of type {MESSAGE}")
-    asked = "" if topic is None else f"{topic} is none of them; "
-    raise ValueError(f"{path} has topics {', '.join(topics)} of type {MESSAGE}; {asked}name one with topic=...")

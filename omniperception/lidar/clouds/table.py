@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+
+PADDING = ("", "_")
+"""Names of fields that are none, but bytes between the others."""
 
 
 @dataclass(frozen=True)
@@ -57,3 +62,82 @@ def table_of(columns: Mapping[str, np.ndarray], frame: str = "", time_s: float =
     for name, values in stored.items():
         points[name] = values
     return PointTable(points, frame, time_s)
+
+
+def column_names(name: str, count: int) -> list[str]:
+    """Of a field of so many numbers."""
+    return [name] if count == 1 else [f"{name}__{k:04d}" for k in range(count)]
+
+
+def check_words(path: Path, names: Iterable[str]) -> None:
+    """Refuses names of columns that a line of words has no room for.
+
+    Raises:
+        ValueError: One is not a word.
+    """
+    for name in names:
+        if len(name.split()) != 1 or name in PADDING:
+            raise ValueError(f"{path}: column {name!r} has no name of one word, which {path.suffix} needs; rename it")
+
+
+def held(path: Path, there: int, told: int, lost: Sequence[str] = ()) -> int:
+    """How many of so many points can be read; says so where some are missing, or columns are lost.
+
+    Raises:
+        ValueError: None is there.
+    """
+    if told and not there:
+        raise ValueError(f"{path} ends before its first point, {told} were expected")
+    if there < told or lost:
+        without = f" without {', '.join(lost)}" if lost else ""
+        print(f"{path} is cut off: read {min(there, told)} of {told} points{without}", file=sys.stderr, flush=True)
+    return min(there, told)
+
+
+def rows_of_text(path: Path, body: bytes, width: int, told: int) -> list[list[str]]:
+    """Words of the lines of so many points; of a file that is cut off, of those before the cut.
+
+    Raises:
+        ValueError: A line has not as many words as a point has numbers, or none is there.
+    """
+    rows = [
+        words for line in body.decode("utf-8", "replace").splitlines() if (words := line.split()) and words[0][0] != "#"
+    ]
+    if len(rows) < told and not body.endswith(b"\n"):
+        rows = rows[:-1]  # the cut may have gone through its last number
+    rows = rows[: held(path, len(rows), told)]
+    for k, row in enumerate(rows):
+        if len(row) != width:
+            raise ValueError(f"{path}: point {k} has {len(row)} numbers, {width} were expected: {' '.join(row)[:80]}")
+    return rows
+
+
+def numbers(
+    path: Path, rows: Sequence[Sequence[str]], columns: Sequence[tuple[str, np.dtype]]
+) -> dict[str, np.ndarray]:
+    """Columns, (P,) each, of a text's rows, but for padding; whole numbers may be written with a point.
+
+    Raises:
+        ValueError: A word is no number of its column.
+    """
+    return {
+        name: _column(path, name, [row[k] for row in rows], kind)
+        for k, (name, kind) in enumerate(columns)
+        if name not in PADDING
+    }
+
+
+def _column(path: Path, name: str, texts: list[str], dtype: np.dtype) -> np.ndarray:
+    try:
+        return np.array(texts, dtype)
+    except (ValueError, OverflowError):
+        made = np.empty(len(texts), dtype)
+    for k, text in enumerate(texts):
+        try:
+            value = float(text)
+            made[k] = value
+            if dtype.kind in "iu" and made[k] != value:
+                raise ValueError
+        except (ValueError, OverflowError):
+            raise ValueError(f"{path}: {name} of point {k} is {text}, {dtype.name} was expected") from None
+    return made
