@@ -175,7 +175,6 @@ def test_results_of_a_run_name_what_cannot_be_written(run_dir, one_line):
     [
         f"train {' '.join(SMALL)} hydra.run.dir={REFUSED}",
         f"train -m {' '.join(SMALL)} hydra.sweep.dir={REFUSED} seed=1,2",
-        f"play run=run trials=2 viewer=none out={REFUSED}",
         f"export run=run out={REFUSED}",
         f"publish run=run to={REFUSED}",
         f"curves runs=run tags=Loss/value out={REFUSED}/a.png",
@@ -185,11 +184,13 @@ def test_results_of_a_run_name_what_cannot_be_written(run_dir, one_line):
     ],
 )
 def test_a_place_that_cannot_be_written_is_named(run_dir, one_line, line):
-    if line.startswith("play"):  # it writes into the run directory alone
-        (run_dir / "replay.json").mkdir()
-        assert "error: run/replay.json: Is a directory; choose another place" in one_line(*line.split()[:-1])
-    else:
-        assert f"{REFUSED}" in one_line(*line.split()).partition(": ")[2].partition(" ")[0]
+    assert REFUSED in one_line(*line.split()).partition("error: ")[2].partition(" ")[0]
+
+
+def test_a_folder_where_a_file_should_be_is_named(run_dir, one_line):
+    (run_dir / "replay.json").mkdir()
+    words = ("play", "run=run", "trials=2", "viewer=none", "terminations.episode_length_s=0.1")
+    assert "error: run/replay.json: Is a directory; choose another place" in one_line(*words)
 
 
 def test_without_a_cache_kernels_are_compiled_for_this_process_alone():
