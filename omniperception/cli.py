@@ -212,6 +212,10 @@ def terminal() -> Iterator[None]:
         finally:
             if sys.stdout is not None:  # as with >&-
                 sys.stdout.flush()
+    except UnicodeEncodeError as error:
+        if error.reason != "surrogates not allowed":
+            raise
+        fail(ConfigError(f"{error.object!a}: a name that is not UTF-8, which not every library takes; rename it"))
     except OSError as error:
         closed = [stream for stream in (sys.stdout, sys.stderr) if stream is not None and _is_closed(stream)]
         for stream in closed:  # Python would try, and complain, once more at its end

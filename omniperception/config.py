@@ -450,8 +450,8 @@ def read(run_dir: Path) -> DictConfig:
         config = OmegaConf.load(path)
     except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError, OSError) as error:
         raise ConfigError(f"{path} is not a configuration: {one_line(error)}") from None
-    if not isinstance(config, DictConfig):
-        raise ConfigError(f"{path} is not a configuration")
+    if not isinstance(config, DictConfig) or not config:
+        raise ConfigError(f"{path} is not a configuration; give another run directory")
     return config
 
 

@@ -39,6 +39,11 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def plain(text: str) -> str:
+    """Text, such as a path, as it is: between two $ matplotlib would read a formula."""
+    return text.replace("$", r"\$")
+
+
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
     """Draws a figure into a file.
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from omniperception.common.errors import ConfigError
 from omniperception.common.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,9 +58,12 @@ def write(run_dir: Path, facts: Mapping) -> None:
 
 
 def read(run_dir: Path) -> dict:
-    """What a run directory says of where the run comes from; empty: nothing."""
+    """What a run directory says of where the run comes from; empty: nothing. A ConfigError: nobody can read it."""
     path = run_dir / FILE
-    return json.loads(path.read_text()) if path.is_file() else {}
+    try:
+        return dict(json.loads(path.read_text("utf-8"))) if path.is_file() else {}
+    except (ValueError, TypeError):
+        raise ConfigError(f"{path} is damaged; delete it: it only says where the run comes from") from None
 
 
 def made_at(run_dir: Path) -> str:

@@ -21,7 +21,6 @@ from torch import nn
 from omniperception import build
 from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
 from omniperception.build import RunConfig
-from omniperception.common.errors import naming
 from omniperception.common.files import write_whole
 from omniperception.common.provenance import provenance
 from omniperception.common.vectors import moved_towards
@@ -424,18 +423,19 @@ def write_onnx(network: BlindNetwork, path: Path) -> tuple[Path, Callable | None
             "ONNX export needs onnx: pip install 'omniperception[export]', or give formats=torchscript"
         ) from None
     names = list(network.input_names)
-    with torch.no_grad(), warnings.catch_warnings(), _plain_scatter(), naming(path):
+    with torch.no_grad(), warnings.catch_warnings(), _plain_scatter():
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
             network.examples(2),
-            str(path),
+            content := io.BytesIO(),  # type: ignore[arg-type]  # which it takes without dynamo
             input_names=names,
             output_names=list(network.output_names),
             dynamic_axes={name: {0: "batch"} for name in (*names, *network.output_names)},
             opset_version=OPSET,
             dynamo=False,
         )
+    write_whole(path, content.getbuffer())
     try:
         from onnxruntime import InferenceSession
     except ImportError:

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from omniperception import config
 from omniperception.common.errors import ConfigError
-from omniperception.common.figures import new_figure, save_figure
+from omniperception.common.figures import new_figure, plain, save_figure
 from omniperception.evaluation.records import training_of
 
 MAY_DIFFER = ("seed", "logger", config.SEARCH_PATH)
@@ -128,7 +128,7 @@ def draw_curves(path: Path, curves: Mapping[str, Sequence[Curve]], smooth: int) 
             values, colour = curve.smoothed(smooth), f"C{labels.index(curve.label) % 10}"
             seeds = "one training" if len(values) == 1 else f"{len(values)} trainings"
             (line,) = axis.plot(curve.steps, values.mean(0), lw=1.5, color=colour)
-            lines.setdefault("\n".join(textwrap.wrap(f"{curve.label}: {seeds}", 130)), line)
+            lines.setdefault("\n".join(textwrap.wrap(plain(f"{curve.label}: {seeds}"), 130)), line)
             if len(values) > 1:
                 axis.fill_between(curve.steps, values.min(0), values.max(0), color=colour, alpha=0.2, lw=0)
         name = tag.rpartition("/")[2]

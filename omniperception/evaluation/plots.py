@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from omniperception.common.figures import new_figure, save_figure
+from omniperception.common.figures import new_figure, plain, save_figure
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.report import rate_cell
 from omniperception.evaluation.tracks import Tracks
@@ -50,7 +50,7 @@ def draw_worlds(path: Path, records: Sequence[Record]) -> None:
     for axis in axes[:, 0]:
         axis.set_ylabel("y (m)", fontsize=8)
     first, ways = records[0], min(SHOWN, max(len(record.episodes) for record in records))
-    what = f"{first.policy} of {first.run}, split {first.split}, condition {first.condition}"
+    what = f"{first.policy} of {plain(first.run)}, split {first.split}, condition {first.condition}"
     key = "thick: the first trial, obstacles where they were at its start (dashed: moving)"
     figure.suptitle(f"{what}\n{key}; thin: {ways - 1} more", fontsize=9)
     figure.legend(handles=_legend(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)

@@ -115,7 +115,7 @@ def read(path: Path) -> list[Record]:
     except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"{path} holds no results of evaluate: {error!r}") from None
+        raise ConfigError(f"{path} holds no results of evaluate ({error!r}); delete it, or give another") from None
 
 
 def merge(path: Path, records: Sequence[Record]) -> None:

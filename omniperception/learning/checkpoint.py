@@ -73,8 +73,10 @@ def load_checkpoint(path: str | os.PathLike, map_location: str | torch.device | 
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({error.strerror or error})") from error
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, struct.error) as error:
+        older = [found.name for found in list_checkpoints(path.parent.parent) if found != path]
+        remedy = f"without it, {older[-1]} is the newest: delete it" if older else "give another run"
         raise CheckpointError(
-            f"{path} ({path.stat().st_size:,} bytes) is damaged or no checkpoint of this program; use an older one"
+            f"{path} ({path.stat().st_size:,} bytes) is damaged or no checkpoint of this program; {remedy}"
         ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path} is no checkpoint of this program: it has no format '{FORMAT}'")

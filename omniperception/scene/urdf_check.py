@@ -9,31 +9,13 @@ from xml.etree.ElementTree import Element
 
 from omniperception.common.errors import repeated, suggest
 
-_NUMBERS = dict.fromkeys(("xyz", "rpy", "size", "scale"), 3) | dict.fromkeys(
-    [
-        "radius",
-        "length",
-        "value",
-        "ixx",
-        "ixy",
-        "ixz",
-        "iyy",
-        "iyz",
-        "izz",
-        "lower",
-        "upper",
-        "effort",
-        "velocity",
-        "damping",
-        "friction",
-        "multiplier",
-        "offset",
-    ],
-    1,
-)
+_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_OF_JOINTS = ("lower", "upper", "effort", "velocity", "damping", "friction", "multiplier", "offset")
+_NUMBERS = dict.fromkeys(("xyz", "rpy", "size", "scale"), 3)
+_NUMBERS |= dict.fromkeys(("radius", "length", "value", *_INERTIA, *_OF_JOINTS), 1)
 """How many numbers an attribute holds."""
-_HOLD_NUMBERS = ("origin", "box", "cylinder", "sphere", "capsule", "mesh", "mass", "inertia", "axis", "limit")
 _SHAPES = ("box", "cylinder", "sphere", "capsule", "mesh")
+_HOLD_NUMBERS = (*_SHAPES, "origin", "mass", "inertia", "axis", "limit", "dynamics", "mimic")
 _MOVING = ("revolute", "continuous", "prismatic")
 _TYPES = (*_MOVING, "fixed", "floating", "planar")
 
@@ -47,7 +29,7 @@ def check_urdf(robot: Element, path: Path) -> None:
         if not part.get("name"):
             raise ValueError(f"a <{part.tag}> has no name; give it one")
         for element in part.iter():
-            if element.tag in (*_HOLD_NUMBERS, "dynamics", "mimic"):
+            if element.tag in _HOLD_NUMBERS:
                 _check_numbers(element, named)
         for geometry in part.findall("*/geometry"):
             if not any(shape.tag in _SHAPES for shape in geometry):
