@@ -358,8 +358,9 @@ def _files(value: object) -> Iterator[Path]:
     if isinstance(value, list):
         for item in value:
             yield from _files(item)
-    elif isinstance(value, str) and os.path.isfile(path := os.path.expanduser(value.partition("#")[0])):
-        yield Path(path)
+    elif isinstance(value, str):  # of a mesh in a file the part before its name
+        named = [Path(os.path.expanduser(path)) for path in dict.fromkeys((value, value.rpartition("#")[0]))]
+        yield from (path for path in named if os.path.isfile(path))
 
 
 def _sources(modules: Sequence[str]) -> Iterator[Path]:

@@ -17,6 +17,7 @@ import torch
 from omniperception.common.checkpoints import checkpoint_path, list_checkpoints
 from omniperception.common.errors import of_a_disk
 from omniperception.common.files import write_whole
+from omniperception.common.shell import command_line
 
 FORMAT = "omniperception-checkpoint"
 VERSION = 1
@@ -59,7 +60,7 @@ def save_checkpoint(path: str | os.PathLike, state: Mapping) -> None:
     except OSError as error:
         run_dir = path.parent.parent
         older = ", ".join(found.name for found in list_checkpoints(run_dir)[-3:])
-        goes_on = f"; older ones are whole, and train run={run_dir} goes on from the last of {older}" if older else ""
+        goes_on = f"; {command_line('train', f'run={run_dir}')} goes on from the last of {older}" if older else ""
         raise CheckpointError(f"{path} cannot be written: {of_a_disk(error) or error}{goes_on}") from None
 
 
@@ -70,9 +71,9 @@ def load_checkpoint(path: str | os.PathLike, map_location: str | torch.device | 
         raise CheckpointError(f"no checkpoint at {path}: give a file such as {checkpoint_path('<run>', 100)}")
     try:
         content = torch.load(path, weights_only=True, map_location=map_location)
-    except OSError as error:
-        raise CheckpointError(f"{path} cannot be read ({error.strerror or error})") from error
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, struct.error) as error:
+    except (OSError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, struct.error) as error:
+        if isinstance(error, OSError) and of_a_disk(error):
+            raise CheckpointError(f"{path} cannot be read: {of_a_disk(error)}") from error
         older = [found.name for found in list_checkpoints(path.parent.parent) if found != path]
         remedy = f"without it, {older[-1]} is the newest: delete it" if older else "give another run"
         raise CheckpointError(

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from rsl_rl.utils.log_writer import LogWriter
 
+from omniperception.common.errors import naming
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.progress import ProgressLine, save_progress, say
 
@@ -65,15 +66,17 @@ class Logger:
         if self.log_dir is not None:
             self._line = ProgressLine()
             if self.config is not None:
-                self._writer = self.config.open(self.log_dir, first_iteration, self.settings)
+                with naming(self.log_dir):
+                    self._writer = self.config.open(self.log_dir, first_iteration, self.settings)
 
     def close(self) -> None:
         """End the log."""
         if self._line is not None:
             self._line.end()
             self._line = None
-        if self._writer is not None:
-            self._writer.stop()
+        if self._writer is not None and self.log_dir is not None:
+            with naming(self.log_dir):
+                self._writer.stop()
             self._writer = None
 
     def say(self, text: str) -> None:
@@ -141,8 +144,9 @@ class Logger:
             values["Train/mean_reward"] = statistics.mean(self.returns)
             values["Train/mean_episode_length"] = statistics.mean(self.lengths)
         if self._writer is not None:
-            for tag, value in values.items():
-                self._writer.add_scalar(tag, value, iteration)
+            with naming(self.log_dir):
+                for tag, value in values.items():
+                    self._writer.add_scalar(tag, value, iteration)
 
         self._recent.append(collect_time + learn_time)
         remaining = statistics.mean(self._recent) * (total - iteration - 1)

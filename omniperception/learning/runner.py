@@ -118,9 +118,7 @@ class Runner:
                     if self.current_learning_iteration % self.config.ppo.save_interval == 0:
                         self._save_checkpoint()
                 self._save_checkpoint()
-        except BaseException as error:
-            if isinstance(error, OSError):
-                error.filename = error.filename or str(self.logger.log_dir)
+        except BaseException:
             with contextlib.suppress(OSError):  # a log that a full disk does not take would hide what has failed
                 self._end()
             raise

@@ -1,10 +1,13 @@
 """Recorded kernel launches: one on a GPU, split over environments and threads on a CPU."""
 
+import atexit
 import contextlib
 import ctypes
 import itertools
 import os
+import shutil
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,6 +37,21 @@ def _init_without_driver() -> None:
             os.close(nowhere)
 
 
+def _keep_kernels() -> None:
+    """Has Warp keep compiled kernels for this process and its children where its usual folder cannot be written."""
+    usual = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "warp")
+    usual = Path(os.environ.get("WARP_CACHE_PATH") or usual)
+    with contextlib.suppress(OSError):
+        usual.mkdir(parents=True, exist_ok=True)
+    if not os.access(usual, os.W_OK):
+        kept = tempfile.mkdtemp(prefix="warp-")
+        atexit.register(shutil.rmtree, kept, ignore_errors=True)
+        os.environ["WARP_CACHE_PATH"] = kept
+        said = f"{usual} cannot be written, so kernels are compiled anew each time; WARP_CACHE_PATH=<folder> keeps them"
+        print(said, file=sys.stderr, flush=True)
+
+
+_keep_kernels()
 _init_without_driver()
 
 SAY_AFTER_S = 2.0

@@ -13,7 +13,7 @@ SCHEME = "fetched:"
 
 def cache() -> Path:
     """Folder of downloaded robots: in `$XDG_CACHE_HOME`, or in ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "omniperception" / "robots"
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "omniperception" / "robots"
 
 
 def fetched(file: str) -> Path:

@@ -54,7 +54,7 @@ MESHES: dict[str, Callable[[], np.ndarray]] = {"rock": rock, "wedge": wedge, "he
 
 def check_mesh(file: str) -> None:
     """Raises a ValueError in one line if `file` is neither a packaged mesh nor a file."""
-    if file not in MESHES and not Path(file.partition("#")[0]).is_file():
+    if file not in MESHES and not any(Path(path).is_file() for path in (file, file.rpartition("#")[0])):
         raise ValueError(f"obstacles: file={file} is neither a packaged mesh ({', '.join(MESHES)}) nor a file")
 
 
@@ -80,10 +80,10 @@ def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
     """
     if file in MESHES:
         points, unit = MESHES[file](), 0.25
-    elif "#" in file:
+    elif "#" in file and not Path(file).is_file():
         from omniperception.scene.thing_file import mesh_vertices
 
-        points, unit = mesh_vertices(*file.split("#", 1)), None
+        points, unit = mesh_vertices(*file.rsplit("#", 1)), None
     else:
         vertices, triangles = read_mesh(file)
         points, unit = np.unique(vertices[triangles.flatten()], axis=0), None

@@ -54,6 +54,7 @@ CALLS = {
     "omniperception/deploy/description.py": 1,
     "omniperception/evaluation/tables.py": 1,
     "omniperception/evaluation/walking_report.py": 1,
+    "omniperception/learning/checkpoint.py": 1,
     "omniperception/hardware/trials.py": 1,
     "omniperception/robots/fetch.py": 1,
     "omniperception/scene/fetched.py": 1,
