@@ -279,6 +279,7 @@ class ExportedPolicy:
             self.see(points, state.base_quat, state.joint_pos)
         if self.safety is not None:
             command = self.safety.limit_command(command)
+            self._reference = self.safety.kept_to_covered(self._reference)
         self.observation = self._observe(state, command)
         self._follow(command)
         feed = {"observations": self.observation[None]}

@@ -140,7 +140,13 @@ class Safety:
         if not self._lacks:
             self._lacks = True
             self._count(logging.WARNING, "frames in part", f"no points from {self.coverage.lacking()}: not going there")
-        return np.concatenate((self.coverage.kept_to_covered(limited[:2]), limited[2:]))
+        return self.kept_to_covered(limited)
+
+    def kept_to_covered(self, command: np.ndarray) -> np.ndarray:
+        """(3,) a command, slowed down where it leads into directions that frames lack."""
+        if self.coverage is None:
+            return command
+        return np.concatenate((self.coverage.kept_to_covered(command[:2]), command[2:]))
 
     def check_state(self, cos_tilt: float, joint_pos: np.ndarray, joint_vel: np.ndarray) -> None:
         """Raises SafetyStop where the robot has fallen or its joints are where they cannot be.

@@ -197,7 +197,7 @@ class EnvState:
         self.stand_s = torch.where((command == 0).all(1), self.stand_s + self.control_dt, 0.0)
         if self._command_acceleration is not None:
             most = [rate * self.control_dt / max(self._difficulty.level, 1e-3) for rate in self._command_acceleration]
-            self._reference = _ramped(self._reference, command, *most)
+            self._reference = _ramped(self.reference, command, *most)
         if self._history is not None:
             self._history.record()
         if self._errors is not None:
@@ -296,14 +296,18 @@ class EnvState:
     @property
     def allowed_command(self) -> torch.Tensor:
         """(num_envs, 3) likewise, slowed down where it leads into directions that LiDAR frames lack."""
-        return self.command if self._sensing is None else self._sensing.known_to_be_free(self.command)
+        return self._known_to_be_free(self.command)
+
+    def _known_to_be_free(self, command: torch.Tensor) -> torch.Tensor:
+        return command if self._sensing is None else self._sensing.known_to_be_free(command)
 
     @property
     def reference(self) -> torch.Tensor:
         """(num_envs, 3) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame: the command as policies observe it and
         tracking terms ask for it, 0 when an episode begins and then towards the allowed command at no more than
-        `ObservationsConfig.command_acceleration` over the difficulty; without one that command itself."""
-        return self.allowed_command if self._command_acceleration is None else self._reference
+        `ObservationsConfig.command_acceleration` over the difficulty; without one that command itself. Where it leads
+        into directions that LiDAR frames lack it falls at once."""
+        return self._known_to_be_free(self.command if self._command_acceleration is None else self._reference)
 
     @lazy
     def joint_acc(self) -> torch.Tensor:

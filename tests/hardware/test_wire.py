@@ -710,8 +710,12 @@ class TestDds:
                 newest = (commands.take() or [newest])[-1]
             return LOW_CMD.from_cdr(newest)["motor_cmd"]
 
-        run_until(lambda: link.mode is Mode.STANDING_UP or link.ask(Request.STAND))
-        assert run_until(lambda: False, 0.2)["kp"][0] == 60.0
+        def stands():
+            """On a busy machine states may come so late that it is damped: it is asked again."""
+            run_until(lambda: link.mode in (Mode.STANDING_UP, Mode.STANDING) or link.ask(Request.STAND))
+            return run_until(lambda: False, 0.2)["kp"][0] == 60.0
+
+        assert any(stands() for _ in range(50))
         if terminal == "closed":
             os.close(read)
         else:
