@@ -7,7 +7,8 @@ import torch
 from mj_rays import assert_rays_are_those_of_mj_ray
 
 from omniperception.common.random import EnvRandom
-from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig, thing_file
+from omniperception.scene.meshes import mesh_points
 from omniperception.scene.thing_file import mesh_vertices
 
 DOOR = """
@@ -49,6 +50,8 @@ FREQUENCY, N, DT = 0.4, 4, 0.01
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     """A working directory with two articulated things and two meshes."""
+    for cached in (thing_file.parts_of, thing_file._compiled, mesh_points):  # by name, whatever the working directory
+        cached.cache_clear()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "door.xml").write_text(DOOR)
     (tmp_path / "cart.urdf").write_text(URDF)
