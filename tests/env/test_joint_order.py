@@ -39,7 +39,9 @@ def columns(env, group):
     return index
 
 
-@pytest.mark.parametrize("sim", ["sim=mujoco", "sim=mujoco_warp sim.device=cpu"])
+@pytest.mark.parametrize(
+    "sim", ["sim=mujoco", pytest.param("sim=mujoco_warp sim.device=cpu", marks=pytest.mark.slow)]
+)  # without a cache its kernels take minutes to compile
 def test_trajectory_observations_and_rewards_are_those_of_the_same_robot(make_env, sim):
     plain, permuted = (make_env(*TASK, *sim.split(), *order) for order in ((), (PERMUTED,)))
     assert permuted.robot.joints != plain.robot.joints
