@@ -17,6 +17,9 @@ class Coverage:
 
     A sector is covered where the answers of the newest FRAMES frames lie in enough bins of elevation: many points in a
     narrow band say nothing of what is above and below.
+
+    Attributes:
+        covered: (num_envs, NUM_SECTORS) bool; everywhere before an episode's first frame.
     """
 
     def __init__(self, num_envs: int, least: torch.Tensor) -> None:
@@ -25,11 +28,7 @@ class Coverage:
         self._answered = torch.ones(
             FRAMES, num_envs, NUM_SECTORS, NUM_BINS, dtype=torch.bool, device=least.device
         )  # the newest last
-
-    @property
-    def covered(self) -> torch.Tensor:
-        """(num_envs, NUM_SECTORS) bool; everywhere before an episode's first frame."""
-        return self._answered.any(0).sum(-1) >= self._least
+        self.covered = self._answered[0, ..., 0].clone()
 
     def begin_frame(self) -> None:
         """Makes room for the next frame, of all environments."""
@@ -45,16 +44,19 @@ class Coverage:
             envs: which.
         """
         self._answered[-1, envs] = answered_bins(directions_l, ranges.isfinite()) & came[:, None, None]
+        self.covered[envs] = self._answered[:, envs].any(0).sum(-1) >= self._least
 
     def reset(self, env_ids: torch.Tensor) -> None:
         """Episodes begin in environments (n,)."""
         self._answered.index_fill_(1, env_ids, True)
+        self.covered.index_fill_(0, env_ids, True)
 
     def state_dict(self) -> dict:
-        return {"answered": self._answered.clone()}
+        return {"answered": self._answered.clone(), "covered": self.covered.clone()}
 
     def load_state_dict(self, state: dict) -> None:
         self._answered.copy_(state["answered"])
+        self.covered.copy_(state["covered"])
 
 
 def answered_bins(directions_l: torch.Tensor, answered: torch.Tensor) -> torch.Tensor:

@@ -233,7 +233,7 @@ def _lidar(sensor: SensorConfig, robot: RobotConfig) -> Lidar:
         num_rays=sensor.num_rays,
         points_per_frame=pattern.points_per_frame(sensor.period_s),
         keep_every=pattern.stride(sensor.period_s, sensor.num_rays) if every_kth else None,
-        least_bins=least_bins_of(sensor, robot).tolist(),
+        least_bins=least_bins_of(sensor, pattern, robot).tolist(),
         carried_by=() if sensor.mount_body is None else _turns(robot, sensor.mount_body),
     )
 

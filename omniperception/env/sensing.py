@@ -193,7 +193,7 @@ class LidarSensing:
         self.fresh = torch.ones(n, dtype=torch.bool, device=device) if delivery is None else delivery.fresh
         self.coverage: Coverage | None = None
         if delivery is not None and delivery.partial is not None and (sampled or measured):
-            self.coverage = Coverage(n, least_bins_of(config, sim.world.robot).to(device))
+            self.coverage = Coverage(n, least_bins_of(config, pattern, sim.world.robot).to(device))
         self.tick, self._is_cast = 0, False
         self.frame_count, self.frame_tick = torch.zeros(2, n, 1, dtype=torch.int64, device=device).unbind(0)
         self.frames: torch.Tensor | None = None
@@ -468,10 +468,10 @@ class LidarSensing:
         return launches
 
 
-def least_bins_of(config: SensorConfig, robot: RobotConfig) -> torch.Tensor:
+def least_bins_of(config: SensorConfig, pattern: ScanPattern, robot: RobotConfig) -> torch.Tensor:
     """(NUM_SECTORS,) what covers each direction around a sensor, see `least_bins`."""
     height = robot.height_of(config.mount_body) + config.mount_pos[2]
-    return least_bins(config.scan_pattern().directions_s.cpu(), torch.tensor(config.quat), height, config.max_range)
+    return least_bins(pattern.directions_s.cpu(), torch.tensor(config.quat), height, config.max_range)
 
 
 def _outputs(
