@@ -170,6 +170,7 @@ def test_legged_terms_in_the_task(make_env):
 def test_launches_take_the_environments_threads(make_env, monkeypatch):
     taken = []
     monkeypatch.setattr(launch, "SplitLaunch", lambda *given: taken.append(given[5]) or (lambda: None))
+    monkeypatch.setattr(launch, "_launches", OrderedDict())  # other tests' launches are not these
     for threads, expected in ((1, 1), (2, 2), (0, default_num_threads())):
         make_env("obstacles=none", f"sim.num_threads={threads}", blind=True, num_envs=1)
         launch.launch_over_envs("kernel", 1, [threads], torch.device("cpu"))
