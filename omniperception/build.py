@@ -33,9 +33,11 @@ from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.memory import check_fits
+from omniperception.learning.navigation import NavigationConfig
 from omniperception.scene import Mount, RobotConfig, SteppingConfig
 from omniperception.scene.held_out import held_out
 from omniperception.schema import ANYTHING, make, types_of, words_of
+from omniperception.sim.planar import PlanarConfig
 
 if TYPE_CHECKING:
     from omniperception.env.sensing import SensorConfig
@@ -53,6 +55,7 @@ class RunConfig:
         logger: where scalars of the training go, or None.
         init: the runs whose weights this one starts from: see `Runner.start_from`.
         distillation: of a teacher at the beginning, or None.
+        navigation: of a policy that asks a gait for velocities, or None.
         condition: under which the robot walks, where its randomization is one of conf/condition as it stands.
         composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
     """
@@ -64,6 +67,7 @@ class RunConfig:
     init: tuple[str, ...]
     distillation: DistillationConfig | None
     condition: Condition | None
+    navigation: NavigationConfig | None
     composed: dict
 
     def __post_init__(self) -> None:
@@ -140,6 +144,9 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         raise DoesNotFit(f"the configuration has no {key}")
     hints = types_of(EnvConfig)
     task = {key: make(hints[key], composed[key], key, trusted) for key in _TASK}
+    if isinstance(task["sim"], PlanarConfig):
+        gait = configs.find_run(task["sim"].response, "sim.response")
+        task["sim"] = replace(task["sim"], response=str(gait))
     if task["obstacles"].split == "test":
         try:
             task["obstacles"] = held_out(task["obstacles"])
@@ -161,7 +168,8 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         condition = make(Condition | None, composed.get("condition"), "condition")
         logger = _logger(composed, trusted)
         init = _names(composed.get("init"))
-        return RunConfig(env, perception, ppo, logger, init, distillation, condition, composed)
+        navigation = make(NavigationConfig | None, composed.get("navigation"), "navigation")
+        return RunConfig(env, perception, ppo, logger, init, distillation, condition, navigation, composed)
     except ValueError as error:
         raise ConfigError(one_line(error)) from None
 
@@ -383,6 +391,7 @@ def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
         run.env.rewards.avoidance.risk,
         None if run.max_acceleration is None else run.max_acceleration * env.control_dt,
         Mirror(env) if run.ppo.symmetry else None,
+        navigation=run.navigation,
         estimator=EstimatorConfig(run.env.observations.estimated) if run.env.observations.estimated else None,
         distillation=run.distillation,
         logger=run.logger,

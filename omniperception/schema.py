@@ -69,7 +69,9 @@ NAMES: dict[str, Kind] = {
         _members("scene.layouts", maze="MazeLayout", blocks="BlocksLayout", barn="BarnLayout")
     ),
     "sim": Kind(
-        _members("sim.mujoco", mujoco="SimConfig") | _members("sim.mujoco_warp", mujoco_warp="MujocoWarpConfig")
+        _members("sim.mujoco", mujoco="SimConfig")
+        | _members("sim.mujoco_warp", mujoco_warp="MujocoWarpConfig")
+        | _members("sim.planar", planar="PlanarConfig")
     ),
     "logger": Kind(
         _members("learning.log_writers", tensorboard="LoggerConfig", wandb="WandbConfig", mlflow="MlflowConfig")

@@ -49,6 +49,14 @@ def nearest_point(place: wp.vec2, axis: wp.vec2, outline: wp.vec2) -> wp.vec2:
 
 
 @wp.func
+def around(outline: wp.vec2) -> float:
+    """Radius of the circle around an outline."""
+    if outline[1] < 0.0:
+        return outline[0]
+    return wp.length(outline)
+
+
+@wp.func
 def keep_nearer(distance: float, velocity: wp.vec2, sector: wp.vec3) -> wp.vec3:
     if distance < sector[0]:
         return wp.vec3(distance, velocity[0], velocity[1])
@@ -78,7 +86,17 @@ def nearest_by_sector(
             near = nearest_point(p, a, outline[env, o])
             own = sector_of(near[0], near[1], num_sectors)
             sectors_out[env, own] = keep_nearer(wp.length(near), w, sectors_out[env, own])
-            for s in range(num_sectors):
+            first = wp.int32(0)
+            count = wp.int32(num_sectors)
+            away = wp.length(p)
+            reach = around(outline[env, o])
+            if away > reach:  # middles of other sectors pass by
+                half = wp.asin(reach / away) / width + 1.0e-3
+                middle = (wp.atan2(p[1], p[0]) + wp.static(math.pi)) / width - 0.5
+                first = wp.int32(wp.ceil(middle - half))
+                count = wp.min(wp.int32(wp.floor(middle + half)) - first + 1, num_sectors)
+            for k in range(count):
+                s = (first + k + 2 * num_sectors) % num_sectors
                 angle = (float(s) + 0.5) * width - wp.static(math.pi)
                 distance = entry(p, a, outline[env, o], wp.vec2(wp.cos(angle), wp.sin(angle)))
                 if distance < sectors_out[env, s][0]:
@@ -135,3 +153,51 @@ def worst_sectors(
                     least[env, k] = exponent
                     sector_out[env, k] = wp.int64(sectors[env, at])
                     time_out[env, k] = time
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def largest_risks(
+    env_offset: int,
+    sectors: wp.array2d(dtype=wp.vec3),
+    bearings: wp.array(dtype=wp.vec2),
+    candidates: wp.array(dtype=wp.vec2),
+    times: wp.array(dtype=wp.float32),
+    robot_radius: float,
+    robot_half_length: float,
+    decay: float,
+    time_constant: float,
+    max_speed: float,
+    none_from: float,
+    # work memory
+    points: wp.array2d(dtype=wp.vec2),
+    # out
+    risk_out: wp.array2d(dtype=wp.float32),
+):
+    """The candidates' risks in one environment; see `VelocityRisk`. Those below exp(-`none_from`) are 0."""
+    env = wp.tid() + env_offset
+    for k in range(candidates.shape[0]):
+        risk_out[env, k] = none_from
+    for t in range(times.shape[0]):
+        time = times[t]
+        left = (none_from - time / time_constant) * decay + robot_radius
+        present = wp.int32(0)
+        for s in range(sectors.shape[1]):
+            sector = sectors[env, s]
+            if sector[0] < 1.0e3:
+                at = sector[0] * bearings[s] + time * wp.vec2(sector[1], sector[2])
+                if wp.length(at) < left + robot_half_length + time * max_speed:
+                    points[env, present] = at
+                    present += 1
+        if present > 0:
+            for k in range(candidates.shape[0]):
+                goal = time * candidates[k]
+                nearest = wp.float32(1.0e6)
+                for j in range(present):
+                    apart = points[env, j] - goal
+                    along = wp.max(wp.abs(apart[0]) - robot_half_length, 0.0)
+                    nearest = wp.min(nearest, along * along + apart[1] * apart[1])
+                exponent = wp.max(wp.sqrt(nearest) - robot_radius, 0.0) / decay + time / time_constant
+                risk_out[env, k] = wp.min(risk_out[env, k], exponent)
+    for k in range(candidates.shape[0]):
+        exponent = risk_out[env, k]
+        risk_out[env, k] = wp.where(exponent < none_from, wp.exp(-exponent), 0.0)

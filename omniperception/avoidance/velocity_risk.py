@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 
@@ -27,8 +28,18 @@ _POSITIVE = (
     "sideways",
 )
 
+_NO_RISK = 16.0
+"""Risks below exp(-_NO_RISK), a ten-millionth, count as none where no gradient is asked for."""
+
 _SMALLEST = 1e-6
 """Squared distance (m^2) below which a gradient would not exist."""
+
+
+@lru_cache(16)
+def _bearings(num_sectors: int, device: torch.device) -> torch.Tensor:
+    """`sector_bearings`, made once."""
+    with torch.inference_mode(False):
+        return sector_bearings(num_sectors, device).contiguous()
 
 
 @dataclass(frozen=True)
@@ -107,11 +118,14 @@ class VelocityRisk:
         Returns:
             (n, K).
         """
+        traced = torch.jit.is_tracing() or torch.onnx.is_in_onnx_export()
+        if not traced and not torch.is_grad_enabled():
+            return self._largest(sectors, candidates)
         bearings = sector_bearings(sectors.shape[1], sectors.device)
         place = sectors[..., :1].clamp(max=_OUT_OF_REACH) * bearings
         velocity = sectors[..., 1:]
         with torch.no_grad():
-            if torch.jit.is_tracing() or torch.onnx.is_in_onnx_export():
+            if traced:
                 sector, time = self._worst(place, velocity, candidates)
             else:
                 sector, time = self._worst_by_kernel(place, velocity, candidates)
@@ -119,6 +133,33 @@ class VelocityRisk:
         meeting = place.gather(1, sector) + time[..., None] * (velocity.gather(1, sector) - candidates)
         distance = self._squared(*meeting.unbind(-1)).clamp(min=_SMALLEST).sqrt()
         return (-self._exponent(distance, time)).exp()
+
+    def _largest(self, sectors: torch.Tensor, candidates: torch.Tensor) -> torch.Tensor:
+        """As :meth:`risk`, without gradients and in a fifth of the time."""
+        import warp as wp
+
+        from omniperception.avoidance.kernels import largest_risks
+        from omniperception.common.launch import constant, launch_over_envs, view
+
+        sectors = sectors.float().contiguous()
+        points = sectors.new_empty(*sectors.shape[:2], 2)
+        risk = sectors.new_empty(len(sectors), len(candidates))
+        inputs = [
+            view(sectors, wp.vec3),
+            view(_bearings(sectors.shape[1], sectors.device), wp.vec2),
+            view(candidates, wp.vec2),
+            view(constant(tuple(self.times), sectors.device), wp.float32),
+            self.robot_radius,
+            self.robot_half_length,
+            self.decay,
+            self.time_constant,
+            self.max_speed,
+            _NO_RISK,
+            view(points, wp.vec2),
+            view(risk, wp.float32),
+        ]
+        launch_over_envs(largest_risks, len(sectors), inputs, sectors.device)
+        return risk
 
     def _worst_by_kernel(
         self, place: torch.Tensor, velocity: torch.Tensor, candidates: torch.Tensor

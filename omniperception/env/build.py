@@ -68,7 +68,13 @@ def build_obstacles(
     """The obstacles, where there are some."""
     if not config.obstacles.num_obstacles:
         return None
-    return ObstacleField(config.obstacles, sim.mocap_pos, sim.mocap_quat, random, ground)
+    field = ObstacleField(config.obstacles, sim.mocap_pos, sim.mocap_quat, random, ground)
+    if not config.sim.has_legs:
+        from omniperception.sim.planar_world import PlanarSimulator
+
+        assert isinstance(sim, PlanarSimulator)
+        sim.meet(field)
+    return field
 
 
 def build_avoidance(config: EnvConfig, field: ObstacleField | None, device: torch.device) -> Avoidance | None:

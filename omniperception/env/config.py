@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, MOTION_TARGET, SECTOR_TARGET
 from omniperception.common.random import MOST_SEEDS
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
-from omniperception.env.mdp.randomization import RandomizationConfig
+from omniperception.env.mdp.randomization import DRAWN, RandomizationConfig
 from omniperception.env.mdp.terminations import TerminationsConfig
 from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
-from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
+from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, LEGS, MEASURED_CLOUD, requirements
 from omniperception.lidar import DEVICES, Noise
 from omniperception.lidar.noise import NAMES as NOISE_NAMES
 from omniperception.scene import (
@@ -24,8 +24,9 @@ from omniperception.scene import (
     TerrainConfig,
     TiledTerrainConfig,
 )
-from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
+from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.sim import SimConfig
+from omniperception.sim.planar import PlanarConfig
 
 if TYPE_CHECKING:  # loaded where it is built
     from omniperception.env.sensing import SensorConfig
@@ -33,6 +34,8 @@ if TYPE_CHECKING:  # loaded where it is built
 HEIGHT_TARGET = "height_target"
 """Observation group with the height grid that a network can be supervised with."""
 
+OF_LEGS = frozenset({LEGS, FOOT_FORCE, LINK_FORCE})
+"""Requirements that only a simulator with legs fulfils."""
 FROM_LIDAR = frozenset({AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD})
 """Requirements that only a LiDAR fulfils."""
 
@@ -73,7 +76,7 @@ class EnvConfig:
     rewards: RewardsConfig
     terminations: TerminationsConfig
     randomization: RandomizationConfig
-    sim: SimConfig
+    sim: SimConfig | PlanarConfig
     lidar: SensorConfig | None = None
     sampler: Callable | None = None
     frame_history: int = 0
@@ -102,6 +105,8 @@ class EnvConfig:
                 f"robot.gait.frequency={gait.frequency:g} is too fast for control steps of {period:g} s; at most"
                 f" {_MOST_STEPS / period:g} Hz"
             )
+        if not self.sim.has_legs:
+            self._check_without_legs()
         if self.log_interval < 1:
             raise ValueError(f"log_interval={self.log_interval} must be at least 1")
         if self.obstacles.free_path is not None and isinstance(self.commands, VelocityCommandConfig):
@@ -146,6 +151,33 @@ class EnvConfig:
                     f"rewards or observations require {', '.join(unmet)} from the LiDAR, but lidar=none;"
                     " use lidar=mid360 or rewards=walk observations=walk"
                 )
+
+    def _check_without_legs(self) -> None:
+        """Nothing is asked of joints, feet or torques where there are none."""
+        terms = {f"rewards.terms.{name}": term.func for name, term in self.rewards.terms.items()}
+        for group, own in self.observations.groups.items():
+            terms |= {f"observations.groups.{group}.terms.{name}": term for name, term in own.terms.items()}
+        reading = [name for name, term in terms.items() if requirements(term) & OF_LEGS]
+        if reading:
+            raise ValueError(
+                f"{', '.join(reading)} read joints, feet or torques, and sim=planar has none; use rewards=navigate"
+                " observations=navigate, or sim=mujoco"
+            )
+        if self.stepping is not None:
+            raise ValueError("stepping moves joints, and sim=planar has none; use stepping=null, or sim=mujoco")
+
+    @property
+    def num_actions(self) -> int:
+        """Joints, or without legs v_x, v_y and yaw rate."""
+        return self.robot.num_joints if self.sim.has_legs else 3
+
+    @property
+    def drawn_physics(self) -> RandomizationConfig:
+        """The randomization, without the rows that a robot without legs has in its measured response."""
+        if self.sim.has_legs:
+            return self.randomization
+        rows = [name for name in DRAWN if name != "latency_s"]
+        return replace(self.randomization, **dict.fromkeys(rows))
 
     def _check_route(self, commands: GoalCommandConfig) -> None:
         end = self.obstacles.route_end

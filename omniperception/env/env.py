@@ -61,7 +61,7 @@ class OmniEnv(VecEnv):
 
     def __init__(self, config: EnvConfig) -> None:
         self.config, self.robot = config, config.robot
-        self.num_envs, self.num_actions = config.num_envs, config.robot.num_joints
+        self.num_envs, self.num_actions = config.num_envs, config.num_actions
         self.control_dt = config.sim.control_dt
         self.max_episode_length = round(config.terminations.episode_length_s / self.control_dt)
         self.timer, self.step_count, self._has_stepped = StageTimer(), 0, False
@@ -70,15 +70,15 @@ class OmniEnv(VecEnv):
         sensors = config.requirements() & CONTACT_SENSORS
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
         late = config.randomization.latency_s is not None
-        self.sim = config.sim.build(self.world, self.num_envs, record_states=late)
-        self.device = self.sim.device
         streams = TrialRandom if config.trials else EnvRandom
-        self.random: EnvRandom = streams(config.seed, self.num_envs, self.device)
+        self.random: EnvRandom = streams(config.seed, self.num_envs, config.sim.torch_device)
+        self.sim = config.sim.build(self.world, self.num_envs, late, self.random)
+        self.device = self.sim.device
         self.command = config.commands.build(self.num_envs, self.device, self.random)
         self._episode_length = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self.difficulty = Curriculum(config.randomization.curriculum)
         branch = self.random.branch("randomization")
-        self.randomizer = Randomizer(config.randomization, self.sim, branch, self.difficulty)
+        self.randomizer = Randomizer(config.drawn_physics, self.sim, branch, self.difficulty)
         self.ground, self.terrain_levels, lookup = build_ground(config, self.sim, self.random)
         self.obstacles = build_obstacles(config, self.sim, self.random, self.ground)
         self.avoidance = build_avoidance(config, self.obstacles, self.device)
@@ -99,7 +99,10 @@ class OmniEnv(VecEnv):
             self.difficulty,
             config.stepping,
             config.requirements(),
+            config.sim.has_legs,
         )
+        if not config.sim.has_legs:
+            self.state.ask_by(lambda: self.state.asked[:, :2].clone())
         if config.full_level:
             self.curriculum_levels = (1.0,) * len(self._curricula())
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
@@ -165,7 +168,7 @@ class OmniEnv(VecEnv):
                 self._reset(ended)
         with self.timer.stage("observations"):
             self.observations = self._observe(ended)
-        extras: dict = {"time_outs": self.outcomes["time_out"].float()}
+        extras: dict = {"time_outs": (self.outcomes["time_out"] | self.outcomes["goal"]).float()}
         if self.step_count % self.config.log_interval == 0:
             extras["log"] = self._report()
         return self.observations, rewards, self.done.long(), extras

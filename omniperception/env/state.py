@@ -21,6 +21,7 @@ from omniperception.scene.stepping import stepping_offsets
 
 if TYPE_CHECKING:  # parts that not every task has
     from omniperception.avoidance.avoidance import Avoidance
+    from omniperception.avoidance.true_sectors import TrueSectors
     from omniperception.env.height_lookup import HeightLookup
     from omniperception.env.mdp.commands import Command
     from omniperception.env.mdp.randomization import Randomizer
@@ -33,10 +34,14 @@ if TYPE_CHECKING:  # parts that not every task has
 AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD = "avoidance", "distal_range", "cloud", "measured_cloud"
 """Outputs of the LiDAR that can be required: V_avoid and sector distances, mean distal ranges, clouds without noise and
 with it."""
+LEGS = "legs"
+"""Required by what reads joints, feet or torques, which not every simulator has."""
 CONTACT_SENSORS = frozenset({FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_FORCE})
-REQUIREMENTS = (*sorted(CONTACT_SENSORS), AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD)
-"""Sensors that must exist before the world is compiled."""
+REQUIREMENTS = (*sorted(CONTACT_SENSORS), AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD, LEGS)
+"""What must exist before the world is compiled: sensors, and legs."""
 
+NUM_SECTORS = 36
+"""Of `EnvState.sectors`."""
 CONTACT_FORCE = 1.0
 """Vertical force (N) from which on a foot is in contact."""
 
@@ -98,7 +103,8 @@ class EnvState:
     from the first read on, at every control step.
 
     Attributes:
-        actions: (num_envs, num_actions) each: those applied, the newest first, and the two before; 0 after a reset.
+        actions: (num_envs, num_actions) each, of joints or, without legs, v_x, v_y (m/s) and yaw rate (rad/s) that are
+            asked for: those applied, the newest first, and the two before; 0 after a reset.
         pose: (num_envs, num_joints) rad: to which the actions of the control step are added; the default pose after a
             reset.
         targets: (num_envs, num_joints) rad each: of the control step, and of the one before; the default pose after a
@@ -130,6 +136,7 @@ class EnvState:
         difficulty: Curriculum,
         stepping: SteppingConfig | None,
         declared: frozenset[str],
+        has_legs: bool = True,
     ) -> None:
         """
         Args:
@@ -147,6 +154,7 @@ class EnvState:
             difficulty: share of the randomization; the less of it, the faster `reference` follows.
             stepping: of `pose`; None: it is the default pose.
             declared: what terms and others have said that they read; see `requires`.
+            has_legs: whether actions move joints; otherwise they are velocities that are asked for.
         """
         self._declared = declared
         self._errors, self._episode_steps = errors, episode_steps
@@ -166,16 +174,20 @@ class EnvState:
         self.default_base_height = robot.base_height
         self._foot_geoms = tuple(model.geom(name).id for foot in robot.feet for name in foot)
         self._foot_of = _membership([len(foot) for foot in robot.feet], self.device)
-        self.actions: tuple[torch.Tensor, ...] = (torch.zeros(self.num_envs, robot.num_joints, device=self.device),) * 3
+        self._has_legs = has_legs
+        width = robot.num_joints if has_legs else 3
+        self.actions: tuple[torch.Tensor, ...] = (torch.zeros(self.num_envs, width, device=self.device),) * 3
         self.drawn_physics = randomizer.drawn
         self._history = None if randomizer.delay is None else StateHistory(sim, randomizer)
         self._foot_times: AirTimes | None = None
+        self._true_sectors: TrueSectors | None = None
         self.before = self.kinematics
         self.stand_s = torch.zeros(self.num_envs, device=self.device)
         self.last_asked = torch.zeros(self.num_envs, 2, device=self.device)
         self._command_acceleration, self._difficulty = command_acceleration, difficulty
         self._reference = torch.zeros(self.num_envs, 3, device=self.device)
-        self.pose = self.default_joint_pos.expand(self.num_envs, -1)
+        self._rest = self.default_joint_pos if has_legs else torch.zeros(3, device=self.device)
+        self.pose = self._rest.expand(self.num_envs, -1)
         self.targets = (self.pose, self.pose)
         self._stepping = None if stepping is None else Stepping(stepping, robot, self.device)
 
@@ -186,7 +198,8 @@ class EnvState:
         self.before, self.actions = self.kinematics, (actions, *self.actions[:-1])
         if self._stepping is not None:
             self.pose = self.default_joint_pos + self._stepping(self)
-        self.targets = (self.pose + self.action_scale * actions, self.targets[0])
+        scale = self.action_scale if self._has_legs else 1.0
+        self.targets = (self.pose + scale * actions, self.targets[0])
         asked = self._asked_source() if self._asked_source is not None else None
         self.last_asked = self.last_asked if asked is None else asked
 
@@ -210,8 +223,8 @@ class EnvState:
         self.invalidate()
         self.actions = tuple(action.index_fill(0, env_ids, 0.0) for action in self.actions)
         fresh = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device).index_fill(0, env_ids, True)
-        last, before = (torch.where(fresh, self.default_joint_pos, targets) for targets in self.targets)
-        self.targets, self.pose = (last, before), torch.where(fresh, self.default_joint_pos, self.pose)
+        last, before = (torch.where(fresh, self._rest, targets) for targets in self.targets)
+        self.targets, self.pose = (last, before), torch.where(fresh, self._rest, self.pose)
         self.before = self.before.replaced(fresh, self.kinematics)
         self.stand_s = self.stand_s.index_fill(0, env_ids, 0.0)
         self.last_asked = self.last_asked.index_fill(0, env_ids, 0.0)
@@ -423,6 +436,39 @@ class EnvState:
         axis = torch.stack((heading.cos(), heading.sin()), -1)
         radius, outline = field.radius[:, free].float(), field.outline[:, free].float()
         return Obstacles(rotate_yaw(-yaw, offset), velocity, radius, field.in_the_way()[:, free], axis, outline)
+
+    @lazy
+    def sectors(self) -> torch.Tensor:
+        """(num_envs, 36, 3) distance (m, infinite without an obstacle) and velocity (m/s, yaw-aligned frame) of the
+        nearest true obstacle by azimuth sector; see `TrueSectors`."""
+        if self._true_sectors is None:
+            from omniperception.avoidance.true_sectors import TrueSectors
+
+            world = self._sim.world.obstacles
+            self._true_sectors = TrueSectors(NUM_SECTORS, world, self._obstacles, self.num_envs, self.device)
+        return self._true_sectors.measure(self.kinematics.base_pos_w, self.kinematics.yaw)
+
+    @property
+    def asked(self) -> torch.Tensor:
+        """(num_envs, 3) m/s and rad/s, yaw-aligned frame: what the gait is asked for now, where a simulator without
+        legs follows that."""
+        asked = getattr(self._sim, "asked", None)
+        if asked is None:
+            raise NotHere("asked")
+        return asked
+
+    @property
+    def drawn_response(self) -> torch.Tensor:
+        """(num_envs, 13) of robots without legs: gain, lag (s), delay (s), offset (m/s, rad/s) by axis, radius (m)."""
+        drawn = getattr(self._sim, "drawn_response", None)
+        if drawn is None:
+            raise NotHere("drawn_response")
+        return drawn
+
+    @property
+    def goal_w(self) -> torch.Tensor | None:
+        """(num_envs, 2) m, environment frame: where the commands lead; None where they lead nowhere."""
+        return self._command.goal_w
 
     @property
     def avoidance_velocity(self) -> torch.Tensor:

@@ -15,6 +15,7 @@ from omniperception.env.config import HEIGHT_TARGET
 from omniperception.learning.distillation import DistillationConfig
 from omniperception.learning.estimator import EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
+from omniperception.learning.navigation import NavigationConfig
 from omniperception.learning.precision import bfloat16_is_faster
 from omniperception.perception import PerceptionNetwork, Sampler
 
@@ -246,6 +247,7 @@ class LearningConfig:
             no limit.
         mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
         estimator: of what the actor does not observe; None: it estimates nothing.
+        navigation: of a policy that asks a gait for velocities; None: it moves joints.
         distillation: of a teacher, which :meth:`PerceptivePpo.learn_from` gives; None: there is none.
         logger: where scalars go; None: nowhere.
         settings: the run's composed configuration, for what is logged.
@@ -261,6 +263,7 @@ class LearningConfig:
     max_change: float | None = None
     mirror: Callable | None = None
     estimator: EstimatorConfig | None = None
+    navigation: NavigationConfig | None = None
     distillation: DistillationConfig | None = None
     logger: LoggerConfig | None = field(default_factory=LoggerConfig)
     settings: Mapping[str, Any] = field(default_factory=dict)

@@ -19,6 +19,7 @@ from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.divergence import DivergenceGuard
 from omniperception.learning.estimator import EstimatingModel
 from omniperception.learning.models import PerceptionActor
+from omniperception.learning.navigation import NavigationActor
 from omniperception.learning.storage import Embedded, PerceptiveStorage, WindowedObservations
 
 ESTIMATOR_LEARNING_RATE = 1.0e-3
@@ -122,7 +123,9 @@ class PerceptivePpo(PPO):
             if not used:
                 raise ValueError(f"observations.{name} is empty; name at least one group of observations")
         distribution = {"class_name": "GaussianDistribution", "init_std": ppo.init_std}
-        if perception is None:
+        if config.navigation is not None:
+            actor = NavigationActor(obs, groups, "actor", env.num_actions, distribution_cfg=distribution, **ppo.mlp)
+        elif perception is None:
             actor = EstimatingModel(
                 obs,
                 groups,
@@ -152,7 +155,8 @@ class PerceptivePpo(PPO):
                 **ppo.mlp,
             )
         actor = actor.to(device)
-        critic = MLPModel(obs, groups, "critic", 1, **ppo.mlp).to(device)
+        of_critic = ppo.mlp | ({"obs_normalization": True} if config.navigation is not None else {})
+        critic = MLPModel(obs, groups, "critic", 1, **of_critic).to(device)
         stored = {*config.actor_groups, *config.critic_groups, *(perception.supervision if perception else ())}
         if config.max_change is not None:
             stored.add(LAST_ASKED)

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 
-from omniperception.env.mdp.terms import JOINT_MAGNITUDES, JOINTS, ROTATION, VECTOR, mirrors
+from omniperception.avoidance.navigation import navigation_inputs
+from omniperception.avoidance.sector_motion import encode
+from omniperception.avoidance.velocity_risk import VelocityRisk
+from omniperception.common.rotations import rotate_yaw
+from omniperception.env.mdp.terms import JOINT_MAGNITUDES, JOINTS, ROTATION, VECTOR, StatefulTerm, mirrors
 from omniperception.env.state import EnvState, requires, rests
 
 
+@requires("legs")
 @mirrors(JOINTS)
 def joint_pos_offset(state: EnvState) -> torch.Tensor:
     """Joint position relative to the default pose, rad, as measured (with latency when randomized)."""
     return state.measured.joint_pos - state.default_joint_pos
 
 
+@requires("legs")
 @mirrors(JOINTS)
 def joint_vel(state: EnvState, scale: float = 1.0) -> torch.Tensor:
     """Joint velocity, rad/s, times `scale`, as measured."""
@@ -62,6 +72,7 @@ def gait_phase(state: EnvState, frequency: float, rest_s: float) -> torch.Tensor
     return torch.stack((angle.sin(), angle.cos()), 1) * ~rests(state, rest_s)[:, None]
 
 
+@requires("legs")
 @mirrors(JOINTS, JOINTS, VECTOR, ROTATION, VECTOR)
 def true_proprioception(state: EnvState, joint_vel_scale: float = 1.0, ang_vel_scale: float = 1.0) -> torch.Tensor:
     """The 33 proprioceptive values without latency or noise: privileged."""
@@ -133,3 +144,103 @@ def nearest_obstacles(state: EnvState, count: int, max_distance: float) -> torch
 def avoidance_target(state: EnvState) -> torch.Tensor:
     """The avoidance velocity (m/s, yaw-aligned frame) that the reward asks for: privileged."""
     return state.avoidance_velocity
+
+
+@dataclass(frozen=True)
+class SectorErrors:
+    """Errors of what is known by sector, beside the truth.
+
+    Attributes:
+        distance: standard deviation (m) of a distance of 1 m; it grows with the distance.
+        velocity: standard deviation (m/s) of each component of a velocity.
+        slowed: (low, high) factor on velocities, drawn for each robot and episode: a network that is unsure says less.
+        lost: share of the sectors that are empty although something is there.
+        late: share of the steps in which what is known is one step old.
+        lasts_s: time (s) after which a fraction 1/e of an error is left.
+    """
+
+    distance: float
+    velocity: float
+    slowed: Sequence[float]
+    lost: float
+    late: float
+    lasts_s: float
+
+
+class NavigationView(StatefulTerm):
+    """What a navigation policy reads (`avoidance.navigation`), from the true sectors with errors."""
+
+    def __init__(self, risk: VelocityRisk, errors: SectorErrors | None = None) -> None:
+        """
+        Args:
+            risk: the controller on whose choice the policy builds.
+            errors: of the sectors; None: they are true.
+        """
+        self._risk, self._errors = risk, errors
+        self._candidates: torch.Tensor | None = None
+
+    def __call__(self, state: EnvState) -> torch.Tensor:
+        if self._candidates is None:
+            self._begin(state)
+        sectors = state.sectors if self._errors is None else self._with_errors(state, self._errors)
+        measured = state.measured
+        velocity = torch.cat((measured.base_lin_vel_yaw, measured.base_ang_vel_b[:, 2:]), 1)
+        return navigation_inputs(sectors, state.reference, velocity, state.asked, self._risk, self._candidates)
+
+    def _begin(self, state: EnvState) -> None:
+        self._candidates = self._risk.candidates(state.device)
+        self.wrong = torch.zeros_like(state.sectors)
+        self.slowed = torch.ones(state.num_envs, device=state.device)
+        self.before = torch.zeros_like(state.sectors)
+        self.before[..., 0] = torch.inf
+        if self._errors is not None:
+            self.reset(torch.arange(state.num_envs, device=state.device))
+
+    def _with_errors(self, state: EnvState, errors: SectorErrors) -> torch.Tensor:
+        kept = math.exp(-state.control_dt / errors.lasts_s)
+        self.wrong = kept * self.wrong + math.sqrt(1 - kept**2) * torch.randn_like(self.wrong)
+        true = state.sectors
+        distance = true[..., 0] * (1 + errors.distance * self.wrong[..., 0])
+        velocity = true[..., 1:] * self.slowed[:, None, None] + errors.velocity * self.wrong[..., 1:]
+        lost = torch.rand_like(distance) < errors.lost
+        known = torch.cat((distance.clamp(min=0.0).masked_fill(lost, torch.inf)[..., None], velocity), -1)
+        late = torch.rand(len(known), 1, 1, device=known.device) < errors.late
+        shown, self.before = torch.where(late, self.before, known), known
+        return shown
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        if self._errors is None or self._candidates is None:
+            return
+        low, high = self._errors.slowed
+        self.slowed[env_ids] = low + (high - low) * torch.rand(len(env_ids), device=self.slowed.device)
+        self.wrong[env_ids] = torch.randn_like(self.wrong[env_ids])
+        self.before[env_ids, :, 0] = torch.inf
+
+
+def true_sectors(state: EnvState) -> torch.Tensor:
+    """(num_envs, 108) nearness, radial and tangential velocity by sector (`sector_motion.encode`): privileged."""
+    return encode(state.sectors).flatten(1)
+
+
+def true_motion(state: EnvState) -> torch.Tensor:
+    """(num_envs, 6) v_x, v_y (m/s, yaw-aligned frame) and yaw rate (rad/s), and what the gait is asked for now:
+    privileged."""
+    k = state.kinematics
+    return torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:], state.asked), 1)
+
+
+def way_to_goal(state: EnvState, unit: float) -> torch.Tensor:
+    """(num_envs, 3) place of the goal (m, yaw-aligned frame) in units of `unit`, at most 2 of them, and the time that
+    the episode has lasted, in units of 20 s: privileged; 0 without a goal."""
+    goal_w = state.goal_w
+    if goal_w is None:
+        place = torch.zeros(state.num_envs, 2, device=state.device)
+    else:
+        k = state.kinematics
+        place = rotate_yaw(-k.yaw, goal_w - k.base_pos_w[:, :2]) / unit
+    return torch.cat((place.clamp(-2.0, 2.0), state.time_s[:, None] / 20.0), 1)
+
+
+def drawn_response(state: EnvState) -> torch.Tensor:
+    """(num_envs, 13) how a robot without legs answers: gain, lag, delay and offset by axis, and radius: privileged."""
+    return state.drawn_response

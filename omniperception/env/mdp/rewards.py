@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import torch
 
+from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.common.launch import constant
 from omniperception.env.state import EnvState, requires, rests
 
@@ -159,6 +160,7 @@ def foot_air_time(state: EnvState, target: float, min_speed: float) -> torch.Ten
     return ((times.last_air - target) * times.touched_down).sum(1) * moving
 
 
+@requires("legs")
 def foot_clearance(state: EnvState, target: float) -> torch.Tensor:
     """Sum over feet of (height - `target`)^2 times horizontal speed, m^3/s: small where feet that move are lifted to
     `target` (m) above the ground below them."""
@@ -171,12 +173,14 @@ def foot_slip(state: EnvState) -> torch.Tensor:
     return (state.foot_vel_w[..., :2].square().sum(-1) * state.foot_contact).sum(1)
 
 
+@requires("legs")
 def joint_limit_violation(state: EnvState) -> torch.Tensor:
     """Number of joints outside their position limits."""
     joint_pos = state.kinematics.joint_pos
     return ((joint_pos < state.joint_lower) | (joint_pos > state.joint_upper)).sum(1).float()
 
 
+@requires("legs")
 def joint_near_stop(state: EnvState, margin: float) -> torch.Tensor:
     """Sum over joints of how far (rad) they are within `margin` (rad) of the ends of their ranges, or beyond."""
     joint_pos = state.kinematics.joint_pos
@@ -184,26 +188,31 @@ def joint_near_stop(state: EnvState, margin: float) -> torch.Tensor:
     return (margin - room).clamp(min=0.0).sum(1)
 
 
+@requires("legs")
 def joint_torque_near_limit(state: EnvState, share: float) -> torch.Tensor:
     """Sum over joints of how far their torque exceeds `share` of its limit, as a share of the limit."""
     return (state.joint_torque.abs() / state.joint_torque_limit - share).clamp(min=0.0).sum(1)
 
 
+@requires("legs")
 def standing_joint_velocity_squared(state: EnvState, rest_s: float) -> torch.Tensor:
     """|qdot|^2, (rad/s)^2, once the robot should rest; 0 otherwise."""
     return state.kinematics.joint_vel.square().sum(1) * rests(state, rest_s)
 
 
+@requires("legs")
 def joint_torque_squared(state: EnvState) -> torch.Tensor:
     """|tau|^2, (N m)^2."""
     return state.joint_torque.square().sum(1)
 
 
+@requires("legs")
 def joint_velocity_squared(state: EnvState) -> torch.Tensor:
     """|qdot|^2, (rad/s)^2."""
     return state.kinematics.joint_vel.square().sum(1)
 
 
+@requires("legs")
 def joint_acceleration_squared(state: EnvState) -> torch.Tensor:
     """|qddot|^2, (rad/s^2)^2, by the difference of joint velocities over the control step."""
     return state.joint_acc.square().sum(1)
@@ -219,6 +228,7 @@ def action_acceleration_squared(state: EnvState) -> torch.Tensor:
     return (state.actions[2] - 2 * state.actions[1] + state.actions[0]).square().sum(1)
 
 
+@requires("legs")
 def default_pose_deviation(state: EnvState) -> torch.Tensor:
     """Squared distance (rad^2) of the joints from `EnvState.pose`, the default one where the robot does not step."""
     return (state.kinematics.joint_pos - state.pose).square().sum(1)
@@ -227,3 +237,79 @@ def default_pose_deviation(state: EnvState) -> torch.Tensor:
 def alive(state: EnvState) -> torch.Tensor:
     """1 in every step."""
     return torch.ones(state.num_envs, device=state.device)
+
+
+def progress_along_command(state: EnvState, enough: float) -> torch.Tensor:
+    """v_xy along v_ref as a share of |v_ref|, in m/s of a command of 1 m/s; more than `enough` of it earns no more, so
+    that there is time to go round. 0 where none is asked for."""
+    wanted = state.reference[:, :2]
+    speed = wanted.norm(dim=1)
+    along = (state.kinematics.base_lin_vel_yaw * wanted).sum(1) / speed.clamp(min=1e-6)
+    return torch.minimum(along, enough * speed) / enough
+
+
+def deviation_while_free(state: EnvState, within: float) -> torch.Tensor:
+    """|v - v_ref|^2, (m/s)^2 and (rad/s)^2, where no obstacle is nearer than `within` (m)."""
+    k = state.kinematics
+    velocity = torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:]), 1)
+    free = (state.sectors[..., 0] > within).all(1)
+    return (velocity - state.reference).square().sum(1) * free
+
+
+def deviation(state: EnvState) -> torch.Tensor:
+    """|v_xy - v_ref|^2, (m/s)^2, whatever is near."""
+    return (state.kinematics.base_lin_vel_yaw - state.reference[:, :2]).square().sum(1)
+
+
+def yaw_deviation(state: EnvState) -> torch.Tensor:
+    """(w_z - w_ref)^2, (rad/s)^2."""
+    return (state.kinematics.base_ang_vel_b[:, 2] - state.reference[:, 2]).square()
+
+
+def time_to_collision(state: EnvState, radius: float, scale_s: float) -> torch.Tensor:
+    """exp(-t / `scale_s`), t (s) until a disc of `radius` (m) meets the obstacle of a sector if both keep their
+    velocities; 0 where it meets none."""
+    sectors = state.sectors
+    distance = sectors[..., 0].clamp(max=50.0)
+    place = distance[..., None] * sector_bearings(sectors.shape[1], sectors.device)
+    velocity = sectors[..., 1:] - state.kinematics.base_lin_vel_yaw[:, None]
+    speed2 = velocity.square().sum(-1)
+    closing = -(place * velocity).sum(-1)
+    inside = closing.square() - speed2 * (distance.square() - radius**2)
+    time = (closing - inside.clamp(min=0.0).sqrt()).clamp(min=0.0) / speed2.clamp(min=1e-6)
+    meets = (inside > 0) & (closing > 0) & sectors[..., 0].isfinite()
+    return torch.where(meets, torch.exp(-time / scale_s), 0.0).amax(1)
+
+
+def nearness(state: EnvState, radius: float, within: float) -> torch.Tensor:
+    """How near the nearest obstacle is: 1 at `radius` (m) from the base's origin, 0 from `within` (m) beyond it."""
+    gap = state.sectors[..., 0].amin(1) - radius
+    return (1 - gap / within).clamp(0.0, 1.0)
+
+
+def standing_while_free(state: EnvState, share: float, free: float) -> torch.Tensor:
+    """1 for a robot that is commanded to go, goes at less than `share` of that speed, and has a way: a sector within 60
+    degrees of the command in which nothing is for `free` (m)."""
+    wanted = state.reference[:, :2]
+    speed = wanted.norm(dim=1)
+    bearings = sector_bearings(state.sectors.shape[1], state.device)
+    ahead = (wanted @ bearings.T) > 0.5 * speed[:, None]
+    way = (ahead & (state.sectors[..., 0] > free)).any(1)
+    slow = state.kinematics.base_lin_vel_yaw.norm(dim=1) < share * speed
+    return (way & slow & (speed > 0.2)).float()
+
+
+def asked_change_squared(state: EnvState) -> torch.Tensor:
+    """|u_t - u_{t-1}|^2 of the velocities that are asked for, (m/s)^2, before the limit of their change."""
+    return (state.targets[0] - state.targets[1])[:, :2].square().sum(1)
+
+
+def asked_jump(state: EnvState, free: float) -> torch.Tensor:
+    """(|u_t - u_{t-1}| - `free`)^2 beyond `free` (m/s) of the velocities that are asked for: jumps throw robots over."""
+    change = (state.targets[0] - state.targets[1])[:, :2].norm(dim=1)
+    return (change - free).clamp(min=0.0).square()
+
+
+def asked_turn_squared(state: EnvState) -> torch.Tensor:
+    """(w_t - w_{t-1})^2 of the yaw rates that are asked for, (rad/s)^2."""
+    return (state.targets[0] - state.targets[1])[:, 2].square()

@@ -1,0 +1,76 @@
+"""Settings of robots without legs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from omniperception.common.random import EnvRandom
+from omniperception.scene import World
+from omniperception.sim.response import GaitResponse, NoResponse
+
+if TYPE_CHECKING:
+    from omniperception.sim.planar_world import PlanarSimulator
+
+
+@dataclass(frozen=True)
+class PlanarConfig:
+    """Settings of `sim=planar`.
+
+    Attributes:
+        response: run directory of the gait whose measured response is followed.
+        under: condition of conf/condition under which it was measured.
+        timestep: (s) of the motion and of contacts.
+        decimation: such steps per control step, which is the period of the decisions.
+        acceleration: most (m/s^2, rad/s^2) by which the asked velocity changes, as whoever asks a gait limits it.
+        spread: factor on the differences between robots; 0: all are as the mean.
+        num_threads: CPU threads; 0 uses every core.
+    """
+
+    response: str
+    under: str = "ideal"
+    timestep: float = 0.025
+    decimation: int = 4
+    acceleration: Sequence[float] = (6.0, 8.0)
+    spread: float = 1.0
+    num_threads: int = 0
+
+    has_legs = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.timestep < float("inf"):
+            raise ValueError(f"sim.timestep={self.timestep} must be positive")
+        if self.decimation < 1:
+            raise ValueError(f"sim.decimation={self.decimation} must be at least 1")
+        if len(self.acceleration) != 2 or min(self.acceleration) <= 0:
+            raise ValueError(f"sim.acceleration={list(self.acceleration)} must be [m/s^2, rad/s^2], both positive")
+        if self.spread < 0:
+            raise ValueError(f"sim.spread={self.spread} must not be negative")
+
+    @property
+    def control_dt(self) -> float:
+        """Control step (s)."""
+        return self.timestep * self.decimation
+
+    @property
+    def torch_device(self) -> torch.device:
+        return torch.device("cpu")
+
+    def build(
+        self, world: World, num_envs: int, record_states: bool = False, random: EnvRandom | None = None
+    ) -> PlanarSimulator:
+        """`num_envs` robots in a world; `random` gives the streams that their responses are drawn from."""
+        from omniperception.sim.planar_world import PlanarSimulator  # with Warp, which not every task loads
+
+        response = GaitResponse.load(Path(self.response))
+        if self.under not in response.conditions:
+            known = ", ".join(response.conditions)
+            raise NoResponse(
+                f"{self.response} has no response measured under condition={self.under} (it has {known}); measure it:"
+                f" omniperception gait run={self.response} what=response condition={self.under}, or set sim.under"
+            )
+        return PlanarSimulator(world, self, response, num_envs, record_states, random or EnvRandom(0, num_envs))
