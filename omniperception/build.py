@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import random
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -16,15 +16,17 @@ from omegaconf.errors import OmegaConfBaseException
 
 from omniperception import config as configs
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET
-from omniperception.common.errors import DoesNotFit
+from omniperception.common.errors import DoesNotFit, suggest
 from omniperception.common.provenance import made_at
 from omniperception.common.shell import command_line
 from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
+from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.env.mdp.randomization import Condition
 from omniperception.env.mdp.terms import first_difference
 from omniperception.env.mirror import Mirror
+from omniperception.env.mixed import MixedEnv, check_alike, shares_of
 from omniperception.env.state import NotHere
 from omniperception.learning import CheckpointError, Runner, distributed, latest_checkpoint, load_checkpoint
 from omniperception.learning.checkpoint import difference
@@ -34,7 +36,7 @@ from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.memory import check_fits
 from omniperception.learning.navigation import NavigationConfig
-from omniperception.scene import Mount, RobotConfig, SteppingConfig
+from omniperception.scene import Mount, ObstaclesConfig, RobotConfig, SteppingConfig
 from omniperception.scene.held_out import held_out
 from omniperception.schema import ANYTHING, make, types_of, words_of
 from omniperception.sim.planar import PlanarConfig
@@ -42,6 +44,36 @@ from omniperception.sim.planar import PlanarConfig
 if TYPE_CHECKING:
     from omniperception.env.sensing import SensorConfig
     from omniperception.evaluation.episodes import Policy
+
+
+FAMILY_STRIDE = 1009
+"""Seeds of two families of worlds are this far apart."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family of worlds to train in; what it leaves open is the run's.
+
+    Attributes:
+        obstacles: what is there.
+        commands: what the robot is told.
+        share: of the environments, in proportion to the other families'.
+        episode_length_s: see TerminationsConfig.
+    """
+
+    obstacles: ObstaclesConfig
+    commands: VelocityCommandConfig | GoalCommandConfig
+    share: float = 1.0
+    episode_length_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.share > 0:
+            raise ValueError(f"share={self.share} must be positive; leave the family out instead")
+        if self.obstacles.split != "dev":
+            raise ValueError(
+                f"obstacles.split={self.obstacles.split} is for reports, and no training may see it; use"
+                " obstacles.split=dev"
+            )
 
 
 @dataclass(frozen=True)
@@ -58,6 +90,8 @@ class RunConfig:
         navigation: of a policy that asks a gait for velocities, or None.
         condition: under which the robot walks, where its randomization is one of conf/condition as it stands.
         composed: the resolved configuration as plain dicts and lists, as saved in the run directory.
+        families: worlds to train in, by name, in place of the obstacles and commands of `env`; none: in these alone.
+            Nothing but training reads them.
     """
 
     env: EnvConfig
@@ -69,6 +103,7 @@ class RunConfig:
     condition: Condition | None
     navigation: NavigationConfig | None
     composed: dict
+    families: Mapping[str, Family] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         supervised = self.perception is not None and self.perception.supervised_epochs > 0
@@ -103,6 +138,40 @@ class RunConfig:
     def max_acceleration(self) -> float | None:
         """Limit (m/s^2) of V_cmd + V_avoid; None without one, and where V_avoid is not added."""
         return self.env.rewards.avoidance.max_acceleration if self.adds_velocity else None
+
+    def family_envs(self) -> dict[str, EnvConfig]:
+        """The tasks of the families by name, with seeds of their own, which share the run's environments.
+
+        Raises:
+            ConfigError: one line that says what to change.
+        """
+        if not self.families:
+            return {}
+        try:
+            numbers = shares_of({name: family.share for name, family in self.families.items()}, self.env.num_envs)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        tasks = {}
+        for index, (name, family) in enumerate(self.families.items()):
+            try:
+                terminations = self.env.terminations
+                if family.episode_length_s is not None:
+                    terminations = replace(terminations, episode_length_s=family.episode_length_s)
+                tasks[name] = replace(
+                    self.env,
+                    num_envs=numbers[name],
+                    seed=self.env.seed + FAMILY_STRIDE * index,
+                    obstacles=family.obstacles,
+                    commands=family.commands,
+                    terminations=terminations,
+                )
+            except ValueError as error:
+                raise ConfigError(f"families.{name}: {one_line(error)}") from None
+        try:
+            check_alike(tasks)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        return tasks
 
     @property
     def task(self) -> dict:
@@ -169,7 +238,8 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         logger = _logger(composed, trusted)
         init = _names(composed.get("init"))
         navigation = make(NavigationConfig | None, composed.get("navigation"), "navigation")
-        return RunConfig(env, perception, ppo, logger, init, distillation, condition, navigation, composed)
+        families = _families(composed.get("families"), trusted)
+        return RunConfig(env, perception, ppo, logger, init, distillation, condition, navigation, composed, families)
     except ValueError as error:
         raise ConfigError(one_line(error)) from None
 
@@ -237,6 +307,33 @@ def _sensor(preset: object, robot: RobotConfig, trust: Sequence[str] | None) -> 
     return make(SensorConfig, settings | mounted, "lidar", trust)
 
 
+def _families(given: object, trust: Sequence[str] | None) -> dict[str, Family]:
+    """Families of worlds, each checked where its name can be said."""
+    if given is not None and not isinstance(given, dict):
+        raise DoesNotFit(f"families={given} must be a group of families by name, such as family=[corridor,hold]")
+    families = {}
+    for name, settings in (given or {}).items():
+        if settings is None:  # left out
+            continue
+        try:
+            if not isinstance(settings, dict):
+                raise DoesNotFit("must be a group of settings")
+            hints = types_of(Family)
+            for key in settings:
+                if key not in hints:
+                    raise DoesNotFit(f"{key} is unknown; {suggest(str(key), tuple(hints))}")
+            for key in ("obstacles", "commands"):
+                if not settings.get(key):
+                    raise DoesNotFit(f"lacks {key}; give families.{name}.{key}=..., as conf/family does")
+            parts = {key: make(hints[key], value, key, trust) for key, value in settings.items()}
+            families[name] = Family(**parts)
+        except DoesNotFit as error:
+            raise DoesNotFit(f"families.{name}: {one_line(error)}") from None
+        except ValueError as error:
+            raise ConfigError(f"families.{name}: {one_line(error)}") from None
+    return families
+
+
 def _logger(composed: dict, trust: Sequence[str] | None) -> LoggerConfig | None:
     """What logs a run."""
     return make(LoggerConfig, composed["logger"], "logger", trust) if composed["logger"] else None
@@ -253,7 +350,8 @@ def _names(value: object) -> tuple[str, ...]:
 
 
 def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
-    """The environment and everything that learns in it, seeded; each process of several with a seed of its own.
+    """The environments, of all families where there are some, and what learns in them, seeded; each process of several
+    with a seed of its own.
 
     A setting that only the compiled world can judge, such as a geom's name, is a ConfigError here.
 
@@ -266,7 +364,7 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
     try:
         if run.perception is not None:
             check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), run.env.sim.torch_device)
-        env = OmniEnv(run.env)
+        env = MixedEnv(run.family_envs()) if run.families else OmniEnv(run.env)
         return Runner(env, learning_config(run, env), log_dir, str(env.device))
     except (ValueError, ImportError) as error:
         raise ConfigError(str(error)) from error
@@ -313,12 +411,12 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
         CheckpointError: there is none, or it does not fit.
     """
     checkpoint = latest_checkpoint(run_dir)
-    runner = build_runner(replace(run, env=replace(run.env, full_level=True, trials=True)), None)
+    runner = build_runner(replace(run, env=replace(run.env, full_level=True, trials=True), families={}), None)
     runner.load_policy(checkpoint)
     return TrainedPolicy(runner.env, runner.policy, checkpoint)
 
 
-def load_teacher(run_dir: Path, env: OmniEnv, trust: Sequence[str] = ()) -> Teacher:
+def load_teacher(run_dir: Path, env: OmniEnv | MixedEnv, trust: Sequence[str] = ()) -> Teacher:
     """The blind policy of a run, to teach in an environment with the same observations; `trust` as `load_run` has it.
 
     Raises:
@@ -380,7 +478,7 @@ def steps_per_frame(run: RunConfig) -> int:
     return max(1, round(run.env.lidar.period_s / run.env.sim.control_dt))
 
 
-def learning_config(run: RunConfig, env: OmniEnv) -> LearningConfig:
+def learning_config(run: RunConfig, env: OmniEnv | MixedEnv) -> LearningConfig:
     """The runner that trains in the environment of a run."""
     return LearningConfig(
         run.ppo,

@@ -44,6 +44,8 @@ FIXED_BY_CONDITION = ("randomization", "condition")
 """Groups that a condition replaces, its own name and version among them."""
 DEFINED_BY_SCENARIO = ("obstacles", "commands")
 """Groups that a scenario writes out in full, so that another preset would be mixed with it."""
+SEVERAL_KEYS = {"scenario": FIXED_BY_SCENARIO, "condition": FIXED_BY_CONDITION, "family": ("families",)}
+"""Keys of a configuration that these groups replace, where not the one of their own name."""
 OPTIONAL_GROUPS = ("experiment", "scenario", "condition")
 """Groups of which none may be chosen."""
 SUITES, STUDIES = "suite", "study"
@@ -160,7 +162,7 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
         if _chooses_none(override):
             config.pop(group, None)
             continue
-        for key in {"scenario": FIXED_BY_SCENARIO, "condition": FIXED_BY_CONDITION}.get(group, (group,)):
+        for key in SEVERAL_KEYS.get(group, (group,)):
             config[key] = fresh[key]
     if any(group_of(override) == "randomization" for override in parsed):
         config.pop("condition", None)
@@ -174,7 +176,7 @@ def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
 def _keys() -> set[str]:
     """Keys at the top of a command line."""
     groups = {path.name for path in CONFIG_DIR.iterdir() if path.is_dir()} - {SUITES, STUDIES}
-    return {"seed", "num_envs", "distillation", "init", "stepping", *groups}
+    return {"seed", "num_envs", "distillation", "families", "init", "stepping", *groups}
 
 
 def _check_keys(config: DictConfig) -> None:

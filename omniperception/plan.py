@@ -18,6 +18,8 @@ from tensordict import TensorDictBase
 
 from omniperception.common.files import write_whole
 from omniperception.env.env import OmniEnv
+from omniperception.env.mixed import MixedEnv, families_of
+from omniperception.env.state import EnvState
 from omniperception.learning import Runner
 
 if TYPE_CHECKING:
@@ -85,13 +87,18 @@ class Watch:
             then: called with the plan within control step number `STEPS`.
         """
         self._runner, self._then, self._left = runner, then, STEPS
-        self._computed, self._stages = set(vars(runner.env.state)), set[str]()
+        self._computed, self._stages = set[str](), set[str]()
+        self._note_computed()
         runner.env.step_hooks.append(self._look)
+
+    def _note_computed(self) -> None:
+        for env in families_of(self._runner.env).values():
+            self._computed |= vars(env.state).keys()
 
     def _look(self) -> None:
         env = self._runner.env
-        self._computed |= vars(env.state).keys()
-        self._stages |= env.timer.seconds.keys()
+        self._note_computed()
+        self._stages |= {stage for own in families_of(env).values() for stage in own.timer.seconds}
         self._left -= 1
         if not self._left:
             env.step_hooks.remove(self._look)
@@ -101,8 +108,9 @@ class Watch:
 def look(runner: Runner) -> Plan:
     """The plan of a run, for which its environment takes a few steps with random actions and all obstacles."""
     env, found = runner.env, list[Plan]()
-    if env.obstacles is not None:
-        env.obstacles.level = 1.0
+    for own in families_of(env).values():
+        if own.obstacles is not None:
+            own.obstacles.level = 1.0
     Watch(runner, found.append)
     with torch.inference_mode():
         runner.alg.actor(env.get_observations())
@@ -124,12 +132,12 @@ def describe(runner: Runner, computed: Iterable[str] = (), stages: Iterable[str]
     launches = [thing for thing in things.values() if _is_launch(thing)]
     cache = sys.modules.get("omniperception.common.launch")
     launches += [] if cache is None else [launch for launch, _ in cache._launches.values()]
-    quantities = {name for name in computed if hasattr(type(env.state), name)}
+    quantities = {name for name in computed if hasattr(EnvState, name)}
     modules = sorted(name for name in sys.modules if name.startswith("omniperception.") or name in _OPTIONAL)
     sections = {
-        "physics": _physics(env),
-        "rays": _rays(env),
-        "terms": _terms(env),
+        "physics": _by_family(env, _physics),
+        "rays": _by_family(env, _rays),
+        "terms": _by_family(env, _terms),
         "state": dict.fromkeys(sorted(quantities), ""),
         "stages": dict.fromkeys(sorted(stages), ""),
         "kernels": dict.fromkeys(sorted({launch.name for launch in launches}), ""),
@@ -149,6 +157,12 @@ def contact_pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
     explicit = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
     return [*(pair for pair in combinations(range(model.ngeom), 2) if may_touch(*pair)), *explicit]
+
+
+def _by_family(env: OmniEnv | MixedEnv, section: Callable[[OmniEnv], dict[str, str]]) -> dict[str, str]:
+    """A section of all families, whose names its entries begin with."""
+    families = families_of(env).items()
+    return {f"{family} {name}".lstrip(): detail for family, own in families for name, detail in section(own).items()}
 
 
 def _physics(env: OmniEnv) -> dict[str, str]:

@@ -120,6 +120,7 @@ def assemble(composed: DictConfig) -> build.RunConfig:
 def _trainable(run: build.RunConfig) -> build.RunConfig:
     """Refuses a run that would see obstacles of the test split, or whose logger lacks its library."""
     build.check_split(run, "training")
+    run.family_envs()
     if run.logger is not None:
         run.logger.check()
     return run

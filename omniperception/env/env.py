@@ -59,7 +59,13 @@ class OmniEnv(VecEnv):
             physics failed.
     """
 
-    def __init__(self, config: EnvConfig) -> None:
+    def __init__(self, config: EnvConfig, episode_length: torch.Tensor | None = None) -> None:
+        """
+        Args:
+            config: of the task.
+            episode_length: (num_envs,) int64 zeros in which `episode_length_buf` is counted, such as a part of others';
+                None: it has memory of its own.
+        """
         self.config, self.robot = config, config.robot
         self.num_envs, self.num_actions = config.num_envs, config.num_actions
         self.control_dt = config.sim.control_dt
@@ -75,7 +81,8 @@ class OmniEnv(VecEnv):
         self.sim = config.sim.build(self.world, self.num_envs, late, self.random)
         self.device = self.sim.device
         self.command = config.commands.build(self.num_envs, self.device, self.random)
-        self._episode_length = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        own = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        self._episode_length = own if episode_length is None else episode_length
         self.difficulty = Curriculum(config.randomization.curriculum)
         branch = self.random.branch("randomization")
         self.randomizer = Randomizer(config.drawn_physics, self.sim, branch, self.difficulty)
@@ -146,6 +153,19 @@ class OmniEnv(VecEnv):
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """One control step with actions (num_envs, num_actions); see rsl_rl.env.VecEnv."""
+        rewards = self.advance(actions)
+        for hook in self.step_hooks:
+            hook()
+        return self.conclude(rewards)
+
+    # ---- a step in two halves, for who steps several environments at once --------------------------------------------
+
+    def advance(self, actions: torch.Tensor) -> torch.Tensor:
+        """The half of a step before finished environments are reset, with actions (num_envs, num_actions).
+
+        Returns:
+            (num_envs,) rewards.
+        """
         self.step_count += 1
         self._has_stepped = True
         self.episode_length_buf += 1
@@ -159,8 +179,10 @@ class OmniEnv(VecEnv):
             self._terminate()
             rewards = self.rewards.compute(self.state, self.healthy)
             self._record()
-        for hook in self.step_hooks:
-            hook()
+        return rewards
+
+    def conclude(self, rewards: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """The other half, after the step hooks: resets finished environments and returns what `step` does."""
         with self.timer.stage("resets"):
             self.command.advance(self.control_dt, self.state.kinematics)
             ended = self.done.nonzero().flatten()
@@ -480,7 +502,8 @@ class OmniEnv(VecEnv):
 
     def begin_at_levels_of(self, state: dict) -> None:
         """Begins new episodes at the levels that the curricula have in the `state_dict` of another task, of those that
-        there are here."""
+        there are here; of several families', in that of the first."""
+        state = next(iter(state.get("families", {"": state}).values()))
         command = state.get("command", {}) if isinstance(self.command, VelocityCommand) else {}
         saved = {"randomization": state["difficulty"], "obstacle": state.get("obstacles", {}), "command": command}
         for name, part in self._curricula().items():

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.observations import gait_phase
 from omniperception.env.mdp.terms import JOINT_MAGNITUDES, JOINTS, ROTATION, VECTOR
+from omniperception.env.mixed import MixedEnv
 from omniperception.scene import RobotConfig
 from omniperception.scene.robot_file import compile_robot, read_robot
 
@@ -20,7 +21,7 @@ from omniperception.scene.robot_file import compile_robot, read_robot
 class Mirror:
     """Adds mirror images to samples; rsl_rl's `data_augmentation_func`."""
 
-    def __init__(self, env: OmniEnv) -> None:
+    def __init__(self, env: OmniEnv | MixedEnv) -> None:
         """Args: env: whose groups and robot to mirror.
 
         Raises:
@@ -47,7 +48,7 @@ class Mirror:
             )
 
     def __call__(
-        self, env: OmniEnv, obs: TensorDict | None, actions: torch.Tensor | None
+        self, env: OmniEnv | MixedEnv, obs: TensorDict | None, actions: torch.Tensor | None
     ) -> tuple[TensorDict | None, torch.Tensor | None]:
         """Samples (B, ...), then their mirror images: (2 B, ...)."""
         if obs is not None:

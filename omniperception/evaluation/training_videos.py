@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from omniperception.env.mixed import families_of
 from omniperception.evaluation.video import Recorder
 from omniperception.evaluation.video_options import VideoOptions
 from omniperception.learning import Runner
@@ -14,7 +15,7 @@ OPTIONS = VideoOptions(size=(640, 360))
 
 
 class TrainingVideos:
-    """Films environment 0 every so many iterations, with the actions as they are explored."""
+    """Films environment 0, of the first family, every so many iterations, with the actions as they are explored."""
 
     def __init__(self, runner: Runner, run_dir: Path, interval: int, duration_s: float) -> None:
         """
@@ -36,7 +37,8 @@ class TrainingVideos:
             self._begun = iteration
             self._path = self._folder / f"{iteration}.mp4"
             self._folder.mkdir(exist_ok=True)
-            self._recorder = Recorder(self._runner.env, self._path, self._duration_s, OPTIONS)
+            film = next(iter(families_of(self._runner.env).values()))
+            self._recorder = Recorder(film, self._path, self._duration_s, OPTIONS)
         if self._recorder is not None:
             self._recorder()
             if not self._recorder.frames_left:

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from omniperception.common.errors import one_line
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig, first_difference
+from omniperception.env.mixed import MixedEnv
 from omniperception.env.state import NotHere
 from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
@@ -58,7 +59,9 @@ class Runner:
         stop_reason: why the last :meth:`learn` ended: "completed" or "time budget".
     """
 
-    def __init__(self, env: OmniEnv, config: LearningConfig, log_dir: Path | None = None, device: str = "cpu") -> None:
+    def __init__(
+        self, env: OmniEnv | MixedEnv, config: LearningConfig, log_dir: Path | None = None, device: str = "cpu"
+    ) -> None:
         """Build models, algorithm and log.
 
         Args:
@@ -101,7 +104,8 @@ class Runner:
         last = first + num_learning_iterations
         if init_at_random_ep_len and first == 0:
             lengths = self.env.episode_length_buf
-            lengths.copy_(torch.randint_like(lengths, high=int(self.env.max_episode_length)))
+            longest = torch.as_tensor(self.env.max_episode_length, device=lengths.device)  # of each, or of all
+            lengths.copy_(torch.randint_like(lengths, high=int(longest.max())) % longest)
         obs = self.env.get_observations().to(self.device)
         self.alg.train_mode()
         if self.alg.is_multi_gpu:

@@ -72,7 +72,7 @@ class Session:
         build.check_split(run, "page", shown.run_dir)
         if shown.policy != "run" and shown.policy not in BASELINES:
             raise ConfigError(f"policy={shown.policy} is unknown; known: run, {', '.join(BASELINES)}")
-        self._runner: Runner = build.build_runner(replace(run, env=_watched(run.env, shown.policy)), None)
+        self._runner: Runner = build.build_runner(replace(run, env=_watched(run.env, shown.policy), families={}), None)
         self.env: OmniEnv = self._runner.env
         self.checkpoint = shown.checkpoint or latest_checkpoint(shown.run_dir)
         self._runner.load_policy(self.checkpoint)
