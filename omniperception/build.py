@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -23,6 +24,7 @@ from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
+from omniperception.env.mdp.observations import base_ang_vel, base_lin_vel
 from omniperception.env.mdp.randomization import Condition
 from omniperception.env.mdp.terms import first_difference
 from omniperception.env.mirror import Mirror
@@ -35,7 +37,7 @@ from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.memory import check_fits
-from omniperception.learning.navigation import NavigationConfig
+from omniperception.learning.navigation import NavigationConfig, VelocityInput
 from omniperception.scene import Mount, ObstaclesConfig, RobotConfig, SteppingConfig
 from omniperception.scene.held_out import held_out
 from omniperception.schema import ANYTHING, make, types_of, words_of
@@ -490,12 +492,38 @@ def learning_config(run: RunConfig, env: OmniEnv | MixedEnv) -> LearningConfig:
         None if run.max_acceleration is None else run.max_acceleration * env.control_dt,
         Mirror(env) if run.ppo.symmetry else None,
         navigation=run.navigation,
+        velocity_inputs=velocity_inputs(env) if run.navigation is not None and run.env.sim.has_legs else (),
+        max_turn=0.0 if run.navigation is None else run.navigation.turn_acceleration * env.control_dt,
         estimator=EstimatorConfig(run.env.observations.estimated) if run.env.observations.estimated else None,
         distillation=run.distillation,
         logger=run.logger,
         settings=run.composed,
         task=run.task,
     )
+
+
+def velocity_inputs(env: OmniEnv) -> tuple[VelocityInput, ...]:
+    """Where the actor observes v_x, v_y and yaw rate of the present, as the base's own velocity.
+
+    Raises:
+        ValueError: it does not observe them.
+    """
+    found: dict[Callable, list[VelocityInput]] = {}
+    for name in env.config.observations.actor:
+        group, widths = env.config.observations.groups[name], env.observation_widths(name)
+        column = (group.history - 1) * sum(widths.values())
+        for term_name, term in group.terms.items():
+            function, options = (term.func, term.keywords) if isinstance(term, partial) else (term, {})
+            scale = options.get("scale", 1.0)
+            found[function] = [VelocityInput(name, column + k, scale) for k in range(widths[term_name])]
+            column += widths[term_name]
+    linear, angular = found.get(base_lin_vel), found.get(base_ang_vel)
+    if linear is None or angular is None:
+        raise ValueError(
+            "navigation reads the base's own velocity, and this policy observes none (base_lin_vel and base_ang_vel);"
+            " use observations=gait"
+        )
+    return (*linear[:2], angular[2])
 
 
 def seed_everything(seed: int) -> None:

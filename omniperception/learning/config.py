@@ -15,7 +15,7 @@ from omniperception.env.config import HEIGHT_TARGET
 from omniperception.learning.distillation import DistillationConfig
 from omniperception.learning.estimator import EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
-from omniperception.learning.navigation import NavigationConfig
+from omniperception.learning.navigation import NavigationConfig, VelocityInput
 from omniperception.learning.precision import bfloat16_is_faster
 from omniperception.perception import PerceptionNetwork, Sampler
 
@@ -248,6 +248,9 @@ class LearningConfig:
         mirror: rsl_rl's `data_augmentation_func`, which adds mirror images to samples, or None.
         estimator: of what the actor does not observe; None: it estimates nothing.
         navigation: of a policy that asks a gait for velocities; None: it moves joints.
+        velocity_inputs: where the policy observes the velocity that navigation reads; none where it has a group of its
+            own.
+        max_turn: most (rad/s) by which the yaw rate that navigation asks for changes from step to step.
         distillation: of a teacher, which :meth:`PerceptivePpo.learn_from` gives; None: there is none.
         logger: where scalars go; None: nowhere.
         settings: the run's composed configuration, for what is logged.
@@ -264,6 +267,8 @@ class LearningConfig:
     mirror: Callable | None = None
     estimator: EstimatorConfig | None = None
     navigation: NavigationConfig | None = None
+    velocity_inputs: Sequence[VelocityInput] = ()
+    max_turn: float = 0.0
     distillation: DistillationConfig | None = None
     logger: LoggerConfig | None = field(default_factory=LoggerConfig)
     settings: Mapping[str, Any] = field(default_factory=dict)

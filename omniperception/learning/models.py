@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
@@ -10,10 +10,12 @@ from rsl_rl.modules import HiddenState
 from tensordict import TensorDict
 from torch import nn
 
+from omniperception.avoidance.sector_motion import decode
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, LAST_ASKED, MOTION_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.common.vectors import moved_towards
 from omniperception.learning.estimator import EstimatingModel
+from omniperception.learning.navigation import ASKED, MOTION, NavigationConfig, Navigator, VelocityInput
 from omniperception.learning.read_out import MotionReadOut, VelocityReadOut
 from omniperception.learning.storage import WindowedObservations
 from omniperception.perception import PerceptionNetwork
@@ -34,14 +36,16 @@ class PerceptionActor(EstimatingModel):
     With supervision of ``avoidance_target`` or ``motion_target`` an avoidance velocity is read out of the embedding and
     added to the commanded one before the MLP sees it, because that sum is what the reward wants tracked (paper,
     r_vel_avoid): a gait that follows commands then avoids as soon as the read-out is right. Without a frame it is 0.
-    With `max_change` the sum moves no further than that from the one of the step before, which is observed.
+    With `max_change` the sum moves no further than that from the one of the step before, which is observed. With a
+    navigation policy that one's velocity, yaw rate and all, takes the place of the sum.
 
     Attributes:
         perception: the network.
         supervision: weight of the regression on each privileged observation group.
         read_out: gives the avoidance velocity, or None.
+        navigation: asks for velocities in place of the sum, or None.
         max_change: most (m/s) by which the sum changes from step to step; None: no limit.
-        asked: (N, 2) m/s, the sum that the newest actions were computed from; None before the first, and without a
+        asked: (N, 2) m/s, or (N, 3) with navigation, which turns (rad/s), too: the sum that the newest actions were computed from; None before the first, and without a
             limit.
     """
 
@@ -56,6 +60,9 @@ class PerceptionActor(EstimatingModel):
         velocity_risk: VelocityRisk | None = None,
         end_to_end: bool = True,
         max_change: float | None = None,
+        navigation: NavigationConfig | None = None,
+        velocity_inputs: Sequence[VelocityInput] = (),
+        max_turn: float = 0.0,
         **mlp_options,
     ) -> None:
         """Build the actor.
@@ -71,14 +78,16 @@ class PerceptionActor(EstimatingModel):
             end_to_end: whether the loss of an update reaches the perception network; otherwise it is trained by
                 supervision alone (:meth:`PerceptivePpo.train_perception`).
             max_change: of the commanded velocity with the avoidance velocity added (m/s).
+            navigation: settings of a navigation policy; None: there is none.
+            velocity_inputs: where v_x, v_y and yaw rate are observed, which it reads.
+            max_turn: most (rad/s) by which the yaw rate that navigation asks for changes from step to step.
             mlp_options: ``estimator``, and ``hidden_dims``, ``activation``, ``obs_normalization`` (of the
                 one-dimensional groups) and ``distribution_cfg`` of rsl_rl's ``MLPModel``.
         """
         self._feature_dim = perception.feature_dim  # read by _get_latent_dim while the base class builds the MLP
         super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
         self.perception = perception
-        with torch.no_grad():  # an untrained embedding is noise to the gait; it enters as its weights learn
-            self.mlp[0].weight[:, self.blind_dim :] = 0.0
+        self._begin_blind()
         self.supervision = dict(supervision or {})
         self.end_to_end = end_to_end
         self.read_out: VelocityReadOut | MotionReadOut | None = None
@@ -91,6 +100,13 @@ class PerceptionActor(EstimatingModel):
             part, num_values = perception.supervised.get(MOTION_TARGET), obs[MOTION_TARGET].shape[-1]
             self.read_out_target = MOTION_TARGET
             self.read_out = MotionReadOut(self._feature_dim, num_values, part, velocity_risk)
+        self.navigation: Navigator | None = None
+        if navigation is not None:
+            if not isinstance(self.read_out, MotionReadOut):
+                raise ValueError("navigation needs to know how obstacles move; set perception.motion_weight")
+            self.navigation = Navigator(navigation)
+        self._velocity_inputs = tuple(velocity_inputs)
+        self._max_turn = 0.0 if navigation is None else max_turn
         self.max_change = max_change
         self.asked: torch.Tensor | None = None
         self._check_supervision(obs)
@@ -184,6 +200,11 @@ class PerceptionActor(EstimatingModel):
             losses.clear()
         return means
 
+    def _begin_blind(self) -> None:
+        """An untrained embedding is noise to the gait; it enters as its weights learn."""
+        with torch.no_grad():
+            self.mlp[0].weight[:, self.blind_dim :] = 0.0
+
     def _get_latent_dim(self) -> int:
         return super()._get_latent_dim() + self._feature_dim
 
@@ -201,6 +222,12 @@ class PerceptionActor(EstimatingModel):
             return groups
         groups = groups.clone(recurse=False)
         command = groups[COMMAND]
+        if self.navigation is not None:
+            asked = self.navigate(features, has_frame, command, self._velocity(groups), groups[LAST_ASKED])
+            if acts:
+                self.asked = asked
+            groups[COMMAND] = asked
+            return groups
         asked = command[:, :2] + self.read_out.velocity(features, command[:, :2]) * has_frame[:, None]
         if self.max_change is not None:
             asked = moved_towards(groups[LAST_ASKED], asked, self.max_change)
@@ -208,6 +235,39 @@ class PerceptionActor(EstimatingModel):
                 self.asked = asked
         groups[COMMAND] = torch.cat((asked, command[:, 2:]), 1)
         return groups
+
+    def sectors(self, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor:
+        """(B, S, 3) distance (m) and velocity (m/s, yaw-aligned frame) as perceived; without a frame (B,) nothing."""
+        assert isinstance(self.read_out, MotionReadOut)
+        sectors = decode(self.read_out.motion(features[:, : self._feature_dim]))
+        empty = torch.cat((sectors[..., :1] + torch.inf, 0.0 * sectors[..., 1:]), -1)
+        return torch.where(has_frame[:, None, None], sectors, empty)
+
+    def navigate(
+        self,
+        features: torch.Tensor,
+        has_frame: torch.Tensor,
+        command: torch.Tensor,
+        velocity: torch.Tensor,
+        last_asked: torch.Tensor,
+    ) -> torch.Tensor:
+        """(B, 3) what the gait is asked for by a navigation policy: what it wants, as fast as it may change.
+
+        Args:
+            features: (B, D) or (B, D + K).
+            has_frame: (B,) bool.
+            command, velocity, last_asked: (B, 3) v_x, v_y (m/s) and yaw rate (rad/s).
+        """
+        assert self.navigation is not None and self.max_change is not None
+        wanted = self.navigation(self.sectors(features, has_frame), command, velocity, last_asked)
+        linear = moved_towards(last_asked[:, :2], wanted[:, :2], self.max_change)
+        turn = last_asked[:, 2:] + (wanted - last_asked)[:, 2:].clamp(-self._max_turn, self._max_turn)
+        return torch.cat((linear, turn), 1)
+
+    def _velocity(self, groups: TensorDict) -> torch.Tensor:
+        """(B, 3) the robot's own velocity as observed."""
+        parts = [groups[one.group][:, one.column] / one.scale for one in self._velocity_inputs]
+        return torch.stack(parts, 1)
 
     def _check_supervision(self, obs: TensorDict) -> None:
         """Every target is observed, in the size that the network gives; what changes the command observes it."""
@@ -239,6 +299,44 @@ class PerceptionActor(EstimatingModel):
                 f"a limit of the change of V_cmd + V_avoid needs observations '{LAST_ASKED}', which the environment"
                 " does not give; set rewards.avoidance.max_acceleration of both"
             )
+
+
+class PerceivingNavigator(PerceptionActor):
+    """A navigation policy on what a perception network says of LiDAR frames, for robots without legs.
+
+    Its actions are the velocities (N, 3) that a gait is asked for. It observes the groups COMMAND, MOTION and ASKED.
+    """
+
+    def __init__(self, obs: TensorDict, *args, **options) -> None:
+        """Arguments as `PerceptionActor` takes them, with a `navigation`."""
+        super().__init__(obs, *args, **options)
+        missing = [name for name in (COMMAND, MOTION, ASKED) if name not in self.obs_groups]
+        if missing:
+            raise ValueError(
+                f"navigation on a perception needs the observations {', '.join(missing)}; use observations=perceive"
+            )
+        assert self.navigation is not None
+        self.mlp = self.navigation.mlp
+        self.max_change = None  # the simulator limits it
+
+    def get_latent(
+        self,
+        obs: TensorDict | WindowedObservations,
+        masks: torch.Tensor | None = None,
+        hidden_state: HiddenState = None,
+    ) -> torch.Tensor:
+        """The inputs of navigation."""
+        assert self.navigation is not None
+        with torch.no_grad():
+            if isinstance(obs, WindowedObservations):
+                groups, features, has_frame = obs.groups, self.embed(obs), obs.step_count > 0
+            else:
+                groups, features, has_frame = obs, self.embed_newest(obs), obs["frame_count"].squeeze(-1) > 0
+            motion = (groups[name] for name in (COMMAND, MOTION, ASKED))
+            return self.navigation.inputs(self.sectors(features, has_frame), *motion)
+
+    def _begin_blind(self) -> None:
+        """The correction begins at 0."""
 
 
 class _AddLoss(torch.autograd.Function):

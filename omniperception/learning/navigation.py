@@ -1,14 +1,37 @@
-"""The actor that asks a gait for velocities: a choice without learning, and a learned correction of it."""
+"""Policies that ask a gait for velocities: a choice without learning, and a learned correction of it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from rsl_rl.models import MLPModel
+from rsl_rl.modules import MLP
+from tensordict import TensorDict
 from torch import nn
 
+from omniperception.avoidance.navigation import navigation_inputs, num_inputs
 from omniperception.avoidance.velocity_risk import VelocityRisk
+
+NUM_SECTORS = 36
+MOTION, ASKED = "motion", "asked"
+"""Groups of observations: the robot's own velocity, and what its gait is asked for, (n, 3) each."""
+
+
+class VelocityInput(NamedTuple):
+    """Where a component of the robot's own velocity is observed.
+
+    Attributes:
+        group: of observations.
+        column: in the group.
+        scale: that the observation is multiplied by.
+    """
+
+    group: str
+    column: int
+    scale: float
 
 
 @dataclass(frozen=True)
@@ -17,11 +40,24 @@ class NavigationConfig:
 
     Attributes:
         risk: the controller whose choice it corrects.
-        learned: whether there is a correction; without one the choice is all.
+        hidden_dims: hidden layers of the correction.
+        turn_acceleration: most (rad/s^2) by which the yaw rate that a gait is asked for changes.
     """
 
     risk: VelocityRisk
-    learned: bool = True
+    hidden_dims: Sequence[int] = (128, 128, 64)
+    turn_acceleration: float = 8.0
+
+    def __post_init__(self) -> None:
+        if not self.hidden_dims or min(self.hidden_dims) < 1:
+            raise ValueError(f"navigation.hidden_dims={list(self.hidden_dims)} must be widths of hidden layers")
+        if self.turn_acceleration <= 0:
+            raise ValueError(f"navigation.turn_acceleration={self.turn_acceleration} must be positive")
+
+    def build_network(self) -> Corrected:
+        """From `navigation_inputs` to velocities."""
+        width = num_inputs(NUM_SECTORS, self.risk)
+        return Corrected(MLP(width, 3, list(self.hidden_dims), "elu"), 3)
 
 
 class Corrected(nn.Module):
@@ -43,9 +79,39 @@ class NavigationActor(MLPModel):
     """Velocities (N, 3) that a gait is asked for, from `avoidance.navigation.navigation_inputs`, which is all that it
     observes."""
 
-    def __init__(self, obs, obs_groups, obs_set: str, output_dim: int, **mlp_options) -> None:
-        """Arguments of rsl_rl's `MLPModel`."""
-        super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
+    def __init__(self, obs: TensorDict, *args, navigation: NavigationConfig, **mlp_options) -> None:
+        """Args: navigation: settings; the others as rsl_rl's `MLPModel` takes them."""
+        super().__init__(obs, *args, **mlp_options)
         if self.obs_normalization:
             raise ValueError("ppo.obs_normalization=true scales the choice that navigation corrects; set it to false")
-        self.mlp = Corrected(self.mlp, output_dim)
+        expected = num_inputs(NUM_SECTORS, navigation.risk)
+        if self.obs_dim != expected:
+            raise ValueError(
+                f"a navigation policy reads the {expected} numbers of NavigationView alone, and observes {self.obs_dim}"
+                f" ({', '.join(self.obs_groups)}); use observations=navigate"
+            )
+        self.mlp = navigation.build_network()
+
+
+class Navigator(nn.Module):
+    """A navigation policy behind a perception network: velocities from sectors."""
+
+    candidates: torch.Tensor
+
+    def __init__(self, config: NavigationConfig) -> None:
+        super().__init__()
+        self.risk = config.risk
+        self.mlp = config.build_network()
+        self.register_buffer("candidates", config.risk.candidates(), persistent=False)
+
+    def inputs(
+        self, sectors: torch.Tensor, reference: torch.Tensor, velocity: torch.Tensor, asked: torch.Tensor
+    ) -> torch.Tensor:
+        """`navigation_inputs` (n, D)."""
+        return navigation_inputs(sectors, reference, velocity, asked, self.risk, self.candidates)
+
+    def forward(
+        self, sectors: torch.Tensor, reference: torch.Tensor, velocity: torch.Tensor, asked: torch.Tensor
+    ) -> torch.Tensor:
+        """(n, 3) what a gait is to be asked for; arguments as `navigation_inputs` takes them."""
+        return self.mlp(self.inputs(sectors, reference, velocity, asked))

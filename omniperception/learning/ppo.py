@@ -18,7 +18,7 @@ from omniperception.learning.config import LearningConfig
 from omniperception.learning.distillation import DistillationConfig, Teacher
 from omniperception.learning.divergence import DivergenceGuard
 from omniperception.learning.estimator import EstimatingModel
-from omniperception.learning.models import PerceptionActor
+from omniperception.learning.models import PerceivingNavigator, PerceptionActor
 from omniperception.learning.navigation import NavigationActor
 from omniperception.learning.storage import Embedded, PerceptiveStorage, WindowedObservations
 
@@ -123,8 +123,16 @@ class PerceptivePpo(PPO):
             if not used:
                 raise ValueError(f"observations.{name} is empty; name at least one group of observations")
         distribution = {"class_name": "GaussianDistribution", "init_std": ppo.init_std}
-        if config.navigation is not None:
-            actor = NavigationActor(obs, groups, "actor", env.num_actions, distribution_cfg=distribution, **ppo.mlp)
+        if config.navigation is not None and perception is None:
+            actor = NavigationActor(
+                obs,
+                groups,
+                "actor",
+                env.num_actions,
+                navigation=config.navigation,
+                distribution_cfg=distribution,
+                **ppo.mlp,
+            )
         elif perception is None:
             actor = EstimatingModel(
                 obs,
@@ -140,7 +148,8 @@ class PerceptivePpo(PPO):
                 "ppo.symmetry works on one-dimensional observations only; with perception set ppo.symmetry=false"
             )
         else:
-            actor = PerceptionActor(
+            moves_joints = env.config.sim.has_legs or config.navigation is None
+            actor = (PerceptionActor if moves_joints else PerceivingNavigator)(
                 obs,
                 groups,
                 "actor",
@@ -148,6 +157,9 @@ class PerceptivePpo(PPO):
                 perception.build_network(),
                 perception.supervision,
                 config.velocity_risk,
+                navigation=config.navigation,
+                velocity_inputs=config.velocity_inputs,
+                max_turn=config.max_turn,
                 max_change=config.max_change,
                 end_to_end=perception.supervised_epochs == 0,
                 estimator=config.estimator,

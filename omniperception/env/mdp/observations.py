@@ -183,8 +183,7 @@ class NavigationView(StatefulTerm):
         if self._candidates is None:
             self._begin(state)
         sectors = state.sectors if self._errors is None else self._with_errors(state, self._errors)
-        measured = state.measured
-        velocity = torch.cat((measured.base_lin_vel_yaw, measured.base_ang_vel_b[:, 2:]), 1)
+        velocity = planar_velocity(state)
         return navigation_inputs(sectors, state.reference, velocity, state.asked, self._risk, self._candidates)
 
     def _begin(self, state: EnvState) -> None:
@@ -244,3 +243,16 @@ def way_to_goal(state: EnvState, unit: float) -> torch.Tensor:
 def drawn_response(state: EnvState) -> torch.Tensor:
     """(num_envs, 13) how a robot without legs answers: gain, lag, delay and offset by axis, and radius: privileged."""
     return state.drawn_response
+
+
+@mirrors((1.0, -1.0, -1.0))
+def planar_velocity(state: EnvState) -> torch.Tensor:
+    """v_x, v_y (m/s, yaw-aligned frame) and yaw rate (rad/s), as measured."""
+    measured = state.measured
+    return torch.cat((measured.base_lin_vel_yaw, measured.base_ang_vel_b[:, 2:]), 1)
+
+
+@mirrors((1.0, -1.0, -1.0))
+def asked_velocity(state: EnvState) -> torch.Tensor:
+    """What the gait is asked for now, v_x, v_y (m/s, yaw-aligned frame) and yaw rate (rad/s)."""
+    return state.asked.clone()
