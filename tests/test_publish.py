@@ -1,6 +1,7 @@
 """A published run replays as the run that it was made from."""
 
 import json
+import os
 import shutil
 
 import pytest
@@ -17,6 +18,7 @@ from omniperception.learning.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from omniperception.sim.response import FILE as RESPONSE
 
 
 @pytest.fixture
@@ -104,6 +106,16 @@ def test_what_was_made_of_an_earlier_publication_goes(run, tmp_path):
     publish.publish(run, published)
     assert sorted(path.name for path in published.iterdir()) == ["checkpoints", "config.yaml", provenance.FILE]
     assert [path.name for path in (published / "checkpoints").iterdir()] == ["model_3.pt"]
+
+
+def test_the_response_that_was_measured_of_its_weights_goes_along(run, tmp_path):
+    (run / RESPONSE).write_text("measured")
+    publish.publish(run, tmp_path / "published")
+    assert (tmp_path / "published" / RESPONSE).read_text() == "measured"
+    later = (run / RESPONSE).stat().st_mtime + 60.0
+    os.utime(latest_checkpoint(run), (later, later))  # learned on since
+    publish.publish(run, tmp_path / "published")
+    assert not (tmp_path / "published" / RESPONSE).exists()
 
 
 def test_a_published_policy_is_not_published_again(run, tmp_path):

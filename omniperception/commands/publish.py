@@ -2,8 +2,8 @@
 
     publish run=latest to=pretrained/mine
 
-The folder holds weights, config.yaml and provenance.json; play, evaluate and export take it as run=<folder>, train as
-init=<folder>. At most 4 MB are published.
+The folder holds weights, config.yaml, provenance.json and, where it was measured, the gait's response.json; play,
+evaluate and export take it as run=<folder>, train as init=<folder>. At most 4 MB are published.
 """
 
 from __future__ import annotations

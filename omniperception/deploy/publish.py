@@ -14,6 +14,7 @@ from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.evaluation.records import FOLDER as RESULTS
 from omniperception.learning import latest_checkpoint, list_checkpoints
 from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+from omniperception.sim.response import FILE as RESPONSE
 
 LIMIT = 4_000_000
 """Most bytes of a published checkpoint: it goes into a repository."""
@@ -22,12 +23,13 @@ LIMIT = 4_000_000
 def publish(run_dir: Path, folder: Path) -> dict:
     """Write a run directory that holds the newest weights, the configuration and where they come from.
 
-    The critic stays, because a run that starts from this one may learn on; the optimisers, the environments' state and
-    the logs go.
+    The critic stays, because a run that starts from this one may learn on, and so does the measured response of its
+    gait, if it is of these weights; the optimisers, the environments' state and the logs go.
 
     Args:
         run_dir: a run.
-        folder: becomes a run directory; weights, evaluations and exported policies of an earlier publication go.
+        folder: becomes a run directory; weights, evaluations, exported policies and the measured response of an earlier
+            publication go.
 
     Returns:
         What provenance.json holds.
@@ -57,6 +59,10 @@ def publish(run_dir: Path, folder: Path) -> dict:
     for stale in ("checkpoints", RESULTS, EXPORTED):
         shutil.rmtree(folder / stale, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / RESPONSE).unlink(missing_ok=True)
+    response = run_dir / RESPONSE
+    if response.is_file() and response.stat().st_mtime_ns >= newest.stat().st_mtime_ns:  # not of earlier weights
+        shutil.copy(response, folder)
     composed.pop(config.SEARCH_PATH, None)  # a folder of this machine
     composed.sim.num_threads = 0  # and how many of its cores
     plain = OmegaConf.to_container(composed)

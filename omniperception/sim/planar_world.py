@@ -92,9 +92,8 @@ class PlanarSimulator:
         """Reads the tables of the measured response."""
         response, own = self.response, self.response.conditions[self.config.under]
         axes = [own.axes[name] for name in AXES]
-        pairs = [[getattr(axis, name) for axis in axes] for name in ("gain", "lag_s", "delay_s")]
-        self._means, self._sds = torch.tensor(pairs, dtype=torch.float32).unbind(-1)  # (3 quantities, 3 axes) each
-        self._offset_sd = torch.tensor([axis.offset for axis in axes])
+        pairs = [[getattr(axis, name) for axis in axes] for name in ("gain", "lag_s", "delay_s", "offset")]
+        self._means, self._sds = torch.tensor(pairs, dtype=torch.float32).unbind(-1)  # (4 quantities, 3 axes) each
         self._noise = torch.tensor([axis.noise for axis in axes])
         noise_s = torch.tensor([axis.noise_s for axis in axes])
         self._kept = torch.exp(-self.config.control_dt / noise_s.clamp(min=1e-3))
@@ -241,10 +240,10 @@ class PlanarSimulator:
         self._random.start_episode(env_ids)
         u = self._random.uniform(env_ids, (17,))
         z = _normal(u[:, :12]).unflatten(1, (4, 3)) * self.config.spread
-        drawn = (self._means + z[:, :3] * self._sds).clamp(min=0.0)
-        self._gain[env_ids], self._lag[env_ids], self._delay[env_ids] = drawn.unbind(1)
-        self._delay[env_ids] = self._delay[env_ids].clamp(max=self.config.control_dt)
-        self._offset[env_ids] = z[:, 3] * self._offset_sd
+        gain, lag, delay, offset = (self._means + z * self._sds).unbind(1)
+        self._gain[env_ids], self._lag[env_ids] = gain, lag.clamp(min=0.0)
+        self._delay[env_ids] = delay.clamp(0.0, self.config.control_dt)
+        self._offset[env_ids] = offset
         self._error[env_ids] = self._noise * _normal(u[:, 12:15])
         self._radius[env_ids] = self.response.radius * (1.0 + 0.1 * self.config.spread * (2 * u[:, 15] - 1))
         self._place[env_ids] = torch.cat((qpos[:, :2], yaw_of(qpos[:, 3:7])[:, None]), 1).float()

@@ -58,6 +58,7 @@ CALLS = {
     "omniperception/hardware/trials.py": 1,
     "omniperception/robots/fetch.py": 1,
     "omniperception/scene/fetched.py": 1,
+    "omniperception/sim/response.py": 1,
 }
 """Commands that are shown, by file; each is run in a test below."""
 
