@@ -229,6 +229,8 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     if perception is not None:
         seen = {"sampler": perception.sampler, "frame_history": perception.history}
         seen |= {"base_motion": perception.base_motion, "targets": tuple(perception.supervision)}
+    if composed.get("navigation") and task["sim"].has_legs:
+        seen["num_asked"] = 3
     distillation = make(DistillationConfig | None, composed.get("distillation"), "distillation")
     if distillation is not None:
         seen["targets"] = tuple(dict.fromkeys((*seen.get("targets", ()), AVOIDANCE_TARGET)))
@@ -346,8 +348,8 @@ def _names(value: object) -> tuple[str, ...]:
     names = [] if value is None else value if isinstance(value, list) else [value]
     if not all(isinstance(name, str) for name in names):
         raise ConfigError(f"init={value} must be a run directory, a list of them, or null")
-    if len(names) > 2:
-        raise ConfigError(f"init={value}: give two at most, a run that perceives and one that moves")
+    if len(names) > 3:
+        raise ConfigError(f"init={value}: give three at most, runs that perceive, that navigate and that move")
     return tuple(names)
 
 

@@ -167,7 +167,7 @@ def _alone_in(run_dir: Path) -> Iterator[None]:
 
 def _check_sources(run: build.RunConfig) -> None:
     """Refuses runs to begin from that have no weights, or moved otherwise, before a directory is written."""
-    if run.init:
+    if run.init and run.env.sim.has_legs:
         _check_motion(OmegaConf.create(run.composed), run.init[-1])
     for name in run.init:
         latest_checkpoint(config.find_run(name, "init"))

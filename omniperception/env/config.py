@@ -59,6 +59,7 @@ class EnvConfig:
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
         shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
         read_besides: requirements of who acts in the task, beside those of its terms; see `state.requires`.
+        num_asked: components of the velocity that a policy asks its gait for: 2, or 3 where it turns, too.
         log_interval: control steps between two reports of the metrics.
         full_level: whether everything that curricula of obstacles, commands and randomization let in is there from the
             first step on, and stays, as in evaluations; the terrain's has `trials`.
@@ -85,6 +86,7 @@ class EnvConfig:
     targets: Sequence[str] = ()
     shows_frames: bool = True
     read_besides: Sequence[str] = ()
+    num_asked: int = 2
     log_interval: int = 24
     full_level: bool = False
     trials: bool = False

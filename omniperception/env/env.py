@@ -107,6 +107,7 @@ class OmniEnv(VecEnv):
             config.stepping,
             config.requirements(),
             config.sim.has_legs,
+            config.num_asked,
         )
         if not config.sim.has_legs:
             self.state.ask_by(lambda: self.state.asked[:, :2].clone())

@@ -116,7 +116,7 @@ class EnvState:
         default_base_height: m, of the default pose.
         drawn_physics: (num_envs, W) what randomization drew; see `Randomizer.drawn`.
         stand_s: (num_envs,) s for which the command has been to stand.
-        last_asked: (num_envs, 2) m/s: what the policy asked its gait for in the step that ended; 0 after a reset, and
+        last_asked: (num_envs, 2) m/s, or (num_envs, 3) with the yaw rate (rad/s): what the policy asked its gait for in the step that ended; 0 after a reset, and
             where no policy says so.
     """
 
@@ -137,6 +137,7 @@ class EnvState:
         stepping: SteppingConfig | None,
         declared: frozenset[str],
         has_legs: bool = True,
+        num_asked: int = 2,
     ) -> None:
         """
         Args:
@@ -154,6 +155,7 @@ class EnvState:
             difficulty: share of the randomization; the less of it, the faster `reference` follows.
             stepping: of `pose`; None: it is the default pose.
             declared: what terms and others have said that they read; see `requires`.
+            num_asked: components of `last_asked`.
             has_legs: whether actions move joints; otherwise they are velocities that are asked for.
         """
         self._declared = declared
@@ -183,7 +185,7 @@ class EnvState:
         self._true_sectors: TrueSectors | None = None
         self.before = self.kinematics
         self.stand_s = torch.zeros(self.num_envs, device=self.device)
-        self.last_asked = torch.zeros(self.num_envs, 2, device=self.device)
+        self.last_asked = torch.zeros(self.num_envs, num_asked, device=self.device)
         self._command_acceleration, self._difficulty = command_acceleration, difficulty
         self._reference = torch.zeros(self.num_envs, 3, device=self.device)
         self._rest = self.default_joint_pos if has_legs else torch.zeros(3, device=self.device)

@@ -36,7 +36,7 @@ from omniperception.learning.divergence import TrainingDiverged
 from omniperception.learning.estimator import estimates_velocity
 from omniperception.learning.logger import Logger
 from omniperception.learning.ppo import PerceptivePpo
-from omniperception.learning.warm_start import estimating, observing_more, perceive_as, start_from
+from omniperception.learning.warm_start import estimating, observing_more, perceive_as, start_from, take_parts
 
 
 class Runner:
@@ -214,9 +214,30 @@ class Runner:
         Raises:
             CheckpointError: they do not fit: what they observe, perceive, estimate or move differs.
         """
+        if self.config.navigation is not None:
+            return self._take_parts(run_dirs, observations)
         *seeing, run_dir = run_dirs
         for other in seeing:
             perceive_as(self.alg.actor, self._weights(other)["actor_state_dict"], str(other))
+        return self._walk_as(run_dir, seeing, observations)
+
+    def _take_parts(self, run_dirs: Sequence[Path], observations: ObservationsConfig | None) -> list[Path]:
+        """`start_from` of a policy that navigates: each run gives what it has, but for the last one, where there are
+        legs, which moves them."""
+        gait = run_dirs[-1] if self.env.config.sim.has_legs else None
+        seeing = []
+        for other in run_dirs[:-1] if gait is not None else run_dirs:
+            state = self._weights(other)
+            if take_parts(self.alg.actor, state["actor_state_dict"], str(other)):
+                seeing.append(other)
+            with contextlib.suppress(CheckpointError, RuntimeError):
+                self.alg.critic.load_state_dict(state["critic_state_dict"])
+        self.alg.is_new = False
+        self.alg.actor.reset()
+        return seeing if gait is None else self._walk_as(gait, seeing or [gait], observations)
+
+    def _walk_as(self, run_dir: Path, seeing: list[Path], observations: ObservationsConfig | None) -> list[Path]:
+        """Moves as another run does."""
         state = self._weights(run_dir)
         weights = state["actor_state_dict"]
         own, theirs = self.env.config.observations, observations or self.env.config.observations

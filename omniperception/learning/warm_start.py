@@ -15,6 +15,7 @@ from omniperception.learning.estimator import EstimatingModel
 _FIRST_LAYER, _FIRST_BIAS = "mlp.0.weight", "mlp.0.bias"
 _TRUE = "true_"  # how the observation begins that an estimator of another one is fitted to
 _OPTIONAL = ("perception.", "read_out.")
+_NAVIGATION, _LAYERS = "navigation.", "mlp.network."
 
 
 def perceive_as(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> None:
@@ -38,6 +39,41 @@ def perceive_as(model: MLPModel, weights: Mapping[str, torch.Tensor], source: st
         raise CheckpointError(f"init={source} is to give its perception, but this run has none; give one run alone")
     for name in perceived:
         state[name].copy_(weights[name])
+
+
+def take_parts(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> bool:
+    """Copies what another run perceives and navigates with into a model that does either, whatever the rest does.
+
+    Args:
+        model: whose weights are replaced in place.
+        weights: the state of the other.
+        source: names the other run in an error.
+
+    Returns:
+        Whether the perception was copied.
+
+    Raises:
+        CheckpointError: the other run has neither, or in another form.
+    """
+    state, given = model.state_dict(), dict(weights)
+    given |= {name.removeprefix(_NAVIGATION): value for name, value in weights.items() if name.startswith(_NAVIGATION)}
+    copies, perceives = [], False
+    for name, own in state.items():
+        other = given.get(name.removeprefix(_NAVIGATION) if name.startswith(_NAVIGATION) else name)
+        if name.startswith(_OPTIONAL):
+            perceives |= other is not None
+        elif not name.removeprefix(_NAVIGATION).startswith(_LAYERS):
+            continue
+        if other is None:
+            continue
+        if other.shape != own.shape:
+            raise _misfit(f"init={source} does not fit", name, own, other, "perception and navigation")
+        copies.append((own, other))
+    if not copies:
+        raise CheckpointError(f"init={source} neither perceives nor navigates as this run does; name another run")
+    for own, other in copies:
+        own.copy_(other)
+    return perceives
 
 
 def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str, with_perception: bool = True) -> bool:

@@ -1,5 +1,6 @@
 """Terms: what is computed for them, terms with state, shapes, and the feet that they read about."""
 
+from collections import OrderedDict
 from dataclasses import replace
 from functools import partial
 

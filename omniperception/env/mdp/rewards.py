@@ -299,6 +299,12 @@ def standing_while_free(state: EnvState, share: float, free: float) -> torch.Ten
     return (way & slow & (speed > 0.2)).float()
 
 
+def fallen(state: EnvState, tilt_deg: float) -> torch.Tensor:
+    """1 for a base that is inclined by more than `tilt_deg`."""
+    upright = -state.kinematics.projected_gravity_b[:, 2]
+    return (upright < math.cos(math.radians(tilt_deg))).float()
+
+
 def asked_change_squared(state: EnvState) -> torch.Tensor:
     """|u_t - u_{t-1}|^2 of the velocities that are asked for, (m/s)^2, before the limit of their change."""
     return (state.targets[0] - state.targets[1])[:, :2].square().sum(1)
