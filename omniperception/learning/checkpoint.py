@@ -22,7 +22,7 @@ from omniperception.common.shell import command_line
 FORMAT = "omniperception-checkpoint"
 VERSION = 1
 
-_LAYER = re.compile(r"mlp\.(\d+)\.weight")
+_LAYER = re.compile(r"mlp\.(?:network\.)?(\d+)\.weight")
 
 
 class CheckpointError(RuntimeError):

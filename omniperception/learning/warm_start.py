@@ -14,7 +14,8 @@ from omniperception.learning.estimator import EstimatingModel
 
 _FIRST_LAYER, _FIRST_BIAS = "mlp.0.weight", "mlp.0.bias"
 _TRUE = "true_"  # how the observation begins that an estimator of another one is fitted to
-_OPTIONAL = ("perception.", "read_out.")
+_OPTIONAL = ("perception.", "read_out.", "navigation.")
+_PERCEIVED = ("perception.", "read_out.")
 _NAVIGATION, _LAYERS = "navigation.", "mlp.network."
 
 
@@ -30,7 +31,7 @@ def perceive_as(model: MLPModel, weights: Mapping[str, torch.Tensor], source: st
         CheckpointError: the other run perceives nothing, or otherwise.
     """
     state = model.state_dict()
-    perceived = [name for name in state if name.startswith(_OPTIONAL)]
+    perceived = [name for name in state if name.startswith(_PERCEIVED)]
     for name in perceived:
         own, other = state[name], weights.get(name)
         if other is None or other.shape != own.shape:
@@ -60,7 +61,7 @@ def take_parts(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
     copies, perceives = [], False
     for name, own in state.items():
         other = given.get(name.removeprefix(_NAVIGATION) if name.startswith(_NAVIGATION) else name)
-        if name.startswith(_OPTIONAL):
+        if name.startswith(_PERCEIVED):
             perceives |= other is not None
         elif not name.removeprefix(_NAVIGATION).startswith(_LAYERS):
             continue
