@@ -67,6 +67,7 @@ NAMES: dict[str, Kind] = {
     "terrain.tiles.*": Kind(_members("scene.tiles", rough="Rough", slope="Slope", stairs="Stairs", stones="Stones")),
     "obstacles.groups.*.layout": Kind(
         _members("scene.layouts", maze="MazeLayout", blocks="BlocksLayout", barn="BarnLayout")
+        | _members("scene.layouts", corridor="CorridorLayout")
     ),
     "sim": Kind(
         _members("sim.mujoco", mujoco="SimConfig")

@@ -200,7 +200,7 @@ def _command_ranges(run: RunConfig) -> dict[str, list[float]]:
     if isinstance(commands, VelocityCommandConfig):
         names = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
         return {name: list(getattr(commands, name)) for name in names}
-    speed, turn = commands.speed, commands.max_ang_vel_z
+    speed, turn = commands.speeds[1], commands.max_ang_vel_z
     return {"lin_vel_x": [-speed, speed], "lin_vel_y": [-speed, speed], "ang_vel_z": [-turn, turn]}
 
 

@@ -116,8 +116,8 @@ class EnvState:
         default_base_height: m, of the default pose.
         drawn_physics: (num_envs, W) what randomization drew; see `Randomizer.drawn`.
         stand_s: (num_envs,) s for which the command has been to stand.
-        last_asked: (num_envs, 2) m/s, or (num_envs, 3) with the yaw rate (rad/s): what the policy asked its gait for in the step that ended; 0 after a reset, and
-            where no policy says so.
+        last_asked: (num_envs, 2) m/s, or (num_envs, 3) with the yaw rate (rad/s): what the policy asked its gait for in
+            the step that ended; 0 after a reset, and where no policy says so.
     """
 
     def __init__(

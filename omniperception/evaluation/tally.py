@@ -77,7 +77,10 @@ class Tally:
             command = self._env.command
             if commands.route_ahead is not None and isinstance(command, GoalCommand):
                 length = command.way(self._env.state.kinematics)[fresh]
-            free = (length.double() / commands.speed).clamp(min=commands.hold_s)
+            speed: torch.Tensor | float = commands.speeds[0]
+            if isinstance(command, GoalCommand) and commands.speeds[0] < commands.speeds[1]:
+                speed = command.speed[fresh, 0].double()
+            free = (length.double() / speed).clamp(min=commands.hold_s)
             self._free_time[self._trial[fresh]] = free
 
     def record(self) -> None:

@@ -45,8 +45,8 @@ class PerceptionActor(EstimatingModel):
         read_out: gives the avoidance velocity, or None.
         navigation: asks for velocities in place of the sum, or None.
         max_change: most (m/s) by which the sum changes from step to step; None: no limit.
-        asked: (N, 2) m/s, or (N, 3) with navigation, which turns (rad/s), too: the sum that the newest actions were computed from; None before the first, and without a
-            limit.
+        asked: (N, 2) m/s, or (N, 3) with navigation, which turns (rad/s), too: the sum that the newest actions were
+            computed from; None before the first, and without a limit.
     """
 
     def __init__(

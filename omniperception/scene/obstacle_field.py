@@ -87,8 +87,8 @@ class ObstacleField:
         self._bottom = column(*(group.bottom for group in groups))
         self._heading = torch.deg2rad(column(*(group.heading_deg for group in groups)))
         self._yaw = torch.deg2rad(column(*(group.yaw_deg for group in groups)))
-        self._placement = Placement(config, random, pos_w)
         self._poses, self._presence = Poses(config, random, pos_w), Presence(config, random)
+        self._placement = Placement(config, random, pos_w, self._poses.areas is not None)
         self.any_fixed = bool(self._poses.fixed.any())
         loose = [k for k, part in enumerate(self.parts) if part.group.poses is None]
         self.free = slice(None) if len(loose) == len(self.parts) else torch.tensor(loose, device=device)
@@ -164,6 +164,7 @@ class ObstacleField:
             within(bounds, u[:, row]) for row, bounds in ((6, self._bottom), (2, self._yaw), (4, self._heading))
         )
         pose, posed = self._resize(env_ids, u[:, 7], u[:, 8])
+        self._follow_world(env_ids)
         active = (u[:, 5] < self.level) | self._poses.fixed
         present = self._presence.draw(env_ids)
         if present is not None:
@@ -289,6 +290,13 @@ class ObstacleField:
         for name, part in self._with_state().items():
             part.load_state_dict(state[name])
         self._follow_sizes()
+        self._follow_world(torch.arange(len(self.world), device=self.world.device))
+
+    def _follow_world(self, env_ids: torch.Tensor) -> None:
+        """Keeps the obstacles of environments (n,) within the areas of their worlds, where those have some."""
+        areas = self._poses.areas_of(env_ids)
+        if areas is not None:
+            self._placement.stay_within(env_ids, areas)
 
     def _kept(self) -> dict[str, torch.Tensor]:
         """Tensors of the state, by name."""

@@ -51,7 +51,7 @@ def bounce(
 
     Args:
         xy, velocity: (n, O, 2) m and m/s.
-        bounds: low and high (O, 2) m.
+        bounds: low and high (O, 2) or (n, O, 2) m.
         bound: (O,) bool, whom an area holds.
     """
     low, high = bounds

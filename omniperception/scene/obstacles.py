@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import mujoco
 
-from omniperception.scene.layouts import MazeLayout
+from omniperception.scene.layouts import CorridorLayout, MazeLayout
 from omniperception.scene.obstacle_group import ObstacleGroup, checked_area
 from omniperception.scene.parts import Part
 
@@ -84,7 +84,7 @@ class ObstaclesConfig:
     Attributes:
         groups: obstacle groups by name.
         area: (x_low, x_high, y_low, y_high) in m: where obstacles are placed and move. With boundary 'bounce' it lies
-            around the environment's origin, with 'wrap' around the robot.
+            around the environment's origin, with 'wrap' around the robot. A layout of corridors gives each world one.
         boundary: 'bounce': obstacles turn back at the area's edge; 'wrap': one that leaves the area enters it again
             at the opposite edge, however near that is to the robot, so that a robot can walk for ever among them.
         clearance: free distance (m) kept at a reset between the robot's centre and an obstacle's edge; what finds no
@@ -123,6 +123,12 @@ class ObstaclesConfig:
         for key in ("spacing", "headroom"):
             if getattr(self, key) < 0:
                 raise ValueError(f"obstacles.{key}={getattr(self, key)} must not be negative")
+        corridors = [name for name, group in self.groups.items() if isinstance(group.layout, CorridorLayout)]
+        if len(corridors) > 1 or (corridors and self.boundary == "wrap"):
+            raise ValueError(
+                f"obstacles: {', '.join(corridors)} with boundary={self.boundary}; a scene has one layout of corridors"
+                " at most, which stays where it is: use boundary=bounce"
+            )
         for name, group in self.groups.items():
             approach, least = group.approach, self.clearance + group.largest_radius
             if approach is not None and approach.distance[0] < least:

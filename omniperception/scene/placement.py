@@ -29,17 +29,30 @@ class Placement:
     """Chooses where obstacles stand.
 
     Attributes:
-        bounds: low and high (O, 2) m of the obstacles' areas.
+        bounds: low and high (O, 2) m of the obstacles' areas, or (num_envs, O, 2) where each world has its own.
         follows: whether the areas lie around the robot.
     """
 
-    def __init__(self, config: ObstaclesConfig, random: EnvRandom, like: torch.Tensor) -> None:
-        """`like` has the precision and the device of positions."""
+    def __init__(self, config: ObstaclesConfig, random: EnvRandom, like: torch.Tensor, by_world: bool) -> None:
+        """`like` has the precision and the device of positions; `by_world`: each environment has areas of its own."""
         self._config, self._random = config, random
         area = like.new_tensor([own.group.area or config.area for own in config.obstacles()])
-        self.bounds = area[:, [0, 2]], area[:, [1, 3]]
+        shape = (len(like), *area.shape) if by_world else area.shape
+        area = area.expand(shape).clone()
+        self.bounds = area[..., [0, 2]], area[..., [1, 3]]
+        self._of_world = torch.tensor([own.group.area is None for own in config.obstacles()], device=like.device)
         self.follows = config.boundary == "wrap"
         self._searches = config.spacing > 0.0 or config.free_path is not None
+
+    def stay_within(self, env_ids: torch.Tensor, areas: torch.Tensor) -> None:
+        """Gives obstacles without an area of their own the areas (n, 4) of the worlds of environments (n,)."""
+        for bound, columns in zip(self.bounds, ([0, 2], [1, 3]), strict=True):
+            bound[env_ids] = torch.where(self._of_world[:, None], areas[:, None, columns], bound[env_ids])
+
+    def _bounds_of(self, env_ids: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Low and high (O, 2) or (n, O, 2) m of the areas in environments (n,)."""
+        low, high = self.bounds
+        return (low, high) if low.dim() == 2 else (low[env_ids], high[env_ids])
 
     def choose(
         self,
@@ -66,14 +79,14 @@ class Placement:
         Returns:
             (n, O, 2) m, and who has found one (n, O) bool.
         """
-        config = self._config
+        config, bounds = self._config, self._bounds_of(env_ids)
         if not self._searches:
             xy, found = push_off(
-                self._in_area(u, robot), robot, config.clearance + radius, self.bounds, around_robot=self.follows
+                self._in_area(u, robot, bounds), robot, config.clearance + radius, bounds, around_robot=self.follows
             )
             return xy, found | placed
         u = self._random.uniform(env_ids, (_CANDIDATES * 2, radius.shape[1])).to(radius.dtype)
-        places = torch.stack([self._in_area(pair, robot) for pair in u.split(2, 1)], 2)  # (n, O, C, 2)
+        places = torch.stack([self._in_area(pair, robot, bounds) for pair in u.split(2, 1)], 2)  # (n, O, C, 2)
         fits = (places - robot[:, None, None]).norm(dim=-1) - radius[..., None] >= config.clearance
         if config.free_path is not None:
             assert goal is not None
@@ -82,9 +95,9 @@ class Placement:
             fits &= (off_path >= config.free_path.width / 2) | ~in_the_way[..., None]
         return choose_apart(places, fits, radius, in_the_way, placed.expand(len(robot), -1), config.spacing)
 
-    def _in_area(self, u: torch.Tensor, robot: torch.Tensor) -> torch.Tensor:
-        """Places (n, O, 2) in the areas from (n, 2, O) draws."""
-        low, high = self.bounds
+    def _in_area(self, u: torch.Tensor, robot: torch.Tensor, bounds: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+        """Places (n, O, 2) within bounds, those of the areas, from (n, 2, O) draws."""
+        low, high = bounds
         return low + u.transpose(1, 2) * (high - low) + (robot[:, None] if self.follows else 0.0)
 
 
@@ -101,7 +114,7 @@ def push_off(
         xy: (n, O, 2) m, where they would stand.
         robot: (n, 2) m.
         keep: (n, O) m, the least distance of their centres from the robot.
-        bounds: low and high (O, 2) m of where they may go.
+        bounds: low and high (O, 2) or (n, O, 2) m of where they may go.
         around_robot: whether the bounds are the robot's; what were beyond them would enter on the other side.
 
     Returns:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from omniperception.common.random import EnvRandom
-from omniperception.scene.layouts import MazeLayout
+from omniperception.scene.layouts import CorridorLayout, MazeLayout
 from omniperception.scene.obstacles import ObstaclesConfig
 
 LAYOUT_SEEDS = {"dev": 1, "test": 2}
@@ -21,6 +21,7 @@ class Poses:
         any: whether there are some.
         world: (num_envs, L) int64, which world of each of the L layouts an environment has.
         routes: (W, R, 2) m, ways through the worlds; None: they have none.
+        areas: (W, 4) x_low, x_high, y_low, y_high in m of the worlds of a layout of corridors; None without one.
     """
 
     def __init__(self, config: ObstaclesConfig, random: EnvRandom, like: torch.Tensor) -> None:
@@ -37,8 +38,13 @@ class Poses:
         names = [own.name for own in obstacles]
         part_names = config.geom_names()
         self._columns: list[tuple[slice, slice]] = []
+        self.areas: torch.Tensor | None = None
+        self._area_of = 0  # the layout that has areas
         for name, group in config.groups.items():
             if group.layout is not None:
+                if isinstance(group.layout, CorridorLayout):
+                    self._area_of = len(self._tables)
+                    self.areas = like.new_tensor(group.layout.areas(LAYOUT_SEEDS[config.split], group.layout.worlds))
                 table = like.new_tensor(group.layout.table(LAYOUT_SEEDS[config.split], group.layout.worlds))
                 own, part = names.index(f"obstacle_{name}_0"), part_names.index(f"obstacle_{name}_0")
                 self._columns.append((slice(own, own + group.count), slice(part, part + group.count)))
@@ -67,6 +73,10 @@ class Poses:
             pose[:, own] = rows[..., :3].nan_to_num(0.0)
             size[:, parts] = torch.where(there[:, own, None], rows[..., 3:], size[:, parts])
         return pose, there
+
+    def areas_of(self, env_ids: torch.Tensor) -> torch.Tensor | None:
+        """(n, 4) the areas of the worlds that environments (n,) have; None where worlds have none."""
+        return None if self.areas is None else self.areas[self.world[env_ids, self._area_of]]
 
 
 class Presence:

@@ -57,13 +57,13 @@ class PlanarSimulator:
         if not isinstance(world.terrain, TerrainConfig):
             raise ValueError("sim=planar has flat ground alone; use terrain=flat, or sim=mujoco")
         self.world, self.config, self.num_envs, self.response = world, config, num_envs, response
-        self.device = device = torch.device("cpu")
+        self.device = torch.device("cpu")
         world.model.opt.timestep = config.timestep
         joints, parts = world.robot.num_joints, len(world.obstacles.parts())
         if any(len(pose) != joints for cycle in response.cycles for pose in cycle.joints):
             raise NoResponse(
-                f"sim.response={config.response} was measured on a robot with other joints than robot={world.robot.base}'s"
-                f" {joints}; name a gait of this robot: sim.response=..."
+                f"sim.response={config.response} was measured on a robot with other joints than this one's {joints}; name"
+                " a gait of this robot: sim.response=..."
             )
         self.qpos = torch.zeros(num_envs, 7 + joints)
         self.qvel = torch.zeros(num_envs, 6 + joints)
@@ -84,6 +84,8 @@ class PlanarSimulator:
         self._places, self._velocities = torch.zeros(2, n, steps, 3).unbind(0)
         self._all_envs = torch.arange(n)
         self._field: ObstacleField | None = None
+        none = torch.zeros(n, 0)
+        self._nothing = (torch.zeros(n, 0, 2), none.bool(), none, none, torch.zeros(n, 0, 2))
         self._links: dict[tuple[int, ...], _Links] = {}
         self._records = record_states
         self._mass = float(world.model.body_subtreemass[world.base_body])
@@ -177,9 +179,7 @@ class PlanarSimulator:
         field = self._field
         path = self.mocap_pos[:, None].expand(-1, num_steps, -1, -1).contiguous() if path is None else path
         quats = self.mocap_quat[:, None] if turn is None else turn
-        none = self.mocap_pos.new_zeros(self.num_envs, 0)
-        flat = (none[..., None].expand(-1, -1, 2), none.bool(), none, none, none[..., None].expand(-1, -1, 2))
-        seen = flat if field is None else _outlines(field)
+        seen = self._nothing if field is None else _outlines(field)
         velocity, active, half_height, radius, outline = (value.contiguous() for value in seen)
         config = self.config
         most_linear, most_angular = config.acceleration
@@ -390,4 +390,4 @@ def _attitude(yaw: torch.Tensor, roll: torch.Tensor, pitch: torch.Tensor) -> tor
 
 
 def _no_legs(what: str) -> str:
-    return f"sim=planar has no {what}: nothing of legs exists there; use rewards=navigate observations=navigate, or sim=mujoco"
+    return f"sim=planar has no {what}; use rewards=navigate observations=navigate, or sim=mujoco"

@@ -168,11 +168,35 @@ class TestGoal:
             (([10.0, 10.0], [0.0, 0.0], None, 0.0), r"commands\.speed=0"),
             (([7.0, 6.0], [0.0, 0.0], None, 1.0), r"commands\.goal_x=\[7\.0, 6\.0\]"),
             (([7.0, 7.0], [0.0, 0.0], 0.0, 1.0), r"commands\.radius=0"),
+            (([7.0, 7.0], [0.0, 0.0], 0.5, [0.0, 1.0]), r"commands\.speed=\[0\.0, 1\.0\] must be positive"),
+            (([7.0, 7.0], [0.0, 0.0], 0.5, [1.3, 0.7]), r"commands\.speed=\[1\.3, 0\.7\] must be \[low, high\]"),
         ],
     )
     def test_wrong_settings_are_refused(self, settings, message):
         with pytest.raises(ValueError, match=message):
             GoalCommandConfig(*settings, 2.0, 1.0, SpawnConfig())
+
+    def test_a_speed_is_drawn_for_each_way_and_lasts(self):
+        n, device = 400, torch.device("cpu")
+        settings = ((10.0, 10.0), (-2.0, 2.0), 0.5)
+        drawn, plain, narrow = (
+            GoalCommandConfig(*settings, speed, 2.0, 1.0, SpawnConfig()).build(n, device, EnvRandom(3, n, device))
+            for speed in ([0.7, 1.3], 1.1, [1.1, 1.1])
+        )
+        here, everybody = robots([[0.0, 0.0]] * n, [0.0] * n), torch.arange(n)
+        for command in (drawn, plain, narrow):
+            command.reset(everybody, here)
+        speeds = drawn.value[:, :2].norm(dim=1)
+        assert 0.7 <= speeds.min() < 0.71 and 1.29 < speeds.max() <= 1.3
+        assert speeds.mean() == pytest.approx(1.0, abs=0.03)
+        drawn.advance(0.02, robots([[1.0, 0.0]] * n, [0.5] * n))
+        torch.testing.assert_close(drawn.value[:, :2].norm(dim=1), speeds)
+        assert torch.equal(plain.value, narrow.value) and torch.equal(plain.goal_w, drawn.goal_w)
+        saved, before = drawn.state_dict(), drawn.value.clone()
+        drawn.reset(everybody[:10], here)
+        assert not torch.equal(drawn.speed, saved["speed"]) and torch.equal(drawn.speed[10:], saved["speed"][10:])
+        drawn.load_state_dict(saved)
+        assert torch.equal(drawn.value, before) and torch.equal(drawn.speed, saved["speed"])
 
     def test_a_place_ahead_on_the_route_is_aimed_at(self):
         """Along an L and around a hairpin, in steps of 0.5 m, 1.5 m ahead."""

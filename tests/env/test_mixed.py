@@ -236,7 +236,7 @@ def test_seeds_and_shares_of_a_run():
         ),
         (
             ["observations.groups.privileged.terms.nearest_obstacles={count: 16, max_distance: 4.0}"],
-            "families.hold: observations.groups.privileged.terms.nearest_obstacles has 96 numbers, and 78 in crossing",
+            "families.hold: observations.groups.privileged.terms.nearest_obstacles has 96 numbers, and 84 in crossing",
         ),
     ],
 )

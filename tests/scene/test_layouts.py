@@ -9,6 +9,7 @@ from omniperception.scene.layouts import (
     ROUTE_PIECES,
     BarnLayout,
     BlocksLayout,
+    CorridorLayout,
     MazeLayout,
     barn_scores,
     inflated,
@@ -305,3 +306,45 @@ def test_thick_worlds_are_harder():
 def test_wrong_layouts_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+class TestCorridor:
+    layout = CorridorLayout(width=(2.5, 7.0), length=(8.0, 16.0), margin=0.4, lead=1.0, depth=0.5)
+
+    def test_what_is_between_the_walls_is_as_wide_and_long_as_asked_for(self):
+        widths, lengths = [], []
+        for world, (x_low, x_high, y_low, y_high) in zip(
+            self.layout.table(3, 200), self.layout.areas(3, 200), strict=True
+        ):
+            left, right, back = world[:4], world[4:8], world[8]
+            inner = [left[:, 1] - left[:, 4], -right[:, 1] - right[:, 4]]
+            np.testing.assert_allclose(inner, inner[0][0])
+            widths.append(2 * inner[0][0])
+            ends = left[:, [0]] + left[:, [3]] * [-1, 1]
+            np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1])  # end to end
+            np.testing.assert_allclose([ends[0, 0], back[0] + back[3]], -self.layout.back)
+            assert back[4] >= inner[0][0]  # closed behind
+            lengths.append(ends[-1, 1])
+            np.testing.assert_allclose((x_low, x_high, y_high), (1.0, lengths[-1], inner[0][0] - 0.4))
+            assert y_low == -y_high
+            assert 0.6 + 0.5 <= 2 * world[0, 5] <= 2.0 + 0.5
+        for drawn, (low, high) in ((widths, self.layout.width), (lengths, self.layout.length)):
+            assert low <= min(drawn) < low + 0.1 * (high - low) and high >= max(drawn) > high - 0.1 * (high - low)
+            assert np.mean(drawn) == pytest.approx((low + high) / 2, abs=0.1 * (high - low))
+
+    def test_worlds_follow_from_the_seed_and_their_number(self):
+        np.testing.assert_array_equal(self.layout.table(1, 3), self.layout.table(1, 9)[:3])
+        assert not np.array_equal(self.layout.table(1, 3), self.layout.table(2, 3))
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"width": (0.5, 1.0)}, "leaves no room with margin=0.3"),
+            ({"length": (1.0, 2.0)}, "must be beyond lead=1.5"),
+            ({"pieces": 0}, "pieces=0 of a corridor's wall must be at least 1"),
+            ({"width": (3.0, 2.0)}, "must be a range"),
+        ],
+    )
+    def test_impossible_corridors_are_refused(self, settings, message):
+        with pytest.raises(ValueError, match=message):
+            CorridorLayout(**settings)

@@ -18,7 +18,14 @@ from omniperception.sim.planar_world import PlanarSimulator
 from omniperception.sim.response import FILE, GaitResponse, NoResponse
 
 GAIT = Path(config.SHIPPED_RUNS) / "gait"
-NAVIGATE = ("experiment=navigate", "randomization=none", "sim.spread=0", "num_envs=3", "obstacles=none", "sim.num_threads=1")
+NAVIGATE = (
+    "experiment=navigate",
+    "randomization=none",
+    "sim.spread=0",
+    "num_envs=3",
+    "obstacles=none",
+    "sim.num_threads=1",
+)
 
 
 def steady(folder: Path, gain=1.0, lag=0.1, delay=0.0, offset=0.0, noise=0.0, falls=()) -> Path:
@@ -64,7 +71,9 @@ class TestMotion:
         assert env.state.last_asked[1].tolist() == pytest.approx([0.12, 0.16], abs=1e-5)
 
     def test_position_is_the_integral_in_the_robots_own_heading(self, tmp_path):
-        env = planar(steady(tmp_path, lag=1e-4), "sim.acceleration=[1e6,1e6]", "sim.timestep=0.005", "sim.decimation=20")
+        env = planar(
+            steady(tmp_path, lag=1e-4), "sim.acceleration=[1e6,1e6]", "sim.timestep=0.005", "sim.decimation=20"
+        )
         for _ in range(10):
             env.step(actions(env, 1.0, 0.0, 1.0))
         x, y, yaw = env.sim._place[0].tolist()
@@ -188,7 +197,13 @@ class TestTouches:
     def test_a_wall_holds_a_robot_up_and_takes_its_momentum(self, tmp_path, heading_deg):
         wall = "obstacles.groups.wall={kind: box, count: 1, size: [[0.1, 0.1], [4.0, 4.0], [0.5, 0.5]], poses: [[1.5, 0.0, 0.0]]}"
         spawn = f"commands.spawn.yaw_deg=[{heading_deg},{heading_deg}]"
-        env = planar(steady(tmp_path, lag=1e-4), f"+{wall}", spawn, "terminations.on_collision=false", "+obstacles.area=[-5,5,-5,5]")
+        env = planar(
+            steady(tmp_path, lag=1e-4),
+            f"+{wall}",
+            spawn,
+            "terminations.on_collision=false",
+            "+obstacles.area=[-5,5,-5,5]",
+        )
         angle = math.radians(heading_deg)
         impulse = 0.0
         for _ in range(20):
@@ -230,7 +245,12 @@ class TestSeen:
     def test_rays_are_those_of_mujoco_in_the_same_scene(self, tmp_path):
         """Base, joints and obstacles put where they are without legs."""
         lidar = ("lidar=mid360", "lidar.num_rays=500", "perception=polar_rings", "perception.motion_weight=1")
-        lidar += ("perception.avoidance_weight=0", "obstacles=static", "obstacles.curriculum=null", "observations=perceive")
+        lidar += (
+            "perception.avoidance_weight=0",
+            "obstacles=static",
+            "obstacles.curriculum=null",
+            "observations=perceive",
+        )
         without = planar(steady(tmp_path), *lidar)
         for _ in range(5):
             without.step(actions(without, 0.5, 0.0, 0.2))
@@ -289,7 +309,10 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("overrides", "said"),
         [
-            (("rewards=default",), "joint_limit_violation.* read joints, feet or torques, and sim=planar has none; use"),
+            (
+                ("rewards=default",),
+                "joint_limit_violation.* read joints, feet or torques, and sim=planar has none; use",
+            ),
             (("observations=gait",), "joint_pos_offset.*use rewards=navigate observations=navigate, or sim=mujoco"),
             (("stepping={lift: 1.0, rest_s: 1.0}",), "stepping moves joints.*use stepping=null"),
             (("sim.response=nowhere",), "sim.response=nowhere does not exist"),

@@ -22,6 +22,10 @@ def _check_range(key: str, bounds: Sequence[float]) -> tuple[float, float]:
     return float(bounds[0]), float(bounds[1])
 
 
+def _shown(value: float | Sequence[float]) -> str:
+    return f"{value if isinstance(value, int | float) else list(value)}"
+
+
 @dataclass(frozen=True)
 class SpawnConfig:
     """Start pose of a robot, in its environment's frame.
@@ -85,7 +89,7 @@ class GoalCommandConfig:
         goal_y: range (m) of its y.
         radius: the goal is reached within this distance (m, horizontal, of the base's origin); None: beyond the line
             x = goal_x, wherever. The command then aims one metre beyond it, so that it never turns around.
-        speed: commanded speed (m/s).
+        speed: commanded speed (m/s), or the range from which it is drawn at every reset.
         yaw_gain: yaw rate per heading error (1/s).
         max_ang_vel_z: bound of the commanded yaw rate (rad/s).
         spawn: where the robot starts.
@@ -99,7 +103,7 @@ class GoalCommandConfig:
     goal_x: Sequence[float]
     goal_y: Sequence[float]
     radius: float | None
-    speed: float
+    speed: float | Sequence[float]
     yaw_gain: float
     max_ang_vel_z: float
     spawn: SpawnConfig
@@ -110,9 +114,12 @@ class GoalCommandConfig:
     def __post_init__(self) -> None:
         for key in ("goal_x", "goal_y"):
             object.__setattr__(self, key, _check_range(key, getattr(self, key)))
+        if not isinstance(self.speed, int | float):
+            object.__setattr__(self, "speed", _check_range("speed", self.speed))
         for key in ("speed", "yaw_gain", "max_ang_vel_z"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"commands.{key}={getattr(self, key)} must be positive")
+            given = getattr(self, key)
+            if (given if isinstance(given, int | float) else given[0]) <= 0:
+                raise ValueError(f"commands.{key}={_shown(given)} must be positive")
         if self.radius is not None and self.radius <= 0:
             raise ValueError(f"commands.radius={self.radius} must be positive, or null for a line to cross")
         for key in ("slow_within", "hold_s"):
@@ -126,6 +133,11 @@ class GoalCommandConfig:
             )
         if self.route_ahead is not None and self.radius is None:
             raise ValueError("commands.route_ahead leads to a place, not across a line: give commands.radius")
+
+    @property
+    def speeds(self) -> tuple[float, float]:
+        """Least and most commanded speed (m/s)."""
+        return (self.speed, self.speed) if isinstance(self.speed, int | float) else (self.speed[0], self.speed[1])
 
     def build(self, num_envs: int, device: torch.device, random: EnvRandom) -> GoalCommand:
         return GoalCommand(self, num_envs, device, random)
@@ -229,6 +241,7 @@ class GoalCommand:
         route_w: (num_envs, R, 2) m, points of the routes; None: straight to the goal.
         along: (num_envs, R) m, the way along the routes to their points.
         progress: (num_envs,) m, the way along the routes to the points nearest to the robots; never falls.
+        speed: (num_envs, 1) m/s, what is commanded on the way.
     """
 
     def __init__(self, config: GoalCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
@@ -238,6 +251,7 @@ class GoalCommand:
         self.route_w: torch.Tensor | None = None
         self.along = torch.zeros(num_envs, 1, device=device)
         self.progress = torch.zeros(num_envs, device=device)
+        self.speed = torch.full((num_envs, 1), config.speeds[0], device=device)
         self._random = random
         ranges = (config.goal_x, config.goal_y)
         self._low = torch.tensor([r[0] for r in ranges], device=device)
@@ -245,6 +259,9 @@ class GoalCommand:
 
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
         self.goal_w[env_ids] = self._low + self._random.uniform(env_ids, (2,)) * (self._high - self._low)
+        if self._draws_speed:
+            low, high = self.config.speeds
+            self.speed[env_ids] = low + self._random.uniform(env_ids, (1,)) * (high - low)
         self._steer(kinematics)
 
     def follow(self, env_ids: torch.Tensor, route: torch.Tensor, kinematics: Kinematics) -> None:
@@ -271,6 +288,11 @@ class GoalCommand:
             self.progress = self.along.gather(1, nearest[:, None])[:, 0]
         self._steer(kinematics)
 
+    @property
+    def _draws_speed(self) -> bool:
+        low, high = self.config.speeds
+        return low < high
+
     def _target(self) -> torch.Tensor:
         """(num_envs, 2) m, where the commands point to."""
         if self.route_w is None or self.config.route_ahead is None:
@@ -286,7 +308,7 @@ class GoalCommand:
             ahead = (ahead + 1.0).clamp(min=0.5)
         bearing = torch.atan2(aside, ahead)
         to_goal = torch.stack((bearing.cos(), bearing.sin()), -1)
-        self.value[:, :2] = rotate_yaw(-kinematics.yaw, to_goal) * config.speed
+        self.value[:, :2] = rotate_yaw(-kinematics.yaw, to_goal) * self.speed
         error = torch.remainder(bearing - kinematics.yaw + math.pi, 2 * math.pi) - math.pi
         self.value[:, 2] = (config.yaw_gain * error).clamp(-config.max_ang_vel_z, config.max_ang_vel_z)
         if config.slow_within > 0:
@@ -304,11 +326,14 @@ class GoalCommand:
 
     def state_dict(self) -> dict:
         names = ("value", "goal_w", *(() if self.route_w is None else ("route_w", "progress")))
+        names += ("speed",) if self._draws_speed else ()
         return {name: getattr(self, name).clone() for name in names}
 
     def load_state_dict(self, state: dict) -> None:
         self.value.copy_(state["value"])
         self.goal_w.copy_(state["goal_w"])
+        if self._draws_speed:
+            self.speed.copy_(state["speed"])
         if "route_w" in state:
             self.route_w, self.progress = state["route_w"].clone(), state["progress"].clone()
             self.along = _along(self.route_w)

@@ -311,7 +311,7 @@ def asked_change_squared(state: EnvState) -> torch.Tensor:
 
 
 def asked_jump(state: EnvState, free: float) -> torch.Tensor:
-    """(|u_t - u_{t-1}| - `free`)^2 beyond `free` (m/s) of the velocities that are asked for: jumps throw robots over."""
+    """(|u_t - u_{t-1}| - `free`)^2 beyond `free` (m/s) of the velocities that are asked for: jumps make robots fall."""
     change = (state.targets[0] - state.targets[1])[:, :2].norm(dim=1)
     return (change - free).clamp(min=0.0).square()
 
