@@ -216,8 +216,7 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     hints = types_of(EnvConfig)
     task = {key: make(hints[key], composed[key], key, trusted) for key in _TASK}
     if isinstance(task["sim"], PlanarConfig):
-        gait = configs.find_run(task["sim"].response, "sim.response")
-        task["sim"] = replace(task["sim"], response=str(gait))
+        task["sim"] = replace(task["sim"], response=str(_gait_of(task["sim"].response, task["robot"])))
     if task["obstacles"].split == "test":
         try:
             task["obstacles"] = held_out(task["obstacles"])
@@ -273,6 +272,18 @@ def check_version(run_dir: Path, trust: Sequence[str] = ()) -> None:
         ) from None
     except ConfigError:
         return  # it fits; what else is wrong is told by whoever asked
+
+
+def _gait_of(name: str, robot: RobotConfig) -> Path:
+    """The run directory whose gait robots without legs follow, of the same robot."""
+    run_dir = configs.find_run(name, "sim.response")
+    theirs = configs.read(run_dir).robot
+    if theirs.file != robot.file or list(theirs.joints) != list(robot.joints):
+        raise ConfigError(
+            f"sim.response={name} is the gait of {theirs.file}, this robot is {robot.file}; give sim.response=<a run of"
+            " experiment=gait with this robot>"
+        )
+    return run_dir
 
 
 def _resolved(config: DictConfig) -> dict:

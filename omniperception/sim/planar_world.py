@@ -17,7 +17,7 @@ from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.scene.terrain import TerrainConfig
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure
 from omniperception.sim.planar_kernels import walk
-from omniperception.sim.response import AXES, GaitResponse, NoResponse
+from omniperception.sim.response import AXES, GaitResponse
 
 if TYPE_CHECKING:
     from omniperception.scene import ObstacleField
@@ -60,11 +60,6 @@ class PlanarSimulator:
         self.device = torch.device("cpu")
         world.model.opt.timestep = config.timestep
         joints, parts = world.robot.num_joints, len(world.obstacles.parts())
-        if any(len(pose) != joints for cycle in response.cycles for pose in cycle.joints):
-            raise NoResponse(
-                f"sim.response={config.response} was measured on a robot with other joints than this one's {joints}; name"
-                " a gait of this robot: sim.response=..."
-            )
         self.qpos = torch.zeros(num_envs, 7 + joints)
         self.qvel = torch.zeros(num_envs, 6 + joints)
         self.mocap_pos, self.mocap_quat = torch.zeros(num_envs, parts, 3), torch.zeros(num_envs, parts, 4)

@@ -1,7 +1,8 @@
-"""Robots without legs: the motion by closed forms, touches by brute force, links and rays by MuJoCo, the gait by itself."""
+"""Robots without legs: motion by closed forms, touches by brute force, links and rays by MuJoCo, the gait by itself."""
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from omniperception import build, config
 from omniperception.build import load_policy
 from omniperception.common.errors import ConfigError
 from omniperception.env.env import OmniEnv
+from omniperception.scene.build import OBSTACLE_FORCE
 from omniperception.sim.planar_world import PlanarSimulator
 from omniperception.sim.response import FILE, GaitResponse, NoResponse
 
@@ -26,6 +28,7 @@ NAVIGATE = (
     "obstacles=none",
     "sim.num_threads=1",
 )
+FAST = ("sim.acceleration=[1e6,1e6]",)
 
 
 def steady(folder: Path, gain=1.0, lag=0.1, delay=0.0, offset=0.0, noise=0.0, falls=()) -> Path:
@@ -38,6 +41,7 @@ def steady(folder: Path, gain=1.0, lag=0.1, delay=0.0, offset=0.0, noise=0.0, fa
     given |= {"radius": 0.2, "half_length": 0.2}
     folder.mkdir(parents=True, exist_ok=True)
     (folder / FILE).write_text(json.dumps(given))
+    shutil.copy(GAIT / "config.yaml", folder)
     return folder
 
 
@@ -54,7 +58,7 @@ class TestMotion:
     @pytest.mark.parametrize("lag", [0.05, 0.3])
     @pytest.mark.parametrize("delay", [0.0, 0.05, 0.08])
     def test_velocity_follows_with_a_lag_after_a_dead_time(self, tmp_path, lag, delay):
-        env = planar(steady(tmp_path, gain=0.8, lag=lag, delay=delay, offset=0.1), "sim.acceleration=[1e6,1e6]")
+        env = planar(steady(tmp_path, gain=0.8, lag=lag, delay=delay, offset=0.1), *FAST)
         for step in range(1, 8):
             env.step(actions(env, 1.0, -0.5, 0.4))
             time = 0.1 * step
@@ -68,12 +72,11 @@ class TestMotion:
         env = planar(steady(tmp_path, lag=1e-4), "sim.acceleration=[2,1]")
         env.step(actions(env, 0.6, 0.8, -1.0))
         assert env.state.asked[1].tolist() == pytest.approx([0.12, 0.16, -0.1], abs=1e-5)
-        assert env.state.last_asked[1].tolist() == pytest.approx([0.12, 0.16], abs=1e-5)
+        env.step(actions(env, 0.6, 0.8, -1.0))
+        assert env.state.last_asked[1].tolist() == pytest.approx([0.12, 0.16], abs=1e-5)  # in the step that ended
 
     def test_position_is_the_integral_in_the_robots_own_heading(self, tmp_path):
-        env = planar(
-            steady(tmp_path, lag=1e-4), "sim.acceleration=[1e6,1e6]", "sim.timestep=0.005", "sim.decimation=20"
-        )
+        env = planar(steady(tmp_path, lag=1e-4), *FAST, "sim.timestep=0.005", "sim.decimation=20")
         for _ in range(10):
             env.step(actions(env, 1.0, 0.0, 1.0))
         x, y, yaw = env.sim._place[0].tolist()
@@ -81,7 +84,7 @@ class TestMotion:
         assert (x, y) == pytest.approx((math.sin(1.0), 1.0 - math.cos(1.0)), abs=1e-3)  # a circle of radius 1 m
 
     def test_more_than_the_gait_can_is_not_asked_for(self, tmp_path):
-        env = planar(steady(tmp_path, lag=1e-4), "sim.acceleration=[1e6,1e6]")
+        env = planar(steady(tmp_path, lag=1e-4), *FAST)
         env.step(actions(env, 9.0, -9.0, 9.0))
         assert env.state.asked[0].tolist() == pytest.approx([2.0, -1.5, 1.5])
 
@@ -104,7 +107,7 @@ class TestMotion:
         assert float(env.sim._velocity[0, 1]) == pytest.approx(math.exp(-0.5), abs=1e-4)
 
     def test_an_action_that_is_not_finite_is_a_failure_and_the_last_one_goes_on(self, tmp_path):
-        env = planar(steady(tmp_path, lag=1e-4), "sim.acceleration=[1e6,1e6]")
+        env = planar(steady(tmp_path, lag=1e-4), *FAST)
         env.step(actions(env, 1.0, 0.0, 0.0))
         given = actions(env, 1.0, 0.0, 0.0)
         given[1, 0] = torch.nan
@@ -145,7 +148,8 @@ class TestMotion:
                 runs[1]._reset(torch.tensor([2]))
         for name in ("qpos", "qvel", "asked"):
             one, other = (getattr(env.sim, name) for env in runs)
-            assert torch.equal(one[[0, 1, 3]], other[[0, 1, 3]]) and not torch.equal(one[2], other[2])
+            assert torch.equal(one[[0, 1, 3]], other[[0, 1, 3]])
+        assert not torch.equal(runs[0].sim.qpos[2], runs[1].sim.qpos[2])
 
 
 def brute_gap(half_length: float, place, yaw, outline) -> float:
@@ -167,8 +171,8 @@ class TestTouches:
         env.obstacles.level = 1.0
         env.reset()
         agree = touches = 0
-        for _ in range(12):
-            env.step(actions(env, 0.0, 0.0, 0.0))
+        for _ in range(20):
+            env.step(actions(env, 0.3, 0.0, 0.0))
             field, sim = env.obstacles, env.sim
             radius = sim._radius[0].item()
             for k in range(env.num_envs):
@@ -191,11 +195,12 @@ class TestTouches:
                 assert min(gaps) > radius - 0.011  # it has been pushed out
                 touches += bool(sim._touched[k])
                 agree += (min(gaps) < radius + 1e-3) <= bool(sim._touched[k])
-        assert touches > 10 and agree == 12 * env.num_envs
+        assert touches > 5 and agree == 20 * env.num_envs
 
     @pytest.mark.parametrize("heading_deg", [0.0, 40.0])
     def test_a_wall_holds_a_robot_up_and_takes_its_momentum(self, tmp_path, heading_deg):
-        wall = "obstacles.groups.wall={kind: box, count: 1, size: [[0.1, 0.1], [4.0, 4.0], [0.5, 0.5]], poses: [[1.5, 0.0, 0.0]]}"
+        size = "[[0.1, 0.1], [4.0, 4.0], [0.5, 0.5]]"
+        wall = "obstacles.groups.wall={kind: box, count: 1, size: " + size + ", poses: [[1.5, 0.0, 0.0]]}"
         spawn = f"commands.spawn.yaw_deg=[{heading_deg},{heading_deg}]"
         env = planar(
             steady(tmp_path, lag=1e-4),
@@ -208,7 +213,7 @@ class TestTouches:
         impulse = 0.0
         for _ in range(20):
             env.step(actions(env, 1.0, 0.0, 0.0))
-            impulse = max(impulse, float(env.state.obstacle_impulse[0]))
+            impulse = max(impulse, float(env.sim.contact_impulse(OBSTACLE_FORCE)[0]))
         reach = 0.2 + 0.2 * math.cos(angle)
         assert float(env.sim._place[0, 0]) == pytest.approx(1.4 - reach, abs=5e-3)
         assert env.contacts.all()
@@ -311,11 +316,12 @@ class TestBadInput:
         [
             (
                 ("rewards=default",),
-                "joint_limit_violation.* read joints, feet or torques, and sim=planar has none; use",
+                "joint_limit_violation.* read joints, feet or torques, and sim=planar has none",
             ),
             (("observations=gait",), "joint_pos_offset.*use rewards=navigate observations=navigate, or sim=mujoco"),
             (("stepping={lift: 1.0, rest_s: 1.0}",), "stepping moves joints.*use stepping=null"),
             (("sim.response=nowhere",), "sim.response=nowhere does not exist"),
+            (("robot=anymal",), "is the gait of go2.xml, this robot is .*sim.response="),
         ],
     )
     def test_what_has_no_legs_is_asked_for_none(self, overrides, said):
@@ -328,7 +334,6 @@ class TestBadInput:
             (("sim.under=faults",), "no response measured under condition=faults .*ideal.*sim.under"),
             (("terrain=rough",), "flat ground alone; use terrain=flat"),
             (("sim.response=pretrained/pd_risknet_taught",), "has no measured response of its gait .*measure it: "),
-            (("robot=anymal",), "other joints|robot"),
         ],
     )
     def test_a_response_that_does_not_fit_is_refused(self, overrides, said):
