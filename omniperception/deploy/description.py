@@ -13,7 +13,7 @@ from omniperception.common.errors import naming
 from omniperception.common.shell import command_line
 
 FORMAT = "omniperception-policy"
-VERSION = 8
+VERSION = 9
 FILE = "policy.json"
 FINGERPRINT = "omniperception-description"
 """Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
@@ -188,6 +188,7 @@ class Description:
             base_lin_vel (m/s, base frame), or none.
         max_acceleration: at most as fast (m/s^2) changes the velocity that the network gives in its last output `asked`
             and reads in its last input `last_asked` at the next step, 0 at the first; None: it has neither.
+        turns: whether that velocity has a yaw rate (rad/s) besides v_x and v_y.
         files: name of the network's file by kind, "onnx" or "torchscript".
         checksums: SHA-256 of each of these files.
         provenance: run, checkpoint, iteration, date and versions.
@@ -203,6 +204,7 @@ class Description:
     perception: Perception | None = None
     estimated: Sequence[str] = ()
     max_acceleration: float | None = None
+    turns: bool = False
     files: Mapping[str, str] = field(default_factory=dict)
     checksums: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping = field(default_factory=dict)
@@ -220,7 +222,7 @@ class Description:
             shapes["frames"] = (self.perception.history, self.perception.num_points, 3)
             shapes["frame_count"] = (1,)
         if self.max_acceleration is not None:
-            shapes["last_asked"] = (2,)
+            shapes["last_asked"] = (3,) if self.turns else (2,)
         return shapes
 
     @property
@@ -230,7 +232,7 @@ class Description:
         if self.estimated:
             sizes["estimate"] = 3
         if self.max_acceleration is not None:
-            sizes["asked"] = 2
+            sizes["asked"] = 3 if self.turns else 2
         return sizes
 
     @property

@@ -6,10 +6,11 @@ import copy
 import io
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 
 import mujoco
@@ -154,6 +155,7 @@ def describe(run: RunConfig, env: OmniEnv) -> Description:
         perception=_perception(run.perception, run.env.lidar) if run.perception is not None else None,
         estimated=_estimated(run),
         max_acceleration=run.max_acceleration,
+        turns=run.navigation is not None,
     )
 
 
@@ -345,10 +347,11 @@ class PerceptiveNetwork(BlindNetwork):
 
     input_names: Sequence[str] = ("observations", "frames", "frame_count")
 
-    def __init__(self, actor: PerceptionActor, command_start: int) -> None:
-        """Args: actor: copied, on the CPU; command_start: where (v_x, v_y) begin in the observations."""
+    def __init__(self, actor: PerceptionActor, starts: Mapping[str, int]) -> None:
+        """Args: actor: copied, on the CPU; starts: where its groups begin in the observations."""
         super().__init__(actor)
-        self.command_start = command_start
+        self.command_start = starts.get(COMMAND, 0)
+        self.velocity = [(starts[one.group] + one.column, one.scale) for one in actor.velocity_inputs]
         if actor.max_change is not None:
             self.input_names = (*self.input_names, LAST_ASKED)
             self.output_names = (*self.output_names, "asked")
@@ -365,10 +368,16 @@ class PerceptiveNetwork(BlindNetwork):
         features = self.actor.perception(frames, frame_count)[:, 0]
         asked: tuple[torch.Tensor, ...] = ()
         if self.actor.read_out is not None:
-            start, stop = self.command_start, self.command_start + 2
+            navigates = self.actor.navigation is not None
+            start, stop = self.command_start, self.command_start + (3 if navigates else 2)
             command = observations[:, start:stop]
-            command = command + self.actor.read_out.velocity(features, command) * (frame_count > 0)
-            if last_asked is not None:
+            if navigates:
+                velocity = torch.stack([observations[:, at] / scale for at, scale in self.velocity], 1)
+                asked = (self.actor.navigate(features, (frame_count > 0)[:, 0], command, velocity, last_asked),)
+                command = asked[0]
+            else:
+                command = command + self.actor.read_out.velocity(features, command) * (frame_count > 0)
+            if last_asked is not None and not navigates:
                 command = moved_towards(last_asked, command, self.actor.max_change)
                 asked = (command,)
             observations = torch.cat((observations[:, :start], command, observations[:, stop:]), 1)
@@ -383,7 +392,8 @@ class PerceptiveNetwork(BlindNetwork):
         nearness = (-nearness).exp()  # a place in the plane and its proximity, as rows of a grid are
         rows = torch.stack((nearness * bearing.cos(), nearness * bearing.sin(), nearness), -1)
         rows[:, :, -1] *= 0.1  # motion from frame to frame is small
-        asked = () if self.actor.max_change is None else (torch.randn(batch, 2),)
+        width = 2 if self.actor.navigation is None else 3
+        asked = () if self.actor.max_change is None else (torch.randn(batch, width),)
         return *super().examples(batch), rows, count, *asked
 
 
@@ -396,10 +406,10 @@ def network_of(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
     """
     if not isinstance(actor, PerceptionActor):
         return BlindNetwork(actor)
-    names, command_start = list(group_sizes), 0
-    if actor.read_out is not None:
-        command_start = sum(group_sizes[name] for name in names[: names.index(COMMAND)])
-    return PerceptiveNetwork(actor, command_start)
+    ends = accumulate(group_sizes.values())
+    return PerceptiveNetwork(
+        actor, {name: end - group_sizes[name] for name, end in zip(group_sizes, ends, strict=True)}
+    )
 
 
 def write_torchscript(network: BlindNetwork, path: Path) -> tuple[Path, Callable]:

@@ -148,7 +148,7 @@ class ExportedPolicy:
             history.clear()
         self.frame_count = self._steps = self._steps_stood = 0
         self._reference = np.zeros(3, np.float32)
-        self._asked = np.zeros(2, np.float32)
+        self._asked = np.zeros(3 if self.description.turns else 2, np.float32)
         self.base_lin_vel: np.ndarray | None = None
         if self.safety is not None:
             self.safety.reset()

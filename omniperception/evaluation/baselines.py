@@ -30,19 +30,22 @@ BASELINES = {
     "stop": "the gait follows V_cmd, which falls to zero while the raw noisy cloud has something near ahead",
     "histogram": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the raw noisy cloud"
     " by geometry: nearest return by sector, ground removed, velocities from successive frames, nothing learned",
+    "told": "the gait follows what the run's navigation policy asks for, told the true places and velocities of all"
+    " obstacles",
     "oracle": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the true places and"
     " velocities of all obstacles",
 }
 """Policies to compare with; the gait is the run's own, which then sees nothing, or that of another run."""
 
-DRIVEN = ("stop", "histogram", "oracle")
+DRIVEN = ("stop", "histogram", "told", "oracle")
 """Those that drive a gait by its command."""
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
 """Ranges of v_x and v_y (m/s)."""
 
 Steering = Callable[[], torch.Tensor]
-"""Velocity (num_envs, 2) (m/s, yaw-aligned frame) that a gait is commanded now."""
+"""Velocity (num_envs, 2) (m/s, yaw-aligned frame), or (num_envs, 3) with the yaw rate (rad/s), that a gait is commanded
+now."""
 
 
 _NO_LIDAR = "this policy needs a LiDAR, but the run has none; use lidar=mid360"
@@ -94,6 +97,8 @@ def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig
         return blind(env, policy)
     if name == "stop":
         return stop(env, policy, limits)
+    if name == "told":
+        return told(env, policy, limits)
     made = {"histogram": histogram, "oracle": oracle}[name]
     return made(env, policy, avoidance, limits)
 
@@ -115,6 +120,23 @@ def oracle(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Lim
         return sectors.measure(kinematics.base_pos_w, kinematics.yaw)
 
     return _driven(env, policy, _avoiding(env, avoidance, motion), limits)
+
+
+def told(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
+    """The policy, driven by what its own navigation asks for when it is told the true obstacles, seen or not."""
+    navigation = getattr(policy, "navigation", None)
+    if navigation is None:
+        raise ValueError("this policy has no navigation that could be told; leave policy=told out")
+    sectors = TrueSectors(NUM_SECTORS, env.world.obstacles, env.obstacles, env.num_envs, env.device)
+
+    def wanted() -> torch.Tensor:
+        state = env.state
+        now = sectors.measure(state.kinematics.base_pos_w, state.kinematics.yaw)
+        measured = state.measured
+        velocity = torch.cat((measured.base_lin_vel_yaw, measured.base_ang_vel_b[:, 2:]), 1)
+        return navigation(now, state.reference, velocity, state.last_asked)
+
+    return _driven(env, policy, wanted, limits)
 
 
 def histogram(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
@@ -304,9 +326,9 @@ def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | N
         velocity = steering()
         if limits is not None:
             low, high = velocity.new_tensor(limits).unbind(1)
-            velocity = velocity.clamp(low, high)
+            velocity = torch.cat((velocity[:, :2].clamp(low, high), velocity[:, 2:]), 1)
         observations = observations.clone(recurse=False)
-        observations[COMMAND] = torch.cat((velocity, env.state.reference[:, 2:]), 1)
+        observations[COMMAND] = torch.cat((velocity, env.state.reference[:, velocity.shape[1] :]), 1)
         return policy(observations)
 
     return drive

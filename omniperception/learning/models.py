@@ -43,6 +43,7 @@ class PerceptionActor(EstimatingModel):
         perception: the network.
         supervision: weight of the regression on each privileged observation group.
         read_out: gives the avoidance velocity, or None.
+        velocity_inputs: where v_x, v_y and yaw rate are observed.
         navigation: asks for velocities in place of the sum, or None.
         max_change: most (m/s) by which the sum changes from step to step; None: no limit.
         asked: (N, 2) m/s, or (N, 3) with navigation, which turns (rad/s), too: the sum that the newest actions were
@@ -105,7 +106,7 @@ class PerceptionActor(EstimatingModel):
             if not isinstance(self.read_out, MotionReadOut):
                 raise ValueError("navigation needs to know how obstacles move; set perception.motion_weight")
             self.navigation = Navigator(navigation)
-        self._velocity_inputs = tuple(velocity_inputs)
+        self.velocity_inputs = tuple(velocity_inputs)
         self._max_turn = 0.0 if navigation is None else max_turn
         self.max_change = max_change
         self.asked: torch.Tensor | None = None
@@ -251,7 +252,8 @@ class PerceptionActor(EstimatingModel):
         velocity: torch.Tensor,
         last_asked: torch.Tensor,
     ) -> torch.Tensor:
-        """(B, 3) what the gait is asked for by a navigation policy: what it wants, as fast as it may change.
+        """(B, 3) what the gait is asked for by a navigation policy: what it wants, within the gait's ranges and as fast
+        as it may change; the command without a frame.
 
         Args:
             features: (B, D) or (B, D + K).
@@ -260,13 +262,14 @@ class PerceptionActor(EstimatingModel):
         """
         assert self.navigation is not None and self.max_change is not None
         wanted = self.navigation(self.sectors(features, has_frame), command, velocity, last_asked)
+        wanted = torch.where(has_frame[:, None], wanted, command)
         linear = moved_towards(last_asked[:, :2], wanted[:, :2], self.max_change)
         turn = last_asked[:, 2:] + (wanted - last_asked)[:, 2:].clamp(-self._max_turn, self._max_turn)
         return torch.cat((linear, turn), 1)
 
     def _velocity(self, groups: TensorDict) -> torch.Tensor:
         """(B, 3) the robot's own velocity as observed."""
-        parts = [groups[one.group][:, one.column] / one.scale for one in self._velocity_inputs]
+        parts = [groups[one.group][:, one.column] / one.scale for one in self.velocity_inputs]
         return torch.stack(parts, 1)
 
     def _check_supervision(self, obs: TensorDict) -> None:

@@ -40,15 +40,19 @@ class NavigationConfig:
 
     Attributes:
         risk: the controller whose choice it corrects.
+        ranges: (low, high) of v_x, v_y (m/s) and yaw rate (rad/s) that a gait is asked for.
         hidden_dims: hidden layers of the correction.
         turn_acceleration: most (rad/s^2) by which the yaw rate that a gait is asked for changes.
     """
 
     risk: VelocityRisk
+    ranges: Sequence[Sequence[float]]
     hidden_dims: Sequence[int] = (128, 128, 64)
     turn_acceleration: float = 8.0
 
     def __post_init__(self) -> None:
+        if len(self.ranges) != 3 or any(len(ends) != 2 or not ends[0] <= ends[1] for ends in self.ranges):
+            raise ValueError(f"navigation.ranges={list(map(list, self.ranges))} must be three pairs [low, high]")
         if not self.hidden_dims or min(self.hidden_dims) < 1:
             raise ValueError(f"navigation.hidden_dims={list(self.hidden_dims)} must be widths of hidden layers")
         if self.turn_acceleration <= 0:
@@ -97,9 +101,13 @@ class Navigator(nn.Module):
     """A navigation policy behind a perception network: velocities from sectors."""
 
     candidates: torch.Tensor
+    least: torch.Tensor
+    most: torch.Tensor
 
     def __init__(self, config: NavigationConfig) -> None:
         super().__init__()
+        for name, values in zip(("least", "most"), zip(*config.ranges, strict=True), strict=True):
+            self.register_buffer(name, torch.tensor(values), persistent=False)
         self.risk = config.risk
         self.mlp = config.build_network()
         self.register_buffer("candidates", config.risk.candidates(), persistent=False)
@@ -114,4 +122,5 @@ class Navigator(nn.Module):
         self, sectors: torch.Tensor, reference: torch.Tensor, velocity: torch.Tensor, asked: torch.Tensor
     ) -> torch.Tensor:
         """(n, 3) what a gait is to be asked for; arguments as `navigation_inputs` takes them."""
-        return self.mlp(self.inputs(sectors, reference, velocity, asked))
+        wanted = self.mlp(self.inputs(sectors, reference, velocity, asked))
+        return torch.minimum(torch.maximum(wanted, self.least), self.most)
