@@ -406,10 +406,8 @@ def network_of(actor: MLPModel, group_sizes: dict[str, int]) -> BlindNetwork:
     """
     if not isinstance(actor, PerceptionActor):
         return BlindNetwork(actor)
-    ends = accumulate(group_sizes.values())
-    return PerceptiveNetwork(
-        actor, {name: end - group_sizes[name] for name, end in zip(group_sizes, ends, strict=True)}
-    )
+    starts = accumulate(group_sizes.values(), initial=0)
+    return PerceptiveNetwork(actor, dict(zip(group_sizes, starts, strict=False)))
 
 
 def write_torchscript(network: BlindNetwork, path: Path) -> tuple[Path, Callable]:

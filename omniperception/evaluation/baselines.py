@@ -20,6 +20,7 @@ from omniperception.env.odometry import Odometry
 from omniperception.env.sensing import SensorConfig
 from omniperception.env.state import MEASURED_CLOUD
 from omniperception.evaluation.episodes import Policy
+from omniperception.learning.navigation import NUM_SECTORS as SECTORS_OF_NAVIGATION
 from omniperception.perception import Attitude
 from omniperception.perception.geometry import NUM_SECTORS, GeometryConfig, Nearest, Standing, nearest_obstacles
 from omniperception.scene import RobotConfig
@@ -127,7 +128,7 @@ def told(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
     navigation = getattr(policy, "navigation", None)
     if navigation is None:
         raise ValueError("this policy has no navigation that could be told; leave policy=told out")
-    sectors = TrueSectors(NUM_SECTORS, env.world.obstacles, env.obstacles, env.num_envs, env.device)
+    sectors = TrueSectors(SECTORS_OF_NAVIGATION, env.world.obstacles, env.obstacles, env.num_envs, env.device)
 
     def wanted() -> torch.Tensor:
         state = env.state
