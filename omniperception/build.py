@@ -506,6 +506,7 @@ def learning_config(run: RunConfig, env: OmniEnv | MixedEnv) -> LearningConfig:
         Mirror(env) if run.ppo.symmetry else None,
         navigation=run.navigation,
         velocity_inputs=velocity_inputs(env) if run.navigation is not None and run.env.sim.has_legs else (),
+        moves_joints=run.env.sim.has_legs,
         max_turn=0.0 if run.navigation is None else run.navigation.turn_acceleration * env.control_dt,
         estimator=EstimatorConfig(run.env.observations.estimated) if run.env.observations.estimated else None,
         distillation=run.distillation,

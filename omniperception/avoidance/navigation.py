@@ -27,6 +27,7 @@ def navigation_inputs(
     asked: torch.Tensor,
     risk: VelocityRisk,
     candidates: torch.Tensor,
+    risks: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Inputs of a navigation policy, in the yaw-aligned frame.
 
@@ -37,6 +38,7 @@ def navigation_inputs(
         asked: (n, 3) what its gait is asked for at present.
         risk: the controller whose choice comes first.
         candidates: its (K, 2) candidates.
+        risks: (n, K) of the candidates, where they are known otherwise; None: they follow from the sectors.
 
     Returns:
         (n, 3 + 4 S + 9 + K): the velocity that the controller chooses, with the commanded yaw rate; nearness,
@@ -46,7 +48,7 @@ def navigation_inputs(
     nearness = (1 - distance / NEARNESS_RANGE).clamp(min=0.0)
     closeness = torch.exp(-(distance - risk.robot_radius).clamp(min=0.0) / CLOSE)
     moving = sectors[..., 1:] * ((nearness > 0) / SPEED)[..., None]
-    risks = risk.risk(sectors, candidates)
+    risks = risk.risk(sectors, candidates) if risks is None else risks
     chosen = reference[:, :2] + risk.avoidance(risks, reference[:, :2], candidates)
     parts = (chosen, reference[:, 2:], nearness, closeness, moving.flatten(1), reference, velocity, asked, risks)
     return torch.cat(parts, 1)

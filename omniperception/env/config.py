@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, MOTION_TARGET, SECTOR_TARGET
 from omniperception.common.random import MOST_SEEDS
@@ -178,8 +178,8 @@ class EnvConfig:
         """The randomization, without the rows that a robot without legs has in its measured response."""
         if self.sim.has_legs:
             return self.randomization
-        rows = [name for name in DRAWN if name != "latency_s"]
-        return replace(self.randomization, **dict.fromkeys(rows))
+        none: dict[str, Any] = dict.fromkeys(name for name in DRAWN if name != "latency_s")
+        return replace(self.randomization, **none)
 
     def _check_route(self, commands: GoalCommandConfig) -> None:
         end = self.obstacles.route_end

@@ -251,6 +251,7 @@ class LearningConfig:
         velocity_inputs: where the policy observes the velocity that navigation reads; none where it has a group of its
             own.
         max_turn: most (rad/s) by which the yaw rate that navigation asks for changes from step to step.
+        moves_joints: whether actions are joints'; otherwise they are the velocities that navigation asks for.
         distillation: of a teacher, which :meth:`PerceptivePpo.learn_from` gives; None: there is none.
         logger: where scalars go; None: nowhere.
         settings: the run's composed configuration, for what is logged.
@@ -269,6 +270,7 @@ class LearningConfig:
     navigation: NavigationConfig | None = None
     velocity_inputs: Sequence[VelocityInput] = ()
     max_turn: float = 0.0
+    moves_joints: bool = True
     distillation: DistillationConfig | None = None
     logger: LoggerConfig | None = field(default_factory=LoggerConfig)
     settings: Mapping[str, Any] = field(default_factory=dict)

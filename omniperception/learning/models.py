@@ -100,11 +100,17 @@ class PerceptionActor(EstimatingModel):
                 raise ValueError("perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk")
             part, num_values = perception.supervised.get(MOTION_TARGET), obs[MOTION_TARGET].shape[-1]
             self.read_out_target = MOTION_TARGET
-            self.read_out = MotionReadOut(self._feature_dim, num_values, part, velocity_risk)
+            risk_part = perception.supervised.get("risk")
+            self.read_out = MotionReadOut(self._feature_dim, num_values, part, velocity_risk, risk_part)
         self.navigation: Navigator | None = None
         if navigation is not None:
             if not isinstance(self.read_out, MotionReadOut):
                 raise ValueError("navigation needs to know how obstacles move; set perception.motion_weight")
+            if self.read_out.risk_part is not None and navigation.risk != velocity_risk:
+                raise ValueError(
+                    "navigation.risk must be rewards.avoidance.risk where the perception network says the risks itself;"
+                    " set rewards.avoidance.risk=${navigation.risk}"
+                )
             self.navigation = Navigator(navigation)
         self.velocity_inputs = tuple(velocity_inputs)
         self._max_turn = 0.0 if navigation is None else max_turn
@@ -261,11 +267,17 @@ class PerceptionActor(EstimatingModel):
             command, velocity, last_asked: (B, 3) v_x, v_y (m/s) and yaw rate (rad/s).
         """
         assert self.navigation is not None and self.max_change is not None
-        wanted = self.navigation(self.sectors(features, has_frame), command, velocity, last_asked)
+        risks = self._said_risks(features, has_frame)
+        wanted = self.navigation(self.sectors(features, has_frame), command, velocity, last_asked, risks)
         wanted = torch.where(has_frame[:, None], wanted, command)
         linear = moved_towards(last_asked[:, :2], wanted[:, :2], self.max_change)
         turn = last_asked[:, 2:] + (wanted - last_asked)[:, 2:].clamp(-self._max_turn, self._max_turn)
         return torch.cat((linear, turn), 1)
+
+    def _said_risks(self, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor | None:
+        """(B, K) risks as the network says them, 0 without a frame; None where they follow from the sectors."""
+        assert isinstance(self.read_out, MotionReadOut)
+        return None if self.read_out.risk_part is None else self.read_out.risks(features) * has_frame[:, None]
 
     def _velocity(self, groups: TensorDict) -> torch.Tensor:
         """(B, 3) the robot's own velocity as observed."""
@@ -335,8 +347,8 @@ class PerceivingNavigator(PerceptionActor):
                 groups, features, has_frame = obs.groups, self.embed(obs), obs.step_count > 0
             else:
                 groups, features, has_frame = obs, self.embed_newest(obs), obs["frame_count"].squeeze(-1) > 0
-            motion = (groups[name] for name in (COMMAND, MOTION, ASKED))
-            return self.navigation.inputs(self.sectors(features, has_frame), *motion)
+            sectors, risks = self.sectors(features, has_frame), self._said_risks(features, has_frame)
+            return self.navigation.inputs(sectors, groups[COMMAND], groups[MOTION], groups[ASKED], risks)
 
     def _begin_blind(self) -> None:
         """The correction begins at 0."""

@@ -113,14 +113,24 @@ class Navigator(nn.Module):
         self.register_buffer("candidates", config.risk.candidates(), persistent=False)
 
     def inputs(
-        self, sectors: torch.Tensor, reference: torch.Tensor, velocity: torch.Tensor, asked: torch.Tensor
+        self,
+        sectors: torch.Tensor,
+        reference: torch.Tensor,
+        velocity: torch.Tensor,
+        asked: torch.Tensor,
+        risks: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """`navigation_inputs` (n, D)."""
-        return navigation_inputs(sectors, reference, velocity, asked, self.risk, self.candidates)
+        return navigation_inputs(sectors, reference, velocity, asked, self.risk, self.candidates, risks)
 
     def forward(
-        self, sectors: torch.Tensor, reference: torch.Tensor, velocity: torch.Tensor, asked: torch.Tensor
+        self,
+        sectors: torch.Tensor,
+        reference: torch.Tensor,
+        velocity: torch.Tensor,
+        asked: torch.Tensor,
+        risks: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """(n, 3) what a gait is to be asked for; arguments as `navigation_inputs` takes them."""
-        wanted = self.mlp(self.inputs(sectors, reference, velocity, asked))
+        wanted = self.mlp(self.inputs(sectors, reference, velocity, asked, risks))
         return torch.minimum(torch.maximum(wanted, self.least), self.most)

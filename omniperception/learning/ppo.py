@@ -148,8 +148,7 @@ class PerceptivePpo(PPO):
                 "ppo.symmetry works on one-dimensional observations only; with perception set ppo.symmetry=false"
             )
         else:
-            moves_joints = env.config.sim.has_legs or config.navigation is None
-            actor = (PerceptionActor if moves_joints else PerceivingNavigator)(
+            actor = (PerceptionActor if config.moves_joints else PerceivingNavigator)(
                 obs,
                 groups,
                 "actor",

@@ -8,6 +8,9 @@ from torch import nn
 from omniperception.avoidance.sector_motion import decode, motion_error
 from omniperception.avoidance.velocity_risk import VelocityRisk
 
+RISK_WEIGHT = 3.0
+"""Weight of the squared error of risks that a network says itself, relative to that of the motion."""
+
 
 class VelocityReadOut(nn.Module):
     """The avoidance velocity itself, by an MLP on the embedding that starts at zero."""
@@ -46,7 +49,14 @@ class MotionReadOut(nn.Module):
 
     candidates: torch.Tensor
 
-    def __init__(self, feature_dim: int, num_values: int, part: slice | None, velocity_risk: VelocityRisk) -> None:
+    def __init__(
+        self,
+        feature_dim: int,
+        num_values: int,
+        part: slice | None,
+        velocity_risk: VelocityRisk,
+        risk_part: slice | None = None,
+    ) -> None:
         """Configure the read-out.
 
         Args:
@@ -54,8 +64,19 @@ class MotionReadOut(nn.Module):
             num_values: 3 S, numbers of the S sectors.
             part: where in the embedding they are; None: an MLP on the whole embedding gives them.
             velocity_risk: the controller.
+            risk_part: where in the embedding the network says the risks of the candidates; None: they follow from the
+                sectors.
         """
         super().__init__()
+        if risk_part is not None:
+            given, directions = risk_part.stop - risk_part.start, num_values // 3
+            if velocity_risk.num_directions != directions or velocity_risk.num_candidates != given:
+                raise ValueError(
+                    f"perception.network.rings.risk_rings={(given - 1) // directions} says risks of as many speeds in"
+                    f" {directions} directions, but rewards.avoidance.risk has num_rings={velocity_risk.num_rings}"
+                    f" num_directions={velocity_risk.num_directions}; give both the same"
+                )
+        self.risk_part = risk_part
         self.feature_dim, self.part, self.velocity_risk = feature_dim, part, velocity_risk
         self.layers = zero_mlp(feature_dim, 256, num_values) if part is None else None
         self.register_buffer("candidates", velocity_risk.candidates(), persistent=False)
@@ -67,8 +88,11 @@ class MotionReadOut(nn.Module):
 
     def extend(self, embedding: torch.Tensor) -> torch.Tensor:
         """Embeddings (..., D) with the risks of the K candidate velocities appended: (..., D + K)."""
-        risk = self._risk(self.motion(embedding.flatten(0, -2)))
-        return torch.cat((embedding, risk.unflatten(0, embedding.shape[:-1])), -1)
+        return torch.cat((embedding, self.risks(embedding.flatten(0, -2)).unflatten(0, embedding.shape[:-1])), -1)
+
+    def risks(self, embedding: torch.Tensor) -> torch.Tensor:
+        """(B, K) risks of the candidates, from (B, D)."""
+        return self._risk(self.motion(embedding)) if self.risk_part is None else embedding[:, self.risk_part].float()
 
     def velocity(self, features: torch.Tensor, command: torch.Tensor) -> torch.Tensor:
         """(B, 2) avoidance velocity (m/s, yaw-aligned frame).
@@ -87,7 +111,11 @@ class MotionReadOut(nn.Module):
         predicted = self.motion(features)
         with torch.no_grad():
             risk = self._risk(target)
-        return motion_error(predicted, target) + (self._risk(predicted) - risk).square().mean(-1)
+        if self.risk_part is not None:
+            weight, said = RISK_WEIGHT, self.risks(features)
+        else:
+            weight, said = 1.0, self._risk(predicted)
+        return motion_error(predicted, target) + weight * (said - risk).square().mean(-1)
 
     def _risk(self, motion: torch.Tensor) -> torch.Tensor:
         return self.velocity_risk.risk(decode(motion), self.candidates)

@@ -224,7 +224,7 @@ class Runner:
     def _take_parts(self, run_dirs: Sequence[Path], observations: ObservationsConfig | None) -> list[Path]:
         """`start_from` of a policy that navigates: each run gives what it has, but for the last one, where there are
         legs, which moves them."""
-        gait = run_dirs[-1] if self.env.config.sim.has_legs else None
+        gait = run_dirs[-1] if self.config.moves_joints else None
         seeing = []
         for other in run_dirs[:-1] if gait is not None else run_dirs:
             state = self._weights(other)

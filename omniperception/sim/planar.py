@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
 from omniperception.common.random import EnvRandom
 from omniperception.scene import World
+from omniperception.sim.base import Simulator
 from omniperception.sim.response import GaitResponse, NoResponse
-
-if TYPE_CHECKING:
-    from omniperception.sim.planar_world import PlanarSimulator
 
 
 @dataclass(frozen=True)
@@ -62,7 +59,7 @@ class PlanarConfig:
 
     def build(
         self, world: World, num_envs: int, record_states: bool = False, random: EnvRandom | None = None
-    ) -> PlanarSimulator:
+    ) -> Simulator:
         """`num_envs` robots in a world; `random` gives the streams that their responses are drawn from."""
         from omniperception.sim.planar_world import PlanarSimulator  # with Warp, which not every task loads
 

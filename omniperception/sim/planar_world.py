@@ -43,7 +43,7 @@ class PlanarSimulator:
         asked: (num_envs, 3) m/s and rad/s, what the gait is asked for now, after the limit of its change.
     """
 
-    ground_pos = None
+    ground_pos: torch.Tensor | None = None
 
     def __init__(
         self,

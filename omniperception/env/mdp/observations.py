@@ -182,6 +182,7 @@ class NavigationView(StatefulTerm):
     def __call__(self, state: EnvState) -> torch.Tensor:
         if self._candidates is None:
             self._begin(state)
+        assert self._candidates is not None
         sectors = state.sectors if self._errors is None else self._with_errors(state, self._errors)
         velocity = planar_velocity(state)
         return navigation_inputs(sectors, state.reference, velocity, state.asked, self._risk, self._candidates)

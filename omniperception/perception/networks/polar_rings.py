@@ -31,7 +31,9 @@ class PolarRings(PerceptionNetwork):
         path = rings(num_cells=num_cells - 1, history=history)
         super().__init__(num_cells, history, path.feature_dim)
         self.rings = path
-        self.supervised = {"motion_target": slice(0, self.feature_dim)}
+        self.supervised = {"motion_target": slice(0, path.motion_dim)}
+        if path.risk is not None:
+            self.supervised["risk"] = slice(path.motion_dim, path.feature_dim)
 
     def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """See :meth:`PerceptionNetwork.forward`."""

@@ -25,6 +25,12 @@ MOTION_CHANNELS = 3
 _GAIN = 8.0
 """Factor on all inputs, which are small because most cells are far or empty; speeds learning up several times."""
 
+_WIDE, _WIDE_SPAN = 2, 11
+"""Sectors between the taps of the convolution behind the risks, and their number: what crosses comes from the side."""
+
+_SAFE = -3.0
+"""Logit of an untrained risk."""
+
 _REACH, _NEARNESS = 6.0, 2.0
 """Distance (m) at which the nearness of the nearest hit falls to 0, and the nearness of a hit at the base."""
 
@@ -149,6 +155,7 @@ class RingPath(nn.Module):
         channels: Sequence[int] = (96, 64, 64, 64),
         kernel_sizes: Sequence[int] = (1, 5, 5, 1),
         match: MotionMatch | None = None,
+        risk_rings: int = 0,
     ) -> None:
         """Configure the path.
 
@@ -160,6 +167,7 @@ class RingPath(nn.Module):
             decays: decays of the proximities that the convolutions read, metres.
             channels: widths of the hidden layers.
             kernel_sizes: sectors that each hidden layer spans, odd.
+            risk_rings: speeds of velocities whose risk is said, in as many directions as there are sectors; 0: none.
             match: candidate velocities, scored against the nearest hits; None: the convolutions find motion alone.
         """
         super().__init__()
@@ -192,25 +200,45 @@ class RingPath(nn.Module):
         for size, span in zip(channels, kernel_sizes, strict=True):
             layers += [_RingConv(width, size, span), nn.ELU()]
             width = size
-        last = nn.Conv1d(width, MOTION_CHANNELS, 1)
-        nn.init.zeros_(last.weight)
-        assert last.bias is not None
-        nn.init.zeros_(last.bias)
-        self.layers = nn.Sequential(*layers, last)
+        self.layers = nn.Sequential(*layers, _from_zero(width, MOTION_CHANNELS))
+        self.risk_rings = risk_rings
+        self.risk: nn.Sequential | None = None
+        if risk_rings:
+            if num_sectors % 2 or num_sectors < _WIDE * (_WIDE_SPAN - 1):
+                raise ValueError(f"perception.network.rings.risk_rings needs another num_sectors than {num_sectors}")
+            wide = _RingConv(width + MOTION_CHANNELS, width, _WIDE_SPAN, dilation=_WIDE)
+            self.risk = nn.Sequential(wide, nn.ELU(), _from_zero(width, risk_rings + 1, _SAFE))
 
     @property
     def feature_dim(self) -> int:
-        """Numbers per window: MOTION_CHANNELS of each sector in turn."""
+        """Numbers per window: MOTION_CHANNELS of each sector in turn, then the risks."""
+        return self.motion_dim + (self.risk_rings * self.shape.num_sectors + 1 if self.risk_rings else 0)
+
+    @property
+    def motion_dim(self) -> int:
+        """Of these the first ones, of the motion."""
         return MOTION_CHANNELS * self.shape.num_sectors
 
     def forward(self, cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
-        """(B, F, bands * S, 3) cells, (B, F, 3) motion, (B, W) valid frames -> (B, W, S * 3)."""
+        """(B, F, bands * S, 3) cells, (B, F, 3) motion, (B, W) valid frames -> (B, W, D)."""
         window_count(cells, count, self.shape.history)
         rings = moved_rings(cells, moved, count, self.shape).flatten(0, 1)
         if self.match is not None:
             rings = torch.cat((rings, self._matched(rings, self.match)), 1)
-        motion = self.layers(_GAIN * rings)  # (B * W, 3, S)
-        return motion.transpose(1, 2).reshape(*count.shape, self.feature_dim)
+        hidden = self.layers[:-1](_GAIN * rings)
+        motion = self.layers[-1](hidden)  # (B * W, 3, S)
+        said = motion.transpose(1, 2).flatten(1)
+        if self.risk is not None:
+            said = torch.cat((said, self._risks(self.risk(torch.cat((hidden, motion), 1)))), 1)
+        return said.reshape(*count.shape, self.feature_dim)
+
+    def _risks(self, logits: torch.Tensor) -> torch.Tensor:
+        """(n, 1 + R S) risks of standing still and of R speeds in S directions each, from straight ahead on
+        counter-clockwise, as `VelocityRisk.candidates` has them, of logits (n, R + 1, S): a direction is the left edge
+        of its sector, and to stand is as risky as the sector that says most."""
+        ahead = self.shape.num_sectors // 2 - 1
+        moving = torch.cat((logits[:, :-1, ahead:], logits[:, :-1, :ahead]), -1)
+        return torch.sigmoid(torch.cat((logits[:, -1].amax(-1, keepdim=True), moving.flatten(1)), 1))
 
     def _matched(self, rings: torch.Tensor, match: MotionMatch) -> torch.Tensor:
         """(n, (H - 1) * K + 2 H, S): scores of candidate velocities, then nearness and bearing of each frame's nearest
@@ -228,9 +256,19 @@ class _RingConv(nn.Conv1d):
     """A convolution around the azimuth; ``padding_mode="circular"`` does the same and takes a tenth longer."""
 
     def forward(self, ring: torch.Tensor) -> torch.Tensor:
-        reach = self.kernel_size[0] // 2
+        step = int(self.dilation[0])
+        reach = step * (self.kernel_size[0] // 2)
         closed = torch.cat((ring[..., -reach:], ring, ring[..., :reach]), -1) if reach else ring
-        return functional.conv1d(closed, self.weight, self.bias)
+        return functional.conv1d(closed, self.weight, self.bias, dilation=step)
+
+
+def _from_zero(inputs: int, outputs: int, bias: float = 0.0) -> nn.Conv1d:
+    """A last layer whose outputs are `bias` until it is trained."""
+    layer = nn.Conv1d(inputs, outputs, 1)
+    nn.init.zeros_(layer.weight)
+    assert layer.bias is not None
+    nn.init.constant_(layer.bias, bias)
+    return layer
 
 
 def _turned(yaw: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
