@@ -239,7 +239,7 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
         env = EnvConfig(**task, lidar=lidar, log_interval=ppo.num_steps_per_env, stepping=stepping, **seen)
         condition = make(Condition | None, composed.get("condition"), "condition")
         logger = _logger(composed, trusted)
-        init = _names(composed.get("init"))
+        init = _names(composed.get("init"), bool(composed.get("navigation")))
         navigation = make(NavigationConfig | None, composed.get("navigation"), "navigation")
         families = _families(composed.get("families"), trusted)
         return RunConfig(env, perception, ppo, logger, init, distillation, condition, navigation, composed, families)
@@ -354,13 +354,14 @@ def _logger(composed: dict, trust: Sequence[str] | None) -> LoggerConfig | None:
     return make(LoggerConfig, composed["logger"], "logger", trust) if composed["logger"] else None
 
 
-def _names(value: object) -> tuple[str, ...]:
-    """Run directories of `init`: none, one, or one that perceives and one that moves."""
+def _names(value: object, navigates: bool) -> tuple[str, ...]:
+    """Run directories of `init`: none, one, or one that perceives, perhaps one that navigates, and one that moves."""
     names = [] if value is None else value if isinstance(value, list) else [value]
     if not all(isinstance(name, str) for name in names):
         raise ConfigError(f"init={value} must be a run directory, a list of them, or null")
-    if len(names) > 3:
-        raise ConfigError(f"init={value}: give three at most, runs that perceive, that navigate and that move")
+    if len(names) > 2 + navigates:
+        most = "three at most, runs that perceive, navigate and move" if navigates else "two at most, a run that"
+        raise ConfigError(f"init={value}: give {most}" + ("" if navigates else " perceives and one that moves"))
     return tuple(names)
 
 
