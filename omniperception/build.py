@@ -227,7 +227,8 @@ def assemble(config: DictConfig, trust: Sequence[str] = ()) -> RunConfig:
     seen = {}
     if perception is not None:
         seen = {"sampler": perception.sampler, "frame_history": perception.history}
-        seen |= {"base_motion": perception.base_motion, "targets": tuple(perception.supervision)}
+        seen |= {"base_motion": perception.base_motion, "frame_times": perception.frame_times}
+        seen |= {"targets": tuple(perception.supervision)}
     if composed.get("navigation") and task["sim"].has_legs:
         seen["num_asked"] = 3
     distillation = make(DistillationConfig | None, composed.get("distillation"), "distillation")

@@ -162,6 +162,7 @@ def build_sensing(
         build_sampler(config),
         config.frame_history,
         config.base_motion,
+        config.frame_times,
         sector_distance=avoidance.sector_distance if avoidance is not None else None,
         obstacles=avoidance.obstacle_names if avoidance is not None else (),
         distal=DISTAL_RANGE in needed,

@@ -56,6 +56,7 @@ class EnvConfig:
         frame_history: LiDAR frames kept for the network.
         stepping: the motion to which actions are added; None: they are added to the default pose.
         base_motion: whether a frame's last row is the base's motion since the frame before.
+        frame_times: whether frames bear the time at which they were taken.
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
         shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
         read_besides: requirements of who acts in the task, beside those of its terms; see `state.requires`.
@@ -83,6 +84,7 @@ class EnvConfig:
     frame_history: int = 0
     stepping: SteppingConfig | None = None
     base_motion: bool = False
+    frame_times: bool = False
     targets: Sequence[str] = ()
     shows_frames: bool = True
     read_besides: Sequence[str] = ()

@@ -14,7 +14,7 @@ from omniperception.common.rotations import multiply
 from omniperception.common.timing import StageTimer
 from omniperception.env.frame_delivery import FrameDelivery, PastPoses
 from omniperception.env.kinematics import Kinematics
-from omniperception.env.odometry import Odometry
+from omniperception.env.odometry import Odometry, TimedOdometry
 from omniperception.lidar import (
     DEVICES,
     Lidar,
@@ -99,7 +99,8 @@ class LidarSensing:
         base: index of the robot's base among the bodies of the ray scene.
         carrier: index of the body that carries the sensor, usually the base.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
-            newest last, with `base_motion` one row more: how the base moved since the frame before; None without a
+            newest last, with `base_motion` one row more: how the base moved since the frame before, with
+            `frame_times` three: when and from where they were taken; None without a
             sampler.
         frame_count: (num_envs, 1) int64 how many of the newest frames are valid.
         frame_tick: (num_envs, 1) int64 number of the newest frame, the same for all environments.
@@ -119,6 +120,7 @@ class LidarSensing:
         sampler: Sampler | None,
         history: int,
         base_motion: bool,
+        frame_times: bool,
         sector_distance: torch.Tensor | None,
         obstacles: Sequence[str],
         distal: bool,
@@ -138,6 +140,8 @@ class LidarSensing:
             sampler: what a network sees of a cloud; None: nothing.
             history: frames kept for the network.
             base_motion: whether a frame's last row is the base's motion since the frame before.
+            frame_times: whether frames bear the time at which they were taken; then their last three rows are those of
+                `TimedOdometry`, and they are levelled with the attitude of that time.
             sector_distance: (num_envs, num_sectors) memory for the horizontal distance (m) from the base to the nearest
                 obstacle hit by sector, without noise; None: not measured.
             obstacles: geoms whose sightings are noted.
@@ -198,9 +202,14 @@ class LidarSensing:
         self.frame_count, self.frame_tick = torch.zeros(2, n, 1, dtype=torch.int64, device=device).unbind(0)
         self.frames: torch.Tensor | None = None
         if sampler is not None:
-            self._newest = torch.zeros(n, sampler.num_points + base_motion, 3, device=device)
+            rows = TimedOdometry.num_rows if frame_times else int(base_motion)
+            self._newest = torch.zeros(n, sampler.num_points + rows, 3, device=device)
             self.frames = self._newest[:, None].repeat(1, history, 1, 1)
-        self.odometry = Odometry(n, control_dt, device) if base_motion else None
+        self.odometry: Odometry | TimedOdometry | None = None
+        if frame_times:
+            self.odometry = TimedOdometry(n, control_dt, late, device)
+        elif base_motion:
+            self.odometry = Odometry(n, control_dt, device)
         self._sectors: list[SectorDistances] = []
         if sector_distance is not None:
             self._sectors = self._record_sectors(sector_distance, num_threads)
@@ -277,6 +286,8 @@ class LidarSensing:
             self.place_bodies()
             if self.coverage is not None:
                 self.coverage.begin_frame()
+        if isinstance(self.odometry, TimedOdometry):
+            base_quat = self.odometry.attitude(self._late_steps)
         attitude = self._attitude(base_quat)
         slices = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
@@ -359,10 +370,17 @@ class LidarSensing:
         newest, came = self._newest, 1 if fresh is None else fresh | (self.frame_count > 0)
         if fresh is not None:
             newest = torch.where(fresh[..., None], newest, self.frames[:, -1])
-        if self.odometry is not None:
+        if isinstance(self.odometry, TimedOdometry):
+            newest[:, -3:] = self.odometry.take(None if fresh is None else fresh[:, 0], self._late_steps)
+        elif self.odometry is not None:
             newest[:, -1] = self.odometry.since_last_frame(fresh)
         self.frames = torch.cat((self.frames[:, 1:], newest[:, None]), 1)
         self.frame_count.add_(came).clamp_(max=self.frames.shape[1])
+
+    @property
+    def _late_steps(self) -> torch.Tensor | None:
+        """(num_envs,) int64 control steps by which the newest frame is old; None: frames are not late."""
+        return None if self._past is None or self._delivery is None else self._delivery.late_steps
 
     def mean_distal_range(self, max_distance: float) -> torch.Tensor:
         """(num_envs,) mean of the noise-free distal ranges (m) of the newest frame, each capped at `max_distance`; the

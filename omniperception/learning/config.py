@@ -40,6 +40,8 @@ class PerceptionConfig:
         final_learning_rate: what it falls to, linearly, until ppo.max_iterations; None keeps it.
         base_motion: whether a frame's last row says how the base moved since the frame before (x, y, yaw), from the
             state estimator.
+        frame_times: whether frames bear the time at which they were taken, as those of most devices do: what is late is
+            put where it was, and its age is known. It needs `base_motion`, and a network that reads three rows more.
         memory_gb: memory (10^9 bytes) that the network may need in training, checked before anything is allocated; None
             for all of the device's.
     """
@@ -55,11 +57,14 @@ class PerceptionConfig:
     learning_rate: float = 1.0e-3
     final_learning_rate: float | None = None
     base_motion: bool = False
+    frame_times: bool = False
     memory_gb: float | None = None
 
     def __post_init__(self) -> None:
         if self.memory_gb is not None and self.memory_gb <= 0:
             raise ValueError(f"perception.memory_gb={self.memory_gb} must be positive, or null for the device's memory")
+        if self.frame_times and not self.base_motion:
+            raise ValueError("perception.frame_times=true needs perception.base_motion=true")
         if self.history < 1:
             raise ValueError(f"perception.history={self.history} must be at least 1")
         for name in ("height_weight", "sector_weight", "avoidance_weight", "motion_weight", "supervised_epochs"):
@@ -86,8 +91,8 @@ class PerceptionConfig:
     def build_network(self) -> PerceptionNetwork:
         """The network that fits the sampler's points and the history."""
         sizes = dict(self.sampler().sizes)
-        if self.base_motion:  # one row more for the last part that there is
-            sizes[[name for name, number in sizes.items() if number][-1]] += 1
+        if self.base_motion:  # rows more for the last part that there is
+            sizes[[name for name, number in sizes.items() if number][-1]] += 3 if self.frame_times else 1
         try:
             return self.network(**sizes, history=self.history)
         except TypeError as error:

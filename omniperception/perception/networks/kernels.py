@@ -22,6 +22,8 @@ def write_rings(
     cells: wp.array3d(dtype=wp.vec3),
     origin: wp.array2d(dtype=wp.vec2),
     yaw: wp.array2d(dtype=wp.float32),
+    here: wp.array2d(dtype=wp.vec2),
+    heading: wp.array2d(dtype=wp.float32),
     count: wp.array2d(dtype=wp.int64),
     decay: float,
     decays: wp.array(dtype=wp.float32),
@@ -39,8 +41,8 @@ def write_rings(
         newest = window + history - 1
         for k in range(history - int(count[env, window]), history):
             frame = window + k
-            step = origin[env, frame] - origin[env, newest]
-            back = -yaw[env, newest]
+            step = origin[env, frame] - here[env, newest]
+            back = -heading[env, newest]
             cos_back = wp.cos(back)
             sin_back = wp.sin(back)
             shift = wp.vec2(cos_back * step[0] - sin_back * step[1], sin_back * step[0] + cos_back * step[1])

@@ -49,7 +49,13 @@ class MotionMatch:
         ring = torch.stack((turn.cos(), turn.sin()), -1)
         return torch.cat((ring.new_zeros(1, 2), *(speed * ring for speed in self.speeds)))
 
-    def __call__(self, distance: torch.Tensor, bearing: torch.Tensor, velocities: torch.Tensor) -> torch.Tensor:
+    def __call__(
+        self,
+        distance: torch.Tensor,
+        bearing: torch.Tensor,
+        velocities: torch.Tensor,
+        ages: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Scores of all candidates, in operations that can be exported.
 
         Args:
@@ -57,6 +63,7 @@ class MotionMatch:
                 from the pose of the newest.
             bearing: (n, S) azimuth of the newest frame's hits from the middle of their sectors, radians.
             velocities: (K, 2), those of :meth:`velocities`.
+            ages: (n, H - 1) s by which each frame is older than the newest; None: a period for each.
 
         Returns:
             (n, (H - 1) * K, S): 1 where a frame has a hit at the distance that the velocity predicts, falling linearly
@@ -68,7 +75,7 @@ class MotionMatch:
         own = torch.arange(sectors, device=distance.device)
         scores = []
         for k in range(history - 1):
-            age = self.period_s * (history - 1 - k)
+            age = self.period_s * (history - 1 - k) if ages is None else ages[:, k, None, None, None]
             x, y = (here - age * velocities.T[None, :, :, None]).unbind(1)  # (n, K, S)
             beside = (torch.atan2(y, x) * (sectors / (2 * math.pi))).round().long()
             there = distance[:, k].gather(1, ((own + beside) % sectors).flatten(1)).view_as(x)

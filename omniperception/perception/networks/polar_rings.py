@@ -20,15 +20,18 @@ class PolarRings(PerceptionNetwork):
     frame's last row is the motion of the base (``perception.base_motion``).
     """
 
-    def __init__(self, num_cells: int, history: int, rings: Callable[..., RingPath]) -> None:
+    def __init__(self, num_cells: int, history: int, rings: Callable[..., RingPath], times: bool = False) -> None:
         """Configure the path.
 
         Args:
-            num_cells: cells of the sampler, and one row for the motion of the base.
+            num_cells: cells of the sampler, and one row for the motion of the base, or three with `times`.
             history: H, frames per window.
             rings: builds the path from the cells per frame and H.
+            times: whether frames say when they were taken (``perception.frame_times``).
         """
-        path = rings(num_cells=num_cells - 1, history=history)
+        self._rows = 3 if times else 1
+        more = {"times": True} if times else {}
+        path = rings(num_cells=num_cells - self._rows, history=history, **more)
         super().__init__(num_cells, history, path.feature_dim)
         self.rings = path
         self.supervised = {"motion_target": slice(0, path.motion_dim)}
@@ -37,4 +40,5 @@ class PolarRings(PerceptionNetwork):
 
     def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
         """See :meth:`PerceptionNetwork.forward`."""
-        return self.rings(frames[:, :, :-1], frames[:, :, -1], count)
+        cells, rows = frames[:, :, : -self._rows], frames[:, :, -self._rows :].unbind(2)
+        return self.rings(cells, rows[0], count, *rows[1:])

@@ -35,8 +35,14 @@ _REACH, _NEARNESS = 6.0, 2.0
 """Distance (m) at which the nearness of the nearest hit falls to 0, and the nearness of a hit at the base."""
 
 
-def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape) -> torch.Tensor:
-    """The frames of every window, moved to the pose of the base at the window's newest frame.
+def moved_rings(
+    cells: torch.Tensor,
+    moved: torch.Tensor,
+    count: torch.Tensor,
+    shape: RingShape,
+    since: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """The frames of every window, moved to the pose of the base when the window's newest frame came.
 
     Args:
         cells: (B, F, bands * S, 3) cells of :class:`StandingSampler`.
@@ -44,6 +50,7 @@ def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, s
             (rad).
         count: (B, W) valid frames of each window; the others are empty.
         shape: sizes and lengths of the rings.
+        since: (B, F, 3) motion of the base since the frame was taken until it came, likewise; None: it comes at once.
 
     Returns:
         (B, W, H * bands * (len(decays) + 1), S), oldest frame first: for each band the proximities exp(-d / decay) of
@@ -52,18 +59,21 @@ def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, s
     An exporter traces torch operations in place of the kernel, which is 2.4 times as fast (docs/lab/one_form.md).
     """
     if torch.jit.is_tracing() or torch.onnx.is_in_onnx_export() or cells.is_meta:
-        return _moved_rings(cells, moved, count, shape)
+        return _moved_rings(cells, moved, count, shape, since)
     batch, windows = count.shape
     bands = cells.shape[2] // shape.num_sectors
     rings = cells.new_zeros(batch, windows, shape.history * bands * shape.channels, shape.num_sectors)
     cells, count = cells.contiguous(), count.long().contiguous()
     origin, yaw = _poses(moved)
+    here, heading = _later(origin, yaw, since)
     scratch = cells.new_empty(batch, bands, shape.num_sectors)
     decays = constant(shape.decays, cells.device)
     inputs = [
         view(cells, wp.vec3),
         view(origin, wp.vec2),
         view(yaw, wp.float32),
+        view(here, wp.vec2),
+        view(heading, wp.float32),
         view(count, wp.int64),
         shape.decay,
         view(decays, wp.float32),
@@ -76,7 +86,9 @@ def moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, s
     return rings
 
 
-def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape) -> torch.Tensor:
+def _moved_rings(
+    cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape, since: torch.Tensor | None
+) -> torch.Tensor:
     """:func:`moved_rings` in operations that can be exported."""
     bearing, proximity = cells[..., :2], cells[..., 2]
     hit = proximity > FAINT
@@ -84,10 +96,11 @@ def _moved_rings(cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, 
     places = bearing / known[..., None] * (-shape.decay * known.log())[..., None]
     places, hit = places.unflatten(2, (-1, shape.num_sectors)), hit.unflatten(2, (-1, shape.num_sectors))
     origin, yaw = _poses(moved)
+    base, heading = _later(origin, yaw, since)
     fixed = _turned(yaw[:, :, None, None], places) + origin[:, :, None, None]
     windows = _windows(fixed, shape.history)  # (B, W, H, bands, S, 2)
     newest = slice(shape.history - 1, None)
-    here = _turned(-yaw[:, newest, None, None, None], windows - origin[:, newest, None, None, None])
+    here = _turned(-heading[:, newest, None, None, None], windows - base[:, newest, None, None, None])
     hit = _windows(hit, shape.history) & valid_frames(count, shape.history)[..., None, None]
     distance = torch.where(hit, here.square().sum(-1).sqrt(), EMPTY_DISTANCE)
     turned = bearing_in_sectors(here, shape.num_sectors)
@@ -112,6 +125,13 @@ def _poses(moved: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     yaw = moved[..., 2].cumsum(1)
     step = _turned(yaw - moved[..., 2], moved[..., :2])  # given in the base of the frame before
     return step.cumsum(1), yaw
+
+
+def _later(origin: torch.Tensor, yaw: torch.Tensor, since: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions (B, F, 2) and headings (B, F) of the base after it has moved on from there."""
+    if since is None:
+        return origin, yaw
+    return origin + _turned(yaw, since[..., :2]), yaw + since[..., 2]
 
 
 @dataclass(frozen=True)
@@ -156,6 +176,7 @@ class RingPath(nn.Module):
         kernel_sizes: Sequence[int] = (1, 5, 5, 1),
         match: MotionMatch | None = None,
         risk_rings: int = 0,
+        times: bool = False,
     ) -> None:
         """Configure the path.
 
@@ -167,6 +188,7 @@ class RingPath(nn.Module):
             decays: decays of the proximities that the convolutions read, metres.
             channels: widths of the hidden layers.
             kernel_sizes: sectors that each hidden layer spans, odd.
+            times: whether frames say when they were taken.
             risk_rings: speeds of velocities whose risk is said, in as many directions as there are sectors; 0: none.
             match: candidate velocities, scored against the nearest hits; None: the convolutions find motion alone.
         """
@@ -196,6 +218,7 @@ class RingPath(nn.Module):
         if match is not None:
             width += (history - 1) * match.num_velocities + 2 * history
             self.register_buffer("_velocities", match.velocities(), persistent=False)
+        width += history if times else 0
         layers: list[nn.Module] = []
         for size, span in zip(channels, kernel_sizes, strict=True):
             layers += [_RingConv(width, size, span), nn.ELU()]
@@ -219,12 +242,26 @@ class RingPath(nn.Module):
         """Of these the first ones, of the motion."""
         return MOTION_CHANNELS * self.shape.num_sectors
 
-    def forward(self, cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
-        """(B, F, bands * S, 3) cells, (B, F, 3) motion, (B, W) valid frames -> (B, W, D)."""
+    def forward(
+        self,
+        cells: torch.Tensor,
+        moved: torch.Tensor,
+        count: torch.Tensor,
+        since: torch.Tensor | None = None,
+        times: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """(B, F, bands * S, 3) cells, (B, F, 3) motion, (B, W) valid frames, (B, F, 3) motion since then, and (B, F, 3)
+        whose first two numbers are the age and the time since the frame before (s) -> (B, W, D)."""
         window_count(cells, count, self.shape.history)
-        rings = moved_rings(cells, moved, count, self.shape).flatten(0, 1)
+        rings = moved_rings(cells, moved, count, self.shape, since).flatten(0, 1)
+        ages = None if times is None else self._ages(times)
         if self.match is not None:
-            rings = torch.cat((rings, self._matched(rings, self.match)), 1)
+            rings = torch.cat((rings, self._matched(rings, self.match, ages)), 1)
+        if ages is not None:
+            assert times is not None
+            age = times[:, self.shape.history - 1 :, 0].flatten()[:, None]
+            known = torch.cat((age, ages), 1)[..., None].expand(-1, -1, rings.shape[-1])
+            rings = torch.cat((rings, known), 1)
         hidden = self.layers[:-1](_GAIN * rings)
         motion = self.layers[-1](hidden)  # (B * W, 3, S)
         said = motion.transpose(1, 2).flatten(1)
@@ -240,7 +277,13 @@ class RingPath(nn.Module):
         moving = torch.cat((logits[:, :-1, ahead:], logits[:, :-1, :ahead]), -1)
         return torch.sigmoid(torch.cat((logits[:, -1].amax(-1, keepdim=True), moving.flatten(1)), 1))
 
-    def _matched(self, rings: torch.Tensor, match: MotionMatch) -> torch.Tensor:
+    def _ages(self, times: torch.Tensor) -> torch.Tensor:
+        """(B * W, H - 1) s by which the frames of each window, the oldest first, were taken before its newest one."""
+        taken = times[..., 1].cumsum(1)
+        windows = _windows(taken, self.shape.history)
+        return (windows[..., -1:] - windows[..., :-1]).flatten(0, 1)
+
+    def _matched(self, rings: torch.Tensor, match: MotionMatch, ages: torch.Tensor | None) -> torch.Tensor:
         """(n, (H - 1) * K + 2 H, S): scores of candidate velocities, then nearness and bearing of each frame's nearest
         hit."""
         cells = rings.unflatten(1, (self.shape.history, -1, self.shape.channels))
@@ -249,7 +292,9 @@ class RingPath(nn.Module):
         reach = -self.shape.decays[-1] * proximity.clamp(min=FAINT).log()
         distance = torch.where(proximity > FAINT, reach, NOTHING)
         nearness = _NEARNESS * (1.0 - distance / _REACH).clamp(min=0.0)
-        return torch.cat((match(distance, bearing[:, -1], self._velocities), nearness, 2.0 * LATERAL * bearing), 1)
+        return torch.cat(
+            (match(distance, bearing[:, -1], self._velocities, ages), nearness, 2.0 * LATERAL * bearing), 1
+        )
 
 
 class _RingConv(nn.Conv1d):
