@@ -169,8 +169,10 @@ class TestErrors:
         view, here = self.view(distance=0.1, velocity=0.2)
         shown = [view._with_errors(here, view._errors) for _ in range(9)]
         error = torch.stack(shown) - here.sectors
-        assert error[..., 0].std().item() == pytest.approx(0.2, rel=0.03)
-        assert error[..., 1:].std().item() == pytest.approx(0.2, rel=0.03)
+        level = view.level[None, :, None]
+        assert 0.0 <= view.level.min() < 0.02 and 0.98 < view.level.max() <= 1.0
+        assert (error[..., 0] / level).std().item() == pytest.approx(0.2, rel=0.03)
+        assert (error[..., 1] / level).std().item() == pytest.approx(0.2, rel=0.03)
         kept = (error[3:] * error[:-3])[..., 1].mean() / error[..., 1].square().mean()
         assert kept.item() == pytest.approx(math.exp(-1), abs=0.03)
 

@@ -150,9 +150,12 @@ def avoidance_target(state: EnvState) -> torch.Tensor:
 class SectorErrors:
     """Errors of what is known by sector, beside the truth.
 
+    Standard deviations are drawn for each robot and episode between none and those given here, so that a policy learns
+    from good eyes and from bad ones.
+
     Attributes:
-        distance: standard deviation (m) of a distance of 1 m; it grows with the distance.
-        velocity: standard deviation (m/s) of each component of a velocity.
+        distance: largest standard deviation (m) of a distance of 1 m; it grows with the distance.
+        velocity: largest standard deviation (m/s) of each component of a velocity.
         slowed: (low, high) factor on velocities, drawn for each robot and episode: a network that is unsure says less.
         lost: share of the sectors that are empty although something is there.
         late: share of the steps in which what is known is one step old.
@@ -190,7 +193,7 @@ class NavigationView(StatefulTerm):
     def _begin(self, state: EnvState) -> None:
         self._candidates = self._risk.candidates(state.device)
         self.wrong = torch.zeros_like(state.sectors)
-        self.slowed = torch.ones(state.num_envs, device=state.device)
+        self.slowed, self.level = torch.ones(2, state.num_envs, device=state.device).unbind(0)
         self.before = torch.zeros_like(state.sectors)
         self.before[..., 0] = torch.inf
         if self._errors is not None:
@@ -199,9 +202,9 @@ class NavigationView(StatefulTerm):
     def _with_errors(self, state: EnvState, errors: SectorErrors) -> torch.Tensor:
         kept = math.exp(-state.control_dt / errors.lasts_s)
         self.wrong = kept * self.wrong + math.sqrt(1 - kept**2) * torch.randn_like(self.wrong)
-        true = state.sectors
-        distance = true[..., 0] * (1 + errors.distance * self.wrong[..., 0])
-        velocity = true[..., 1:] * self.slowed[:, None, None] + errors.velocity * self.wrong[..., 1:]
+        true, wrong = state.sectors, self.wrong * self.level[:, None, None]
+        distance = true[..., 0] * (1 + errors.distance * wrong[..., 0])
+        velocity = true[..., 1:] * self.slowed[:, None, None] + errors.velocity * wrong[..., 1:]
         lost = torch.rand_like(distance) < errors.lost
         known = torch.cat((distance.clamp(min=0.0).masked_fill(lost, torch.inf)[..., None], velocity), -1)
         late = torch.rand(len(known), 1, 1, device=known.device) < errors.late
@@ -213,6 +216,7 @@ class NavigationView(StatefulTerm):
             return
         low, high = self._errors.slowed
         self.slowed[env_ids] = low + (high - low) * torch.rand(len(env_ids), device=self.slowed.device)
+        self.level[env_ids] = torch.rand(len(env_ids), device=self.level.device)
         self.wrong[env_ids] = torch.randn_like(self.wrong[env_ids])
         self.before[env_ids, :, 0] = torch.inf
 
