@@ -162,12 +162,14 @@ class Perception:
         num_points: rows of a frame, sampled points and the base's motion.
         sampler: kind and parameters of the sampler, see `omniperception.deploy.sampling.make_sampler`.
         base_motion: whether a frame's last row is how the base moved since the frame before.
+        times: whether its last three rows are those of `odometry.TimedOdometry`, which take the frame's age.
     """
 
     history: int
     num_points: int
     sampler: Mapping
     base_motion: bool = False
+    times: bool = False
 
 
 @dataclass(frozen=True)

@@ -271,7 +271,8 @@ def _perception(config: PerceptionConfig, lidar: SensorConfig | None) -> Percept
             f"perception.sampler.max_range={sampler.max_range} cannot be exported: on a robot, points beyond it are"
             f" misses, in training those beyond lidar.max_range={lidar.max_range}; train with both the same"
         )
-    return Perception(config.history, sampler.num_points + moves, sampler_parameters(sampler), moves)
+    rows = 3 if config.frame_times else int(moves)
+    return Perception(config.history, sampler.num_points + rows, sampler_parameters(sampler), moves, config.frame_times)
 
 
 def sampler_parameters(sampler: Sampler) -> dict:
@@ -391,7 +392,7 @@ class PerceptiveNetwork(BlindNetwork):
         bearing, nearness = 2 * torch.pi * torch.rand(2, batch, history, points)
         nearness = (-nearness).exp()  # a place in the plane and its proximity, as rows of a grid are
         rows = torch.stack((nearness * bearing.cos(), nearness * bearing.sin(), nearness), -1)
-        rows[:, :, -1] *= 0.1  # motion from frame to frame is small
+        rows[:, :, -3:] *= 0.1  # motion from frame to frame is small
         width = 2 if self.actor.navigation is None else 3
         asked = () if self.actor.max_change is None else (torch.randn(batch, width),)
         return *super().examples(batch), rows, count, *asked

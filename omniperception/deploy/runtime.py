@@ -21,7 +21,7 @@ from omniperception.deploy.description import (
     checksum,
     export_line,
 )
-from omniperception.deploy.odometry import Odometry
+from omniperception.deploy.odometry import Odometry, TimedOdometry
 from omniperception.deploy.safety import Safety, SafetyConfig, SafetyStop, Sight
 from omniperception.deploy.sampling import Attitude, CloudSampler, down, make_sampler
 
@@ -96,7 +96,10 @@ class ExportedPolicy:
         if perception is not None:
             self.frames = np.zeros((perception.history, perception.num_points, 3), np.float32)
         follows = perception is not None and perception.base_motion
-        self._odometry = Odometry(description.control_period_s) if follows else None
+        self._follows = (
+            (TimedOdometry if perception is not None and perception.times else Odometry) if follows else None
+        )
+        self._odometry = None if self._follows is None else self._follows(description.control_period_s)
         self._rays = _rays_of_points(description.lidar) if description.lidar is not None else np.zeros(0, np.int64)
         self.observation = np.zeros(description.observation_size, np.float32)
         self._check_network()
@@ -154,8 +157,8 @@ class ExportedPolicy:
             self.safety.reset()
         if self.frames is not None:
             self.frames = np.zeros_like(self.frames)
-        if self._odometry is not None:
-            self._odometry = Odometry(self.description.control_period_s)
+        if self._follows is not None:
+            self._odometry = self._follows(self.description.control_period_s)
 
     def thin(self, points: np.ndarray, offsets_s: ArrayLike | None = None) -> np.ndarray:
         """The points of a device's frame that training would have kept, by the time of their measurement.
@@ -202,22 +205,32 @@ class ExportedPolicy:
         kept[rows[rows >= 0]] = points[inside][rows >= 0]
         return kept
 
-    def see(self, points: np.ndarray, base_quat: ArrayLike, joint_pos: ArrayLike | None = None) -> None:
+    def see(
+        self, points: np.ndarray, base_quat: ArrayLike, joint_pos: ArrayLike | None = None, age_s: float = 0.0
+    ) -> None:
         """Appends a LiDAR frame to the history, unless it holds too few hits; :meth:`step` does it for its points.
 
         Args:
             points: (n, 3) m in the sensor frame, in the order of measurement.
-            base_quat: (4,) orientation of the base at the end of the frame, (w, x, y, z).
+            base_quat: (4,) orientation of the base at the end of the frame, (w, x, y, z); now, where the policy reads
+                `age_s`.
             joint_pos: (num_joints,) rad at that moment; needed where `description.lidar.carried_by` names joints.
+            age_s: since the end of the frame; read where `description.perception.times` is true.
         """
+        if not 0.0 <= age_s < np.inf:
+            raise DeployError(f"age_s: seconds since the end of the frame were expected, at least 0, {age_s} given")
         lidar, sampler, frames = self._perception()
         points = _without_nearer(_cloud(points), lidar.min_range)
+        if isinstance(self._odometry, TimedOdometry):
+            base_quat = self._odometry.attitude(age_s)
         attitude = Attitude(self._carrier_quat(lidar, base_quat, joint_pos), lidar.mount_pos, lidar.mount_quat)
         if self.safety is not None and not self.safety.frame_is_good(points, attitude):
             return self.miss()
         frames[:-1] = frames[1:]
         frames[-1, : sampler.num_points] = sampler(points, attitude)
-        if self._odometry is not None:
+        if isinstance(self._odometry, TimedOdometry):
+            frames[-1, -TimedOdometry.num_rows :] = self._odometry.take(age_s)
+        elif self._odometry is not None:
             frames[-1, -1] = self._odometry.since_last_frame()
         self.frame_count = min(self.frame_count + 1, len(frames))
 
@@ -250,17 +263,22 @@ class ExportedPolicy:
         if not self.frame_count:
             return
         frames[:-1] = frames[1:]
-        if self._odometry is not None:
+        if isinstance(self._odometry, TimedOdometry):
+            frames[-1, -TimedOdometry.num_rows :] = self._odometry.take(None)
+        elif self._odometry is not None:
             frames[-1, -1] = 0.0
         self.frame_count = min(self.frame_count + 1, len(frames))
 
-    def step(self, state: RobotState, command: ArrayLike, points: np.ndarray | None = None) -> np.ndarray:
+    def step(
+        self, state: RobotState, command: ArrayLike, points: np.ndarray | None = None, age_s: float = 0.0
+    ) -> np.ndarray:
         """One control step.
 
         Args:
             state: what the robot senses of itself now.
             command: (3,) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame.
             points: (n, 3) m in the sensor frame of a LiDAR frame that has just been completed; None without one.
+            age_s: of that frame, see :meth:`see`.
 
         Returns:
             (num_joints,) float32 joint targets, rad, in the order of `description.joints`.
@@ -276,7 +294,7 @@ class ExportedPolicy:
         if self._odometry is not None:
             self._odometry.advance(_quaternion(state.base_quat), self._velocity(state))
         if points is not None:
-            self.see(points, state.base_quat, state.joint_pos)
+            self.see(points, state.base_quat, state.joint_pos, age_s)
         if self.safety is not None:
             command = self.safety.limit_command(command)
             self._reference = self.safety.kept_to_covered(self._reference)

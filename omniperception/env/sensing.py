@@ -287,7 +287,7 @@ class LidarSensing:
             if self.coverage is not None:
                 self.coverage.begin_frame()
         if isinstance(self.odometry, TimedOdometry):
-            base_quat = self.odometry.attitude(self._late_steps)
+            base_quat = self.odometry.attitude(self.late_steps)
         attitude = self._attitude(base_quat)
         slices = self.lidar.cast_slices(self._time.fill_(time_s))
         for index in range(len(self.lidar.env_slices)):
@@ -371,14 +371,14 @@ class LidarSensing:
         if fresh is not None:
             newest = torch.where(fresh[..., None], newest, self.frames[:, -1])
         if isinstance(self.odometry, TimedOdometry):
-            newest[:, -3:] = self.odometry.take(None if fresh is None else fresh[:, 0], self._late_steps)
+            newest[:, -3:] = self.odometry.take(None if fresh is None else fresh[:, 0], self.late_steps)
         elif self.odometry is not None:
             newest[:, -1] = self.odometry.since_last_frame(fresh)
         self.frames = torch.cat((self.frames[:, 1:], newest[:, None]), 1)
         self.frame_count.add_(came).clamp_(max=self.frames.shape[1])
 
     @property
-    def _late_steps(self) -> torch.Tensor | None:
+    def late_steps(self) -> torch.Tensor | None:
         """(num_envs,) int64 control steps by which the newest frame is old; None: frames are not late."""
         return None if self._past is None or self._delivery is None else self._delivery.late_steps
 

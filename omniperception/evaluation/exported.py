@@ -42,8 +42,14 @@ class ExportedPolicies:
             for index in env.done.nonzero().flatten().tolist():
                 self.robots[index].reset()
         states, commands, clouds = robot_states(env), env.command.value.cpu().numpy(), self._new_clouds()
-        given = zip(self.robots, states, commands, clouds, strict=True)
+        given = zip(self.robots, states, commands, clouds, self._ages(), strict=True)
         return torch.from_numpy(np.stack([_action(*each) for each in given])).to(env.device)
+
+    def _ages(self) -> list[float]:
+        """Of the newest frames, s."""
+        sensing = self._env.sensing
+        late = None if sensing is None else sensing.late_steps
+        return [0.0] * self._env.num_envs if late is None else (late * self._env.control_dt).tolist()
 
     def _new_clouds(self) -> list[np.ndarray | None]:
         """Points of the frame that has just come; None without one, or where the episode has just begun."""
@@ -60,11 +66,13 @@ class ExportedPolicies:
         return [cloud if is_new else None for cloud, is_new in zip(raw_points(frame), new, strict=True)]
 
 
-def _action(robot: ExportedPolicy, state: RobotState, command: np.ndarray, cloud: np.ndarray | None) -> np.ndarray:
+def _action(
+    robot: ExportedPolicy, state: RobotState, command: np.ndarray, cloud: np.ndarray | None, age_s: float
+) -> np.ndarray:
     """(num_actions,) the action whose target is the robot's."""
     joints = robot.description.joints
     try:
-        targets = robot.step(state, command, cloud)
+        targets = robot.step(state, command, cloud, age_s)
     except SafetyStop:
         targets = np.asarray(state.joint_pos, np.float32)
     if robot.safety is None:

@@ -32,6 +32,7 @@ from omniperception.hardware.messages import LOW_STATE, remote
 from omniperception.hardware.operator import Goal, Operator, make_operator
 from omniperception.hardware.recording import Recorder, Step, make_folder
 from omniperception.hardware.saying import say
+from omniperception.hardware.sensor_clock import FrameAges
 from omniperception.hardware.switcher import ensure_released
 
 
@@ -268,7 +269,7 @@ class Control:
         self._heard, self._stopped = -math.inf, ""
         self.missed = 0
         self._mode, self._last_frame = Mode.DAMPING, math.inf
-        self._velocity = np.zeros(3)
+        self._velocity, self._ages = np.zeros(3), FrameAges()
         self._begin_odometry()
 
     def _begin_odometry(self) -> None:
@@ -319,7 +320,7 @@ class Control:
     ) -> np.ndarray | None:
         """(12,) rad, in the motors' order; None: the policy stops, and the guard has been asked to damp."""
         try:
-            targets = self.policy.step(state, command, points)
+            targets = self.policy.step(state, command, points, self._ages.newest_s)
         except SafetyStop as stop:
             if self._mode in DRIVEN or str(stop) != self._stopped:
                 say(f"stop: {stop}")
@@ -345,6 +346,7 @@ class Control:
                 self.missed += self._mode in DRIVEN
             return None
         self._last_frame = now
+        self._ages.add(1e-9 * frames[-1].start_ns + period, now)
         return self.policy.thin(frames[-1].points, frames[-1].offsets_s)
 
     def _advance_odometry(self, state: np.ndarray) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 
@@ -14,12 +15,34 @@ _GAP_S = 3.0
 """Without messages for so long, judging begins anew."""
 BACK_NS = 20_000_000
 """Further back than messages may overtake each other, 20 ms."""
+_FRAMES, _OTHER_TIME_S = 100, 1.0
+"""Frames among which the least delay is looked for, and a change of the delay that is none."""
 _MANY = 0.25
 """Share of messages whose times jump, from which on no time is believed."""
 _SLOW, _FLAT = 0.01, 0.01
 """Shares of the time that passes: times that go on by less are wrong, and messages that span less have one time."""
 _LONGEST_NS = 500_000_000
 """Between two messages whose points are spread over it."""
+
+
+class FrameAges:
+    """How old frames are when they come, beyond the least that was seen: the two clocks need not agree.
+
+    Attributes:
+        newest_s: of the newest frame.
+    """
+
+    def __init__(self) -> None:
+        self.newest_s = 0.0
+        self._behind: deque[float] = deque(maxlen=_FRAMES)
+
+    def add(self, end_s: float, now: float) -> None:
+        """A frame comes `now` whose last point was measured at `end_s`, by the sensor's clock."""
+        behind = now - end_s
+        if self._behind and abs(behind - self._behind[-1]) > _OTHER_TIME_S:
+            self._behind.clear()  # the sensor's time begins anew
+        self._behind.append(behind)
+        self.newest_s = behind - min(self._behind)
 
 
 class SensorClock:
