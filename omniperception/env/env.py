@@ -191,6 +191,7 @@ class OmniEnv(VecEnv):
                 self._reset(ended)
         with self.timer.stage("observations"):
             self.observations = self._observe(ended)
+        # a goal is no failure: what would have come counts, as after a time-out
         extras: dict = {"time_outs": (self.outcomes["time_out"] | self.outcomes["goal"]).float()}
         if self.step_count % self.config.log_interval == 0:
             extras["log"] = self._report()
