@@ -31,6 +31,23 @@ def seen(place, velocity):
     return distance, bearing, sector
 
 
+def test_ages_of_the_frames_count_where_they_are_known():
+    """A point that comes at 1.5 m/s, seen at odd times: only with them does its velocity fit."""
+    ages = [0.55, 0.37, 0.2, 0.05, 0.0]
+    place = (2.0, 0.17)  # the middle of a sector, nearly
+    distance, bearing = torch.full((1, HISTORY, SECTORS), NOTHING), torch.zeros(1, SECTORS)
+    middle = math.radians(5.0)
+    for k, age in enumerate(ages):
+        x, y = place[0] + 1.5 * age * math.cos(middle), place[1] + 1.5 * age * math.sin(middle)
+        distance[0, k, sector_of(x, y)[0]] = math.hypot(x, y)
+    sector, bearing[0, sector_of(*place)[0]] = sector_of(*place)
+    coming = next(k for k, v in enumerate(VELOCITIES.tolist()) if v == pytest.approx([-1.5, 0.0], abs=1e-5))
+    known = MATCH(distance, bearing, VELOCITIES, torch.tensor([ages[:-1]]))[0].unflatten(0, (HISTORY - 1, -1))
+    assert known[:, coming, sector].min() > 0.95
+    unknown = MATCH(distance, bearing, VELOCITIES)[0].unflatten(0, (HISTORY - 1, -1))
+    assert unknown[:, coming, sector].min() < 0.6
+
+
 @pytest.mark.parametrize("place", [(2.0, 0.4), (-1.2, 1.9), (0.3, -2.6)])
 @pytest.mark.parametrize("index", [0, 3, 13, 20])
 def test_the_velocity_of_a_point_fits_all_frames(place, index):

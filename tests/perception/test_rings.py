@@ -51,6 +51,39 @@ def test_what_stands_still_is_in_the_same_place_in_all_frames():
         assert (rings[frame] != 0).sum() <= 2
 
 
+def test_late_frames_show_what_stands_where_it_is_now():
+    """As above, each frame taken a while before it comes, and the robot has moved on and turned meanwhile."""
+    shape = RingShape(SECTORS, 3, DECAY, (1.0,))
+    pole, poses = (2.0, 1.0), [(0.0, 0.0, 0.0), (0.1, 0.05, 0.3), (0.25, 0.0, 0.7)]
+    now = (0.33, -0.06, 0.9)
+
+    def seen_from(pose, point):
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        dx, dy = point[0] - pose[0], point[1] - pose[1]
+        return c * dx + s * dy, -s * dx + c * dy
+
+    moved = [[*seen_from(a, b), b[2] - a[2]] for a, b in zip([poses[0], *poses], poses, strict=False)]
+    since = torch.zeros(1, 3, 3)
+    since[0, 2] = torch.tensor([*seen_from(poses[2], now), now[2] - poses[2][2]])
+    since[0, :2] = torch.randn(2, 3)  # of frames before the newest nobody asks
+    cells = torch.stack([cells_of([seen_from(pose, pole)], 1) for pose in poses])[None]
+    given = cells, torch.tensor([moved]), torch.tensor([[3]]), shape, since
+    x, y = seen_from(now, pole)
+    sector = int((math.atan2(y, x) + math.pi) / (2 * math.pi) * SECTORS)
+    for rings in (moved_rings(*given), _moved_rings(*given)):
+        found = rings.unflatten(2, (3, BANDS, 2))[0, 0, :, 1, 0]
+        assert found[:, sector].tolist() == pytest.approx([math.exp(-math.hypot(x, y))] * 3, abs=1e-5)
+        assert (found != 0).sum() == 3
+
+
+def test_times_are_counted_back_from_the_newest_frame():
+    path = RingPath(BANDS * SECTORS, 4, match=MATCH, times=True)
+    times = torch.zeros(1, 5, 3)
+    times[0, :, 1] = torch.tensor([9.0, 0.1, 0.05, 0.2, 0.12])
+    assert path._ages(times)[0].tolist() == pytest.approx([0.35, 0.25, 0.2], abs=1e-5)
+    assert path._ages(times)[1].tolist() == pytest.approx([0.37, 0.32, 0.12], abs=1e-5)
+
+
 def random_windows(generator, batch=5, frames=7, history=4):
     shape = (batch, frames, BANDS * SECTORS)
     bearing = (torch.arange(SECTORS) + torch.rand(batch, frames, BANDS, SECTORS, generator=generator)).flatten(2)

@@ -87,7 +87,11 @@ def moved_rings(
 
 
 def _moved_rings(
-    cells: torch.Tensor, moved: torch.Tensor, count: torch.Tensor, shape: RingShape, since: torch.Tensor | None
+    cells: torch.Tensor,
+    moved: torch.Tensor,
+    count: torch.Tensor,
+    shape: RingShape,
+    since: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """:func:`moved_rings` in operations that can be exported."""
     bearing, proximity = cells[..., :2], cells[..., 2]
