@@ -27,6 +27,10 @@ COMPANIONS = {
     "commands/corridor": ["obstacles=corridor"],
     "obstacles/corridor": ["commands=corridor"],
     "lidar/none": BLIND,
+    "observations/navigate": ["experiment=navigate"],
+    "observations/perceive": ["experiment=perceive"],
+    "rewards/navigate": ["experiment=navigate"],
+    "sim/planar": ["experiment=navigate"],
 }
 """What a preset needs beside it."""
 QUICK = ["perception=none", "lidar.selection=every_kth"]
@@ -35,7 +39,7 @@ LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
 
 
 def test_no_preset_is_missed():
-    assert len(PRESETS) == 152
+    assert len(PRESETS) == 161
     groups = {preset.split("/")[0] for preset in PRESETS}
     assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()} - NO_PRESETS
     assert set(COMPANIONS) <= set(PRESETS)
@@ -59,7 +63,7 @@ def test_every_preset_composes_builds_and_steps(preset):
         env = runner.env
         with torch.inference_mode():
             actions = runner.policy(env.get_observations())
-        assert actions.shape == (2, 12)
+        assert actions.shape == (2, env.num_actions)
     else:
         env = OmniEnv(run.env)
         actions = torch.zeros(2, env.num_actions)

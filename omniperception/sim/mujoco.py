@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from mujoco.batch import Batch, SimulationError
 
-from omniperception.common.random import EnvRandom
 from omniperception.lidar.launch import default_num_threads
 from omniperception.scene import World
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointColumns, Simulator, SizedGeoms
@@ -73,11 +72,8 @@ class SimConfig:
         """Device of the simulations and of everything that they feed."""
         return torch.device("cpu")
 
-    def build(
-        self, world: World, num_envs: int, record_states: bool = False, random: EnvRandom | None = None
-    ) -> Simulator:
-        """`num_envs` simulations of a world; with `record_states` their states after each physics step are kept.
-        `random` is for simulators that draw something themselves."""
+    def build(self, world: World, num_envs: int, record_states: bool = False) -> Simulator:
+        """`num_envs` simulations of a world; with `record_states` their states after each physics step are kept."""
         return MujocoSimulator(world, self, num_envs, record_states)
 
 

@@ -13,7 +13,6 @@ import mujoco
 import torch
 import warp as wp
 
-from omniperception.common.random import EnvRandom
 from omniperception.lidar.launch import wp_device
 from omniperception.scene import World
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointColumns, SizedGeoms
@@ -76,9 +75,7 @@ class MujocoWarpConfig(SimConfig):
             return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
         return torch.device(kind)
 
-    def build(
-        self, world: World, num_envs: int, record_states: bool = False, random: EnvRandom | None = None
-    ) -> MujocoWarpSimulator:
+    def build(self, world: World, num_envs: int, record_states: bool = False) -> MujocoWarpSimulator:
         return MujocoWarpSimulator(world, self, num_envs, record_states)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from omniperception.common.random import EnvRandom
+from omniperception.common.shell import command_line
 from omniperception.scene import World
 from omniperception.sim.base import Simulator
 from omniperception.sim.response import GaitResponse, NoResponse
@@ -57,17 +58,23 @@ class PlanarConfig:
     def torch_device(self) -> torch.device:
         return torch.device("cpu")
 
-    def build(
-        self, world: World, num_envs: int, record_states: bool = False, random: EnvRandom | None = None
-    ) -> Simulator:
-        """`num_envs` robots in a world; `random` gives the streams that their responses are drawn from."""
+    def build(self, world: World, num_envs: int, record_states: bool = False) -> Simulator:
+        """`num_envs` robots in a world, which draw from streams of their own until `draw_by`."""
         from omniperception.sim.planar_world import PlanarSimulator  # with Warp, which not every task loads
 
         response = GaitResponse.load(Path(self.response))
         if self.under not in response.conditions:
             known = ", ".join(response.conditions)
+            line = command_line("gait", f"run={self.response}", "what=response", f"conditions={self.under}")
             raise NoResponse(
                 f"{self.response} has no response measured under condition={self.under} (it has {known}); measure it:"
-                f" omniperception gait run={self.response} what=response condition={self.under}, or set sim.under"
+                f" {line}, or set sim.under"
             )
-        return PlanarSimulator(world, self, response, num_envs, record_states, random or EnvRandom(0, num_envs))
+        return PlanarSimulator(world, self, response, num_envs)
+
+    def draw_by(self, sim: Simulator, random: EnvRandom) -> None:
+        """Lets the robots of a simulator that this has built draw from an environment's streams."""
+        from omniperception.sim.planar_world import PlanarSimulator
+
+        assert isinstance(sim, PlanarSimulator)
+        sim.draw_by(random)

@@ -51,8 +51,6 @@ class PlanarSimulator:
         config: PlanarConfig,
         response: GaitResponse,
         num_envs: int,
-        record_states: bool,
-        random: EnvRandom,
     ) -> None:
         if not isinstance(world.terrain, TerrainConfig):
             raise ValueError("sim=planar has flat ground alone; use terrain=flat, or sim=mujoco")
@@ -65,7 +63,7 @@ class PlanarSimulator:
         self.mocap_pos, self.mocap_quat = torch.zeros(num_envs, parts, 3), torch.zeros(num_envs, parts, 4)
         self.mocap_quat[..., 0] = 1.0
         self.failure = torch.zeros(num_envs, dtype=torch.int64)
-        self._random: Branch = random.branch("response")
+        self._random: Branch = EnvRandom(0, num_envs).branch("response")
         self._follow_response()
         n = num_envs
         self._place, self._velocity, self.asked, self._before, self._error = torch.zeros(5, n, 3).unbind(0)
@@ -82,7 +80,6 @@ class PlanarSimulator:
         none = torch.zeros(n, 0)
         self._nothing = (torch.zeros(n, 0, 2), none.bool(), none, none, torch.zeros(n, 0, 2))
         self._links: dict[tuple[int, ...], _Links] = {}
-        self._records = record_states
         self._mass = float(world.model.body_subtreemass[world.base_body])
 
     def _follow_response(self) -> None:
@@ -105,6 +102,10 @@ class PlanarSimulator:
         self._bases = torch.tensor(bases).transpose(1, 2).contiguous()  # (cycles, P, 3): height, roll, pitch
         self._joints = torch.tensor([[list(pose) for pose in cycle.joints] for cycle in cycles])
         self._in_cycle = torch.zeros(self.num_envs, dtype=torch.int64)  # row of cycle and phase
+
+    def draw_by(self, random: EnvRandom) -> None:
+        """Draws responses and errors from streams of these from now on."""
+        self._random = random.branch("response")
 
     def meet(self, field: ObstacleField) -> None:
         """Takes in the obstacles, whose outlines the robots touch."""

@@ -51,6 +51,7 @@ RECIPES = {
     "pd_risknet_no_distal": overrides_of("pd_risknet_no_distal"),
     "proximity_gru_no_proximal": overrides_of("proximity_gru_no_proximal"),
     "polar_rings": ("experiment=avoid", "init=unread", "rewards.avoidance.max_acceleration=2.0"),
+    "timed_rings": ("experiment=navigator", "init=unread"),
     "motion_by_fps": ("experiment=avoid", "init=unread", *overrides_of("fps_gru_small"), "perception.base_motion=true"),
     "clock": (
         *("experiment=walk", "observations=gait", "commands.standing=0.5", "commands.resample_s=[0.1,0.3]"),
@@ -424,7 +425,7 @@ def test_wrong_points_are_named(exported_run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 99}, "format version 99, this program reads 8"),
+        ({"version": 99}, "format version 99, this program reads 9"),
         ({"format": "something"}, "describes no exported policy"),
         ({"joints": None}, "is incomplete"),
         ({"control_period_s": 0.03}, "policy.onnx and policy.json are not from the same export"),

@@ -58,6 +58,7 @@ CALLS = {
     "omniperception/hardware/trials.py": 1,
     "omniperception/robots/fetch.py": 1,
     "omniperception/scene/fetched.py": 1,
+    "omniperception/sim/planar.py": 1,
     "omniperception/sim/response.py": 1,
 }
 """Commands that are shown, by file; each is run in a test below."""
@@ -439,3 +440,17 @@ def test_the_extras_that_messages_name_are_installed_by_the_line_that_is_shown(p
     pip = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-deps"]
     done = subprocess.run([*pip, f"omniperception[{','.join(extras)}]"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0 and "already satisfied" in done.stdout, done.stderr
+
+
+def test_a_response_that_is_not_measured(place, run, capsys):
+    """Neither at all, nor under the condition that is asked for: the commands that are shown measure it."""
+    gait = Path(os.path.relpath(shutil.copytree(config.SHIPPED_RUNS / "gait", place / "a gait")))
+    words = ["train", "experiment=navigate", "num_envs=4", "ppo.num_mini_batches=1", "ppo.max_iterations=1"]
+    words += [f"sim.response={gait}", f"hydra.run.dir={place / 'navigates'}", "obstacles=none"]
+    for step, wrong in enumerate(([], ["sim.under=faults"])):
+        if not step:
+            (gait / "response.json").unlink()
+        (shown,) = commands_in(refused(capsys, [*words, *wrong]).replace(", or set sim.under", ""))
+        run([*shown, "robots=8", "seconds=8"])
+    main([*words, "sim.under=faults"])
+    assert "completed" in capsys.readouterr().out
