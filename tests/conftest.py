@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import logging
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,9 @@ def pytest_configure(config):
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     build.seed_everything(0)
+    for logger in list(logging.Logger.manager.loggerDict.values()):  # another test may have let Hydra silence them
+        if isinstance(logger, logging.Logger):
+            logger.disabled = False
 
 
 @pytest.hookimpl(tryfirst=True)

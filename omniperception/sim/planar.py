@@ -67,8 +67,8 @@ class PlanarConfig:
             known = ", ".join(response.conditions)
             line = command_line("gait", f"run={self.response}", "what=response", f"conditions={self.under}")
             raise NoResponse(
-                f"{self.response} has no response measured under condition={self.under} (it has {known}); measure it:"
-                f" {line}, or set sim.under"
+                f"{self.response} has no response measured under condition={self.under} (it has {known}); set"
+                f" sim.under, or measure it: {line}"
             )
         return PlanarSimulator(world, self, response, num_envs)
 
