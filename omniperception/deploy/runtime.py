@@ -150,6 +150,7 @@ class ExportedPolicy:
         for history in self._histories.values():
             history.clear()
         self.frame_count = self._steps = self._steps_stood = 0
+        self._has_missed = False
         self._reference = np.zeros(3, np.float32)
         self._asked = np.zeros(3 if self.description.turns else 2, np.float32)
         self.base_lin_vel: np.ndarray | None = None
@@ -265,6 +266,7 @@ class ExportedPolicy:
         frames[:-1] = frames[1:]
         if isinstance(self._odometry, TimedOdometry):
             frames[-1, -TimedOdometry.num_rows :] = self._odometry.take(None)
+            self._has_missed = True  # and is yet older once the step that begins has been taken in
         elif self._odometry is not None:
             frames[-1, -1] = 0.0
         self.frame_count = min(self.frame_count + 1, len(frames))
@@ -293,6 +295,9 @@ class ExportedPolicy:
             raise DeployError(f"command: 3 numbers were expected, {command.tolist()} given")
         if self._odometry is not None:
             self._odometry.advance(_quaternion(state.base_quat), self._velocity(state))
+            if self._has_missed and isinstance(self._odometry, TimedOdometry) and self.frames is not None:
+                self.frames[-1, -TimedOdometry.num_rows :] = self._odometry.take(None)
+            self._has_missed = False
         if points is not None:
             self.see(points, state.base_quat, state.joint_pos, age_s)
         if self.safety is not None:
@@ -419,7 +424,7 @@ class ExportedPolicy:
             )
         if self.frames is None:
             return
-        rows = self._perception()[1].num_points + (self._odometry is not None)
+        rows = self._perception()[1].num_points + (0 if self._odometry is None else self._odometry.num_rows)
         if rows != self.frames.shape[1]:
             raise DeployError(
                 f"the sampler and the base's motion give {rows} rows, the network reads {self.frames.shape[1]}; export"

@@ -72,13 +72,14 @@ class TimedOdometry:
         self._newest = 0
         self._taken = torch.zeros(num_envs, 3, device=device)
         self._age = torch.zeros(num_envs, device=device)
+        self._has_frame = torch.zeros(num_envs, dtype=torch.bool, device=device)
 
     def start(self, env_ids: torch.Tensor, measured: Kinematics) -> None:
         """The robots of some environments (n,) stand elsewhere; `measured` of all."""
         pose = torch.zeros(len(env_ids), 3, device=self._pose.device)
         pose[:, 2] = measured.yaw[env_ids]
         self._pose[:, env_ids], self._quat[:, env_ids] = pose, measured.base_quat_w[env_ids]
-        self._taken[env_ids], self._age[env_ids] = pose, 0.0
+        self._taken[env_ids], self._age[env_ids], self._has_frame[env_ids] = pose, 0.0, False
 
     def advance(self, measured: Kinematics) -> None:
         """One control step."""
@@ -104,15 +105,17 @@ class TimedOdometry:
             this one was, in the levelled base of then; from there to now, likewise; and the age of this frame, the time
             from the one before to it (s), and 0. Where no frame comes, those of the last one that came: no motion and
             no time, and all that it is older.
+            The first frame follows none.
         """
         here = self._pose[self._newest]
         late = torch.zeros_like(self._age) if late_steps is None else late_steps * self._dt
         taken = here if late_steps is None else self._pose[self._at(late_steps), self._all_envs]
         between = self._age - late
-        came = torch.ones_like(between, dtype=torch.bool) if came is None else came
-        moved = _seen_from(self._taken, taken) * came[:, None]
+        came = torch.ones_like(self._has_frame) if came is None else came
+        follows, self._has_frame = came & self._has_frame, came | self._has_frame
+        moved = _seen_from(self._taken, taken) * follows[:, None]
         self._taken, self._age = torch.where(came[:, None], taken, self._taken), torch.where(came, late, self._age)
-        times = torch.stack((self._age, between * came, torch.zeros_like(between)), 1)
+        times = torch.stack((self._age, between * follows, torch.zeros_like(between)), 1)
         return torch.stack((moved, _seen_from(self._taken, here), times), 1)
 
     def _at(self, late_steps: torch.Tensor) -> torch.Tensor:
@@ -120,13 +123,13 @@ class TimedOdometry:
 
     def state_dict(self) -> dict:
         kept = {"pose": self._pose, "quat": self._quat, "taken": self._taken, "age": self._age}
+        kept["has_frame"] = self._has_frame
         return {"newest": self._newest, **{name: value.clone() for name, value in kept.items()}}
 
     def load_state_dict(self, state: dict) -> None:
         self._newest = state["newest"]
-        self._pose, self._quat, self._taken, self._age = (
-            state[name].clone() for name in ("pose", "quat", "taken", "age")
-        )
+        names = ("pose", "quat", "taken", "age", "has_frame")
+        self._pose, self._quat, self._taken, self._age, self._has_frame = (state[name].clone() for name in names)
 
 
 def _seen_from(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
