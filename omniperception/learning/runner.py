@@ -230,11 +230,11 @@ class Runner:
             state = self._weights(other)
             if take_parts(self.alg.actor, state["actor_state_dict"], str(other)):
                 seeing.append(other)
-            with contextlib.suppress(CheckpointError, RuntimeError):
-                self.alg.critic.load_state_dict(state["critic_state_dict"])
+            with contextlib.suppress(CheckpointError):  # it values something else
+                start_from(self.alg.critic, state.get("critic_state_dict", {}), str(other))
         self.alg.is_new = False
         self.alg.actor.reset()
-        return seeing if gait is None else self._walk_as(gait, seeing or [gait], observations)
+        return seeing if gait is None else self._walk_as(gait, seeing, observations)
 
     def _walk_as(self, run_dir: Path, seeing: list[Path], observations: ObservationsConfig | None) -> list[Path]:
         """Moves as another run does."""

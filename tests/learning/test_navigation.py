@@ -120,6 +120,23 @@ def test_weights_of_each_run_go_where_they_belong():
         take_parts(joined.alg.actor, wider.alg.actor.state_dict(), "d")
 
 
+def test_one_run_that_is_such_a_policy_gives_all_that_it_has(tmp_path):
+    """A critic of something else is left out as a whole."""
+    first, second = runner(*ON_LEGS), runner(*ON_LEGS, "ppo.hidden_dims=[256,128,64]")
+    for value in first.alg.actor.parameters():
+        torch.nn.init.constant_(value, 0.25)
+    (tmp_path / "checkpoints").mkdir()
+    first.save(tmp_path / "checkpoints" / "model_1.pt")
+    assert second.start_from(tmp_path) == [tmp_path]
+    state, given = second.alg.actor.state_dict(), first.alg.actor.state_dict()
+    assert all(torch.equal(state[name], given[name]) for name in given if not name.startswith("distribution"))
+    told = runner(*TOLD)
+    before = {name: value.clone() for name, value in told.alg.critic.state_dict().items()}
+    told.start_from(tmp_path)
+    assert all(torch.equal(before[name], value) for name, value in told.alg.critic.state_dict().items())
+    assert (told.alg.actor.state_dict()["mlp.network.0.weight"] == 0.25).all()
+
+
 class TestSaidRisks:
     RISK = VelocityRisk(1.8, 2, 36, (0.4, 0.8), 0.25, 0.15, 2.0, 8.0, 0.05)
 
