@@ -18,10 +18,8 @@ import torch
 from benchmarks.harness.table import Table, about, report
 from benchmarks.harness.timing import Timing, paired_ratio, paired_timings
 from omniperception import build, config
-from omniperception.avoidance.true_sectors import TrueSectors
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.cli import Command, argument
-from omniperception.learning.navigation import NUM_SECTORS
 
 DECISION_S = 0.1
 
@@ -46,13 +44,11 @@ def decisions(overrides: list[str], risk: VelocityRisk | None = None) -> tuple[i
     if env.obstacles is not None:
         env.obstacles.level = 1.0
     steps = round(DECISION_S / env.control_dt)
-    sectors = TrueSectors(NUM_SECTORS, env.world.obstacles, env.obstacles, env.num_envs, env.device)
 
     def decide(_: int) -> None:
         with torch.inference_mode():
             if risk is not None:
-                kinematics = env.state.kinematics
-                risk.risk(sectors.measure(kinematics.base_pos_w, kinematics.yaw), risk.candidates())
+                risk.risk(env.state.sectors, risk.candidates())
             for _ in range(steps):
                 env.step(policy(env.get_observations()))
 

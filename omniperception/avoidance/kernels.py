@@ -103,6 +103,19 @@ def nearest_by_sector(
                     sectors_out[env, s] = keep_nearer(distance, w, sectors_out[env, s])
 
 
+@wp.func
+def squared_from_line(apart: wp.vec2, half_length: float) -> float:
+    """Squared distance from the line from (-half_length, 0) to (half_length, 0)."""
+    along = wp.max(wp.abs(apart[0]) - half_length, 0.0)
+    return along * along + apart[1] * apart[1]
+
+
+@wp.func
+def exponent_of(squared: float, time: float, radius: float, decay: float, time_constant: float) -> float:
+    """Minus the logarithm of the risk of passing at a squared distance after a time."""
+    return wp.max(wp.sqrt(squared) - radius, 0.0) / decay + time / time_constant
+
+
 @wp.kernel(module="unique", enable_backward=False)
 def worst_sectors(
     env_offset: int,
@@ -141,14 +154,12 @@ def worst_sectors(
             nearest = float(wp.inf)
             at = wp.int32(0)
             for j in range(present):
-                apart = points[env, j] - goal
-                along = wp.max(wp.abs(apart[0]) - robot_half_length, 0.0)
-                squared = along * along + apart[1] * apart[1]
+                squared = squared_from_line(points[env, j] - goal, robot_half_length)
                 if squared < nearest:
                     nearest = squared
                     at = j
             if present > 0:
-                exponent = wp.max(wp.sqrt(nearest) - robot_radius, 0.0) / decay + time / time_constant
+                exponent = exponent_of(nearest, time, robot_radius, decay, time_constant)
                 if exponent < least[env, k]:
                     least[env, k] = exponent
                     sector_out[env, k] = wp.int64(sectors[env, at])
@@ -193,10 +204,8 @@ def largest_risks(
                 goal = time * candidates[k]
                 nearest = wp.float32(1.0e6)
                 for j in range(present):
-                    apart = points[env, j] - goal
-                    along = wp.max(wp.abs(apart[0]) - robot_half_length, 0.0)
-                    nearest = wp.min(nearest, along * along + apart[1] * apart[1])
-                exponent = wp.max(wp.sqrt(nearest) - robot_radius, 0.0) / decay + time / time_constant
+                    nearest = wp.min(nearest, squared_from_line(points[env, j] - goal, robot_half_length))
+                exponent = exponent_of(nearest, time, robot_radius, decay, time_constant)
                 risk_out[env, k] = wp.min(risk_out[env, k], exponent)
     for k in range(candidates.shape[0]):
         exponent = risk_out[env, k]

@@ -7,6 +7,8 @@ import torch
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.avoidance.velocity_risk import VelocityRisk
 
+NUM_SECTORS = 36
+"""Azimuth sectors that a navigation policy reads."""
 CLOSE = 0.4
 """Decay (m) of the second number of a sector's distance, which resolves what is close."""
 SPEED = 1.5
@@ -15,9 +17,9 @@ OWN_MOTION = 9
 """Numbers of the robot's own motion: reference, velocity and asked velocity, three each."""
 
 
-def num_inputs(num_sectors: int, risk: VelocityRisk) -> int:
-    """How many numbers `navigation_inputs` gives."""
-    return 3 + 4 * num_sectors + OWN_MOTION + risk.num_candidates
+def num_inputs(risk: VelocityRisk) -> int:
+    """How many numbers `navigation_inputs` gives of NUM_SECTORS sectors."""
+    return 3 + 4 * NUM_SECTORS + OWN_MOTION + risk.num_candidates
 
 
 def navigation_inputs(

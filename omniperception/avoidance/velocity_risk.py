@@ -135,7 +135,7 @@ class VelocityRisk:
         return (-self._exponent(distance, time)).exp()
 
     def _largest(self, sectors: torch.Tensor, candidates: torch.Tensor) -> torch.Tensor:
-        """As :meth:`risk`, without gradients and in a fifth of the time."""
+        """As :meth:`risk`, without gradients: whose sector makes a risk, and when, is not kept."""
         import warp as wp
 
         from omniperception.avoidance.kernels import largest_risks

@@ -271,8 +271,8 @@ def _perception(config: PerceptionConfig, lidar: SensorConfig | None) -> Percept
             f"perception.sampler.max_range={sampler.max_range} cannot be exported: on a robot, points beyond it are"
             f" misses, in training those beyond lidar.max_range={lidar.max_range}; train with both the same"
         )
-    rows = 3 if config.frame_times else int(moves)
-    return Perception(config.history, sampler.num_points + rows, sampler_parameters(sampler), moves, config.frame_times)
+    rows = sampler.num_points + config.num_rows
+    return Perception(config.history, rows, sampler_parameters(sampler), moves, config.frame_times)
 
 
 def sampler_parameters(sampler: Sampler) -> dict:
@@ -374,13 +374,12 @@ class PerceptiveNetwork(BlindNetwork):
             command = observations[:, start:stop]
             if navigates:
                 velocity = torch.stack([observations[:, at] / scale for at, scale in self.velocity], 1)
-                asked = (self.actor.navigate(features, (frame_count > 0)[:, 0], command, velocity, last_asked),)
-                command = asked[0]
+                command = self.actor.navigate(features, (frame_count > 0)[:, 0], command, velocity, last_asked)
             else:
                 command = command + self.actor.read_out.velocity(features, command) * (frame_count > 0)
-            if last_asked is not None and not navigates:
-                command = moved_towards(last_asked, command, self.actor.max_change)
-                asked = (command,)
+                if last_asked is not None:
+                    command = moved_towards(last_asked, command, self.actor.max_change)
+            asked = () if last_asked is None else (command,)
             observations = torch.cat((observations[:, :start], command, observations[:, stop:]), 1)
         latent = self.latent(observations)
         return self.outputs(latent, torch.cat((latent, features), 1), *asked)

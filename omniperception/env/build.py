@@ -10,7 +10,7 @@ from omniperception.avoidance.velocity import MOTION_TARGET
 from omniperception.common.random import EnvRandom
 from omniperception.env.config import EnvConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, MEASURED_CLOUD
-from omniperception.scene import ObstacleField, TerrainConfig
+from omniperception.scene import ObstacleField, TerrainConfig, World
 from omniperception.sim import Simulator
 
 if TYPE_CHECKING:
@@ -24,6 +24,23 @@ if TYPE_CHECKING:
     from omniperception.env.terrain_levels import TerrainLevels
     from omniperception.perception import Sampler
     from omniperception.scene.ground import Ground
+    from omniperception.sim.planar_world import PlanarSimulator
+
+
+def build_sim(config: EnvConfig, world: World, random: EnvRandom) -> Simulator:
+    """The physics; robots without legs draw how they answer from `random`."""
+    sim = config.sim.build(world, config.num_envs, record_states=config.randomization.latency_s is not None)
+    if not config.sim.has_legs:
+        _without_legs(sim).draw_by(random)
+    return sim
+
+
+def _without_legs(sim: Simulator) -> PlanarSimulator:
+    """A simulator of a task whose `sim` has no legs."""
+    from omniperception.sim.planar_world import PlanarSimulator
+
+    assert isinstance(sim, PlanarSimulator)
+    return sim
 
 
 def build_ground(
@@ -70,10 +87,7 @@ def build_obstacles(
         return None
     field = ObstacleField(config.obstacles, sim.mocap_pos, sim.mocap_quat, random, ground)
     if not config.sim.has_legs:
-        from omniperception.sim.planar_world import PlanarSimulator
-
-        assert isinstance(sim, PlanarSimulator)
-        sim.meet(field)
+        _without_legs(sim).set_obstacles(field)
     return field
 
 

@@ -21,6 +21,7 @@ from omniperception.env.build import (
     build_obstacles,
     build_pushes,
     build_sensing,
+    build_sim,
 )
 from omniperception.env.config import HEIGHT_TARGET, EnvConfig
 from omniperception.env.mdp.commands import GoalCommand, VelocityCommand
@@ -31,7 +32,6 @@ from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 from omniperception.env.metrics import OUTCOMES, EpisodeMetrics
 from omniperception.env.state import CONTACT_SENSORS, EnvState
 from omniperception.scene import ObstacleField, build_world
-from omniperception.sim.planar import PlanarConfig
 
 MAX_ACTION = 100.0
 """Actions beyond this magnitude are clipped and counted; a policy that gets here has diverged."""
@@ -76,12 +76,9 @@ class OmniEnv(VecEnv):
         use_threads(config.sim.num_threads or None)
         sensors = config.requirements() & CONTACT_SENSORS
         self.world = build_world(config.robot, config.terrain, config.obstacles, sensors)
-        late = config.randomization.latency_s is not None
         streams = TrialRandom if config.trials else EnvRandom
         self.random: EnvRandom = streams(config.seed, self.num_envs, config.sim.torch_device)
-        self.sim = config.sim.build(self.world, self.num_envs, record_states=late)
-        if isinstance(config.sim, PlanarConfig):
-            config.sim.draw_by(self.sim, self.random)
+        self.sim = build_sim(config, self.world, self.random)
         self.device = self.sim.device
         self.command = config.commands.build(self.num_envs, self.device, self.random)
         own = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)

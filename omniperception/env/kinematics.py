@@ -40,6 +40,11 @@ class Kinematics:
         """(n, 2) m/s: horizontal velocity in the yaw-aligned frame."""
         return rotate_yaw(-self.yaw, self.base_lin_vel_w[:, :2])
 
+    @lazy
+    def planar_velocity(self) -> torch.Tensor:
+        """(n, 3) v_x, v_y (m/s, yaw-aligned frame) and yaw rate (rad/s)."""
+        return torch.cat((self.base_lin_vel_yaw, self.base_ang_vel_b[:, 2:]), 1)
+
     @property
     def base_lin_vel_b(self) -> torch.Tensor:
         """(n, 3) m/s: linear velocity in the base frame."""

@@ -104,8 +104,7 @@ class TimedOdometry:
             (num_envs, 3, 3): how the base moved (x, y in m, yaw in rad) from where the frame before was taken to where
             this one was, in the levelled base of then; from there to now, likewise; and the age of this frame, the time
             from the one before to it (s), and 0. Where no frame comes, those of the last one that came: no motion and
-            no time, and all that it is older.
-            The first frame follows none.
+            no time, and all that it is older. The first frame follows none.
         """
         here = self._pose[self._newest]
         late = torch.zeros_like(self._age) if late_steps is None else late_steps * self._dt

@@ -100,8 +100,7 @@ class LidarSensing:
         carrier: index of the body that carries the sensor, usually the base.
         frames: (num_envs, history, num_points, 3) sampled points in the sensor frame divided by the maximum range,
             newest last, with `base_motion` one row more: how the base moved since the frame before, with
-            `frame_times` three: when and from where they were taken; None without a
-            sampler.
+            `frame_times` three: when and from where they were taken; None without a sampler.
         frame_count: (num_envs, 1) int64 how many of the newest frames are valid.
         frame_tick: (num_envs, 1) int64 number of the newest frame, the same for all environments.
         coverage: directions that the newest frames cover; None where frames are always whole, or nobody looks.
@@ -367,15 +366,17 @@ class LidarSensing:
         """Appends the sampled points to the history, or the last frame again where this one is lost."""
         assert self.frames is not None
         fresh = None if self._delivery is None else self.fresh[:, None]
-        newest, came = self._newest, 1 if fresh is None else fresh | (self.frame_count > 0)
+        newest, counts = self._newest, 1 if fresh is None else fresh | (self.frame_count > 0)
         if fresh is not None:
             newest = torch.where(fresh[..., None], newest, self.frames[:, -1])
         if isinstance(self.odometry, TimedOdometry):
-            newest[:, -3:] = self.odometry.take(None if fresh is None else fresh[:, 0], self.late_steps)
+            newest[:, -TimedOdometry.num_rows :] = self.odometry.take(
+                None if fresh is None else fresh[:, 0], self.late_steps
+            )
         elif self.odometry is not None:
             newest[:, -1] = self.odometry.since_last_frame(fresh)
         self.frames = torch.cat((self.frames[:, 1:], newest[:, None]), 1)
-        self.frame_count.add_(came).clamp_(max=self.frames.shape[1])
+        self.frame_count.add_(counts).clamp_(max=self.frames.shape[1])
 
     @property
     def late_steps(self) -> torch.Tensor | None:

@@ -40,10 +40,10 @@ CONTACT_SENSORS = frozenset({FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT, OBSTACLE_
 REQUIREMENTS = (*sorted(CONTACT_SENSORS), AVOIDANCE, DISTAL_RANGE, CLOUD, MEASURED_CLOUD, LEGS)
 """What must exist before the world is compiled: sensors, and legs."""
 
-NUM_SECTORS = 36
-"""Of `EnvState.sectors`."""
 CONTACT_FORCE = 1.0
 """Vertical force (N) from which on a foot is in contact."""
+
+_WITHOUT_LEGS = "of robots without legs; use sim=planar, or other observations"
 
 Marked = TypeVar("Marked", bound=Callable)
 Part = TypeVar("Part")
@@ -444,6 +444,7 @@ class EnvState:
         """(num_envs, 36, 3) distance (m, infinite without an obstacle) and velocity (m/s, yaw-aligned frame) of the
         nearest true obstacle by azimuth sector; see `TrueSectors`."""
         if self._true_sectors is None:
+            from omniperception.avoidance.navigation import NUM_SECTORS
             from omniperception.avoidance.true_sectors import TrueSectors
 
             world = self._sim.world.obstacles
@@ -456,7 +457,7 @@ class EnvState:
         legs follows that."""
         asked = getattr(self._sim, "asked", None)
         if asked is None:
-            raise NotHere("asked")
+            raise NotHere("asked", _WITHOUT_LEGS)
         return asked
 
     @property
@@ -464,7 +465,7 @@ class EnvState:
         """(num_envs, 13) of robots without legs: gain, lag (s), delay (s), offset (m/s, rad/s) by axis, radius (m)."""
         drawn = getattr(self._sim, "drawn_response", None)
         if drawn is None:
-            raise NotHere("drawn_response")
+            raise NotHere("drawn_response", _WITHOUT_LEGS)
         return drawn
 
     @property
@@ -534,10 +535,11 @@ def _membership(sizes: Sequence[int], device: torch.device) -> torch.Tensor | No
 
 
 class NotHere(ValueError):
-    """A quantity, by its name, that this task does not have, because none of its terms declares it."""
+    """A quantity, by its name, that this task does not have, and why; mostly because none of its terms declares it."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(f"a term reads {name} without declaring it; decorate the term with @requires({name!r})")
+    def __init__(self, name: str, why: str | None = None) -> None:
+        why = why or f"without declaring it; decorate the term with @requires({name!r})"
+        super().__init__(f"a term reads {name} {why}")
         self.name = name
 
 

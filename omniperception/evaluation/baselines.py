@@ -20,7 +20,6 @@ from omniperception.env.odometry import Odometry
 from omniperception.env.sensing import SensorConfig
 from omniperception.env.state import MEASURED_CLOUD
 from omniperception.evaluation.episodes import Policy
-from omniperception.learning.navigation import NUM_SECTORS as SECTORS_OF_NAVIGATION
 from omniperception.perception import Attitude
 from omniperception.perception.geometry import NUM_SECTORS, GeometryConfig, Nearest, Standing, nearest_obstacles
 from omniperception.scene import RobotConfig
@@ -128,14 +127,10 @@ def told(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
     navigation = getattr(policy, "navigation", None)
     if navigation is None:
         raise ValueError("this policy has no navigation that could be told; leave policy=told out")
-    sectors = TrueSectors(SECTORS_OF_NAVIGATION, env.world.obstacles, env.obstacles, env.num_envs, env.device)
 
     def wanted() -> torch.Tensor:
         state = env.state
-        now = sectors.measure(state.kinematics.base_pos_w, state.kinematics.yaw)
-        measured = state.measured
-        velocity = torch.cat((measured.base_lin_vel_yaw, measured.base_ang_vel_b[:, 2:]), 1)
-        return navigation(now, state.reference, velocity, state.last_asked)
+        return navigation(state.sectors, state.reference, state.measured.planar_velocity, state.last_asked)
 
     return _driven(env, policy, wanted, limits)
 

@@ -40,7 +40,7 @@ class FrameAges:
         """A frame comes `now` whose last point was measured at `end_s`, by the sensor's clock."""
         behind = now - end_s
         if self._behind and abs(behind - self._behind[-1]) > _OTHER_TIME_S:
-            self._behind.clear()  # the sensor's time begins anew
+            self._behind.clear()  # the sensor has restarted
         self._behind.append(behind)
         self.newest_s = behind - min(self._behind)
 

@@ -12,6 +12,7 @@ from rsl_rl.utils import resolve_nn_activation
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.env.config import HEIGHT_TARGET
+from omniperception.env.odometry import TimedOdometry
 from omniperception.learning.distillation import DistillationConfig
 from omniperception.learning.estimator import EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
@@ -91,12 +92,16 @@ class PerceptionConfig:
     def build_network(self) -> PerceptionNetwork:
         """The network that fits the sampler's points and the history."""
         sizes = dict(self.sampler().sizes)
-        if self.base_motion:  # rows more for the last part that there is
-            sizes[[name for name, number in sizes.items() if number][-1]] += 3 if self.frame_times else 1
+        sizes[[name for name, number in sizes.items() if number][-1]] += self.num_rows  # to the last part that there is
         try:
             return self.network(**sizes, history=self.history)
         except TypeError as error:
             raise ValueError(f"perception.network does not fit the sampler, which gives {sizes}: {error}") from None
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of a frame beside its points: how the base moved, and where frames bear their times what those give."""
+        return TimedOdometry.num_rows if self.frame_times else int(self.base_motion)
 
     @property
     def supervision(self) -> dict[str, float]:

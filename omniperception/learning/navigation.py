@@ -15,7 +15,6 @@ from torch import nn
 from omniperception.avoidance.navigation import navigation_inputs, num_inputs
 from omniperception.avoidance.velocity_risk import VelocityRisk
 
-NUM_SECTORS = 36
 MOTION, ASKED = "motion", "asked"
 """Groups of observations: the robot's own velocity, and what its gait is asked for, (n, 3) each."""
 
@@ -60,7 +59,7 @@ class NavigationConfig:
 
     def build_network(self) -> Corrected:
         """From `navigation_inputs` to velocities."""
-        width = num_inputs(NUM_SECTORS, self.risk)
+        width = num_inputs(self.risk)
         return Corrected(MLP(width, 3, list(self.hidden_dims), "elu"), 3)
 
 
@@ -88,7 +87,7 @@ class NavigationActor(MLPModel):
         super().__init__(obs, *args, **mlp_options)
         if self.obs_normalization:
             raise ValueError("ppo.obs_normalization=true scales the choice that navigation corrects; set it to false")
-        expected = num_inputs(NUM_SECTORS, navigation.risk)
+        expected = num_inputs(navigation.risk)
         if self.obs_dim != expected:
             raise ValueError(
                 f"a navigation policy reads the {expected} numbers of NavigationView alone, and observes {self.obs_dim}"

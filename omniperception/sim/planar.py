@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 
-from omniperception.common.random import EnvRandom
 from omniperception.common.shell import command_line
 from omniperception.scene import World
 from omniperception.sim.base import Simulator
@@ -59,7 +58,7 @@ class PlanarConfig:
         return torch.device("cpu")
 
     def build(self, world: World, num_envs: int, record_states: bool = False) -> Simulator:
-        """`num_envs` robots in a world, which draw from streams of their own until `draw_by`."""
+        """`num_envs` robots in a world, which draw from streams of their own until `PlanarSimulator.draw_by`."""
         from omniperception.sim.planar_world import PlanarSimulator  # with Warp, which not every task loads
 
         response = GaitResponse.load(Path(self.response))
@@ -71,10 +70,3 @@ class PlanarConfig:
                 f" sim.under, or measure it: {line}"
             )
         return PlanarSimulator(world, self, response, num_envs)
-
-    def draw_by(self, sim: Simulator, random: EnvRandom) -> None:
-        """Lets the robots of a simulator that this has built draw from an environment's streams."""
-        from omniperception.sim.planar_world import PlanarSimulator
-
-        assert isinstance(sim, PlanarSimulator)
-        sim.draw_by(random)

@@ -11,7 +11,7 @@ import warp as wp
 
 from omniperception.common.launch import launch_over_envs, view
 from omniperception.common.random import Branch, EnvRandom
-from omniperception.common.rotations import multiply, rotate, rotate_yaw, yaw_of, yaw_quat
+from omniperception.common.rotations import matrix_of, multiply, rotate, rotate_yaw, yaw_of, yaw_quat
 from omniperception.scene import World
 from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.scene.terrain import TerrainConfig
@@ -45,13 +45,7 @@ class PlanarSimulator:
 
     ground_pos: torch.Tensor | None = None
 
-    def __init__(
-        self,
-        world: World,
-        config: PlanarConfig,
-        response: GaitResponse,
-        num_envs: int,
-    ) -> None:
+    def __init__(self, world: World, config: PlanarConfig, response: GaitResponse, num_envs: int) -> None:
         if not isinstance(world.terrain, TerrainConfig):
             raise ValueError("sim=planar has flat ground alone; use terrain=flat, or sim=mujoco")
         self.world, self.config, self.num_envs, self.response = world, config, num_envs, response
@@ -107,7 +101,7 @@ class PlanarSimulator:
         """Draws responses and errors from streams of these from now on."""
         self._random = random.branch("response")
 
-    def meet(self, field: ObstacleField) -> None:
+    def set_obstacles(self, field: ObstacleField) -> None:
         """Takes in the obstacles, whose outlines the robots touch."""
         self._field = field
 
@@ -277,8 +271,6 @@ class PlanarSimulator:
         return self._links[bodies].poses(self.qpos, self._in_cycle, self.mocap_pos, self.mocap_quat)
 
     def geom_poses(self, geoms: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
-        from omniperception.common.rotations import matrix_of
-
         model = self.world.model
         pos, quat = self.body_poses(tuple(int(model.geom_bodyid[k]) for k in geoms))
         index = list(geoms)

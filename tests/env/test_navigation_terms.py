@@ -27,6 +27,7 @@ def state(velocity=(0.0, 0.0), wanted=(1.0, 0.0, 0.0), turn=0.0, around=None, ta
     kinematics = SimpleNamespace(
         base_lin_vel_yaw=torch.tensor([velocity]),
         base_ang_vel_b=torch.tensor([[0.0, 0.0, turn]]),
+        planar_velocity=torch.tensor([[*velocity, turn]]),
         projected_gravity_b=torch.tensor([[0.0, 0.0, upright]]),
     )
     targets = tuple(torch.tensor([target]) for target in (targets or [(0.0, 0.0, 0.0)] * 2))
@@ -49,7 +50,7 @@ def state(velocity=(0.0, 0.0), wanted=(1.0, 0.0, 0.0), turn=0.0, around=None, ta
     ],
 )
 def test_progress(velocity, wanted, earned):
-    found = rewards.progress_along_command(state(velocity, wanted), enough=0.7)
+    found = rewards.progress(state(velocity, wanted), enough=0.7)
     assert found.tolist() == pytest.approx([earned], abs=1e-5)
 
 
@@ -125,7 +126,7 @@ class TestInputs:
 
     def test_nothing_around_is_the_command_and_no_risk(self):
         found = self.given(sectors())
-        assert len(found) == num_inputs(36, RISK) == 3 + 144 + 9 + 109
+        assert len(found) == num_inputs(RISK) == 3 + 144 + 9 + 109
         assert found[:3].tolist() == pytest.approx([1.0, 0.0, 0.3])
         assert not found[3:147].any() and not found[156:].any()
         assert found[147:156].tolist() == pytest.approx([1.0, 0.0, 0.3, 0.5, 0.1, 0.2, 0.6, 0.0, 0.1])

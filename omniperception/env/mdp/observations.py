@@ -187,8 +187,8 @@ class NavigationView(StatefulTerm):
             self._begin(state)
         assert self._candidates is not None
         sectors = state.sectors if self._errors is None else self._with_errors(state, self._errors)
-        velocity = planar_velocity(state)
-        return navigation_inputs(sectors, state.reference, velocity, state.asked, self._risk, self._candidates)
+        velocity, asked = state.measured.planar_velocity, state.asked
+        return navigation_inputs(sectors, state.reference, velocity, asked, self._risk, self._candidates)
 
     def _begin(self, state: EnvState) -> None:
         self._candidates = self._risk.candidates(state.device)
@@ -229,8 +229,7 @@ def true_sectors(state: EnvState) -> torch.Tensor:
 def true_motion(state: EnvState) -> torch.Tensor:
     """(num_envs, 6) v_x, v_y (m/s, yaw-aligned frame) and yaw rate (rad/s), and what the gait is asked for now:
     privileged."""
-    k = state.kinematics
-    return torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:], state.asked), 1)
+    return torch.cat((state.kinematics.planar_velocity, state.asked), 1)
 
 
 def way_to_goal(state: EnvState, unit: float) -> torch.Tensor:
@@ -253,8 +252,7 @@ def drawn_response(state: EnvState) -> torch.Tensor:
 @mirrors((1.0, -1.0, -1.0))
 def planar_velocity(state: EnvState) -> torch.Tensor:
     """v_x, v_y (m/s, yaw-aligned frame) and yaw rate (rad/s), as measured."""
-    measured = state.measured
-    return torch.cat((measured.base_lin_vel_yaw, measured.base_ang_vel_b[:, 2:]), 1)
+    return state.measured.planar_velocity
 
 
 @mirrors((1.0, -1.0, -1.0))

@@ -35,12 +35,13 @@ def yaw_rate_tracking(state: EnvState, beta: float) -> torch.Tensor:
     return torch.exp(-beta * error.square())
 
 
-def progress(state: EnvState) -> torch.Tensor:
-    """v_xy along v_ref, at most |v_ref|, m/s: below 0 for a robot that backs off, 0 where none is asked for."""
+def progress(state: EnvState, enough: float = 1.0) -> torch.Tensor:
+    """v_xy along v_ref, in units of `enough` and at most |v_ref|, m/s: below 0 for a robot that backs off, 0 where none
+    is asked for. With an `enough` below 1 that share of the speed earns all, so that there is time to go round."""
     wanted = state.reference[:, :2]
     speed = wanted.norm(dim=1)
     along = (state.kinematics.base_lin_vel_yaw * wanted).sum(1) / speed.clamp(min=1e-6)
-    return torch.minimum(along, speed)
+    return torch.minimum(along, enough * speed) / enough
 
 
 def velocity_error(state: EnvState) -> torch.Tensor:
@@ -239,21 +240,10 @@ def alive(state: EnvState) -> torch.Tensor:
     return torch.ones(state.num_envs, device=state.device)
 
 
-def progress_along_command(state: EnvState, enough: float) -> torch.Tensor:
-    """v_xy along v_ref as a share of |v_ref|, in m/s of a command of 1 m/s; more than `enough` of it earns no more, so
-    that there is time to go round. 0 where none is asked for."""
-    wanted = state.reference[:, :2]
-    speed = wanted.norm(dim=1)
-    along = (state.kinematics.base_lin_vel_yaw * wanted).sum(1) / speed.clamp(min=1e-6)
-    return torch.minimum(along, enough * speed) / enough
-
-
 def deviation_while_free(state: EnvState, within: float) -> torch.Tensor:
     """|v - v_ref|^2, (m/s)^2 and (rad/s)^2, where no obstacle is nearer than `within` (m)."""
-    k = state.kinematics
-    velocity = torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:]), 1)
     free = (state.sectors[..., 0] > within).all(1)
-    return (velocity - state.reference).square().sum(1) * free
+    return (state.kinematics.planar_velocity - state.reference).square().sum(1) * free
 
 
 def deviation(state: EnvState) -> torch.Tensor:

@@ -261,8 +261,7 @@ class RingPath(nn.Module):
         ages = None if times is None else self._ages(times)
         if self.match is not None:
             rings = torch.cat((rings, self._matched(rings, self.match, ages)), 1)
-        if ages is not None:
-            assert times is not None
+        if times is not None and ages is not None:
             age = times[:, self.shape.history - 1 :, 0].flatten()[:, None]
             known = torch.cat((age, ages), 1)[..., None].expand(-1, -1, rings.shape[-1])
             rings = torch.cat((rings, known), 1)
