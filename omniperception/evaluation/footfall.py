@@ -96,7 +96,7 @@ def watch(env: OmniEnv, policy: Policy) -> Footfall:
             if step * env.control_dt >= SETTLES_S:
                 k = env.state.kinematics
                 contact.append(env.state.foot_contact.cpu())
-                velocity.append(torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:]), 1).cpu())
+                velocity.append(k.planar_velocity.cpu())
     mean = torch.stack(velocity).mean(0)
     return Footfall(wanted.cpu(), fell, torch.stack(contact), mean, env.control_dt, env.robot.foot_names)
 

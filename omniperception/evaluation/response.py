@@ -127,7 +127,7 @@ def record(env: OmniEnv, policy: Policy, ranges: Ranges, seconds: int) -> Record
 
     for step, asked in enumerate(driven(env, policy, target, seconds * every)):
         k, done = env.state.kinematics, env.done.cpu()
-        velocity = torch.cat((k.base_lin_vel_yaw, k.base_ang_vel_b[:, 2:]), 1)
+        velocity = k.planar_velocity
         rows.append([one.cpu() for one in (asked, velocity, _pose(env), _phase(env))] + [done])
         ended |= done
         fallen |= done & ~env.outcomes["time_out"].cpu()
