@@ -20,7 +20,8 @@ def pytest_configure(config):
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     build.seed_everything(0)
-    for logger in list(logging.Logger.manager.loggerDict.values()):  # another test may have let Hydra silence them
+    logging.root.setLevel(logging.WARNING)  # a sweep of another test may have let Hydra silence all
+    for logger in list(logging.Logger.manager.loggerDict.values()):
         if isinstance(logger, logging.Logger):
             logger.disabled = False
 
