@@ -23,8 +23,8 @@ def held_out_worlds():
 
 
 def test_no_family_is_missed():
-    assert len(FAMILIES) == 12 and len(HELD_OUT) == 19
-    everything = build.assemble(config.compose([*BLIND, "family=all", "num_envs=24"]))
+    assert len(FAMILIES) == 13 and len(HELD_OUT) == 19
+    everything = build.assemble(config.compose([*BLIND, "family=all", "num_envs=26"]))
     assert sorted(everything.families) == FAMILIES
     assert {task.num_envs for task in everything.family_envs().values()} == {2}
 
@@ -39,7 +39,10 @@ def test_every_family_composes_builds_and_steps(name):
     assert torch.isfinite(rewards).all() and not env.contacts.any()
     assert task.obstacles.curriculum is None and task.obstacles.split == "dev"
     assert task.obstacles.num_obstacles >= 6  # as many as critics observe
-    assert task.commands.speeds == (0.7, 1.3)
+    if name == "driven":  # velocities, as far as the gait goes, and none
+        assert task.commands.lin_vel_x == (-1.0, 2.0) and task.commands.standing == 0.2
+    else:
+        assert task.commands.speeds == (0.7, 1.3)
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -55,11 +58,11 @@ def test_no_family_is_a_world_of_the_held_out_suite(name, held_out_worlds):
 
 def test_all_of_them_go_beside_each_other(make_config):
     nearest = "observations.groups.privileged.terms.nearest_obstacles={count: 6, max_distance: 4.0}"
-    run = make_config(*BLIND, "family=all", "num_envs=12", nearest)
+    run = make_config(*BLIND, "family=all", "num_envs=13", nearest)
     env = MixedEnv(run.family_envs())
     for _ in range(2):
-        _, rewards, _, _ = env.step(torch.zeros(12, env.num_actions))
-    assert env.observations["privileged"].shape == (12, 34 + 36) and torch.isfinite(rewards).all()
+        _, rewards, _, _ = env.step(torch.zeros(13, env.num_actions))
+    assert env.observations["privileged"].shape == (13, 34 + 36) and torch.isfinite(rewards).all()
 
 
 def walls_and_people(env):
@@ -97,7 +100,7 @@ def test_people_stay_in_the_corridor_of_their_world(make_config):
 
 
 def test_people_of_all_speeds():
-    everything = build.assemble(config.compose([*BLIND, "family=all", "num_envs=12"]))
+    everything = build.assemble(config.compose([*BLIND, "family=all", "num_envs=13"]))
     groups = [group for family in everything.families.values() for group in family.obstacles.groups.values()]
     people = [group.speed for group in groups if group.moves]
     assert min(low for low, _ in people) <= 0.3 and max(high for _, high in people) == 2.5
