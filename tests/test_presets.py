@@ -39,7 +39,7 @@ LEARNING = ("perception/", "ppo/", "experiment/", "observations/")
 
 
 def test_no_preset_is_missed():
-    assert len(PRESETS) == 161
+    assert len(PRESETS) == 163
     groups = {preset.split("/")[0] for preset in PRESETS}
     assert groups == {path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir()} - NO_PRESETS
     assert set(COMPANIONS) <= set(PRESETS)
