@@ -267,17 +267,20 @@ class PerceptionActor(EstimatingModel):
             command, velocity, last_asked: (B, 3) v_x, v_y (m/s) and yaw rate (rad/s).
         """
         assert self.navigation is not None and self.max_change is not None
-        risks = self._said_risks(features, has_frame)
+        risks = self._known_risks(features, has_frame)
         wanted = self.navigation(self.sectors(features, has_frame), command, velocity, last_asked, risks)
         wanted = torch.where(has_frame[:, None], wanted, command)
         linear = moved_towards(last_asked[:, :2], wanted[:, :2], self.max_change)
         turn = last_asked[:, 2:] + (wanted - last_asked)[:, 2:].clamp(-self._max_turn, self._max_turn)
         return torch.cat((linear, turn), 1)
 
-    def _said_risks(self, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor | None:
-        """(B, K) risks as the network says them, 0 without a frame; None where they follow from the sectors."""
-        assert isinstance(self.read_out, MotionReadOut)
-        return None if self.read_out.risk_part is None else self.read_out.risks(features) * has_frame[:, None]
+    def _known_risks(self, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor | None:
+        """(B, K) risks of navigation's candidates, 0 without a frame; None where the read-out has others."""
+        assert isinstance(self.read_out, MotionReadOut) and self.navigation is not None
+        if self.navigation.risk != self.read_out.velocity_risk:
+            return None
+        extended = features if features.shape[1] > self._feature_dim else self.read_out.extend(features)
+        return extended[:, self._feature_dim :] * has_frame[:, None]
 
     def _velocity(self, groups: TensorDict) -> torch.Tensor:
         """(B, 3) the robot's own velocity as observed."""
@@ -347,7 +350,7 @@ class PerceivingNavigator(PerceptionActor):
                 groups, features, has_frame = obs.groups, self.embed(obs), obs.step_count > 0
             else:
                 groups, features, has_frame = obs, self.embed_newest(obs), obs["frame_count"].squeeze(-1) > 0
-            sectors, risks = self.sectors(features, has_frame), self._said_risks(features, has_frame)
+            sectors, risks = self.sectors(features, has_frame), self._known_risks(features, has_frame)
             return self.navigation.inputs(sectors, groups[COMMAND], groups[MOTION], groups[ASKED], risks)
 
     def _begin_blind(self) -> None:

@@ -150,6 +150,27 @@ class Simulator(Protocol):
         """Recomputes what the engine derives from model fields that were written for environments `env_ids` (n,)."""
 
 
+class Failures:
+    """The part of a simulator that keeps which simulations failed."""
+
+    failure: torch.Tensor
+
+    @property
+    def failed(self) -> torch.Tensor:
+        """(num_envs,) bool."""
+        return self.failure != Failure.NONE
+
+    def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
+        """See :meth:`Simulator.mark_failed`."""
+        self.failure.copy_(torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure))
+
+    def mark_beyond_limits(self, speed: torch.Tensor, distance: torch.Tensor) -> None:
+        """Marks simulations by their largest velocity and position (num_envs,), which are not finite or too large."""
+        self.mark_failed(~torch.isfinite(speed + distance), Failure.NOT_FINITE)
+        self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
+        self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
+
+
 class SizedGeoms:
     """Geoms of a model that are resized together.
 

@@ -11,7 +11,7 @@ from mujoco.batch import Batch, SimulationError
 
 from omniperception.lidar.launch import default_num_threads
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointColumns, Simulator, SizedGeoms
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, Failures, JointColumns, Simulator, SizedGeoms
 
 _INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -77,7 +77,7 @@ class SimConfig:
         return MujocoSimulator(world, self, num_envs, record_states)
 
 
-class MujocoSimulator:
+class MujocoSimulator(Failures):
     """`num_envs` simulations on a native thread pool; only what is asked for is copied out of the engine.
 
     State tensors are views of the engine's own memory. Contact sensors and torques describe the state before the last
@@ -124,10 +124,6 @@ class MujocoSimulator:
             pose = self.qpos[:, first : first + 3], self.qpos[:, first + 3 : first + 7]
             roots[int(model.jnt_bodyid[joint])] = pose
         return roots
-
-    @property
-    def failed(self) -> torch.Tensor:
-        return self.failure > Failure.NONE
 
     def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self._joints.state(self.qpos.float(), self.qvel.float())
@@ -192,17 +188,12 @@ class MujocoSimulator:
         widths = {"sensordata": model.nsensordata, "qpos": model.nq, "qvel": model.nv}
         return {name: np.zeros((self.num_envs, num_steps, widths[name])) for name in self._record}
 
-    def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
-        self.failure.copy_(torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure))
-
     def detect_failures(self) -> None:
         """Looks at speed, position and the engine's warnings, at which a simulation stops until the call's end."""
         speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
         warned = torch.from_numpy(self.batch.warning[..., 1].any(1))
         if not bool(((speed < MAX_SPEED) & (distance < MAX_DISTANCE) & ~warned).all()):
-            self.mark_failed(~torch.isfinite(speed + distance), Failure.NOT_FINITE)
-            self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
-            self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
+            self.mark_beyond_limits(speed, distance)
             self.mark_failed(warned, Failure.ENGINE)
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:

@@ -15,7 +15,7 @@ import warp as wp
 
 from omniperception.lidar.launch import wp_device
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, JointColumns, SizedGeoms
+from omniperception.sim.base import Failure, Failures, JointColumns, SizedGeoms
 from omniperception.sim.kernels import move_kinematic, record, turn_kinematic
 from omniperception.sim.mujoco import SimConfig, apply_options
 
@@ -109,7 +109,7 @@ class Capacity:
         return cls(contacts, min(convex, contacts), rows)
 
 
-class MujocoWarpSimulator:
+class MujocoWarpSimulator(Failures):
     """`num_envs` worlds on one device; every tensor is a view of the engine's own float32 memory.
 
     A call of `step` is one CUDA graph on a GPU: the obstacles' way, the physics steps and the recording of what
@@ -164,10 +164,6 @@ class MujocoWarpSimulator:
         self._constants: Constants | None = None
         self._allocate_steps(config.decimation)
 
-    @property
-    def failed(self) -> torch.Tensor:
-        return self.failure > Failure.NONE
-
     def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self._joints.state(self.qpos.clone(), self.qvel.clone())
 
@@ -197,15 +193,10 @@ class MujocoWarpSimulator:
             self._turns().copy_(mocap_turn)
             self._launch("steps along the path, turning", self._steps_turning)
 
-    def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
-        self.failure.copy_(torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure))
-
     def detect_failures(self) -> None:
         """Looks at speed and position; the engine itself has no warnings."""
         speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
-        self.mark_failed(~torch.isfinite(speed + distance), Failure.NOT_FINITE)
-        self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
-        self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
+        self.mark_beyond_limits(speed, distance)
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self.qpos[env_ids], self.qvel[env_ids] = self._joints.engine_state(qpos.float(), qvel.float())

@@ -15,7 +15,7 @@ from omniperception.common.rotations import matrix_of, multiply, rotate, rotate_
 from omniperception.scene import World
 from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.scene.terrain import TerrainConfig
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure
+from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, Failures
 from omniperception.sim.planar_kernels import walk
 from omniperception.sim.response import AXES, GaitResponse
 
@@ -28,7 +28,7 @@ NEW_TARGET = 0.3
 robot over."""
 
 
-class PlanarSimulator:
+class PlanarSimulator(Failures):
     """`num_envs` robots that are their outline, base height and attitude, behind the Simulator protocol.
 
     `step` takes velocities (num_envs, 3) in place of joint targets: v_x, v_y (m/s, yaw-aligned frame) and yaw rate
@@ -109,10 +109,6 @@ class PlanarSimulator:
     def drawn_response(self) -> torch.Tensor:
         """(num_envs, 13) gain, lag (s), delay (s), offset (m/s, rad/s) by axis, and radius (m)."""
         return torch.cat((self._gain, self._lag, self._delay, self._offset, self._radius[:, None]), 1)
-
-    @property
-    def failed(self) -> torch.Tensor:
-        return self.failure > Failure.NONE
 
     def robot_state(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self.qpos.clone(), self.qvel.clone()
@@ -290,15 +286,10 @@ class PlanarSimulator:
     def anomalies(self) -> dict[str, float]:
         return {}
 
-    def mark_failed(self, which: torch.Tensor, cause: Failure) -> None:
-        self.failure.copy_(torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure))
-
     def detect_failures(self) -> None:
         speed, distance = self.qvel.abs().amax(1), self.qpos[:, :3].abs().amax(1)
         if not bool(((speed < MAX_SPEED) & (distance < MAX_DISTANCE)).all()):
-            self.mark_failed(~torch.isfinite(speed + distance), Failure.NOT_FINITE)
-            self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
-            self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)
+            self.mark_beyond_limits(speed, distance)
 
     def state_dict(self) -> dict:
         return {"fields": {}, **{name: getattr(self, name).clone() for name in _STATE}}
