@@ -134,7 +134,7 @@ def laid_out(levels: list[list[str]], edges: set[Edge]) -> tuple[dict[str, float
         elif passed:
             long.append(passed)
         ways[a, b] = [a, *passed, b]
-    links = {pair for way in ways.values() if len(way) < 4 for pair in pairwise(way)}
+    links = sorted({pair for way in ways.values() if len(way) < 4 for pair in pairwise(way)})
     for sweep in range(24):
         x = {node: at for row in grid for node, at in _places(row).items()}
         to, of = (0, 1) if sweep % 2 == 0 else (1, 0)
