@@ -99,9 +99,25 @@ def test_files_and_presets_that_a_page_names_exist(page):
     }
 
 
-def test_the_readme_names_every_page():
-    text = (ROOT / "README.md").read_text()
-    assert [page.name for page in PAGES if page.parent.parent == ROOT / "docs" and page.name not in text] == []
+def test_every_page_is_reached_from_the_readme():
+    reached, left = set[Path](), [ROOT / "README.md"]
+    while left:
+        page = left.pop()
+        if page.suffix == ".md" and page not in reached:
+            reached.add(page)
+            left += [(page.parent / path).resolve() for path in re.findall(r"\]\((?!http)([^)#]+)", page.read_text())]
+    assert [
+        str(page.relative_to(ROOT)) for page in PAGES if ROOT / "docs" in page.parents and page not in reached
+    ] == []
+
+
+def test_what_the_architecture_names_exists():
+    named = re.findall(r"`([A-Za-z_][\w.]*)`", (ROOT / "docs" / "guide" / "architecture.md").read_text())
+    sources = [*ROOT.glob("omniperception/**/*.py"), *ROOT.glob("conf/**/*.yaml")]
+    known = set(re.findall(r"\w+", " ".join(path.read_text() for path in sources)))
+    known |= {path.stem for path in ROOT.glob("omniperception/**/*.py")} | {"py", "yaml"}
+    known |= {path.name for path in (ROOT / "omniperception").iterdir()}
+    assert len(named) > 50 and [name for name in named if not set(name.split(".")) <= known] == []
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,5 @@
-"""The docs site: every page and module that it names exists, every page is in it, links out of docs/ are replaced."""
+"""The docs site: every page and module that it names exists, every page is in it, links out of docs/ are replaced, the
+picture of the packages is that of the sources."""
 
 import re
 import sys
@@ -7,6 +8,8 @@ from pathlib import Path
 import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "tools"))
+import draw_packages
 from hooks import outward
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,3 +44,32 @@ def test_links_that_leave_the_docs_lead_to_the_repository():
     there = outward(text, "guide/p.md", "https://example.org/o/r/")
     assert "[a](https://example.org/o/r/blob/main/tests/x.py)" in there and "[b](../lab/y.md)" in there
     assert outward("[r](../README.md)", "index.md", None) == "r"
+
+
+def test_the_picture_of_the_packages_is_that_of_the_sources():
+    names = draw_packages.packages()
+    assert set(names) == set(draw_packages.ROLES), "correct ROLES in docs/tools/draw_packages.py"
+    drawn = draw_packages.picture(draw_packages.imports(), names)
+    assert drawn == draw_packages.PICTURE.read_text(), "python docs/tools/draw_packages.py draws it again"
+
+
+def test_imports_of_packages_are_found_and_ordered(tmp_path):
+    root = tmp_path / "tree"
+    sources = {
+        "__init__.py": "from tree import top",
+        "top.py": "import tree.middle.parts\nfrom tree.bottom import a",
+        "middle/__init__.py": "from . import parts",
+        "middle/parts.py": "from tree import bottom\nfrom ..bottom import b\nimport os",
+        "bottom/__init__.py": "def late():\n    from tree.middle import parts",
+        "notes/read.txt": "import tree.top",
+    }
+    for name, text in sources.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    assert draw_packages.packages(root) == ["bottom", "middle", "top"]
+    found = draw_packages.imports(root)
+    assert found == {("top", "middle"): 1, ("top", "bottom"): 1, ("middle", "bottom"): 2, ("bottom", "middle"): 1}
+    back = draw_packages.against_the_order(found)
+    assert back == {("bottom", "middle")}
+    assert draw_packages.shown(set(found) - back) == {("top", "middle"), ("middle", "bottom")}
+    assert draw_packages.rows(set(found) - back, ["bottom", "middle", "top"]) == [["top"], ["middle"], ["bottom"]]
