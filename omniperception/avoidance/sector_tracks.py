@@ -17,7 +17,7 @@ _NOWHERE = 1e3
 
 @dataclass(frozen=True)
 class TracksConfig:
-    """How frames are matched; the values were chosen on split=dev, see docs/lab/baselines.md.
+    """How frames are matched; the values were chosen on split=dev, see docs/lab/worlds.md.
 
     Attributes:
         link: places of neighbouring sectors belong to one cluster where they are at most this (m) and the width of a

@@ -54,7 +54,7 @@ class VelocityRisk:
     under the weights softmax(-(along^2 + sideways * across^2 + weight * risk) / temperature), where along and across
     (m/s) are how much a candidate deviates from the command in its direction and beside it.
 
-    Beyond the paper, whose V_avoid sees distances alone; see docs/lab/learning.md for what it brings.
+    Beyond the paper, whose V_avoid sees distances alone; see docs/lab/negative.md for what it brings.
 
     Attributes:
         max_speed: of the outermost ring (m/s).

@@ -137,7 +137,7 @@ class PPOConfig:
             another run's weights (init=): advantages by a critic that knows nothing destroy it. Those in which a
             teacher teaches (`distillation`) are among them: there the critic learns as well.
         critic_learning_rate: of the critic's steps, which stay so; None: they are the policy's, which an adaptive
-            schedule makes as small as its trust region asks for (docs/lab/learning.md, "PPO on top").
+            schedule makes as small as its trust region asks for (docs/lab/negative.md, "PPO on top").
         final_entropy_coef: what entropy_coef changes to, linearly, until max_iterations; None: it stays as it is.
         final_desired_kl: what desired_kl changes to, likewise: smaller steps at the end.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).

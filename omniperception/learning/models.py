@@ -217,7 +217,7 @@ class PerceptionActor(EstimatingModel):
 
     def _precision(self, frames: torch.Tensor) -> AbstractContextManager:
         """In which an update embeds: that of acting with a read-out, as V_avoid makes much of what bfloat16 rounds off
-        (docs/lab/learning.md, "PPO on top"), otherwise the update's."""
+        (docs/lab/negative.md, "PPO on top"), otherwise the update's."""
         return nullcontext() if self.read_out is None else torch.autocast(frames.device.type, enabled=False)
 
     def _extend(self, embedding: torch.Tensor) -> torch.Tensor:

@@ -31,7 +31,7 @@ _SPREAD = 0.15
 
 @dataclass(frozen=True)
 class GeometryConfig:
-    """What is ground, noise and body; the values were chosen on split=dev, see docs/lab/baselines.md.
+    """What is ground, noise and body; the values were chosen on split=dev, see docs/lab/worlds.md.
 
     Attributes:
         reach: distance (m) up to which returns tell where the ground is; what lies farther away stands on the ground of

@@ -56,7 +56,7 @@ def moved_rings(
         (B, W, H * bands * (len(decays) + 1), S), oldest frame first: for each band the proximities exp(-d / decay) of
         the nearest hit in the cell, and its bearing within the sector times the last of them; empty cells are 0.
 
-    An exporter traces torch operations in place of the kernel, which is 2.4 times as fast (docs/lab/one_form.md).
+    An exporter traces torch operations in place of the kernel, which is 2.4 times as fast (docs/lab/perception.md).
     """
     if torch.jit.is_tracing() or torch.onnx.is_in_onnx_export() or cells.is_meta:
         return _moved_rings(cells, moved, count, shape, since)

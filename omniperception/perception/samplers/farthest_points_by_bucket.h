@@ -2,7 +2,7 @@
 //
 // The points are sorted into buckets of 32 neighbours. A new pick can only lower the distances in a bucket whose box is
 // nearer to it than the bucket's farthest point is to the picks before it; all other buckets are skipped. Picking 280 points
-// is 1.75 times as fast among 16,000 of them, 1.15 times among 1600 (docs/lab/one_form.md).
+// is 1.75 times as fast among 16,000 of them, 1.15 times among 1600 (docs/lab/perception.md).
 //
 // work is a row of memory for each environment, WORDS_PER_BUCKET of kernels.py for each bucket. CUDA compiles nothing of this.
 inline void farthest_points_by_bucket(array_t<float> x, array_t<float> y, array_t<float> z, array_t<int> picked,

@@ -2,7 +2,7 @@
 
 The one operation of the samplers with a form for each kind of device: on a CPU one thread sorts the distal hits of an
 environment; on a GPU, Warp's segmented sort orders all rays at once, with which sampling takes 1.4 to 1.9 times as long
-on a CPU (docs/lab/one_form.md). A test holds that both give the same points.
+on a CPU (docs/lab/perception.md). A test holds that both give the same points.
 """
 
 from __future__ import annotations
