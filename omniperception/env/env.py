@@ -10,7 +10,6 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
-from omniperception.common.launch import use_threads
 from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
@@ -31,10 +30,15 @@ from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 from omniperception.env.metrics import OUTCOMES, EpisodeMetrics
 from omniperception.env.state import CONTACT_SENSORS, EnvState
+from omniperception.lidar.launch import use_threads
 from omniperception.scene import ObstacleField, build_world
 
 MAX_ACTION = 100.0
 """Actions beyond this magnitude are clipped and counted; a policy that gets here has diverged."""
+
+
+Policy = Callable[[TensorDict], torch.Tensor]
+"""From observations to actions (num_envs, num_actions), without exploration noise."""
 
 
 class OmniEnv(VecEnv):
