@@ -3,7 +3,7 @@
     python scripts/figures.py what=framework,avoidance out=docs/lab
 
 Settings are read from the presets, so the pictures change with them. Scans of the sensors'
-patterns: `omniperception scan` and `pattern_coverage.py`; worlds from above: `evaluate plots=true`; learning curves:
+patterns: `omniperception scan`; worlds from above: `evaluate plots=true`; learning curves:
 `omniperception curves`.
 """
 

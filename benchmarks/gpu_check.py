@@ -9,7 +9,7 @@ steps      one physics step against mj_step; graph replay against the CPU
 syncs      host synchronisations in a control step
 rays       the paper's rendering-time table, also beside the paper's scheme and mujoco_warp.rays
 env        environment steps per second at 4096 environments, by stage
-training   whole PPO iterations of experiment=paper, and memory beside its prediction
+training   whole PPO iterations of experiment=paper, and the memory that they used
 
 Every part writes its tables to `out` as CSV, JSON and Markdown as soon as it has them; `summary.md` tells what ran. No
 part begins after `minutes`. Exit status 0: all good; 1: something failed or was wrong.
@@ -30,7 +30,6 @@ import torch
 import warp as wp
 
 from benchmarks import env as env_benchmark
-from benchmarks import memory
 from benchmarks.harness.table import Table, about, machine_line, write
 from benchmarks.harness.timing import device_barrier
 from benchmarks.lidar.baselines import ONE_MESH
@@ -216,7 +215,7 @@ def _measure_steps(given: Arguments, name: str, *overrides: str) -> Table:
 def measure_training(given: Arguments) -> list[Table]:
     """A few whole iterations at the paper's setting: throughput, collection and update, memory."""
     run = given.run()
-    parts, runner = memory.predict(run), build_runner(run, None)
+    runner = build_runner(run, None)
     runner.learn(1 if given.small else 2)
     seconds, iterations = runner.total_time, 1 if given.small else 10
     runner.learn(iterations)
@@ -226,12 +225,11 @@ def measure_training(given: Arguments) -> list[Table]:
     table = Table("training", title, ("iterations", "s per iteration", "env steps/s"), [(iterations, seconds, rate)])
     met = "met" if rate >= STEPS_PER_SECOND else "NOT MET"
     table.notes = [f"target: {STEPS_PER_SECOND:,.0f} env steps/s: {met}"]
-    used = memory.prediction(parts, run.env.num_envs)
     if given.on_gpu:
         device = runner.env.device
         most = torch.cuda.max_memory_allocated(device) + wp.get_mempool_used_mem_high(wp.get_device(str(device)))
-        used.notes = [f"used at most: {most / 1e6:,.0f} MB (PyTorch's and Warp's allocators)"]
-    return [table, used]
+        table.notes.append(f"memory used at most: {most / 1e6:,.0f} MB (PyTorch's and Warp's allocators)")
+    return [table]
 
 
 PARTS: dict[str, Callable[[Arguments], list[Table]]] = dict(

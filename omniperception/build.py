@@ -22,7 +22,7 @@ from omniperception.common.provenance import made_at
 from omniperception.common.shell import command_line
 from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
 from omniperception.env.mdp.observations import base_ang_vel, base_lin_vel
 from omniperception.env.mdp.randomization import Condition
@@ -45,7 +45,6 @@ from omniperception.sim.planar import PlanarConfig
 
 if TYPE_CHECKING:
     from omniperception.env.sensing import SensorConfig
-    from omniperception.evaluation.episodes import Policy
 
 
 FAMILY_STRIDE = 1009

@@ -66,8 +66,10 @@ NAMES: dict[str, Kind] = {
     ),
     "terrain.tiles.*": Kind(_members("scene.tiles", rough="Rough", slope="Slope", stairs="Stairs", stones="Stones")),
     "obstacles.groups.*.layout": Kind(
-        _members("scene.layouts", maze="MazeLayout", blocks="BlocksLayout", barn="BarnLayout")
-        | _members("scene.layouts", corridor="CorridorLayout")
+        _members("scene.layouts.maze", maze="MazeLayout")
+        | _members("scene.layouts.corridor", corridor="CorridorLayout")
+        | _members("scene.layouts.blocks", blocks="BlocksLayout")
+        | _members("scene.layouts.barn", barn="BarnLayout")
     ),
     "sim": Kind(
         _members("sim.mujoco", mujoco="SimConfig")

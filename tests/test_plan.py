@@ -1,24 +1,20 @@
-"""What a configuration does not need does not exist in it, and the plan tells what does, by looking."""
+"""What a configuration does not need does not exist in it, and the plan tells what does."""
 
 import json
 import os
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 import torch
 import warp as wp
-import yaml
 
-from omniperception import build, config
-from omniperception.commands.plan import command, plan_of
+from omniperception.commands.plan import build_parts, command
 from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid
 from omniperception.lidar.launch import SplitLaunch
-from omniperception.plan import PLAN_FILE, contact_pairs, describe, walk
+from omniperception.plan import summary
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = """
@@ -30,58 +26,35 @@ print("FOUND", json.dumps([sorted(sys.modules), torch.cuda.is_initialized()]))
 """
 
 
-@pytest.fixture(scope="module")
-def seeing():
-    return plan_of(["experiment=quickstart"])
+def test_walking_has_no_lidar_no_contact_sensor_and_no_field_of_its_own():
+    parts = build_parts(["experiment=walk", "num_envs=2"])
+    built, left_out = (line.partition(": ")[2].split(", ") for line in summary(parts).splitlines())
+    assert built == ["physics", "rewards", "observations"] and set(left_out) == parts.keys() - set(built)
+    assert {"rays", "contact sensors", "randomized fields", "obstacles", "sectors", "perception"} <= set(left_out)
 
 
-@pytest.fixture(scope="module")
-def blind():
-    """In a process of its own, since modules and recorded launches are of the whole process."""
-    code = "from omniperception.commands.plan import plan_of; import json, dataclasses\n"
-    code += "print(json.dumps(dataclasses.asdict(plan_of(['experiment=walk']))))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def test_walking_has_no_lidar_no_contact_sensor_and_no_field_of_its_own(blind):
-    sections = blind["sections"]
-    assert not sections["rays"] and not sections["kernels"]
-    assert set(sections["stages"]) == {"observations", "physics", "resets", "rewards", "state"}
-    assert set(sections["physics"]) == {"bodies", "geoms", "contact pairs", "actuators"}
-    assert sections["physics"]["contact pairs"] == "19"  # every geom of the robot with the ground
-    assert not {"foot_force", "link_force", "heights", "obstacles"} & set(sections["state"])
-    assert not [name for name in blind["buffers"] if "frames" in name or "sensing" in name or "_fields" in name]
-    unneeded = ("omniperception.lidar.kernels", "omniperception.lidar.sensor", "omniperception.env.sensing")
-    assert not [name for name in sections["modules"] if name.startswith((*unneeded, "mujoco_warp", "matplotlib"))]
-
-
-def test_a_lidar_brings_its_rays_kernels_and_frames(blind, seeing):
-    assert {"cast_scan", "place_shapes", "pick_farthest"} <= set(seeing.sections["kernels"])
-    assert {"rays", "sampling", "obstacles"} <= set(seeing.sections["stages"])
-    assert seeing.sections["rays"]["shapes cylinder"] == "12"  # 4 posts and 8 links that are not in the housing
-    assert seeing.buffers["storage.frames"] == 13 * (5 - 1 + 6) * (64 + 36 * 6) * 3 * 4
-    absent = type(seeing)(**blind).absent(seeing)
-    assert "cast_scan" in absent["kernels"] and "env.sensing.frames" in absent["buffers"]
-    assert "omniperception.env.sensing" in absent["modules"] and "output ranges" in absent["rays"]
+def test_a_lidar_brings_its_rays_and_shapes():
+    parts = build_parts(["experiment=quickstart", "num_envs=2"])
+    assert {"1000 every 5 steps", "cylinder", "plane", "distance"} <= set(parts["rays"])
+    assert parts["contact sensors"] == ["obstacle_contact"] and parts["perception"] and not parts["uneven ground"]
 
 
 @pytest.mark.parametrize(
     ("term", "sensor", "quantity"),
-    [("foot_stumble", "contact sensor foot_force", "foot_force"), ("joint_torque_squared", None, "joint_torque")],
+    [("foot_stumble", "foot_force", "foot_force"), ("joint_torque_squared", None, "joint_torque")],
 )
-def test_a_term_brings_what_it_reads_and_weight_0_removes_it(term, sensor, quantity):
-    base = ("rewards=paper", "perception=none", "lidar.num_rays=50", "obstacles=none", "num_envs=2")
+def test_a_term_brings_what_it_reads_and_weight_0_removes_it(term, sensor, quantity, make_env):
+    base = ("rewards=paper", "perception=none", "lidar.num_rays=50")
     for weight, there in ((-1.0, True), (0.0, False)):
-        sections = plan_of([*base, f"rewards.terms.{term}.weight={weight}"]).sections
-        assert (f"rewards.{term}" in sections["terms"]) == there == (quantity in sections["state"])
-        assert sensor is None or (sensor in sections["physics"]) == there
+        env = make_env(*base, "obstacles=none", f"rewards.terms.{term}.weight={weight}", num_envs=2)
+        env.step(torch.zeros(2, env.num_actions))
+        assert (term in env.config.rewards.terms) == there == env.state.has_computed(quantity)
+        assert sensor is None or (sensor in env.world.sensors) == there
 
 
 def test_only_what_is_randomized_is_a_field_of_its_own():
-    sections = plan_of(["experiment=walk", "randomization.motor_strength=[0.9,1.1]", "num_envs=2"]).sections
-    fields = {name for name in sections["physics"] if name.startswith("model field")}
-    assert fields == {"model field actuator_gainprm", "model field actuator_biasprm"}
+    parts = build_parts(["experiment=walk", "randomization.motor_strength=[0.9,1.1]", "num_envs=2"])
+    assert parts["randomized fields"] == ["actuator_biasprm", "actuator_gainprm"]
 
 
 def test_a_lidar_that_is_not_read_is_not_built(make_env):
@@ -89,23 +62,9 @@ def test_a_lidar_that_is_not_read_is_not_built(make_env):
     assert env.config.lidar is not None and env.sensing is None
 
 
-def test_contact_pairs_are_those_that_the_engine_finds(make_env):
-    model = make_env("obstacles=static", blind=True).world.model
-    obstacles = sum(model.geom(k).name.startswith("obstacle") for k in range(model.ngeom))
-    pairs = set(contact_pairs(model))
-    assert len(pairs) == (model.ngeom - 1 - obstacles) * (1 + obstacles)
-    rng, data, found = np.random.default_rng(0), mujoco.MjData(model), set()
-    for _ in range(300):
-        data.qpos[:7] = [0, 0, 0.1, *rng.normal(size=4)]
-        data.mocap_pos[:] = rng.uniform(-0.4, 0.4, (model.nmocap, 3))
-        mujoco.mj_forward(model, data)
-        found |= {tuple(sorted(pair)) for pair in data.contact.geom.tolist()}
-    assert found and found <= pairs
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("experiment", "sees"), [("walk", False), ("quickstart", True)])
-def test_training_saves_the_plan_and_imports_no_extras(experiment, sees, tmp_path):
+def test_training_says_what_is_built_and_imports_no_extras(experiment, sees, tmp_path):
     sizes = ["num_envs=8", "ppo.max_iterations=1", "ppo.num_mini_batches=2", "hydra.run.dir=run"]
     code = TRAIN.format(overrides=[f"experiment={experiment}", *sizes])
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -115,27 +74,18 @@ def test_training_saves_the_plan_and_imports_no_extras(experiment, sees, tmp_pat
     modules, cuda = json.loads(found.removeprefix("FOUND "))
     extras = {"matplotlib", "trimesh", "viser", "onnx", "onnxruntime", "imageio_ffmpeg", "mujoco_lidar", "mujoco_warp"}
     assert not cuda and not extras & set(modules)
-    assert ("omniperception.lidar.sensor" in modules) == sees
-    saved = yaml.safe_load((tmp_path / "run" / PLAN_FILE).read_text())
-    assert saved["num_envs"] == 8 and bool(saved["sections"]["rays"]) == sees
-    assert sum(line.startswith("plan: ") for line in done.stdout.splitlines()) == 1
+    unneeded = {"omniperception.lidar.kernels", "omniperception.lidar.sensor", "omniperception.env.sensing"}
+    assert (unneeded <= set(modules)) == sees == bool(unneeded & set(modules))
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("built: "))
+    assert ("rays" in line.split(", ")) == sees
 
 
-def test_memory_counts_every_byte_once():
-    base = torch.zeros(6, 4)
-    runner = build.build_runner(build.assemble(config.compose(["experiment=walk", "num_envs=2"])), None)
-    runner.env.extra = [base, base[1:], base.numpy()]
-    assert len([name for name in walk({"env": runner.env}) if "extra" in name]) == 3
-    assert [size for name, size in describe(runner).buffers.items() if "extra" in name] == [96]
-
-
-def test_the_plan_is_saved_and_the_command_prints_it(seeing, tmp_path, capsys):
-    seeing.save(tmp_path)
-    assert yaml.safe_load((tmp_path / PLAN_FILE).read_text()) == asdict(seeing)
-    assert "\n" not in seeing.summary()
+def test_the_command_prints_what_is_built_and_what_another_recipe_has(capsys):
     command(["experiment=walk", "beside=quickstart", "num_envs=2"])
     out = capsys.readouterr().out
-    assert "  + rewards.velocity_tracking " in out and "  - shapes cylinder" in out
+    assert "+ rewards: velocity_tracking 2, " in out and "- rays: 1000 every 5 steps, " in out
+    command(["experiment=walk", "beside=null", "num_envs=2"])
+    assert "- rays\n" in capsys.readouterr().out
 
 
 # --- what is computed and compiled ------------------------------------------------------------------------------------

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from omniperception import build, config
+from omniperception import build, config, publish
 from omniperception.build import build_runner, load_policy
 from omniperception.common import provenance
-from omniperception.deploy import publish
 from omniperception.evaluation.baselines import prepared
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.learning import latest_checkpoint

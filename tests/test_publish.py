@@ -7,10 +7,9 @@ import shutil
 import pytest
 import torch
 
-from omniperception import build, config
+from omniperception import build, config, publish
 from omniperception.build import build_runner, load_policy
 from omniperception.common import provenance
-from omniperception.deploy import publish
 from omniperception.learning.checkpoint import (
     CheckpointError,
     checkpoint_path,

@@ -7,8 +7,8 @@ import warp as wp
 
 from omniperception.avoidance.kernels import nearest_by_sector
 from omniperception.avoidance.sector_motion import nothing_near
-from omniperception.common.launch import launch_over_envs, view
 from omniperception.common.rotations import rotate_yaw
+from omniperception.lidar.launch import launch_over_envs, view
 from omniperception.scene import ObstacleField, ObstaclesConfig
 
 

@@ -139,7 +139,7 @@ class VelocityRisk:
         import warp as wp
 
         from omniperception.avoidance.kernels import largest_risks
-        from omniperception.common.launch import constant, launch_over_envs, view
+        from omniperception.lidar.launch import constant, launch_over_envs, view
 
         sectors = sectors.float().contiguous()
         points = sectors.new_empty(*sectors.shape[:2], 2)
@@ -168,7 +168,7 @@ class VelocityRisk:
         import warp as wp
 
         from omniperception.avoidance.kernels import worst_sectors
-        from omniperception.common.launch import constant, launch_over_envs, view
+        from omniperception.lidar.launch import constant, launch_over_envs, view
 
         place, velocity = place.contiguous(), velocity.contiguous()
         sector = torch.zeros(len(place), len(candidates), dtype=torch.int64, device=place.device)

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omniperception.cli import argument
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, Policy
 from omniperception.evaluation.camera import CAMERAS
-from omniperception.evaluation.episodes import Policy
 from omniperception.evaluation.video_options import VideoOptions
 
 if TYPE_CHECKING:

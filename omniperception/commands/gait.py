@@ -25,9 +25,8 @@ from omniperception.cli import RESULTS, Command, argument, refuse_arguments, ref
 from omniperception.common.errors import ConfigError
 from omniperception.common.figures import PlotsUnavailable, check_figures
 from omniperception.common.tables import markdown
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, Policy
 from omniperception.evaluation import robustness
-from omniperception.evaluation.episodes import Policy
 from omniperception.evaluation.footfall import COMMANDS, SETTLES_S, SHOWN_S, Footfall, draw_footfall, watch
 from omniperception.evaluation.kicks import AFTER_S, WATCHED_S, KickResults, draw_kicks, kick
 from omniperception.evaluation.records import FOLDER, merge

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.cli import Command, argument
-from omniperception.deploy.publish import publish
 from omniperception.learning import CheckpointError
+from omniperception.publish import publish
 
 
 @dataclass(frozen=True, kw_only=True)

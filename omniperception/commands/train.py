@@ -44,7 +44,7 @@ from omniperception.learning import (
 from omniperception.learning.log_writers import LoggerError
 from omniperception.learning.ppo import check_rollout
 from omniperception.learning.progress import say
-from omniperception.plan import Plan, Watch
+from omniperception.plan import parts_of, summary
 from omniperception.schema import words_of
 
 ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
@@ -214,18 +214,13 @@ def learn(
         _report_other_terms(composed, teacher, key)
         runner.alg.learn_from(build.load_teacher(teacher, runner.env, trust))
 
-    def save(plan: Plan) -> None:
-        plan.save(run_dir)
-        runner.logger.say(plan.summary())
+    report(summary(parts_of(runner)))
+    if distributed.rank() == 0 and run.logger is not None and run.logger.video_interval is not None:
+        from omniperception.evaluation.training_videos import TrainingVideos
 
-    if distributed.rank() == 0:
-        Watch(runner, save)
-        if run.logger is not None and run.logger.video_interval is not None:
-            from omniperception.evaluation.training_videos import TrainingVideos
-
-            videos = TrainingVideos(runner, run_dir, run.logger.video_interval, run.logger.video_s)
-            runner.step_hooks.append(videos.step)
-            runner.end_hooks.append(videos.close)
+        videos = TrainingVideos(runner, run_dir, run.logger.video_interval, run.logger.video_s)
+        runner.step_hooks.append(videos.step)
+        runner.end_hooks.append(videos.close)
     runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
     play = command_line("play", *words_of(run_dir, run.composed))
     report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; next: {play}")

@@ -10,7 +10,6 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
-from omniperception.common.launch import use_threads
 from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat
 from omniperception.common.timing import StageTimer
@@ -31,10 +30,15 @@ from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 from omniperception.env.metrics import OUTCOMES, EpisodeMetrics
 from omniperception.env.state import CONTACT_SENSORS, EnvState
+from omniperception.lidar.launch import use_threads
 from omniperception.scene import ObstacleField, build_world
 
 MAX_ACTION = 100.0
 """Actions beyond this magnitude are clipped and counted; a policy that gets here has diverged."""
+
+
+Policy = Callable[[TensorDict], torch.Tensor]
+"""From observations to actions (num_envs, num_actions), without exploration noise."""
 
 
 class OmniEnv(VecEnv):
@@ -115,7 +119,7 @@ class OmniEnv(VecEnv):
             self.curriculum_levels = (1.0,) * len(self._curricula())
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self._spawn = self._spawn_bounds()
-        self._sized = self._find_sized()
+        self._sized = self._resizable_geoms()
         self._frame_heights: torch.Tensor | None = None  # at the newest frame, where only supervision reads heights
         self.rewards = RewardManager(config.rewards.terms, self.state)
         self._groups = {n: ObservationManager(n, g, self.state) for n, g in config.observations.groups.items()}
@@ -276,14 +280,14 @@ class OmniEnv(VecEnv):
             self.sensing.follow(self.state.measured)
             if self.sensing.due(self.step_count):
                 self._sense()
-            elif self._lidar_is_awake():
+            elif self._casts_frames():
                 self.sensing.record_motion(self.step_count)
         if self.avoidance is not None:
             self.avoidance.choose(self.state.reference[:, :2])
 
     def _sense(self) -> None:
         """Casts a frame of the LiDAR, samples it and updates the avoidance velocity."""
-        if self.sensing is None or not self._lidar_is_awake():
+        if self.sensing is None or not self._casts_frames():
             return
         self.sensing.take_frame(self.step_count * self.control_dt, self.state.measured.base_quat_w, self.timer)
         if self.avoidance is not None:
@@ -294,7 +298,7 @@ class OmniEnv(VecEnv):
             with self.timer.stage("heights"):
                 self._frame_heights = self.state.heights
 
-    def _lidar_is_awake(self) -> bool:
+    def _casts_frames(self) -> bool:
         """Tell whether frames are cast: there is a LiDAR, somebody to see them, and the curriculum has an obstacle."""
         something_there = self.obstacles is None or self.obstacles.level > 0.0 or self.obstacles.any_fixed
         return self.sensing is not None and self.config.casts_frames and something_there
@@ -529,7 +533,7 @@ class OmniEnv(VecEnv):
         parts = {name: getattr(self, name) for name in names} | self._managers()
         return {name: part for name, part in parts.items() if part is not None}
 
-    def _find_sized(self) -> tuple[tuple[str, ...], tuple[int, ...], torch.Tensor]:
+    def _resizable_geoms(self) -> tuple[tuple[str, ...], tuple[int, ...], torch.Tensor]:
         """Names, geoms and indices of the parts of obstacles whose sizes differ between environments."""
         names: tuple[str, ...] = ()
         varying: tuple[int, ...] = ()

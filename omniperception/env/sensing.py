@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 
 from omniperception.avoidance.coverage import Coverage, kept_to_covered, least_bins, levelled
-from omniperception.common.launch import constant
 from omniperception.common.rotations import multiply
 from omniperception.common.timing import StageTimer
 from omniperception.env.frame_delivery import FrameDelivery, PastPoses
@@ -27,6 +26,7 @@ from omniperception.lidar import (
     env_slices,
     ray_bytes,
 )
+from omniperception.lidar.launch import constant
 from omniperception.perception import Attitude, Sampler
 from omniperception.scene import RobotConfig
 from omniperception.scene.rays import HitClass, ray_shapes

@@ -1,7 +1,7 @@
 """Evaluation of trained policies: counted episodes with confidence intervals, baselines, pictures and videos."""
 
+from omniperception.common.statistics import wilson
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.statistics import wilson
 
 __all__ = ["Episodes", "run_episodes", "wilson"]

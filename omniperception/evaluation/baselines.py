@@ -14,12 +14,11 @@ from omniperception.avoidance.true_sectors import TrueSectors
 from omniperception.avoidance.velocity import COMMAND, AvoidanceConfig, avoidance_velocity
 from omniperception.config import read
 from omniperception.env.config import EnvConfig
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.mdp.commands import VelocityCommandConfig
 from omniperception.env.odometry import Odometry
 from omniperception.env.sensing import SensorConfig
 from omniperception.env.state import MEASURED_CLOUD
-from omniperception.evaluation.episodes import Policy
 from omniperception.perception import Attitude
 from omniperception.perception.geometry import NUM_SECTORS, GeometryConfig, Nearest, Standing, nearest_obstacles
 from omniperception.scene import RobotConfig

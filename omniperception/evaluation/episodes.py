@@ -5,18 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from tensordict import TensorDict
 
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.mdp.commands import VelocityCommand
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.tally import Tally
 from omniperception.evaluation.tracks import TrackRecorder
 from omniperception.evaluation.walking import WalkingTally
 from omniperception.scene.build import FOOT_FORCE
-
-Policy = Callable[[TensorDict], torch.Tensor]
-"""From observations to actions (num_envs, num_actions), without exploration noise."""
 
 
 def run_episodes(

@@ -11,9 +11,8 @@ import torch
 from omniperception.avoidance.velocity import COMMAND
 from omniperception.common.errors import ConfigError
 from omniperception.common.figures import new_figure, save_figure
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.mdp.commands import VelocityCommand, VelocityCommandConfig
-from omniperception.evaluation.episodes import Policy
 
 COMMANDS = (
     (0.0, 0.0, 0.0),

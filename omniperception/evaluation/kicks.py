@@ -10,8 +10,8 @@ import torch
 
 from omniperception.common.figures import new_figure, save_figure
 from omniperception.common.rotations import rotate_yaw
-from omniperception.env.env import OmniEnv
-from omniperception.evaluation.episodes import Policy, run_episodes
+from omniperception.env.env import OmniEnv, Policy
+from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.statistics import rate
 from omniperception.evaluation.tally import trial_numbers
 

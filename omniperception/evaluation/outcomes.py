@@ -51,7 +51,7 @@ class Episodes:
         yaw_rate_error: mean error of the yaw rate (rad/s).
         has_goal: whether the commands lead to a goal.
         weight: of the robot (N).
-        world: int64 number of the world of the obstacles' layout, as in its table and scores; None without a layout.
+        world: int64 number of the world of the obstacles' layout, as in its table; None without a layout.
         us_per_env_step: wall time by stage in microseconds per environment and control step; `policy` is the network,
             `measuring` what is measured here.
         tracks: ways of the robots, where asked for.

@@ -15,9 +15,8 @@ from omniperception.common.errors import ConfigError
 from omniperception.common.figures import new_figure, save_figure
 from omniperception.common.rotations import matrix_of, yaw_quat
 from omniperception.common.vectors import moved_towards
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.mdp.commands import VelocityCommand
-from omniperception.evaluation.episodes import Policy
 from omniperception.sim.response import AXES, Cycle
 
 ACCELERATION = (6.0, 8.0)

@@ -22,8 +22,8 @@ import numpy as np
 
 from omniperception.common.files import write_whole
 from omniperception.common.shell import command_line
+from omniperception.common.statistics import wilson
 from omniperception.deploy.description import FILE, DeployError, checksum
-from omniperception.evaluation.statistics import wilson
 from omniperception.hardware.faults import FAULTS, SENSORS
 
 PROCESS_FAULTS = {

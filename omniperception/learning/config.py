@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from rsl_rl.utils import resolve_nn_activation
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
@@ -17,7 +16,6 @@ from omniperception.learning.distillation import DistillationConfig
 from omniperception.learning.estimator import EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.navigation import NavigationConfig, VelocityInput
-from omniperception.learning.precision import bfloat16_is_faster
 from omniperception.perception import PerceptionNetwork, Sampler
 
 
@@ -131,8 +129,8 @@ class PPOConfig:
         start_std: standard deviation of the actions with which a policy that starts from another run's weights (init=)
             explores; None: what it had there, with which a finished one learns nothing new (docs/lab/end_to_end.md).
         obs_normalization: whether observations are normalised by running statistics.
-        mixed_precision: whether updates multiply matrices in bfloat16; None where that is measured to be faster on a
-            CPU, on a GPU not.
+        mixed_precision: whether updates multiply matrices in bfloat16, which takes half to 1.6 times as long, by the
+            CPU; None, in files of older runs: no.
         critic_warmup: iterations at the beginning in which only the critic learns, for a policy that starts from
             another run's weights (init=): advantages by a critic that knows nothing destroy it. Those in which a
             teacher teaches (`distillation`) are among them: there the critic learns as well.
@@ -217,12 +215,10 @@ class PPOConfig:
             "obs_normalization": self.obs_normalization,
         }
 
-    def algorithm(self, device: torch.device | str) -> dict[str, Any]:
-        """Arguments of rsl_rl's `PPO` for networks on a device."""
-        mixed = self.mixed_precision
-        if mixed is None:
-            mixed = torch.device(device).type == "cpu" and bfloat16_is_faster(torch.get_num_threads())
-        return {name: getattr(self, name) for name in _RSL_RL} | {"use_mixed_precision": mixed}
+    @property
+    def algorithm(self) -> dict[str, Any]:
+        """Arguments of rsl_rl's `PPO`."""
+        return {name: getattr(self, name) for name in _RSL_RL} | {"use_mixed_precision": bool(self.mixed_precision)}
 
 
 _RSL_RL = (

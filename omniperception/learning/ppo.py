@@ -194,7 +194,7 @@ class PerceptivePpo(PPO):
             symmetry_cfg=symmetry if config.mirror is not None else None,
             multi_gpu_cfg=multi_gpu,
             critic_learning_rate=ppo.critic_learning_rate,
-            **ppo.algorithm(device),
+            **ppo.algorithm,
         )
         for name, final in (("entropy_coef", ppo.final_entropy_coef), ("desired_kl", ppo.final_desired_kl)):
             if final is not None:

@@ -73,7 +73,6 @@ class Runner:
         distributed.connect(device)
         self.env, self.config, self.device = env, config, device
         self.alg = PerceptivePpo.build(env, config, device, distributed.multi_gpu())
-        self.alg.use_mixed_precision = distributed.of_first(self.alg.use_mixed_precision)  # it may be a measurement
         actor = self.alg.actor
         if config.estimator is not None and estimates_velocity(env.config.observations):
             env.state.measure_velocity_by(lambda: actor.estimate)
@@ -161,7 +160,6 @@ class Runner:
         state = self.alg.save() | {
             "iteration": self.current_learning_iteration,
             "total_time": self.total_time,
-            "use_mixed_precision": self.alg.use_mixed_precision,
             "logger": self.logger.state_dict(),
             "rng": rng_state(),
             "env": self.env.state_dict(),
@@ -180,8 +178,6 @@ class Runner:
         same_task = state.get("task") == self.config.task
         self.current_learning_iteration, self.total_time = state["iteration"], state["total_time"]
         self.logger.load_state_dict(state["logger"])
-        if self.config.ppo.mixed_precision is None:
-            self.alg.use_mixed_precision = state["use_mixed_precision"]
         if not same_task:
             self.logger.begin_episodes()
             self.env.begin_at_levels_of(state["env"])

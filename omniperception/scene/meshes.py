@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from omniperception.lidar.mesh_files import read_mesh, unit_said
@@ -81,8 +82,6 @@ def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
     if file in MESHES:
         points, unit = MESHES[file](), 0.25
     elif "#" in file and not Path(file).is_file():
-        from omniperception.scene.thing_file import mesh_vertices
-
         points, unit = mesh_vertices(*file.rsplit("#", 1)), None
     else:
         vertices, triangles = read_mesh(file)
@@ -93,3 +92,25 @@ def mesh_points(file: str) -> tuple[np.ndarray, tuple[float, float, float]]:
         raise ValueError(f"obstacles: file={file} is flat; a mesh needs a volume")
     x, y, z = half if unit is None else (unit, unit, unit)
     return (points - (low + high) / 2) / half, (float(x), float(y), float(z))
+
+
+def mesh_vertices(file: str, name: str) -> np.ndarray:
+    """(V, 3) m, of a mesh of a thing, in its geom's frame."""
+    model = compiled(file)
+    names = [model.mesh(k).name for k in range(model.nmesh)]
+    if name not in names:
+        raise ValueError(f"obstacles: file={file}#{name}: it has meshes {', '.join(names) or 'none'}")
+    mesh = names.index(name)
+    first = model.mesh_vertadr[mesh]
+    return model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(np.float64)
+
+
+@cache
+def compiled(file: str) -> mujoco.MjModel:
+    """The model of an MJCF or URDF file."""
+    if not Path(file).is_file():
+        raise ValueError(f"obstacles: file={file} does not exist (working directory: {Path.cwd()})")
+    try:
+        return mujoco.MjModel.from_xml_path(file)
+    except ValueError as error:
+        raise ValueError(f"obstacles: file={file} cannot be read: {' '.join(str(error).split())}") from None

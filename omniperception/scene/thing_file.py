@@ -9,6 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from omniperception.scene.meshes import compiled, mesh_vertices
 from omniperception.scene.parts import PartConfig, SwingConfig
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
@@ -38,7 +39,7 @@ def parts_of(file: str, frequency: float) -> dict[str, PartConfig]:
     Raises:
         ValueError: one line that names the file, the element and what was expected.
     """
-    model = _compiled(file)
+    model = compiled(file)
     data = mujoco.MjData(model)
     for joint in range(model.njnt):
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
@@ -49,27 +50,6 @@ def parts_of(file: str, frequency: float) -> dict[str, PartConfig]:
         raise ValueError(f"obstacles: file={file} has no geom that can touch something (contype or conaffinity)")
     names = [_name(model, k) for k in geoms]
     return {name: _part(file, model, data, k, frequency) for name, k in zip(names, geoms, strict=True)}
-
-
-def mesh_vertices(file: str, name: str) -> np.ndarray:
-    """(V, 3) m, of a mesh of a thing, in its geom's frame."""
-    model = _compiled(file)
-    names = [model.mesh(k).name for k in range(model.nmesh)]
-    if name not in names:
-        raise ValueError(f"obstacles: file={file}#{name}: it has meshes {', '.join(names) or 'none'}")
-    mesh = names.index(name)
-    first = model.mesh_vertadr[mesh]
-    return model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(np.float64)
-
-
-@cache
-def _compiled(file: str) -> mujoco.MjModel:
-    if not Path(file).is_file():
-        raise ValueError(f"obstacles: file={file} does not exist (working directory: {Path.cwd()})")
-    try:
-        return mujoco.MjModel.from_xml_path(file)
-    except ValueError as error:
-        raise ValueError(f"obstacles: file={file} cannot be read: {' '.join(str(error).split())}") from None
 
 
 def _name(model: mujoco.MjModel, geom: int) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import queue
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from omniperception.config import ConfigError
 from omniperception.env.sensing import SensorConfig
 from omniperception.lidar import (
     AngularJitter,
@@ -32,7 +30,7 @@ from omniperception.viewer.clock import Clock
 from omniperception.viewer.colours import scale
 from omniperception.viewer.meshes import triangles
 from omniperception.viewer.options import PageOptions, Room
-from omniperception.viewer.page import check_free, close_page, open_page
+from omniperception.viewer.page import Page, check_free, open_page
 
 DT = 0.02
 """Time (s) between two poses of everything."""
@@ -233,13 +231,12 @@ class Bench:
         scene.body_quat[0, self._own] = torch.stack((c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w), 1)
 
 
-class Lab:
+class Lab(Page):
     """The page of the scan lab.
 
     Attributes:
         bench: the sensor and what is around it.
         clock: paces the steps.
-        message: the newest line for whoever looks.
     """
 
     def __init__(
@@ -250,10 +247,8 @@ class Lab:
         self.name = next(iter(sensors))
         sensor = sensors[self.name]()
         self.bench = Bench(room, sensor, Knobs.of(sensor))
-        self.server = open_page(options, "Scan lab")
+        super().__init__(open_page(options, "Scan lab"))
         self.clock = Clock(DT, PICTURE_HZ)
-        self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
-        self._stopped, self._status_due, self.message = False, 0.0, ""
         self.coloured_by, self.point_size = COLOURED_BY[0], 0.02
         self._sliders: dict[str, Any] = {}
         self._bodies: list[tuple[int, Any]] = []
@@ -269,7 +264,7 @@ class Lab:
         self.clock.start()
         try:
             while not self._stopped and time.monotonic() < end:
-                self._serve_requests()
+                self.serve_requests()
                 if self.bench.step():
                     self._draw_points()
                 wait = self.clock.stepped()
@@ -280,30 +275,6 @@ class Lab:
                     time.sleep(wait)
         except KeyboardInterrupt:
             print("viewer: ended")
-
-    def stop(self) -> None:
-        """Ends `run`; from any thread."""
-        self._stopped = True
-
-    def close(self) -> None:
-        """Takes the page down."""
-        close_page(self.server)
-
-    def ask(self, request: Callable[[], None]) -> None:
-        """Has something done between two steps; from any thread."""
-        self._requests.put(request)
-
-    def say(self, line: str) -> None:
-        """Shows a line to whoever looks, on the page and in the terminal."""
-        self.message, self._status_due = line, 0.0
-        print(f"viewer: {line}", flush=True)
-
-    def _serve_requests(self) -> None:
-        while not self._requests.empty():
-            try:
-                self._requests.get()()
-            except (ConfigError, ValueError, ImportError, OSError) as error:
-                self.say(f"refused: {' '.join(str(error).split())}")
 
     # ---- what a person asks for --------------------------------------------------------------------------------------
 

@@ -4,18 +4,66 @@ from __future__ import annotations
 
 import errno
 import logging
+import queue
 import socket
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from omniperception.common.errors import ConfigError
 from omniperception.viewer.options import LOCALHOST, PageOptions, ViewerError
 
 if TYPE_CHECKING:
     import viser
 
 PANEL_PIXELS = 440
+
+
+class Page:
+    """A page whose loop does, between two steps, what other threads ask for.
+
+    Attributes:
+        server: the page's.
+        message: the newest line for whoever looks.
+        refused: errors of a request that are told and do not end the loop.
+    """
+
+    refused: tuple[type[Exception], ...] = (ConfigError, ValueError, ImportError, OSError)
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.server, self.message = server, ""
+        self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
+        self._stopped, self._status_due = False, 0.0
+
+    def stop(self) -> None:
+        """Ends `run`; from any thread."""
+        self._stopped = True
+
+    def close(self) -> None:
+        """Takes the page down."""
+        with _quiet():
+            self.server.stop()
+
+    def ask(self, request: Callable[[], None]) -> None:
+        """Has something done between two steps; from any thread."""
+        self._requests.put(request)
+
+    def say(self, line: str) -> None:
+        """Shows a line to whoever looks, on the page and in the terminal."""
+        self.message, self._status_due = line, 0.0
+        print(f"viewer: {line}", flush=True)
+
+    def serve_requests(self) -> bool:
+        """Does what was asked for; whether there was anything."""
+        served = False
+        while not self._requests.empty():
+            served, request = True, self._requests.get()
+            try:
+                request()
+            except self.refused as error:
+                self.say(f"refused: {' '.join(str(error).split())}")
+        return served
 
 
 def open_page(options: PageOptions, title: str) -> viser.ViserServer:
@@ -37,12 +85,6 @@ def open_page(options: PageOptions, title: str) -> viser.ViserServer:
     if options.open_browser:
         webbrowser.open(f"http://{options.host}:{options.port}")
     return server
-
-
-def close_page(server: viser.ViserServer) -> None:
-    """Takes a page down."""
-    with _quiet():
-        server.stop()
 
 
 @contextmanager

@@ -12,10 +12,9 @@ from tensordict import TensorDict
 from omniperception import build
 from omniperception.config import ConfigError
 from omniperception.env.config import FROM_LIDAR, EnvConfig
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.state import AVOIDANCE, MEASURED_CLOUD
 from omniperception.evaluation.baselines import BASELINES, Limits, baseline, commanded_ranges
-from omniperception.evaluation.episodes import Policy
 from omniperception.evaluation.perceived import Perceived, perceived
 from omniperception.learning import Runner, latest_checkpoint
 from omniperception.lidar import Lidar, LidarFrame

@@ -20,7 +20,7 @@ from omniperception.learning.checkpoint import list_checkpoints
 from omniperception.viewer.clock import Clock
 from omniperception.viewer.drive import Stick, Velocity
 from omniperception.viewer.options import SWITCHED, PageOptions, Shown
-from omniperception.viewer.page import check_free, close_page, open_page
+from omniperception.viewer.page import Page, check_free, open_page
 from omniperception.viewer.panels import Panels
 from omniperception.viewer.session import Session
 from omniperception.viewer.stage import STICK_REACH, Stage, turned
@@ -36,7 +36,7 @@ WRONG = (ConfigError, CheckpointError, ValueError, ImportError)
 """What a person can ask for in vain: one line on the page, and what was there goes on."""
 
 
-class Viewer:
+class Viewer(Page):
     """A run in the browser.
 
     Attributes:
@@ -47,8 +47,9 @@ class Viewer:
         stick: what a person commands.
         push_speed: m/s by which a push changes the robot's velocity.
         follows: whether the newest checkpoint of the run is loaded as it appears.
-        message: the newest line for whoever looks.
     """
+
+    refused = WRONG
 
     def __init__(self, shown: Shown, options: PageOptions) -> None:
         """Builds the task, then opens the page; a port that is taken is told at once.
@@ -63,12 +64,11 @@ class Viewer:
         self._options = options
         check_free(options)
         self.session = Session(replace(shown, overrides=self._overrides()))
-        self.server = open_page(options, "OmniPerception")
-        self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
-        self.paused, self._single, self._stopped = False, 0, False
-        self.stick, self.push_speed, self.follows, self.message = Stick(), 0.8, False, ""
+        super().__init__(open_page(options, "OmniPerception"))
+        self.paused, self._single = False, 0
+        self.stick, self.push_speed, self.follows = Stick(), 0.8, False
         self.clock = Clock(self.session.env.control_dt, PICTURE_HZ)
-        self._charts_due = self._status_due = self._look_due = self._lists_due = 0.0
+        self._charts_due = self._look_due = self._lists_due = 0.0
         self._frames_drawn, self._shown_points, self._frames_window = 0, 0, (time.monotonic(), 0)
         self.points_hz = 0.0
         self._redraw = True
@@ -90,7 +90,7 @@ class Viewer:
         self.clock.start()
         try:
             while not self._stopped and time.monotonic() < end:
-                self._serve_requests()
+                self._redraw |= self.serve_requests()
                 if self.paused and not self._single:
                     self._draw_if_due(paused=True)
                     time.sleep(0.02)
@@ -106,36 +106,6 @@ class Viewer:
             print("viewer: ended")
         finally:
             torch.set_num_threads(self._threads)
-
-    def stop(self) -> None:
-        """Ends `run`; from any thread."""
-        self._stopped = True
-
-    def close(self) -> None:
-        """Takes the page down."""
-        close_page(self.server)
-
-    def ask(self, request: Callable[[], None]) -> None:
-        """Has something done between two control steps; from any thread."""
-        self._requests.put(request)
-
-    def say(self, line: str) -> None:
-        """Shows a line to whoever looks, on the page and in the terminal."""
-        self.message = line
-        self._status_due = 0.0
-        print(f"viewer: {line}", flush=True)
-
-    def _serve_requests(self) -> None:
-        while True:
-            try:
-                request = self._requests.get_nowait()
-            except queue.Empty:
-                return
-            self._redraw = True
-            try:
-                request()
-            except WRONG as error:
-                self.say(f"refused: {' '.join(str(error).split())}")
 
     # ---- drawing -----------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import mid360_fit, mid360_misses, real_scans
+from benchmarks import real_scans
 from omniperception.lidar import (
     DEVICES,
     GaussianNoise,
@@ -21,7 +21,7 @@ from omniperception.lidar import (
     write_points,
 )
 from omniperception.lidar.clouds import table_of
-from omniperception.lidar.patterns.mid360_series import LASERS, MEASURED, mid360_model
+from omniperception.lidar.patterns.mid360_series import MEASURED, mid360_model
 
 
 @pytest.fixture(scope="module")
@@ -33,52 +33,6 @@ def frame_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("frames") / "frame.ply"
     write_points(path, table_of(dict(zip("xyz", rows.T, strict=True))))
     return path
-
-
-def test_lasers_are_told_apart_around_a_lost_point(frame_file):
-    shots = mid360_fit.read_shots(frame_file)
-    assert len(shots.lost) == 1 and 6001 - 12 <= shots.lost[0] <= 6001 + 12
-    rows = 41_000 + np.rint(shots.time_s * 2e5).astype(int)
-    true = mid360_model(MEASURED)
-    laser = np.array([LASERS.index(p) for p in shots.laser])
-    assert np.abs(true.elevation.numpy()[rows + laser] - shots.elevation).max() < 1e-5
-
-
-def test_phases_of_a_known_scan_are_found(frame_file):
-    shots = mid360_fit.read_shots(frame_file)
-    found = mid360_fit.start_phases(MEASURED, shots)
-    start = 41_000 / 2e5
-    for phase, rate in ((found.turn_start, 181.033), (found.sweep_start, 9.845)):
-        off = (phase - 2.0 * math.pi * rate * start + math.pi) % (2.0 * math.pi) - math.pi
-        assert off == pytest.approx(0.0, abs=1e-3)
-    assert mid360_fit.angles(found, shots).max() < 0.01
-
-
-def test_the_makers_table_does_not_fit_a_device_that_turns_the_other_way(frame_file):
-    shots = mid360_fit.read_shots(frame_file).every(5)
-    motion = mid360_fit.start_phases(mid360_fit.TABLE, shots)
-    assert np.median(mid360_fit.angles(motion, shots)) > 20.0
-
-
-def test_misses_are_told_by_what_surrounds_them():
-    """A wall 1.1 m ahead of a known scan; every second shot of a laser lost below 8 degrees, none above."""
-    motion, rows = MEASURED, 20_000
-    unit = mid360_model(motion).directions_s[:rows].numpy().astype(float)
-    distance = 1.1 / np.maximum(unit[:, 0], 1e-6)
-    xyz = np.where((distance < 4.0)[:, None], unit * distance[:, None], 0.0)
-    shot, laser = np.arange(rows) // 4, np.arange(rows) % 4
-    lost = (unit[:, 2] < math.sin(math.radians(8.0))) & ((shot + laser) % 2 == 0)
-    xyz[lost] = 0.0
-    rays = mid360_misses.look_around(xyz, (), motion)
-    inside = rays.smooth & (distance < 3.0)
-    np.testing.assert_allclose(rays.around_m[inside], distance[inside], rtol=0.05)
-    np.testing.assert_allclose(rays.incidence_deg[inside], np.degrees(np.arccos(unit[inside, 0])), atol=0.1)
-    by_elevation = [row for row in mid360_misses.by_angle(rays) if row["of"] == "elevation"]
-    shares = {row["from, deg"]: row["0.7 to 1.5 m: misses, %"] for row in by_elevation}
-    assert shares[-2.0] == pytest.approx(50.0, abs=3.0) and shares[18.0] == 0.0
-    low = next(row for row in mid360_misses.by_range(rays) if row["range from, m"] == 1.0)
-    assert low["of misses: laser's shot before missed, %"] == 0.0
-    assert low["shot before that missed, %"] == pytest.approx(100.0, abs=3.0)
 
 
 @pytest.fixture(scope="module")

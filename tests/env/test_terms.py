@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.common import launch
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp import rewards
 from omniperception.env.mdp.terms import RewardTerm, StatefulTerm
 from omniperception.env.state import AirTimes, requires
+from omniperception.lidar import launch
 from omniperception.lidar.launch import default_num_threads
 
 FEET = {

@@ -6,8 +6,7 @@ import pytest
 import torch
 from toy_env import ToyEnv, collect, config, steps_of
 
-from omniperception.learning import PerceptivePpo, TrainingDiverged, precision
-from omniperception.learning import config as learning_config
+from omniperception.learning import PerceptivePpo, TrainingDiverged
 from omniperception.learning.ppo import FIRST_LEARNING_RATE
 
 
@@ -200,26 +199,14 @@ def test_the_critic_warms_up_alone():
         algorithm(env, critic_warmup=-1)
 
 
-class TestPrecision:
-    @pytest.mark.parametrize(("seconds", "chosen"), [((1.0, 0.5), True), ((1.0, 0.9), False), ((1.0, 1.6), False)])
-    def test_the_clearly_faster_one_is_chosen_and_seeds_give_what_they_gave(self, monkeypatch, seconds, chosen):
-        monkeypatch.setattr(precision, "_seconds", lambda network, samples, in_bfloat16: seconds[in_bfloat16])
-        torch.manual_seed(3)
-        expected = torch.rand(4)
-        torch.manual_seed(3)
-        assert precision.bfloat16_is_faster.__wrapped__(1) is chosen
-        assert torch.equal(torch.rand(4), expected)
-
-    def test_it_is_measured_on_a_cpu_alone(self, monkeypatch):
-        monkeypatch.setattr(learning_config, "bfloat16_is_faster", lambda num_threads: True)
-        ppo = config(frames=False, mixed_precision=None).ppo
-        assert ppo.algorithm("cpu")["use_mixed_precision"] is True
-        assert ppo.algorithm("cuda")["use_mixed_precision"] is False
-        assert replace(ppo, mixed_precision=False).algorithm("cpu")["use_mixed_precision"] is False
-
-    def test_both_are_really_run(self):
-        network, samples = torch.nn.Linear(8, 4), torch.ones(16, 8)
-        kinds = []
-        network.register_forward_hook(lambda module, given, result: kinds.append(result.dtype))
-        assert precision._seconds(network, samples, True) > 0 and precision._seconds(network, samples, False) > 0
-        assert kinds == [torch.bfloat16, torch.float32]
+@pytest.mark.parametrize(
+    ("given", "dtype"), [(True, torch.bfloat16), (False, torch.float32), (None, torch.float32)]
+)  # None is in the files of older runs
+def test_updates_multiply_in_the_precision_that_is_asked_for(given, dtype):
+    env, kinds = ToyEnv(6), set()
+    alg = PerceptivePpo.build(env, config(frames=False, mixed_precision=given), "cpu")
+    collect(alg, env, 8)
+    first = next(module for module in alg.actor.modules() if isinstance(module, torch.nn.Linear))
+    first.register_forward_hook(lambda module, inputs, result: kinds.add(result.dtype))
+    alg.update()
+    assert kinds == {dtype}

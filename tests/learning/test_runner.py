@@ -225,16 +225,6 @@ class TestLearn:
         spent.learn(50)
         assert spent.stop_reason == "time budget" and spent.current_learning_iteration == 3
 
-    def test_whether_bfloat16_is_faster_is_measured_once(self, tmp_path):
-        runner = runner_for(tmp_path, mixed_precision=None)
-        runner.alg.use_mixed_precision = True
-        runner.save(tmp_path / "model_0.pt")
-        for given, then in ((None, True), (False, False)):
-            resumed = runner_for(None, mixed_precision=given)
-            resumed.alg.use_mixed_precision = False
-            resumed.load(tmp_path / "model_0.pt")
-            assert resumed.alg.use_mixed_precision is then
-
     def test_the_eta_is_that_of_whichever_limit_comes_first(self, tmp_path, capsys):
         budget, runner = 1.0, runner_for(tmp_path, max_minutes=1.0, max_iterations=10**6)
         runner.total_time = 60.0 * budget - 5.0

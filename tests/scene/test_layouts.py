@@ -1,23 +1,13 @@
-"""Layouts: passable by an independent search, exact covers, and BARN's measures by hand."""
+"""Layouts: passable by an independent search, exact covers."""
 
 import itertools
 
 import numpy as np
 import pytest
 
-from omniperception.scene.layouts import (
-    ROUTE_PIECES,
-    BarnLayout,
-    BlocksLayout,
-    CorridorLayout,
-    MazeLayout,
-    barn_scores,
-    inflated,
-    passable,
-    rectangles,
-    shortest_way,
-    smoothed,
-)
+from omniperception.scene.layouts import BarnLayout, BlocksLayout, CorridorLayout, MazeLayout
+from omniperception.scene.layouts.barn import inflated, passable, rectangles, smoothed
+from omniperception.scene.layouts.maze import ROUTE_PIECES
 
 _MAZE, _SPARSE = MazeLayout(), BlocksLayout()
 _HOLD = BlocksLayout(area=(-4.5, 4.5, -3.75, 3.75), stagger=0.0, jitter=1.0, free=3.0)
@@ -231,53 +221,6 @@ def test_boxes_cover_exactly_the_automatons_cells():
 def test_each_setting_of_the_automaton_has_its_share_of_the_worlds():
     thin, thick = BarnLayout(fill=(0.1, 0.3), smoothing=(2,), boxes=120).grids(0, 40).reshape(2, 20, -1).mean(-1)
     assert thin.max() < thick.min()
-
-
-def test_measures_of_a_narrow_way_by_hand():
-    wall, way = "#" * 11, "." * 11
-    scores = barn_scores(_drawn(wall, wall, wall, way, wall, wall, wall), robot=0, cell=0.5)
-    assert scores == {
-        "closest": pytest.approx(0.5),
-        "visibility": pytest.approx(10 / 8 * 0.5),  # ahead and back 10 cells in all, nothing elsewhere
-        "dispersion": 4.0,  # free ahead and behind, blocked on both sides
-        "dimension": 0.0,
-        "tortuosity": pytest.approx(1.0),
-    }
-
-
-def test_the_shortest_chord_by_hand():
-    wall, way = "#" * 9, "." * 9
-    scores = barn_scores(_drawn(wall, way, way, way, wall), robot=0, cell=1.0)
-    # along y = 1, the first of equally long ways: across 2 cells; slanted at most 2 * sqrt(2), less at the field's ends
-    assert scores["dimension"] == pytest.approx((0 + 2**0.5 + 5 * 2 + 2**0.5 + 0) / 9)
-    assert scores["closest"] == pytest.approx(1.0)
-
-
-def test_what_is_seen_by_hand():
-    world = _drawn("#####", "..#..", "..#..", ".....", "#####")
-    way = shortest_way(world)
-    assert way.tolist() == [[0, 3], [1, 3], [2, 3], [3, 3], [4, 3]]
-    scores = barn_scores(world, robot=0, cell=1.0)
-    # ahead and back 4 in all; upwards 2 but under the pillar; slanted up to the pillar or the field's edge sqrt(2)
-    ends, beside, under = 4 + 2 + 2**0.5, 4 + 2 + 2**0.5, 4 + 2 * 2 * 2**0.5
-    assert scores["visibility"] == pytest.approx((2 * ends + 2 * beside + under) / 5 / 8)
-
-
-def test_a_longer_way_is_more_tortuous():
-    world = _drawn("######", "..#...", "..#.#.", "....#.", "######")
-    scores = barn_scores(world, robot=0, cell=0.3)
-    assert scores["tortuosity"] > 1.05
-
-
-def test_no_way_is_an_error():
-    with pytest.raises(ValueError, match="no way"):
-        shortest_way(_drawn("###", ".#.", "###"))
-
-
-def test_thick_worlds_are_harder():
-    scores = BarnLayout(fill=(0.15, 0.3), smoothing=(3,), boxes=120).scores(0, 24)
-    assert abs(scores["difficulty"].mean()) < 1e-9
-    assert scores["difficulty"][12:].mean() > scores["difficulty"][:12].mean() + 0.5
 
 
 # ---- wrong input -----------------------------------------------------------------------------------------------------

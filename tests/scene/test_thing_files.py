@@ -8,8 +8,7 @@ from mj_rays import assert_rays_are_those_of_mj_ray
 
 from omniperception.common.random import EnvRandom
 from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig, thing_file
-from omniperception.scene.meshes import mesh_points
-from omniperception.scene.thing_file import mesh_vertices
+from omniperception.scene.meshes import compiled, mesh_points, mesh_vertices
 
 DOOR = """
 <mujoco>
@@ -50,7 +49,7 @@ FREQUENCY, N, DT = 0.4, 4, 0.01
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     """A working directory with two articulated things and two meshes."""
-    for cached in (thing_file.parts_of, thing_file._compiled, mesh_points):  # by name, whatever the working directory
+    for cached in (thing_file.parts_of, compiled, mesh_points):  # by name, whatever the working directory
         cached.cache_clear()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "door.xml").write_text(DOOR)
@@ -140,9 +139,7 @@ def test_rays_hit_them_as_mj_ray_does_and_each_environment_has_its_own(files, ma
 def test_what_is_wrong_with_a_file_is_said_in_one_line(files, change, message):
     assert change[0] in DOOR
     (files / "door.xml").write_text(DOOR.replace(*change))
-    from omniperception.scene import thing_file
-
-    thing_file._compiled.cache_clear()
+    compiled.cache_clear()
     thing_file.parts_of.cache_clear()
     with pytest.raises(ValueError, match=message) as error:
         ObstacleGroup("compound", 1, file="door.xml")

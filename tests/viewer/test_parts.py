@@ -181,5 +181,5 @@ def test_an_obstacle_of_a_task_that_is_gone_is_not_another_one_now(rebuilt):
     viewer._obstacle_taken(3)
     if rebuilt:
         viewer.session = Held()
-    viewer._serve_requests()
+    viewer.serve_requests()
     assert viewer.session.done == ([] if rebuilt else [("hold", 3), ("take away", 3)])

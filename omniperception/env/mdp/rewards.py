@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import torch
 
 from omniperception.avoidance.sector_motion import sector_bearings
-from omniperception.common.launch import constant
 from omniperception.env.state import EnvState, requires, rests
+from omniperception.lidar.launch import constant
 
 
 @requires("avoidance")

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 import warp as wp
 
-from omniperception.common.launch import launch_over_envs, view
+from omniperception.lidar.launch import launch_over_envs, view
 from omniperception.perception.samplers import kernels, sorting, sorting_kernels
 from omniperception.perception.samplers.base import Sampler
 from omniperception.perception.samplers.kernels import Work
