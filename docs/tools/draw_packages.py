@@ -32,6 +32,7 @@ ROLES = {
     "lidar": "LiDAR toolkit",
     "perception": "samplers and networks",
     "plan": "what a run consists of",
+    "publish": "a run for others to have",
     "robots": "presets from robots' files",
     "scene": "robot, terrain, obstacles",
     "schema": "text to checked objects",
