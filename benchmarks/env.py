@@ -74,7 +74,7 @@ class Timed:
 def environment(run: RunConfig) -> OmniEnv:
     """A task with all obstacles, so that the LiDAR is awake, whose stages no report drains meanwhile."""
     seed_everything(run.env.seed)
-    return OmniEnv(replace(run.env, log_interval=10**9, full_level=True))
+    return OmniEnv(replace(run.env, log_interval=10**9, skip_curricula=True))
 
 
 def step_of(run: RunConfig) -> Timed:
@@ -215,7 +215,7 @@ class Thinning:
         self._policy, self.reset = policy, policy.reset
 
     def step(self, state, command, points) -> None:
-        self._policy.step(state, command, None if points is None else self._policy.thin(points))
+        self._policy.step(state, command, None if points is None else self._policy.subsample(points))
 
 
 def latency(run_dir: Path, steps: int) -> Table:
@@ -224,7 +224,7 @@ def latency(run_dir: Path, steps: int) -> Table:
     run = build.assemble(config.load(run_dir, ["num_envs=1"]))
 
     def readings(whole_frames: bool):
-        return record(OmniEnv(replace(run.env, full_level=True)), policy, RECORDED, whole_frames)
+        return record(OmniEnv(replace(run.env, skip_curricula=True)), policy, RECORDED, whole_frames)
 
     cases = {"as trained": (policy, readings(False))}
     if policy.description.perception is not None:

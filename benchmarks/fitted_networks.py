@@ -77,7 +77,7 @@ def record(run: RunConfig, walker: Path, frames: int) -> Recording:
     rules = (run.env.rewards.avoidance, WIDE)
     risky = build.assemble(config.compose(["rewards=velocity_risk"])).env.rewards.avoidance.risk
     rewards = replace(run.env.rewards, avoidance=replace(rules[0], risk=risky))
-    env = OmniEnv(replace(run.env, rewards=rewards, targets=(AVOIDANCE_TARGET,), full_level=True))
+    env = OmniEnv(replace(run.env, rewards=rewards, targets=(AVOIDANCE_TARGET,), skip_curricula=True))
     assert env.sensing is not None and env.sensing.frames is not None and env.avoidance is not None
     teacher = build.load_teacher(walker, env)
     told = (torch.arange(env.num_envs) % 2 == 0).float()[:, None]

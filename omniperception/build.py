@@ -29,7 +29,7 @@ from omniperception.env.mdp.randomization import Condition
 from omniperception.env.mdp.terms import first_difference
 from omniperception.env.mirror import Mirror
 from omniperception.env.mixed import MixedEnv, check_alike, shares_of
-from omniperception.env.state import NotHere
+from omniperception.env.state import UndeclaredQuantity
 from omniperception.learning import CheckpointError, Runner, distributed, latest_checkpoint, load_checkpoint
 from omniperception.learning.checkpoint import difference
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
@@ -427,7 +427,7 @@ def load_policy(run: RunConfig, run_dir: Path) -> TrainedPolicy:
         CheckpointError: there is none, or it does not fit.
     """
     checkpoint = latest_checkpoint(run_dir)
-    runner = build_runner(replace(run, env=replace(run.env, full_level=True, trials=True), families={}), None)
+    runner = build_runner(replace(run, env=replace(run.env, skip_curricula=True, trials=True), families={}), None)
     runner.load_policy(checkpoint)
     return TrainedPolicy(runner.env, runner.policy, checkpoint)
 
@@ -451,7 +451,7 @@ def load_teacher(run_dir: Path, env: OmniEnv | MixedEnv, trust: Sequence[str] = 
     own = replace(env.config.observations, actor=list(groups))
     try:
         theirs = env.actor_inputs(run.env.observations)
-    except NotHere as error:
+    except UndeclaredQuantity as error:
         raise CheckpointError(
             f"distillation.teacher={run_dir} observes {error.name}, which nothing here reads; give both the same preset"
             " of observations"

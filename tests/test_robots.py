@@ -14,7 +14,7 @@ from omniperception import build, config
 from omniperception.commands import main
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.robots.body import Body
-from omniperception.robots.guess import GUESSED, SURE, Wishes, guess
+from omniperception.robots.guess import GUESSED, SURE, Options, guess
 from omniperception.robots.preset import text_of
 from omniperception.robots.stand import flat_world, reached_limits, stand
 from omniperception.scene import RobotConfig
@@ -34,9 +34,9 @@ def guesses(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robots")
     (folder / "biped.xml").write_text(BIPED)
     (folder / "hexapod.urdf").write_text(HEXAPOD)
-    wishes = {"biped.xml": Wishes(joints=(*LEGS, "neck"), lidar="head")}
+    options = {"biped.xml": Options(joints=(*LEGS, "neck"), lidar="head")}
     return {
-        path.stem: guess(path, str(path), wishes.get(path.name, Wishes()))
+        path.stem: guess(path, str(path), options.get(path.name, Options()))
         for path in (folder / "biped.xml", folder / "hexapod.urdf", GO2)
     }
 
@@ -137,7 +137,7 @@ def test_actuators_of_the_file_say_which_joints_are_driven(tmp_path):
     (tmp_path / "biped.xml").write_text(
         BIPED.replace('<motor joint="tail"/>', "".join(f'<motor joint="{x}" ctrlrange="-9 9" gear="2"/>' for x in LEGS))
     )
-    found = guess(tmp_path / "biped.xml", str(tmp_path / "biped.xml"), Wishes(self_collision=False))
+    found = guess(tmp_path / "biped.xml", str(tmp_path / "biped.xml"), Options(self_collision=False))
     assert found.preset["joints"] == list(LEGS) and found.preset["torque_limits"] == 18.0
     assert found.preset["self_collision"] == []
 
@@ -194,7 +194,7 @@ def test_a_shank_that_ends_just_above_its_foots_ball_makes_no_sole(tmp_path):
     path.write_text(
         f'<mujoco><compiler angle="radian"/><worldbody><body name="trunk">{trunk}{legs}</body></worldbody></mujoco>'
     )
-    preset = guess(path, str(path), Wishes()).preset
+    preset = guess(path, str(path), Options()).preset
     assert preset["base_height"] == pytest.approx(0.8 * 0.4 + 0.022, abs=0.015)
     assert preset["default_joint_pos"]["fl_knee"] == pytest.approx(-2 * math.acos(0.8), abs=0.1)
     assert preset["gait"]["foot_height"] == pytest.approx(0.022 + 0.2 * preset["base_height"], abs=0.01)

@@ -96,7 +96,7 @@ def run_case(case: Case, iterations: int) -> dict[str, object]:
     outcome, runner = "survives", None
     try:
         run = build.assemble(config.compose([*BASE, *case.overrides]))
-        runner = build_runner(replace(run, env=replace(run.env, full_level=True)), None)
+        runner = build_runner(replace(run, env=replace(run.env, skip_curricula=True)), None)
         case.disturb(runner)
         runner.learn(iterations)
     except (TrainingDiverged, RolloutTooSmall, config.ConfigError) as error:
@@ -116,7 +116,7 @@ def precision(seed: int = 0, num_envs: int = 16) -> list[dict[str, object]]:
     torch.manual_seed(seed)
     overrides = ["experiment=quickstart", "perception=pd_risknet", f"num_envs={num_envs}", "ppo.num_steps_per_env=11"]
     run = build.assemble(config.compose([*overrides, "ppo.mixed_precision=false", "obstacles.curriculum=null"]))
-    runner = build_runner(replace(run, env=replace(run.env, full_level=True)), None)
+    runner = build_runner(replace(run, env=replace(run.env, skip_curricula=True)), None)
     runner.learn(1)
     alg, obs = runner.alg, runner.env.get_observations()
     with torch.inference_mode():

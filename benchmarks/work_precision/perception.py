@@ -112,7 +112,7 @@ class Recorder:
         given = [*overrides, "randomization=none", f"num_envs={num_envs}", "sim.num_threads=1"]
         self.run: RunConfig = assemble(compose([*given, f"terminations.episode_length_s={EPISODE_S}", *extra]))
         targets = (HEIGHT_TARGET, SECTOR_TARGET)
-        self.env = OmniEnv(replace(self.run.env, targets=targets, full_level=True))
+        self.env = OmniEnv(replace(self.run.env, targets=targets, skip_curricula=True))
         self.generator = torch.Generator().manual_seed(0)
         self._dense, self._dense_sectors = self._look_everywhere()
 

@@ -95,7 +95,7 @@ class TrainedRun:
     def stepper(self) -> Callable[[int], None]:
         """Control steps through readings recorded in an environment of the run; called with their number."""
         run = build.assemble(config.load(self.path, ["num_envs=1"]))
-        env = OmniEnv(replace(run.env, full_level=True))
+        env = OmniEnv(replace(run.env, skip_curricula=True))
         policy, readings = self.exported, record(env, self.exported, RECORDED, whole_frames=False)
 
         def step(number: int) -> None:

@@ -72,7 +72,7 @@ class Avoidance:
         """Geoms of the obstacles whose sightings `see` takes, in its order."""
         return () if self.true_sectors is None else self.true_sectors.names
 
-    def see(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, seen: torch.Tensor | None) -> None:
+    def add_frame(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, seen: torch.Tensor | None) -> None:
         """Takes in a frame, whose sector distances are already there.
 
         Args:

@@ -34,7 +34,7 @@ class Coverage:
         """Makes room for the next frame, of all environments."""
         self._answered = self._answered.roll(-1, 0)
 
-    def see(self, ranges: torch.Tensor, directions_l: torch.Tensor, came: torch.Tensor, envs: slice) -> None:
+    def add_frame(self, ranges: torch.Tensor, directions_l: torch.Tensor, came: torch.Tensor, envs: slice) -> None:
         """Takes in a frame of some environments.
 
         Args:

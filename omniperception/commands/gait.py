@@ -201,7 +201,7 @@ def policy_on_free_ground(arguments: Arguments, run_dir: Path, overrides: list[s
     build.check_split(run, "picture", run_dir)
     calm = replace(run.env.randomization, pushes=None)
     return build.load_policy(
-        replace(run, env=replace(run.env, randomization=calm, read_besides=(FOOT_FORCE,))), run_dir
+        replace(run, env=replace(run.env, randomization=calm, extra_requirements=(FOOT_FORCE,))), run_dir
     )
 
 

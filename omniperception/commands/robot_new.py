@@ -21,7 +21,7 @@ from omniperception.cli import Command, argument
 from omniperception.common.files import write_whole
 from omniperception.common.shell import command_line
 from omniperception.config import ConfigError
-from omniperception.robots.guess import Wishes, guess
+from omniperception.robots.guess import Options, guess
 from omniperception.robots.preset import table_of, text_of
 
 
@@ -56,14 +56,14 @@ def main(arguments: Arguments) -> None:
     path = arguments.out / f"{name}.yaml"
     if path.exists() and not arguments.again:
         raise ConfigError(f"{path} exists; give another name=..., or again=true to write over it")
-    wishes = Wishes(
+    options = Options(
         arguments.joints,
         arguments.frequency,
         arguments.damping_ratio,
         arguments.self_collision,
         arguments.lidar,
     )
-    found = guess(arguments.file, str(arguments.file), wishes)
+    found = guess(arguments.file, str(arguments.file), options)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, text_of(found, arguments.file))
     print(table_of(found))

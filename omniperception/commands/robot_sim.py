@@ -91,7 +91,7 @@ def world(run_dir: Path, overrides: list[str], trust: Sequence[str] = ()) -> Omn
         del own["sim"]
     run = build.load_run(run_dir, [*overrides, *(f"{key}={value}" for key, value in own.items())], trust)
     build.check_split(run, "trial on the wire", run_dir)
-    return OmniEnv(replace(run.env, full_level=True, trials=True))
+    return OmniEnv(replace(run.env, skip_curricula=True, trials=True))
 
 
 command = Command(main, Arguments, __doc__, overrides="of the run's configuration", errors=(DeployError,))

@@ -33,7 +33,7 @@ class Coverage:
         self._answered = np.ones((FRAMES, NUM_SECTORS, NUM_BINS), bool)
         self.covered = np.ones(NUM_SECTORS, bool)
 
-    def see(self, points: np.ndarray, attitude: Attitude) -> None:
+    def add_frame(self, points: np.ndarray, attitude: Attitude) -> None:
         """Takes in a frame (n, 3), m, sensor frame; rows that are zero, too far or not finite are no answers."""
         distance = np.linalg.norm(points, axis=1)
         answers = (distance > 0.0) & (distance <= self._max_range)
@@ -45,7 +45,7 @@ class Coverage:
         found[sector_of(places[:, :2], NUM_SECTORS), np.minimum(elevation // BIN_DEG, NUM_BINS - 1).astype(int)] = True
         self._append(found)
 
-    def miss(self) -> None:
+    def repeat_frame(self) -> None:
         """Takes in that a frame was due and did not come."""
         self._append(np.zeros((NUM_SECTORS, NUM_BINS), bool))
 

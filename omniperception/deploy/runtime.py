@@ -22,7 +22,7 @@ from omniperception.deploy.description import (
     export_line,
 )
 from omniperception.deploy.odometry import Odometry, TimedOdometry
-from omniperception.deploy.safety import Safety, SafetyConfig, SafetyStop, Sight
+from omniperception.deploy.safety import LidarStatus, Safety, SafetyConfig, SafetyStop
 from omniperception.deploy.sampling import Attitude, CloudSampler, down, make_sampler
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ class ExportedPolicy:
             raise DeployError(f"{path} and {FILE} are not from the same export, or were changed; export again")
         return policy
 
-    def another(self) -> ExportedPolicy:
+    def clone(self) -> ExportedPolicy:
         """The same policy for another robot, which shares the network and nothing else."""
         return ExportedPolicy(self.description, self._session, self.safety.config if self.safety else None)
 
@@ -161,7 +161,7 @@ class ExportedPolicy:
         if self._follows is not None:
             self._odometry = self._follows(self.description.control_period_s)
 
-    def thin(self, points: np.ndarray, offsets_s: ArrayLike | None = None) -> np.ndarray:
+    def subsample(self, points: np.ndarray, offsets_s: ArrayLike | None = None) -> np.ndarray:
         """The points of a device's frame that training would have kept, by the time of their measurement.
 
         Of what was trained with `lidar.selection=stratified`, as many, spread over the frame.
@@ -206,7 +206,7 @@ class ExportedPolicy:
         kept[rows[rows >= 0]] = points[inside][rows >= 0]
         return kept
 
-    def see(
+    def add_frame(
         self, points: np.ndarray, base_quat: ArrayLike, joint_pos: ArrayLike | None = None, age_s: float = 0.0
     ) -> None:
         """Appends a LiDAR frame to the history, unless it holds too few hits; :meth:`step` does it for its points.
@@ -226,7 +226,7 @@ class ExportedPolicy:
             base_quat = self._odometry.attitude(age_s)
         attitude = Attitude(self._carrier_quat(lidar, base_quat, joint_pos), lidar.mount_pos, lidar.mount_quat)
         if self.safety is not None and not self.safety.frame_is_good(points, attitude):
-            return self.miss()
+            return self.repeat_frame()
         frames[:-1] = frames[1:]
         frames[-1, : sampler.num_points] = sampler(points, attitude)
         if isinstance(self._odometry, TimedOdometry):
@@ -253,7 +253,7 @@ class ExportedPolicy:
             quat = _product(quat, _product(np.asarray(turn.quat, np.float64), own))
         return quat
 
-    def miss(self) -> None:
+    def repeat_frame(self) -> None:
         """Repeats the last frame in the history, with no motion of the base, where one was due and did not come.
 
         Training does the same (`randomization.frames_lost`); the motion of the next frame spans both periods.
@@ -299,7 +299,7 @@ class ExportedPolicy:
                 self.frames[-1, -TimedOdometry.num_rows :] = self._odometry.take(None)
             self._has_missed = False
         if points is not None:
-            self.see(points, state.base_quat, state.joint_pos, age_s)
+            self.add_frame(points, state.base_quat, state.joint_pos, age_s)
         if self.safety is not None:
             command = self.safety.limit_command(command)
             self._reference = self.safety.kept_to_covered(self._reference)
@@ -307,7 +307,7 @@ class ExportedPolicy:
         self._follow(command)
         feed = {"observations": self.observation[None]}
         if self.frames is not None:
-            blind = self.safety is not None and self.safety.sight is Sight.STOPPED
+            blind = self.safety is not None and self.safety.lidar_status is LidarStatus.STOPPED
             feed |= {"frames": self.frames[None], "frame_count": np.array([[0 if blind else self.frame_count]])}
         joints = self.description.joints
         if self.description.max_acceleration is not None:

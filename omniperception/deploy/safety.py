@@ -22,7 +22,7 @@ class SafetyStop(DeployError):
     """The policy must not move the robot any longer; the message says why. Let the joints be damped."""
 
 
-class Sight(StrEnum):
+class LidarStatus(StrEnum):
     """Whether a policy sees well enough to walk."""
 
     FRESH = "fresh"
@@ -68,7 +68,7 @@ class Safety:
     Attributes:
         config: the limits.
         counts: how often each limit has acted since the start, by name.
-        sight: whether frames are fresh; always for a blind policy.
+        lidar_status: whether frames are fresh; always for a blind policy.
         coverage: directions that the newest frames cover; None for a blind policy.
     """
 
@@ -90,7 +90,7 @@ class Safety:
 
     def reset(self) -> None:
         """As at the start of an episode; the counts stay."""
-        self.sight, self._age, self._pace = Sight.FRESH, 0.0, 1.0
+        self.lidar_status, self._age, self._pace = LidarStatus.FRESH, 0.0, 1.0
         self._targets: np.ndarray | None = None
         self._strained, self._lacks = np.zeros(len(self._names), np.int64), False
         if self.coverage is not None:
@@ -99,7 +99,7 @@ class Safety:
     def await_frame(self) -> None:
         """Holds a policy that sees at a command of 0 until a good frame comes; training begins without that wait."""
         if self._sees:
-            self.sight, self._age, self._pace = Sight.STOPPED, math.inf, 0.0
+            self.lidar_status, self._age, self._pace = LidarStatus.STOPPED, math.inf, 0.0
             log.warning("standing until a good frame comes")
 
     def frame_is_good(self, points: np.ndarray, attitude: Attitude) -> bool:
@@ -109,7 +109,7 @@ class Safety:
         if hits >= self._min_hits and hits:
             self._age = 0.0
             if self.coverage is not None:
-                self.coverage.see(points, attitude)
+                self.coverage.add_frame(points, attitude)
             return True
         self._count(
             logging.WARNING, "frames refused", f"a frame has {hits} hits, at least {self._min_hits:.0f} were expected"
@@ -119,7 +119,7 @@ class Safety:
     def miss_frame(self) -> None:
         """Takes in that a frame was due and none, or none that is good, came."""
         if self.coverage is not None:
-            self.coverage.miss()
+            self.coverage.repeat_frame()
 
     def limit_command(self, command: np.ndarray) -> np.ndarray:
         """(3,) the command within training's ranges and 0, slowed down while no good frame comes and where it leads to
@@ -198,14 +198,16 @@ class Safety:
         fresh = self._age <= self.config.frame_age_s
         change = np.clip(self._dt / self.config.slow_down_s, 0.0, 1.0)
         self._pace = min(1.0, self._pace + change) if fresh else max(0.0, self._pace - change)
-        sight = Sight.FRESH if fresh else Sight.SLOWING if self._pace > 0.0 else Sight.STOPPED
-        if sight is not self.sight:
+        status = LidarStatus.FRESH if fresh else LidarStatus.SLOWING if self._pace > 0.0 else LidarStatus.STOPPED
+        if status is not self.lidar_status:
             age = f"no good frame for {self._age:.2f} s"
             log.warning(
-                {Sight.FRESH: "frames are back", Sight.SLOWING: f"{age}: slowing down"}.get(sight, f"{age}: standing")
+                {LidarStatus.FRESH: "frames are back", LidarStatus.SLOWING: f"{age}: slowing down"}.get(
+                    status, f"{age}: standing"
+                )
             )
-            self.counts["stops for want of frames"] += sight is Sight.SLOWING
-            self.sight = sight
+            self.counts["stops for want of frames"] += status is LidarStatus.SLOWING
+            self.lidar_status = status
         self._age += self._dt
 
     def _count(self, level: int, what: str, why: str) -> None:

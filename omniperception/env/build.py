@@ -141,7 +141,7 @@ def build_sampler(config: EnvConfig) -> Sampler | None:
     from omniperception.perception import ProximitySampler, RawSampler
 
     sampler, link = config.sampler(), config.lidar.mount_body
-    if isinstance(sampler, RawSampler) and config.shows_frames and sampler.num_points != config.lidar.num_rays:
+    if isinstance(sampler, RawSampler) and config.network_sees_frames and sampler.num_points != config.lidar.num_rays:
         raise ValueError(
             f"lidar.num_rays={config.lidar.num_rays} must be perception.sampler.num_rays={sampler.num_points}: the"
             " network reads every ray; give both the same"
@@ -182,6 +182,6 @@ def build_sensing(
         distal=DISTAL_RANGE in needed,
         whole=CLOUD in needed,
         measured=MEASURED_CLOUD in needed,
-        shown=config.shows_frames,
+        shown=config.network_sees_frames,
         delivery=build_delivery(config, random),
     )

@@ -58,12 +58,12 @@ class EnvConfig:
         base_motion: whether a frame's last row is the base's motion since the frame before.
         frame_times: whether frames bear the time at which they were taken.
         targets: privileged groups that the network is supervised with: HEIGHT_TARGET and those of `avoidance`.
-        shows_frames: whether the network is shown frames; where not it never has one, and none is sampled.
-        read_besides: requirements of who acts in the task, beside those of its terms; see `state.requires`.
+        network_sees_frames: whether the network is shown frames; where not it never has one, and none is sampled.
+        extra_requirements: requirements of who acts in the task, beside those of its terms; see `state.requires`.
         num_asked: components of the velocity that a policy asks its gait for: 2, or 3 where it turns, too.
         log_interval: control steps between two reports of the metrics.
-        full_level: whether everything that curricula of obstacles, commands and randomization let in is there from the
-            first step on, and stays, as in evaluations; the terrain's has `trials`.
+        skip_curricula: whether everything that curricula of obstacles, commands and randomization let in is there from
+            the first step on, and stays, as in evaluations; the terrain's has `trials`.
         trials: whether episodes are trials of an evaluation: the k-th to begin is the same scene whatever the number of
             environments, on a tile that it draws; see `TrialRandom`.
     """
@@ -86,11 +86,11 @@ class EnvConfig:
     base_motion: bool = False
     frame_times: bool = False
     targets: Sequence[str] = ()
-    shows_frames: bool = True
-    read_besides: Sequence[str] = ()
+    network_sees_frames: bool = True
+    extra_requirements: Sequence[str] = ()
     num_asked: int = 2
     log_interval: int = 24
-    full_level: bool = False
+    skip_curricula: bool = False
     trials: bool = False
 
     def __post_init__(self) -> None:
@@ -224,7 +224,7 @@ class EnvConfig:
 
     def requirements(self) -> frozenset[str]:
         """Sensors that must exist before the world is compiled, see `state.requires`."""
-        needed = {*self.rewards.requirements(), *self.observations.requirements(), *self.read_besides}
+        needed = {*self.rewards.requirements(), *self.observations.requirements(), *self.extra_requirements}
         if {SECTOR_TARGET, AVOIDANCE_TARGET} & set(self.targets):
             needed.add(AVOIDANCE)
         if self.obstacles.num_obstacles:
@@ -254,7 +254,7 @@ class EnvConfig:
     @property
     def casts_frames(self) -> bool:
         """Tell whether somebody is shown what the LiDAR sees: the network, or who acts in its place."""
-        return self.shows_frames or not FROM_LIDAR.isdisjoint(self.read_besides)
+        return self.network_sees_frames or not FROM_LIDAR.isdisjoint(self.extra_requirements)
 
     @property
     def uses_lidar(self) -> bool:

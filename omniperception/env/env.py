@@ -115,7 +115,7 @@ class OmniEnv(VecEnv):
         )
         if not config.sim.has_legs:
             self.state.ask_by(lambda: self.state.asked[:, :2].clone())
-        if config.full_level:
+        if config.skip_curricula:
             self.curriculum_levels = (1.0,) * len(self._curricula())
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self._spawn = self._spawn_bounds()
@@ -209,26 +209,26 @@ class OmniEnv(VecEnv):
         Args:
             env_ids: which; None: all.
             seeds: (n,) int64: all that is drawn from now on follows from an environment's seed, whichever environment
-                it is, but for its column of a tiled terrain and the levels of curricula. Where all get seeds, time
-                begins anew, too. None: everything goes on, and no episode repeats another's noise.
+                it is, but for its column of a tiled terrain and the levels of curricula. Where all get seeds, the step
+                counter restarts, too. None: everything goes on, and no episode repeats another's noise.
 
         Returns:
             Observations.
         """
         env_ids = self._all_envs if env_ids is None else env_ids
-        everybody = len(env_ids) == self.num_envs
+        all_envs = len(env_ids) == self.num_envs
         if seeds is not None:
             self.random.seed(env_ids, seeds)
-            if everybody:
+            if all_envs:
                 self.step_count = 0
-        time_begins = everybody and self.step_count == 0
+        time_begins = all_envs and self.step_count == 0
         if time_begins and self.sensing is not None:
             self.sensing.lidar.reset()
         self._reset(env_ids, seeds, interrupted=True)
         self.healthy = ~self.sim.failed
         if time_begins:
             self._sense()
-        self.observations = self._observe(env_ids) if everybody else self._begun(env_ids)
+        self.observations = self._observe(env_ids) if all_envs else self._begun(env_ids)
         return self.observations
 
     def final_observations(self) -> TensorDict:
@@ -293,7 +293,7 @@ class OmniEnv(VecEnv):
         if self.avoidance is not None:
             with self.timer.stage("avoidance"):
                 kinematics, seen = self.state.kinematics, self.sensing.seen_within(self.config.remembered_frames)
-                self.avoidance.see(kinematics.base_pos_w, kinematics.yaw, seen)
+                self.avoidance.add_frame(kinematics.base_pos_w, kinematics.yaw, seen)
         if self._frame_heights is not None:
             with self.timer.stage("heights"):
                 self._frame_heights = self.state.heights
@@ -416,7 +416,7 @@ class OmniEnv(VecEnv):
     def _report(self) -> dict[str, float]:
         """Metrics at the end of a log interval."""
         config = self.config
-        if not config.full_level:
+        if not config.skip_curricula:
             seconds, error = config.log_interval * self.control_dt, self.metrics.calm_velocity_error()
             for curriculum in self._curricula().values():
                 curriculum.follow(error, seconds)

@@ -337,7 +337,7 @@ class LidarSensing:
         assert frame.ranges is not None and frame.directions_s is not None
         self._delivery.partial.take_away(frame.ranges, frame.directions_s, envs)
         directions_l = levelled(frame.directions_s, attitude[envs], constant(self.config.quat, attitude.device))
-        self.coverage.see(frame.ranges, directions_l, self.fresh[envs], envs)
+        self.coverage.add_frame(frame.ranges, directions_l, self.fresh[envs], envs)
 
     def known_to_be_free(self, command: torch.Tensor) -> torch.Tensor:
         """(num_envs, 3) the commanded v_x, v_y (m/s) and yaw rate (rad/s), slowed down where nobody looked."""

@@ -386,7 +386,7 @@ class EnvState:
 
     def _contact_force(self, kind: str) -> torch.Tensor:
         if kind not in self._sim.world.sensors:
-            raise NotHere(kind)
+            raise UndeclaredQuantity(kind)
         return self._sim.contact_sensor(kind).unflatten(1, (-1, 3))
 
     # ---- feet, in the order of robot.foot_geoms ----------------------------------------------------------------------
@@ -457,7 +457,7 @@ class EnvState:
         legs follows that."""
         asked = getattr(self._sim, "asked", None)
         if asked is None:
-            raise NotHere("asked", _WITHOUT_LEGS)
+            raise UndeclaredQuantity("asked", _WITHOUT_LEGS)
         return asked
 
     @property
@@ -465,7 +465,7 @@ class EnvState:
         """(num_envs, 13) of robots without legs: gain, lag (s), delay (s), offset (m/s, rad/s) by axis, radius (m)."""
         drawn = getattr(self._sim, "drawn_response", None)
         if drawn is None:
-            raise NotHere("drawn_response", _WITHOUT_LEGS)
+            raise UndeclaredQuantity("drawn_response", _WITHOUT_LEGS)
         return drawn
 
     @property
@@ -492,7 +492,7 @@ class EnvState:
     def _part(self, part: Part | None, name: str) -> Part:
         """The part that has a quantity, if it was declared: otherwise it is not computed."""
         if part is None or name not in self._declared:
-            raise NotHere(name)
+            raise UndeclaredQuantity(name)
         return part
 
 
@@ -534,7 +534,7 @@ def _membership(sizes: Sequence[int], device: torch.device) -> torch.Tensor | No
     return (foot == torch.arange(len(sizes))[:, None]).float().to(device)
 
 
-class NotHere(ValueError):
+class UndeclaredQuantity(ValueError):
     """A quantity, by its name, that this task does not have, and why; mostly because none of its terms declares it."""
 
     def __init__(self, name: str, why: str | None = None) -> None:

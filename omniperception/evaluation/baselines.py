@@ -63,13 +63,13 @@ def prepared(name: str, config: EnvConfig, lidar: SensorConfig | None) -> EnvCon
     Raises:
         ValueError: there is none, and the policy reads clouds.
     """
-    config = replace(config, rewards=replace(config.rewards, terms={}), shows_frames=name not in BASELINES)
+    config = replace(config, rewards=replace(config.rewards, terms={}), network_sees_frames=name not in BASELINES)
     if isinstance(config.commands, VelocityCommandConfig):
-        config = replace(config, read_besides=(FOOT_FORCE,))  # for the figures of a gait
+        config = replace(config, extra_requirements=(FOOT_FORCE,))  # for the figures of a gait
     if name in ("stop", "histogram"):
         if lidar is None:
             raise ValueError(_NO_LIDAR)
-        config = replace(config, lidar=lidar, read_besides=(*config.read_besides, MEASURED_CLOUD))
+        config = replace(config, lidar=lidar, extra_requirements=(*config.extra_requirements, MEASURED_CLOUD))
     return config
 
 
@@ -330,5 +330,7 @@ def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | N
 
 
 def _check_hidden(env: OmniEnv) -> None:
-    if env.sensing is not None and env.sensing.frames is not None and env.config.shows_frames:
-        raise ValueError("this task shows the network LiDAR frames; prepare it with EnvConfig.shows_frames=False")
+    if env.sensing is not None and env.sensing.frames is not None and env.config.network_sees_frames:
+        raise ValueError(
+            "this task shows the network LiDAR frames; prepare it with EnvConfig.network_sees_frames=False"
+        )

@@ -28,7 +28,7 @@ class ExportedPolicies:
         if tuple(described.joints.names) != tuple(env.robot.joints):
             raise DeployError(f"the policy moves {list(described.joints.names)}, this robot has {env.robot.joints}")
         self._env = env
-        self.robots = [policy.another() for _ in range(env.num_envs)]
+        self.robots = [policy.clone() for _ in range(env.num_envs)]
         self._tick = 0
 
     def __call__(self, observations: TensorDict) -> torch.Tensor:
@@ -61,7 +61,7 @@ class ExportedPolicies:
         assert frame is not None  # it has ticked
         for robot, came in zip(self.robots, env.sensing.fresh.tolist(), strict=True):
             if not came:
-                robot.miss()
+                robot.repeat_frame()
         new = (env.sensing.fresh & (env.sensing.frame_count[:, 0] > 0)).tolist()
         return [cloud if is_new else None for cloud, is_new in zip(raw_points(frame), new, strict=True)]
 

@@ -342,12 +342,12 @@ class Control:
         if not frames:
             if now - self._last_frame > 1.5 * period:
                 self._last_frame += period
-                self.policy.miss()
+                self.policy.repeat_frame()
                 self.missed += self._mode in DRIVEN
             return None
         self._last_frame = now
         self._ages.add(1e-9 * frames[-1].start_ns + period, now)
-        return self.policy.thin(frames[-1].points, frames[-1].offsets_s)
+        return self.policy.subsample(frames[-1].points, frames[-1].offsets_s)
 
     def _advance_odometry(self, state: np.ndarray) -> None:
         """Adds one step to the pose (3,) x, y (m), heading (rad) since the policy began."""

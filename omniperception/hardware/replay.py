@@ -28,14 +28,14 @@ class Replayed:
 
     Attributes:
         steps: each of them.
-        sight: of each, the policy's.
+        lidar: of each, the policy's.
         recorded: (steps, 12) rad, targets of the recording, in the motors' order; nan where it has none.
         stops: of the policy: time (s) and why.
         counts: what limits and frames have counted, by name.
     """
 
     steps: list[Step]
-    sight: list[str]
+    lidar: list[str]
     recorded: np.ndarray
     stops: list[tuple[float, str]]
     counts: dict[str, int]
@@ -152,7 +152,7 @@ def replay(policy: ExportedPolicy, events: Iterable[Event], command: np.ndarray 
     link, taken = _Link(), _Steps()
     control = Control(policy, ends, ends if sees else None, ends, link, taken)
     recorded: list[np.ndarray] = []
-    sight: list[str] = []
+    lidar: list[str] = []
     period, due = described.control_period_s, -np.inf
     for event in events:
         if event.points is not None:
@@ -169,11 +169,11 @@ def replay(policy: ExportedPolicy, events: Iterable[Event], command: np.ndarray 
         ends.state = event.state
         control.step(event.time_s)
         recorded.append(np.full(len(MOTORS), np.nan))
-        sight.append(str(policy.safety.sight) if policy.safety is not None else "fresh")
+        lidar.append(str(policy.safety.lidar_status) if policy.safety is not None else "fresh")
     if not taken.steps:
         raise DeployError("the recording holds no state of the robot")
     counts = ({} if policy.safety is None else dict(policy.safety.counts)) | ends.counts()
-    return Replayed(taken.steps, sight, np.array(recorded), taken.stops, counts)
+    return Replayed(taken.steps, lidar, np.array(recorded), taken.stops, counts)
 
 
 def draw(replayed: Replayed, policy: ExportedPolicy, path: Path) -> None:
@@ -234,7 +234,7 @@ def _draw_hits(axes, frames: list[Step], times: np.ndarray, replayed: Replayed) 
     hits = [int(step.seen.any(axis=1).sum()) for step in frames if step.seen is not None]
     axes.plot([step.time_s for step in frames], hits, ".", label=f"points of {len(frames)} frames")
     for kind, color in (("slowing", "tab:orange"), ("stopped", "tab:red")):
-        is_so = np.array([sight == kind for sight in replayed.sight])
+        is_so = np.array([lidar == kind for lidar in replayed.lidar])
         if is_so.any():
             axes.fill_between(
                 times,
@@ -244,7 +244,7 @@ def _draw_hits(axes, frames: list[Step], times: np.ndarray, replayed: Replayed) 
                 transform=axes.get_xaxis_transform(),
                 color=color,
                 alpha=0.3,
-                label=f"sight: {kind}",
+                label=f"lidar: {kind}",
             )
     for k, (at, _) in enumerate(replayed.stops[:20]):
         axes.axvline(at, color="black", linewidth=0.8, label=None if k else "the policy stops")

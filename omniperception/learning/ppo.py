@@ -261,8 +261,8 @@ class PerceptivePpo(PPO):
         if self.distillation is not None and self.num_updates < self.distillation.iterations:
             return self._imitate(self.distillation.learning_rate)
         if self.num_updates >= self.critic_warmup:
-            if self._begins_with_what_is() and self.schedule == "adaptive":
-                self.learning_rate = FIRST_LEARNING_RATE  # a larger one carries it off in a single step
+            if self._is_first_ppo_update_of_pretrained() and self.schedule == "adaptive":
+                self.learning_rate = FIRST_LEARNING_RATE  # a larger step leaves the trust region
             return super().update()
         schedule = self.schedule
         self.schedule = "fixed"  # a policy that stays would have its steps grow without end
@@ -273,7 +273,7 @@ class PerceptivePpo(PPO):
             self.schedule = schedule
             self.actor.requires_grad_(True)
 
-    def _begins_with_what_is(self) -> bool:
+    def _is_first_ppo_update_of_pretrained(self) -> bool:
         """Whether this is PPO's first update of a policy that is another run's, has been taught or has waited."""
         lessons = self.distillation.iterations if self.distillation is not None else 0
         return self.num_updates == max(self.critic_warmup, lessons) and (self.num_updates > 0 or not self.is_new)

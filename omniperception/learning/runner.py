@@ -18,7 +18,7 @@ from omniperception.common.errors import one_line
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig, first_difference
 from omniperception.env.mixed import MixedEnv
-from omniperception.env.state import NotHere
+from omniperception.env.state import UndeclaredQuantity
 from omniperception.learning import distributed
 from omniperception.learning.checkpoint import (
     CheckpointError,
@@ -267,7 +267,7 @@ class Runner:
         """What these groups are here; None: they are of quantities that this task does not have."""
         try:
             return self.env.actor_inputs(replace(observations, actor=groups))
-        except NotHere:
+        except UndeclaredQuantity:
             return None
 
     def _weights(self, run_dir: str | Path) -> dict:

@@ -168,7 +168,7 @@ def estimating(
 def observing_more(
     weights: Mapping[str, torch.Tensor], own: Sequence[ActorInput], given: Sequence[ActorInput]
 ) -> Mapping[str, torch.Tensor]:
-    """The weights of an actor that observes less, for one that at first does not heed what it observes besides.
+    """The weights of an actor that observes less, for one whose added inputs have zero weights.
 
     The running mean and standard deviation of the inputs it adds start at 0 and 1 with the sample count of the others,
     so new samples move them slowly. The weights of an actor that differs in anything else are returned unchanged.

@@ -74,7 +74,7 @@ class Guess:
 
 
 @dataclass(frozen=True)
-class Wishes:
+class Options:
     """What the user can say about a preset.
 
     Attributes:
@@ -92,16 +92,16 @@ class Wishes:
     lidar: str | None = None
 
 
-def guess(file: Path, written: str, wishes: Wishes = Wishes()) -> Guess:
+def guess(file: Path, written: str, options: Options = Options()) -> Guess:
     """The preset of the robot in a file.
 
     Args:
         file: MJCF or URDF.
         written: how the preset names it.
-        wishes: of the user.
+        options: of the user.
 
     Raises:
-        ValueError: one line that says what is wrong with the file or the wishes.
+        ValueError: one line that says what is wrong with the file or the options.
     """
     raw, spec = parse(file), read_robot(file)
     drop_unseen(spec, None)
@@ -111,7 +111,7 @@ def guess(file: Path, written: str, wishes: Wishes = Wishes()) -> Guess:
             f"robot.file={file}: no geom collides (contype=0 conaffinity=0 for all), so that nothing carries the robot;"
             " give its feet geoms that collide"
         )
-    joints, by_joint = _actuated(body, raw, file, wishes)
+    joints, by_joint = _actuated(body, raw, file, options)
     pose, by_pose = _start(body, raw)
     body.place(pose)
     feet = feet_of(body)
@@ -124,7 +124,9 @@ def guess(file: Path, written: str, wishes: Wishes = Wishes()) -> Guess:
         pose = _symmetric(pose, body, *twins)
     pose = {joint: round(float(np.clip(angle, *body.limits(joint))), 3) for joint, angle in pose.items()}
     body.place(pose)
-    return _settled(_Draft(body, raw, file, written, wishes, joints, feet, pose, twins), (by_joint, by_pose), notes)
+    return _stiffened_until_standing(
+        _Draft(body, raw, file, written, options, joints, feet, pose, twins), (by_joint, by_pose), notes
+    )
 
 
 @dataclass(frozen=True)
@@ -135,17 +137,17 @@ class _Draft:
     raw: mujoco.MjSpec
     file: Path
     written: str
-    wishes: Wishes
+    options: Options
     joints: list[int]
     feet: list[Foot]
     pose: dict[int, float]
     twins: tuple[np.ndarray, np.ndarray] | None
 
 
-def _settled(draft: _Draft, findings: tuple[Finding, ...], notes: list[str]) -> Guess:
+def _stiffened_until_standing(draft: _Draft, findings: tuple[Finding, ...], notes: list[str]) -> Guess:
     """The preset with the softest of some gains with which the robot stands."""
     body = draft.body
-    gains = gains_of(body, draft.raw, draft.joints, draft.feet, draft.wishes.frequency, draft.wishes.damping_ratio)
+    gains = gains_of(body, draft.raw, draft.joints, draft.feet, draft.options.frequency, draft.options.damping_ratio)
     fixed, found = _described(draft, gains)
     for factor in _STIFFER:
         preset = fixed | _numbers(draft, gains, factor)
@@ -165,13 +167,13 @@ def _settled(draft: _Draft, findings: tuple[Finding, ...], notes: list[str]) -> 
 # --- joints and pose --------------------------------------------------------------------------------------------------
 
 
-def _actuated(body: Body, raw: mujoco.MjSpec, file: Path, wishes: Wishes) -> tuple[list[int], Finding]:
+def _actuated(body: Body, raw: mujoco.MjSpec, file: Path, options: Options) -> tuple[list[int], Finding]:
     names = {body.name(joint): joint for joint in body.joints}
-    if wishes.joints:
-        unknown = sorted(set(wishes.joints) - names.keys())
+    if options.joints:
+        unknown = sorted(set(options.joints) - names.keys())
         if unknown:
             raise ValueError(f"joints={','.join(unknown)} are no hinges or slides of {file}; known: {', '.join(names)}")
-        return [names[name] for name in wishes.joints], Finding("joints", SURE, "as asked for")
+        return [names[name] for name in options.joints], Finding("joints", SURE, "as asked for")
     driven = [actuator.target for actuator in raw.actuators if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT]
     chosen = [names[name] for name in dict.fromkeys(driven) if name in names]
     if chosen:
@@ -254,7 +256,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
     gait = _gait(draft, height)
     low, high = body.bounds(body.touchable)
     length, width = (high - low)[:2]
-    pairs = self_collisions(body, draft.pose) if draft.wishes.self_collision else []
+    pairs = self_collisions(body, draft.pose) if draft.options.self_collision else []
     mounts, by_mount = _mounts(draft)
     preset: dict[str, object] = {
         "file": draft.written,
@@ -277,7 +279,7 @@ def _described(draft: _Draft, gains: Gains) -> tuple[dict[str, object], list[Fin
     }
     named = all("foot" in name.lower() or "toe" in name.lower() for name in carrying)
     limits = f"{int(gains.said.sum())} of {len(gains.said)} are the file's; the others from weight and length"
-    rate, ratio = draft.wishes.frequency, draft.wishes.damping_ratio
+    rate, ratio = draft.options.frequency, draft.options.damping_ratio
     findings = [
         Finding("base", SURE, "the body with the free joint"),
         _on_masses(draft),
@@ -347,7 +349,7 @@ def _on_masses(draft: _Draft) -> Finding:
 
 
 def _on_self_collision(draft: _Draft, pairs: list[tuple[str, str]]) -> Finding:
-    if not draft.wishes.self_collision:
+    if not draft.options.self_collision:
         return Finding("self_collision", SURE, "none, as asked for: links pass through each other")
     return Finding(
         "self_collision",
@@ -443,12 +445,12 @@ def _mounts(draft: _Draft) -> tuple[dict[str, object], Finding]:
     if frame is not None:
         housing = [geom.name for link in read_robot(draft.file).bodies if link.name == frame for geom in link.geoms]
         mounts["head"] = {"pos": [0.0, 0.0, 0.0], "body": frame} | ({"exclude_geoms": housing} if housing else {})
-    return mounts, Finding("mounts", SURE if frame or draft.wishes.lidar else GUESSED, why)
+    return mounts, Finding("mounts", SURE if frame or draft.options.lidar else GUESSED, why)
 
 
 def _lidar_link(draft: _Draft) -> tuple[int, str | None, str]:
     """The link that carries the LiDAR, a frame of the file that is a LiDAR's, and why."""
-    body, model, wanted = draft.body, draft.body.model, draft.wishes.lidar
+    body, model, wanted = draft.body, draft.body.model, draft.options.lidar
     if wanted is not None:
         known = [link.name for link in draft.raw.bodies[1:]]
         if wanted not in known:

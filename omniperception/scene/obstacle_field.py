@@ -323,13 +323,13 @@ class ObstacleField:
         """
         u = self._random.uniform(env_ids, (3, len(self.parts))).to(self._dtype)
         size = self._ranges.draw(u, share)
-        told = self._poses.draw(env_ids, size)
+        poses = self._poses.draw(env_ids, size)
         self.size[env_ids] = size
         if self.articulation is not None:
             half_height = self._shapes.half_extents(size)[..., 2]
             self.articulation.reset(env_ids, within(self._scale, share), half_height, cycle)
         self._follow_sizes(env_ids)
-        return told
+        return poses
 
     def _follow_sizes(self, env_ids: torch.Tensor | None = None) -> None:
         """Brings what depends on sizes and tilts up to date, in all environments or in some (n,)."""

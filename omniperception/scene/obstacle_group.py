@@ -46,7 +46,7 @@ class ApproachConfig:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Changes of mind of what moves: after random times an obstacle stands, heads for the robot, or turns.
+    """Random changes of heading of what moves: after random times an obstacle stands, heads for the robot, or turns.
 
     Attributes:
         every_s: (low, high) range (s) of the time until it chooses again.
@@ -221,7 +221,7 @@ class ObstacleGroup:
 
     @property
     def has_poses(self) -> bool:
-        """Tell whether its obstacles stand where they are told: fixed poses or a layout's."""
+        """Tell whether its obstacles have fixed poses or a layout's."""
         return self.poses is not None or self.layout is not None
 
     @property

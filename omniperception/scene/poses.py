@@ -1,4 +1,4 @@
-"""Obstacles that stand where they are told, and which obstacles take part in an episode."""
+"""Obstacles at fixed or generated poses, and which obstacles take part in an episode."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LAYOUT_SEEDS = {"dev": 1, "test": 2}
 
 
 class Poses:
-    """Obstacles that stand where they are told: at fixed poses, or as the worlds of layouts have them.
+    """Obstacles at fixed poses, or as the worlds of layouts have them.
 
     Attributes:
         which: (O,) bool, those with fixed poses or in a layout.

@@ -203,11 +203,11 @@ def test_a_policy_sees_with_a_head_that_turns(tmp_path):
     assert robot.frame_count >= 2 and (robot.frames[-1] != 0).any(-1).sum() > 20
     points = np.random.default_rng(0).uniform(-3, 3, (300, 3))
     for angle in (0.0, 0.7):  # of the neck, the third joint
-        robot.see(points, [1.0, 0.0, 0.0, 0.0], [0.2, 0.4, angle, -0.2, 0.4])
+        robot.add_frame(points, [1.0, 0.0, 0.0, 0.0], [0.2, 0.4, angle, -0.2, 0.4])
         seen.append(robot.frames[-1].copy())
     assert not np.allclose(*seen, atol=1e-2)
     with pytest.raises(DeployError, match="carried by neck; angles of 5 joints were expected, none given"):
-        robot.see(points, [1.0, 0.0, 0.0, 0.0])
+        robot.add_frame(points, [1.0, 0.0, 0.0, 0.0])
 
 
 GIMBAL = """<body name="gimbal" pos="0.04 0 0.08" euler="20 0 50">
@@ -331,7 +331,7 @@ def test_targets_are_those_of_the_training_environment_where_a_robot_steps(expor
 
 
 def test_histories_are_filled_by_the_first_observation_and_then_move(exported_run):
-    policy = plain(exported_run("none")).another()
+    policy = plain(exported_run("none")).clone()
     described = policy.description
     assert [group.name for group in described.observations] == ["proprioception", "command", "action"]
     width, history = described.observations[0].width, described.observations[0].history
@@ -367,7 +367,7 @@ def test_thinning_keeps_what_training_kept(exported_run):
     assert len(frames) == 2
     for everything, expected in frames:
         assert everything.shape == (20000, 3)
-        np.testing.assert_allclose(policy.thin(everything), expected, atol=1e-6)
+        np.testing.assert_allclose(policy.subsample(everything), expected, atol=1e-6)
 
 
 def test_the_description_says_what_was_trained(exported_run):
@@ -417,7 +417,7 @@ def test_wrong_points_are_named(exported_run):
         (np.zeros((20, 3)), times + np.nan, "offsets_s: seconds since the frame began"),
     ):
         with pytest.raises(DeployError, match=message):
-            policy.thin(points, offsets)
+            policy.subsample(points, offsets)
     with pytest.raises(DeployError, match="this policy is blind"):
         ExportedPolicy.load(exported_run("none") / "exported").step(STAND, [0.0] * 3, np.zeros((20, 3)))
 

@@ -15,7 +15,7 @@ from omniperception.deploy import DeployError, Description, ExportedPolicy, Robo
 from omniperception.deploy.description import Group, Joints, Lidar, Perception, Term
 from omniperception.deploy.go2 import MOTORS
 from omniperception.deploy.runtime import DEFAULT_SAFETY
-from omniperception.deploy.safety import Safety, Sight
+from omniperception.deploy.safety import LidarStatus, Safety
 
 POSE = [0.0, 0.8, -1.5] * 4
 LIMITS = {"lower": [-1.0, -1.5, -2.7] * 4, "upper": [1.0, 3.4, -0.8] * 4}
@@ -112,14 +112,14 @@ def test_without_good_frames_the_robot_slows_down_and_stands_blind(bad, caplog):
             speeds.append(fed_command(robot)[0])
     assert speeds[:16] == [1.0] * 16  # up to 0.34 s
     assert speeds[17:32] == pytest.approx([1 - k / 15 for k in range(1, 16)], abs=1e-6) and speeds[32:] == [0.0] * 7
-    assert robot.safety.sight is Sight.STOPPED and robot._session.fed["frame_count"].tolist() == [[0]]
+    assert robot.safety.lidar_status is LidarStatus.STOPPED and robot._session.fed["frame_count"].tolist() == [[0]]
     assert "slowing down" in caplog.text and "standing" in caplog.text
     assert np.array_equal(robot.frames[-1], seen[-1])  # nothing was taken for free space
     robot.step(state(), [1.0, 0.0, 0.0], CLOUD)
     assert fed_command(robot)[0] == pytest.approx(1 / 15) and robot._session.fed["frame_count"][0, 0] > 0
     for _ in range(14):
         robot.step(state(), [1.0, 0.0, 0.0])
-    assert fed_command(robot)[0] == pytest.approx(1.0) and robot.safety.sight is Sight.FRESH
+    assert fed_command(robot)[0] == pytest.approx(1.0) and robot.safety.lidar_status is LidarStatus.FRESH
 
 
 def test_points_nearer_than_the_sensor_of_training_measures_are_misses():
@@ -128,9 +128,9 @@ def test_points_nearer_than_the_sensor_of_training_measures_are_misses():
     cloud = CLOUD.copy()
     cloud[:2] = [[0.1, 0.0, 0.0], [0.0999, 0.0, 0.0]]
     cloud[2] = np.nan
-    robot.see(cloud, UPRIGHT)
+    robot.add_frame(cloud, UPRIGHT)
     assert robot.frames[-1, :4] * 6.0 == pytest.approx(np.array([[0.1, 0, 0], [0, 0, 0], [0, 0, 0], CLOUD[3]]))
-    robot.see(CLOUD * 0.04, UPRIGHT)
+    robot.add_frame(CLOUD * 0.04, UPRIGHT)
     assert robot.safety.counts["frames refused"] == 1
 
 
@@ -147,7 +147,7 @@ def test_a_robot_that_awaits_its_first_frame_stands():
     robot.safety.await_frame()
     for cloud in [None] * 10 + [CLOUD[:4]] + [None] * 40:
         robot.step(state(), [1.0, 0.0, 0.0], cloud)
-        assert fed_command(robot) == [0.0] * 3 and robot.safety.sight is Sight.STOPPED
+        assert fed_command(robot) == [0.0] * 3 and robot.safety.lidar_status is LidarStatus.STOPPED
     for step in range(1, 16):
         robot.step(state(), [1.0, 0.0, 0.0], CLOUD if step % 5 == 1 else None)
         assert fed_command(robot)[0] == pytest.approx(step / 15)
@@ -233,37 +233,41 @@ class TestThinning:
     times = np.arange(500) * 2e-4
 
     def test_a_whole_frame_is_thinned_by_number(self):
-        assert policy().thin(self.points)[:, 0].tolist() == [1.0 + 5 * k for k in range(100)]
+        assert policy().subsample(self.points)[:, 0].tolist() == [1.0 + 5 * k for k in range(100)]
 
     def test_misses_that_a_driver_left_out_are_zeros_in_their_place(self):
         hit = np.arange(500) % 7 != 0
-        kept = policy().thin(self.points[hit], self.times[hit])[:, 0]
+        kept = policy().subsample(self.points[hit], self.times[hit])[:, 0]
         assert kept.tolist() == [0.0 if 5 * k % 7 == 0 else 1.0 + 5 * k for k in range(100)]
 
     def test_the_order_of_rows_does_not_matter_and_points_of_other_frames_do_not_count(self):
         order = np.random.default_rng(0).permutation(500)
-        assert np.array_equal(policy().thin(self.points[order], self.times[order]), policy().thin(self.points))
+        assert np.array_equal(
+            policy().subsample(self.points[order], self.times[order]), policy().subsample(self.points)
+        )
         assert (
-            not policy().thin(self.points, self.times + 0.1).any()
-            and not policy().thin(self.points, self.times - 0.2).any()
+            not policy().subsample(self.points, self.times + 0.1).any()
+            and not policy().subsample(self.points, self.times - 0.2).any()
         )
 
     def test_rows_are_no_numbers_where_misses_are_left_out(self):
         with pytest.raises(
             DeployError, match=r"a whole frame of 500 was expected, 400 given.*thin\(points, offsets_s\)"
         ):
-            policy().thin(self.points[:400])
+            policy().subsample(self.points[:400])
 
     def test_other_selections_are_spread_over_the_frame_and_its_lasers(self):
         """Of 32 lasers that fire together, 20 times a frame; one of each 6.4 points."""
         robot = policy(lidar=Lidar(0.1, [0.0] * 3, UPRIGHT, 0.1, 6.0, 100, 640, None))
         lasers, shots = np.arange(640) % 32, np.arange(640) // 32
         points = np.stack((1.0 + np.arange(640), lasers, shots), 1)
-        kept = robot.thin(points)
+        kept = robot.subsample(points)
         assert np.unique(kept[:, 1]).size > 28 and np.unique(kept[:, 2]).size == 20
         part = np.searchsorted(np.arange(101) * 640 // 100, kept[:, 0] - 1, "right") - 1
         assert part.tolist() == list(range(100))
-        assert np.array_equal(robot.thin(points, shots * 0.1 / 20), kept)  # those that fire together in their order
+        assert np.array_equal(
+            robot.subsample(points, shots * 0.1 / 20), kept
+        )  # those that fire together in their order
 
 
 def test_the_fingerprint_covers_what_the_network_depends_on(tmp_path):
@@ -301,7 +305,7 @@ def test_the_published_policy_stands_half_a_second_after_it_slows_down(tmp_path)
     blind_from = 100 + 18  # the last frame's age is 0.35 s
     assert np.mean(speeds[50:100]) > 0.5
     assert np.mean(speeds[blind_from + 25 : blind_from + 50]) < 0.15 and np.mean(speeds[200:]) < 0.1
-    assert not env.done.any() and robot.safety.sight is Sight.STOPPED
+    assert not env.done.any() and robot.safety.lidar_status is LidarStatus.STOPPED
 
 
 class TestFramesInPart:

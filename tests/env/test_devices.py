@@ -38,7 +38,7 @@ def device(request):
 def run(request, device):
     overrides = ("sim=mujoco_warp", f"sim.device={device}", "sim.deterministic=true", *SIZES)
     run = build.assemble(config.compose([*TASKS[request.param], *overrides]))
-    return replace(run, env=replace(run.env, full_level=True))
+    return replace(run, env=replace(run.env, skip_curricula=True))
 
 
 def actions(env, steps):

@@ -387,7 +387,7 @@ class TestCurriculum:
 
     def test_at_full_level_it_is_over_from_the_first_step_on(self, make_env):
         rising = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=2).config
-        env = OmniEnv(replace(rising, full_level=True, log_interval=1))
+        env = OmniEnv(replace(rising, skip_curricula=True, log_interval=1))
         logs = [env.step(torch.zeros(2, 12))[3]["log"] for _ in range(3)]
         assert all(log["Metrics/randomization_level"] == log["Metrics/command_level"] == 1.0 for log in logs)
 

@@ -15,8 +15,8 @@ MakeEnv = Callable[..., OmniEnv]
 def make_env() -> MakeEnv:
     """Builds an environment of trials from command-line overrides, with all obstacles."""
 
-    def make(*overrides: str, trials: bool = True, read_besides: tuple[str, ...] = ()) -> OmniEnv:
+    def make(*overrides: str, trials: bool = True, extra_requirements: tuple[str, ...] = ()) -> OmniEnv:
         run = build.assemble(config.compose(["rewards=default", "perception=none", *overrides]))
-        return OmniEnv(replace(run.env, full_level=True, trials=trials, read_besides=read_besides))
+        return OmniEnv(replace(run.env, skip_curricula=True, trials=trials, extra_requirements=extra_requirements))
 
     return make

@@ -57,9 +57,9 @@ class TestBlind:
 
     def test_a_task_that_shows_frames_is_refused(self):
         avoider = trained("run", "scenario=corridor")
-        with pytest.raises(ValueError, match="EnvConfig.shows_frames=False"):
+        with pytest.raises(ValueError, match="EnvConfig.network_sees_frames=False"):
             blind(avoider.env, avoider.policy)
-        with pytest.raises(ValueError, match="EnvConfig.shows_frames=False"):
+        with pytest.raises(ValueError, match="EnvConfig.network_sees_frames=False"):
             oracle(avoider.env, avoider.policy, CONTROLLER, None)
 
     def test_a_policy_without_a_lidar_is_blind_already(self, make_env):

@@ -26,7 +26,7 @@ def test_shares_frequencies_and_bars_of_a_known_pattern():
 
 
 def test_robots_that_stand_have_all_feet_down_and_each_is_commanded_its_own(make_env, tmp_path):
-    env = make_env(*TASK, "observations.command_acceleration=[4,8]", read_besides=("foot_force",))
+    env = make_env(*TASK, "observations.command_acceleration=[4,8]", extra_requirements=("foot_force",))
     seen = []
 
     def stand(observations):
@@ -46,7 +46,7 @@ def test_robots_that_stand_have_all_feet_down_and_each_is_commanded_its_own(make
 
 def test_one_that_falls_has_no_figures_and_none_is_asked_for_more_than_it_is_for(make_env, tmp_path):
     """Legs folded by the one that is to walk back; commands of a robot that goes 0.8 m/s at most, never back."""
-    env = make_env(*TASK, "robot.gait.lin_vel_x=[0.0,0.8]", read_besides=("foot_force",))
+    env = make_env(*TASK, "robot.gait.lin_vel_x=[0.0,0.8]", extra_requirements=("foot_force",))
     folded = torch.zeros(len(COMMANDS), 12)
     folded[4, 0::3] = 6.0
     footfall = watch(env, lambda _: folded)

@@ -89,7 +89,7 @@ def test_ranges_may_be_those_of_a_preset_of_ones_own(tmp_path):
 
 def test_a_kick_changes_one_velocity_once(make_env):
     blind = ("lidar=none", "perception=none", "rewards=walk", "observations=walk", "num_envs=3")
-    env = make_env(*blind, "scenario=walk", "terminations.episode_length_s=8", read_besides=(FOOT_FORCE,))
+    env = make_env(*blind, "scenario=walk", "terminations.episode_length_s=8", extra_requirements=(FOOT_FORCE,))
     kicks = Kicks(env, torch.tensor([[1.0, 0.0], [0.0, 0.5]]))  # the third trial has none
     env.pushes = kicks
     due = round(AFTER_S / env.control_dt)

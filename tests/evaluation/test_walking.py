@@ -54,7 +54,7 @@ def walking_env(make_env):
             "terminations.min_base_height=0.01",
             "terminations.max_tilt_deg=179",
             *overrides,
-            read_besides=("foot_force",),
+            extra_requirements=("foot_force",),
         )
 
     return make

@@ -152,7 +152,7 @@ def test_simulated_frames_agree_with_their_labels(scenario, recall):
     there or beside, where range noise along a ray from the head may put it; and how many of the other sectors report
     one."""
     run = build.assemble(config.load(AVOIDER, [f"scenario={scenario}", "num_envs=8", "seed=5"]))
-    env = OmniEnv(replace(run.env, read_besides=(MEASURED_CLOUD,), full_level=True))
+    env = OmniEnv(replace(run.env, extra_requirements=(MEASURED_CLOUD,), skip_curricula=True))
     sensor, outputs = run.env.lidar, ("ranges", "true_ranges", "directions_s", "class_id")
     lidar = Lidar(
         sensor,

@@ -127,10 +127,10 @@ class TestCoverage:
         coverage = Coverage(1, torch.full((NUM_SECTORS,), 6))
         assert coverage.covered.all()  # before the first frame, as training begins
 
-        def see(answered, came=True):
+        def add_frame(answered, came=True):
             ranges = torch.where(torch.tensor(answered), 1.0, math.inf)[None]
             coverage.begin_frame()
-            coverage.see(ranges, rays[None], torch.tensor([came]), slice(0, 1))
+            coverage.add_frame(ranges, rays[None], torch.tensor([came]), slice(0, 1))
             return set(coverage.covered[0].nonzero().flatten().tolist())
 
         everywhere = set(range(NUM_SECTORS))
@@ -160,11 +160,11 @@ class TestCoverage:
             quat = torch.nn.functional.normalize(tilt, dim=1)
             ours.begin_frame()
             answered = torch.where(ranges <= 6.0, ranges, math.inf)
-            ours.see(answered, levelled(rays, quat, mount), torch.tensor([True]), slice(0, 1))
+            ours.add_frame(answered, levelled(rays, quat, mount), torch.tensor([True]), slice(0, 1))
             points = (ranges[..., None] * rays)[0].numpy()
             points[ranges[0].numpy() > 8.0] = np.nan
             points[(ranges[0].numpy() > 6.0) & (ranges[0].numpy() < 7.0)] = 0.0
-            theirs.see(points, Attitude(quat[0].numpy(), (0.0, 0.0, 0.0), mount.numpy()))
+            theirs.add_frame(points, Attitude(quat[0].numpy(), (0.0, 0.0, 0.0), mount.numpy()))
             assert theirs.covered.tolist() == ours.covered[0].tolist()
             seen.append(theirs.covered.copy())
             for velocity in torch.randn(5, 2, generator=generator):
