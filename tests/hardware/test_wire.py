@@ -105,9 +105,9 @@ def replayed_is_recorded(record, exported):
     assert record.with_suffix(".png").stat().st_size > 20_000
     blind = replay(ExportedPolicy.load(exported), (event for event in events(record, Topics()) if event.points is None))
     assert (
-        not blind.frames() and blind.sight[-1] == "stopped" and np.nanmax(abs(blind.targets() - blind.recorded)) > 0.05
+        not blind.frames() and blind.lidar[-1] == "stopped" and np.nanmax(abs(blind.targets() - blind.recorded)) > 0.05
     )
-    seen = {sight for sight, step in zip(blind.sight, blind.steps, strict=True) if step.mode.startswith("policy")}
+    seen = {status for status, step in zip(blind.lidar, blind.steps, strict=True) if step.mode.startswith("policy")}
     assert seen == {"stopped"}  # a policy that has never had a frame does not begin to walk
 
 

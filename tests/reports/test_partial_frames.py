@@ -127,7 +127,7 @@ class TestCoverage:
         coverage = Coverage(1, torch.full((NUM_SECTORS,), 6))
         assert coverage.covered.all()  # before the first frame, as training begins
 
-        def add_frame(answered, came=True):
+        def see(answered, came=True):
             ranges = torch.where(torch.tensor(answered), 1.0, math.inf)[None]
             coverage.begin_frame()
             coverage.add_frame(ranges, rays[None], torch.tensor([came]), slice(0, 1))
