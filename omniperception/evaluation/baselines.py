@@ -29,14 +29,14 @@ BASELINES = {
     "stop": "the gait follows V_cmd, which falls to zero while the raw noisy cloud has something near ahead",
     "histogram": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the raw noisy cloud"
     " by geometry: nearest return by sector, ground removed, velocities from successive frames, nothing learned",
-    "told": "the gait follows what the run's navigation policy asks for, told the true places and velocities of all"
+    "ground_truth": "the gait follows what the run's navigation policy asks for, given the true places and velocities of all"
     " obstacles",
     "oracle": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the true places and"
     " velocities of all obstacles",
 }
 """Policies to compare with; the gait is the run's own, which then sees nothing, or that of another run."""
 
-DRIVEN = ("stop", "histogram", "told", "oracle")
+DRIVEN = ("stop", "histogram", "ground_truth", "oracle")
 """Those that drive a gait by its command."""
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
@@ -96,8 +96,8 @@ def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig
         return blind(env, policy)
     if name == "stop":
         return stop(env, policy, limits)
-    if name == "told":
-        return told(env, policy, limits)
+    if name == "ground_truth":
+        return ground_truth(env, policy, limits)
     made = {"histogram": histogram, "oracle": oracle}[name]
     return made(env, policy, avoidance, limits)
 
@@ -121,11 +121,11 @@ def oracle(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Lim
     return _driven(env, policy, _avoiding(env, avoidance, motion), limits)
 
 
-def told(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
-    """The policy, driven by what its own navigation asks for when it is told the true obstacles, seen or not."""
+def ground_truth(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
+    """The policy, driven by what its own navigation asks for of the true obstacles, seen or not."""
     navigation = getattr(policy, "navigation", None)
     if navigation is None:
-        raise ValueError("this policy has no navigation that could be told; leave policy=told out")
+        raise ValueError("this policy has no navigation to give ground truth to; leave policy=ground_truth out")
 
     def wanted() -> torch.Tensor:
         state = env.state

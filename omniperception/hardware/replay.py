@@ -28,7 +28,7 @@ class Replayed:
 
     Attributes:
         steps: each of them.
-        lidar: of each, the policy's.
+        lidar: status of the LiDAR at each, as the policy judged it.
         recorded: (steps, 12) rad, targets of the recording, in the motors' order; nan where it has none.
         stops: of the policy: time (s) and why.
         counts: what limits and frames have counted, by name.
