@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omniperception import build, config
 from omniperception.commands import main
 from omniperception.common import provenance
-from omniperception.common.files import held
+from omniperception.common.files import try_lock
 from omniperception.learning import CheckpointError, Runner, distributed, load_checkpoint
 from omniperception.learning.checkpoint import checkpoint_path
 from omniperception.learning.ppo import PerceptivePpo
@@ -58,7 +58,7 @@ def test_two_processes_do_not_train_in_one_directory(tmp_path, monkeypatch, caps
     command = ["train", "experiment=walk", *SMALL, "ppo.max_iterations=1", "hydra.run.dir=here"]
     for again in (command, ["train", "run=here", "ppo.max_iterations=2"]):
         Path("here/checkpoints").mkdir(parents=True, exist_ok=True)
-        with held(tmp_path / "here" / "checkpoints") as alone:
+        with try_lock(tmp_path / "here" / "checkpoints") as alone:
             assert alone
             with pytest.raises(SystemExit, match="2"):
                 main(again)

@@ -32,7 +32,7 @@ from omniperception.cli import Command, argument, fail, trust
 from omniperception.common import provenance
 from omniperception.common.checkpoints import checkpoint_path
 from omniperception.common.errors import one_line
-from omniperception.common.files import held
+from omniperception.common.files import try_lock
 from omniperception.common.shell import command_line
 from omniperception.learning import (
     CheckpointError,
@@ -97,7 +97,7 @@ def go_on(run_dir: Path, overrides: Sequence[str], trust: Sequence[str]) -> None
                     f"{override.input_line}: ppo.schedule=adaptive goes on from the checkpoint's; leave it out, or give"
                     " ppo.schedule=fixed with it"
                 )
-    with _alone_in(run_dir):
+    with _exclusive_run_dir(run_dir):
         learn(run, run_dir, resume=True, changes=overrides, trust=trust)
 
 
@@ -136,7 +136,7 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: 
         _check_sources(run)
         ppo = run.ppo
         check_rollout(run.env.num_envs, ppo.num_steps_per_env, ppo.num_mini_batches, run.perception is not None)
-    with _alone_in(run_dir):
+    with _exclusive_run_dir(run_dir):
         begun = distributed.of_first(config.is_begun(run_dir, run.composed))  # another process may have ended meanwhile
         if distributed.rank() == 0:
             config.save(run.composed, run_dir)
@@ -147,7 +147,7 @@ def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: 
 
 
 @contextmanager
-def _alone_in(run_dir: Path) -> Iterator[None]:
+def _exclusive_run_dir(run_dir: Path) -> Iterator[None]:
     """Refuses to train in a directory in which another process trains: it holds the folder of the checkpoints."""
     if distributed.rank() > 0:
         yield
@@ -159,7 +159,7 @@ def _alone_in(run_dir: Path) -> Iterator[None]:
         raise config.ConfigError(
             f"{run_dir} cannot be written: {error.strerror}; choose another hydra.run.dir"
         ) from None
-    with held(checkpoints) as alone:
+    with try_lock(checkpoints) as alone:
         if not alone:
             raise config.ConfigError(f"{run_dir}: another process trains there; wait for its end, or stop it and go on")
         yield

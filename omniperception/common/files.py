@@ -47,7 +47,7 @@ def _sync(folder: Path) -> None:
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
+def lock(folder: Path) -> Iterator[None]:
     """Keeps other processes that ask for the same folder waiting, so that none loses what another writes there."""
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -58,7 +58,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[bool]:
+def try_lock(folder: Path) -> Iterator[bool]:
     """Holds a folder, and says whether no other process does; it is let go when this ends, or the process dies.
 
     On a file system without locks nobody is kept off.

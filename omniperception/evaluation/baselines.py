@@ -29,8 +29,8 @@ BASELINES = {
     "stop": "the gait follows V_cmd, which falls to zero while the raw noisy cloud has something near ahead",
     "histogram": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the raw noisy cloud"
     " by geometry: nearest return by sector, ground removed, velocities from successive frames, nothing learned",
-    "ground_truth": "the gait follows what the run's navigation policy asks for, given the true places and velocities of all"
-    " obstacles",
+    "ground_truth": "the gait follows what the run's navigation policy asks for, given the true places and velocities"
+    " of all obstacles",
     "oracle": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the true places and"
     " velocities of all obstacles",
 }

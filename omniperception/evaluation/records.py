@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from omniperception.common.files import alone_in, write_whole
+from omniperception.common.files import lock, write_whole
 from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes
 
@@ -121,6 +121,6 @@ def read(path: Path) -> list[Record]:
 def merge(path: Path, records: Sequence[Record]) -> None:
     """Adds records to a file, to which other processes may add theirs; those that measured the same are replaced."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with alone_in(path.parent):
+    with lock(path.parent):
         kept = {record.key: record for record in (read(path) if path.exists() else [])}
         write(path, (kept | {record.key: record for record in records}).values())

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from omniperception.common.files import alone_in
+from omniperception.common.files import lock
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.outcomes import Episodes
@@ -147,7 +147,7 @@ def test_what_another_process_adds_meanwhile_is_kept(tmp_path):
     merge(path, [record()])
     with multiprocessing.get_context("spawn").Pool(1) as other:
         other.apply(read, (path,))  # it has started
-        with alone_in(tmp_path):
+        with lock(tmp_path):
             added = other.apply_async(merge, (path, [record(policy="blind")]))
             with pytest.raises(multiprocessing.TimeoutError):
                 added.get(timeout=0.5)
