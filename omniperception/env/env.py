@@ -41,7 +41,37 @@ Policy = Callable[[TensorDict], torch.Tensor]
 """From observations to actions (num_envs, num_actions), without exploration noise."""
 
 
-class OmniEnv(VecEnv):
+class TaskEnv(VecEnv):
+    """What an environment of one world and one of several families have in common of rsl_rl's contract.
+
+    Attributes:
+        config: of the task.
+        observations: of the present.
+    """
+
+    config: EnvConfig
+    observations: TensorDict
+    _episode_length: torch.Tensor
+
+    @property
+    def cfg(self) -> EnvConfig:
+        """The name by which rsl_rl knows the configuration."""
+        return self.config
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
+        """(num_envs,) int64 control steps since the episodes began; what is assigned is copied, the state reads it."""
+        return self._episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self._episode_length.copy_(steps)
+
+    def get_observations(self) -> TensorDict:
+        return self.observations
+
+
+class OmniEnv(TaskEnv):
     """`num_envs` robots among obstacles behind rsl_rl's VecEnv contract.
 
     One control step: pushes -> `decimation` physics steps, before each of which the obstacles move -> at the LiDAR's
@@ -137,24 +167,7 @@ class OmniEnv(VecEnv):
         self._sense()
         self.observations = self._observe(self._all_envs)
 
-    @property
-    def cfg(self) -> EnvConfig:
-        """The name by which rsl_rl knows the configuration."""
-        return self.config
-
     # ---- rsl_rl's contract -------------------------------------------------------------------------------------------
-
-    @property
-    def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
-        """(num_envs,) int64 control steps since the episodes began; what is assigned is copied, the state reads it."""
-        return self._episode_length
-
-    @episode_length_buf.setter
-    def episode_length_buf(self, steps: torch.Tensor) -> None:
-        self._episode_length.copy_(steps)
-
-    def get_observations(self) -> TensorDict:
-        return self.observations
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """One control step with actions (num_envs, num_actions); see rsl_rl.env.VecEnv."""

@@ -7,11 +7,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import torch
-from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from omniperception.env.config import EnvConfig
-from omniperception.env.env import OmniEnv
+from omniperception.env.env import OmniEnv, TaskEnv
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 
 OF_A_FAMILY = ("num_envs", "seed", "obstacles", "commands", "terminations")
@@ -22,7 +21,7 @@ _SHOWN = ("goal_rate", "collision_rate", "fall_rate", "time_out_rate", "contact_
 """Metrics that are logged for each family, too."""
 
 
-class MixedEnv(VecEnv):
+class MixedEnv(TaskEnv):
     """Groups of environments, one for each family of worlds, as one behind rsl_rl's VecEnv contract.
 
     The environments of a family lie side by side, in the order of the families. All step at once and see LiDAR frames
@@ -66,24 +65,7 @@ class MixedEnv(VecEnv):
         self._joined: dict[str, tuple[list[torch.Tensor], torch.Tensor]] = {}
         self.observations = self._join([env.get_observations() for env in self._each()])
 
-    @property
-    def cfg(self) -> EnvConfig:
-        """The name by which rsl_rl knows the configuration."""
-        return self.config
-
     # ---- rsl_rl's contract -------------------------------------------------------------------------------------------
-
-    @property
-    def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
-        """(num_envs,) int64 control steps since the episodes began; the families count in its parts."""
-        return self._episode_length
-
-    @episode_length_buf.setter
-    def episode_length_buf(self, steps: torch.Tensor) -> None:
-        self._episode_length.copy_(steps)
-
-    def get_observations(self) -> TensorDict:
-        return self.observations
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """One control step with actions (num_envs, num_actions) of all families; see rsl_rl.env.VecEnv."""
