@@ -137,7 +137,10 @@ def heard():
 
 
 @pytest.mark.usefixtures("heard")
-@pytest.mark.parametrize("signals", [[(0.3, "SIGINT"), (0.7, "SIGTERM")], [(0.3, "SIGTERM"), (0.7, "SIGHUP")]])
+@pytest.mark.parametrize(
+    "signals",
+    [[(0.3, "SIGINT"), (0.7, "SIGTERM")], pytest.param([(0.3, "SIGTERM"), (0.7, "SIGHUP")], marks=pytest.mark.slow)],
+)
 def test_a_signal_while_it_walks_slows_it_down_and_lays_it_down(lockstep, monkeypatch, signals):
     """And a second one changes nothing, as a service manager sends it."""
     robot = walking(lockstep("scenario=static"), 1.0)
@@ -155,6 +158,7 @@ def test_a_signal_while_it_walks_slows_it_down_and_lays_it_down(lockstep, monkey
     assert is_lying(robot) and not robot.robot.outcome.fell and robot.robot.outcome.largest_tilt_deg < 30
 
 
+@pytest.mark.slow
 def test_a_guard_that_is_told_to_leave_lays_a_walking_robot_down(lockstep, monkeypatch):
     """While the policy is there and slows it down, as where a service manager ends both."""
     robot = walking(lockstep("scenario=static"), 1.0)

@@ -442,6 +442,7 @@ def test_the_extras_that_messages_name_are_installed_by_the_line_that_is_shown(p
     assert done.returncode == 0 and "already satisfied" in done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_a_response_that_is_not_measured(place, run, capsys):
     """Neither at all, nor under the condition that is asked for: the commands that are shown measure it."""
     gait = Path(os.path.relpath(shutil.copytree(config.SHIPPED_RUNS / "gait", place / "a gait")))
