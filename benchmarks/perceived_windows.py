@@ -55,11 +55,10 @@ class Said(torch.nn.Module):
         return {"nearness": motion[..., 0], "velocity": motion[..., 1:].flatten(1)}
 
 
-def recordings(run: build.RunConfig, given: Arguments, overrides: list[str]) -> dict[str, Recording]:
-    """Frames by scenario, as a run's network takes them, on legs."""
+def recordings(timed: bool, given: Arguments, overrides: list[str]) -> dict[str, Recording]:
+    """Frames by scenario on legs, with the times at which they were taken or without."""
     walker = config.find_run(given.walker, "walker")
-    assert run.perception is not None
-    task = ["experiment=navigator", f"perception={'timed_rings' if run.env.frame_times else 'polar_rings'}"]
+    task = ["experiment=navigator", f"perception={'timed_rings' if timed else 'polar_rings'}"]
     task += [f"condition={given.condition}", f"num_envs={given.num_envs}", "obstacles.curriculum=null", *overrides]
     worlds = {}
     for scenario in given.scenarios:
@@ -74,13 +73,15 @@ def main(given: Arguments, overrides: list[str]) -> None:
     columns = ("run", "windows", "world", "nearness", "velocity")
     table = Table("perceived_windows", f"R^2 on frames of a walking robot, condition={given.condition}", columns)
     curves: dict[str, list[tuple[int, float, float]]] = {}
-    worlds: dict[str, Recording] = {}
+    by_frames: dict[bool, dict[str, Recording]] = {}  # frames with and without times are other rows
     for name in given.runs:
         run_dir = config.find_run(name, "runs")
         run = build.load_run(run_dir)
         if run.perception is None or not run.families:
             raise config.ConfigError(f"runs={name} is no run of experiment=perceive")
-        worlds = worlds or recordings(run, given, overrides)
+        timed = run.env.frame_times
+        if timed not in by_frames:
+            by_frames[timed] = recordings(timed, given, overrides)
         steps = run.ppo.num_steps_per_env // build.steps_per_frame(run)
         for checkpoint in list_checkpoints(run_dir):
             state = load_checkpoint(checkpoint, "cpu")
@@ -90,7 +91,7 @@ def main(given: Arguments, overrides: list[str]) -> None:
             network.load_state_dict(own)
             windows = state["iteration"] * steps * run.env.num_envs
             everyone = torch.arange(given.num_envs)
-            found = {world: scores(Said(network), frames, everyone) for world, frames in worlds.items()}
+            found = {world: scores(Said(network), frames, everyone) for world, frames in by_frames[timed].items()}
             for world, score in found.items():
                 table.rows.append((name, windows, world, score["nearness"], score["velocity"]))
             means = [sum(score[key] for score in found.values()) / len(found) for key in Said.sizes]

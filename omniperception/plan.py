@@ -1,5 +1,7 @@
 """What a run consists of and what it leaves out, read off the parts that were built."""
 
+from collections.abc import Collection
+
 from omniperception.env.env import OmniEnv
 from omniperception.env.mixed import families_of
 from omniperception.learning import Runner
@@ -31,7 +33,11 @@ def _of_env(env: OmniEnv) -> dict[str, list[str]]:
     }
 
 
-def summary(parts: dict[str, list[str]]) -> str:
-    """Two lines for the start of a run."""
-    built, left_out = ([name for name, items in parts.items() if bool(items) == there] for there in (True, False))
+def summary(parts: dict[str, list[str]], families: Collection[str] = ()) -> str:
+    """Two lines for the start of a run; what one of its families has is built, and stands there once."""
+    there: dict[str, list[str]] = {}
+    for name, items in parts.items():
+        family, _, own = name.partition(" ")
+        there.setdefault(own if family in families else name, []).extend(items)
+    built, left_out = ([name for name, items in there.items() if bool(items) == wanted] for wanted in (True, False))
     return f"built: {', '.join(built)}\nleft out: {', '.join(left_out) or 'nothing'}"

@@ -33,6 +33,11 @@ def test_walking_has_no_lidar_no_contact_sensor_and_no_field_of_its_own():
     assert {"rays", "contact sensors", "randomized fields", "obstacles", "sectors", "perception"} <= set(left_out)
 
 
+def test_parts_of_families_are_said_once():
+    parts = {"hold rays": [], "hold sectors": [], "crowd rays": ["9"], "crowd sectors": [], "perception": ["learned"]}
+    assert summary(parts, ("hold", "crowd")) == "built: rays, perception\nleft out: sectors"
+
+
 def test_a_lidar_brings_its_rays_and_shapes():
     parts = build_parts(["experiment=quickstart", "num_envs=2"])
     assert {"1000 every 5 steps", "cylinder", "plane", "distance"} <= set(parts["rays"])

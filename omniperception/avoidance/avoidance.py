@@ -19,7 +19,7 @@ from omniperception.scene import ObstacleField, ObstaclesConfig
 
 
 class Avoidance:
-    """V_avoid of all environments: `see` at each LiDAR frame, `choose` at each control step, `reset` at each reset.
+    """V_avoid of all environments: `add_frame` at each LiDAR frame, `choose` at each step, `reset` at each reset.
 
     It exists only where a term or a supervised network reads it, and holds only what they read.
 
@@ -69,7 +69,7 @@ class Avoidance:
 
     @property
     def obstacle_names(self) -> tuple[str, ...]:
-        """Geoms of the obstacles whose sightings `see` takes, in its order."""
+        """Geoms of the obstacles whose sightings `add_frame` takes, in its order."""
         return () if self.true_sectors is None else self.true_sectors.names
 
     def add_frame(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, seen: torch.Tensor | None) -> None:

@@ -214,7 +214,7 @@ def learn(
         _report_other_terms(composed, teacher, key)
         runner.alg.learn_from(build.load_teacher(teacher, runner.env, trust))
 
-    report(summary(parts_of(runner)))
+    report(summary(parts_of(runner), run.families))
     if distributed.rank() == 0 and run.logger is not None and run.logger.video_interval is not None:
         from omniperception.evaluation.training_videos import TrainingVideos
 

@@ -60,9 +60,9 @@ class ExportedPolicy:
     """The policy of one robot with its memory: proprioception, frames and the previous action.
 
     Call :meth:`step` once per `description.control_period_s`, with the points of a LiDAR frame whenever one is
-    complete, once per `description.lidar.period_s`; where one is lost, call :meth:`miss`. Points are in the sensor
-    frame, in metres, in the order of their measurement, without a correction for the robot's motion. Rows that are not
-    finite or zero are misses, and so are points nearer or farther than training's sensor measures.
+    complete, once per `description.lidar.period_s`; where one is lost, call :meth:`repeat_frame`. Points are in the
+    sensor frame, in metres, in the order of their measurement, without a correction for the robot's motion. Rows that
+    are not finite or zero are misses, and so are points nearer or farther than training's sensor measures.
 
     Unless `safety` is None, commands are limited to the ranges of training and targets to the limits and a rate of the
     joints; without good frames the robot slows down and stands, blind, and it does not go where frames lack points; and
@@ -280,7 +280,7 @@ class ExportedPolicy:
             state: what the robot senses of itself now.
             command: (3,) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame.
             points: (n, 3) m in the sensor frame of a LiDAR frame that has just been completed; None without one.
-            age_s: of that frame, see :meth:`see`.
+            age_s: of that frame, see :meth:`add_frame`.
 
         Returns:
             (num_joints,) float32 joint targets, rad, in the order of `description.joints`.
