@@ -7,13 +7,13 @@ IN_PARALLEL := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 .PHONY: setup demo train test test-fast lint docs
 setup: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml requirements.txt requirements-no-deps.txt
+$(VENV)/.installed: pyproject.toml packages/lidar/pyproject.toml packages/robot/pyproject.toml requirements.txt requirements-no-deps.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed, $$($(PYTHON) -V) was found; name another: $(strip make $(MAKECMDGOALS)) PYTHON=python3.12" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(RUN) -m pip install --quiet --upgrade pip
 	$(RUN) -m pip install --quiet --no-compile --requirement requirements.txt
 	$(RUN) -m pip install --quiet --no-compile --no-deps --requirement requirements-no-deps.txt
-	$(RUN) -m pip install --quiet --no-deps --editable .
+	$(RUN) -m pip install --quiet --no-deps --editable packages/lidar --editable packages/robot --editable .
 	@touch $@
 
 demo: setup

@@ -24,16 +24,16 @@ from pathlib import Path
 
 import torch
 from mujoco.batch import Batch
+from omnirobot.common.cli import Command, argument
+from omnirobot.runtime import DeployError, ExportedPolicy
+from omnirobot.runtime.latency import measure
 
 from benchmarks.harness.table import Table, about, report
 from benchmarks.harness.timing import Timing, paired_ratio, paired_timings
 from omniperception import build, config
 from omniperception.build import RunConfig, build_runner, seed_everything
-from omniperception.cli import Command, argument
 from omniperception.config import ConfigError
-from omniperception.deploy import DeployError, ExportedPolicy
 from omniperception.deploy.export import FOLDER
-from omniperception.deploy.latency import measure
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.exported import record
 from omniperception.sim import SimConfig

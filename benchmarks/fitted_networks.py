@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from omnirobot.common.cli import Command, argument
 from torch import nn
 
 from benchmarks.harness.table import Table, about, report
@@ -24,7 +25,6 @@ from omniperception import build, config
 from omniperception.avoidance.sector_motion import encode
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, AvoidanceConfig, avoidance_velocity
 from omniperception.build import RunConfig
-from omniperception.cli import Command, argument
 from omniperception.env.env import OmniEnv
 from omniperception.learning import CheckpointError
 from omniperception.learning.config import PerceptionConfig

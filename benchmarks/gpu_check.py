@@ -28,6 +28,7 @@ from pathlib import Path
 
 import torch
 import warp as wp
+from omnirobot.common.cli import Command, argument
 
 from benchmarks import env as env_benchmark
 from benchmarks.harness.table import Table, about, machine_line, write
@@ -39,7 +40,6 @@ from benchmarks.lidar_accuracy import accuracy
 from benchmarks.step_errors import step_errors
 from omniperception import build, config
 from omniperception.build import build_runner
-from omniperception.cli import Command, argument
 from omniperception.common.timing import StageTimer
 from omniperception.config import ConfigError
 from omniperception.scene import build_world

@@ -17,13 +17,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
-
-from benchmarks.harness.reference import mujoco_ranges
-from benchmarks.harness.rotations import matrices, random_unit
-from benchmarks.harness.table import Table, about, report
-from omniperception.cli import Command, argument
-from omniperception.common.errors import ConfigError
-from omniperception.lidar import (
+from omnilidar import (
     HeightField,
     Lidar,
     LidarConfig,
@@ -33,7 +27,13 @@ from omniperception.lidar import (
     ShapeKind,
     TriangleMesh,
 )
-from omniperception.lidar.mujoco import MujocoScene
+from omnilidar.mujoco import MujocoScene
+from omnirobot.common.cli import Command, argument
+from omnirobot.common.errors import ConfigError
+
+from benchmarks.harness.reference import mujoco_ranges
+from benchmarks.harness.rotations import matrices, random_unit
+from benchmarks.harness.table import Table, about, report
 
 RELATIVE, ABSOLUTE = 1e-5, 1e-5
 """A range is right within this fraction of it plus this many metres."""

@@ -18,14 +18,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from omnilidar import Lidar, RayScene
+from omnirobot.common.cli import Command, argument
 
 from benchmarks.harness.table import Table, about, report
 from benchmarks.harness.timing import paired_ratio, paired_timings
 from omniperception import build, config
-from omniperception.cli import Command, argument
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.env.sensing import SensorConfig
-from omniperception.lidar import Lidar, RayScene
 from omniperception.scene import World, build_world
 from omniperception.scene.rays import HitClass, RayShapes, ray_shapes
 

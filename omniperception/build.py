@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from omnirobot.common.errors import DoesNotFit, suggest
+from omnirobot.common.shell import command_line
 
 from omniperception import config as configs
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET
-from omniperception.common.errors import DoesNotFit, suggest
 from omniperception.common.provenance import made_at
-from omniperception.common.shell import command_line
 from omniperception.config import ConfigError, is_composed, one_line
 from omniperception.env.config import EnvConfig
 from omniperception.env.env import OmniEnv, Policy

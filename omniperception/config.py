@@ -21,11 +21,11 @@ from hydra.core.override_parser.types import ChoiceSweep, Override, OverrideType
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from omnirobot.common.errors import ConfigError, UnknownKey, one_line, suggest
+from omnirobot.common.files import write_whole
+from omnirobot.common.shell import command_line
 
 from omniperception.common.checkpoints import list_checkpoints
-from omniperception.common.errors import ConfigError, UnknownKey, one_line, suggest
-from omniperception.common.files import write_whole
-from omniperception.common.shell import command_line
 
 _SHIPPED = Path(__file__).resolve().parent / "conf"
 CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"
@@ -57,7 +57,7 @@ _PATHS = ("dir", "file", "files", "init", "path", "searchpath", "subdir", "teach
 
 def _device_figure(name: str, figure: str) -> float:
     """A figure of a device, for `${device:...}` in presets."""
-    from omniperception.lidar import DEVICES
+    from omnilidar import DEVICES
 
     if name not in DEVICES:
         raise ValueError(f"lidar.device={name} is unknown; known: {', '.join(DEVICES)}")

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from omnirobot.common.errors import ConfigError, DoesNotFit, UnknownKey, suggest
 
-from omniperception.common.errors import ConfigError, DoesNotFit, UnknownKey, suggest
 from omniperception.env.mdp.terms import RewardTerm
 
 ANYTHING = None

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from omnirobot.common.cli import Command, argument
 
-from omniperception.cli import Command, argument
 from omniperception.config import ConfigError
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omnilidar import Lidar, vlp16
 
 from omniperception.build import assemble, build_runner
 from omniperception.config import compose
-from omniperception.lidar import Lidar, vlp16
 
 ROOT = Path(__file__).resolve().parents[1]
 LIDAR = ROOT / "docs" / "guide" / "lidar.md"

@@ -12,11 +12,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from omnilidar import TriangleMesh, mid360
+from omnirobot.common.figures import PlotsUnavailable, new_figure
 
 from omniperception.commands import COMMANDS, main
 from omniperception.commands import EXTRAS as EXTRA_OF
-from omniperception.common.figures import PlotsUnavailable, new_figure
-from omniperception.lidar import TriangleMesh, mid360
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -41,13 +41,13 @@ sys.meta_path.insert(0, Blocked())
 EXTRAS = {"hydra", "omegaconf", "yaml", "mujoco", "rsl_rl", "tensordict", "tensorboard", "matplotlib", "trimesh"}
 CAST = """
 import numpy as np
-from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, vlp16
+from omnilidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, vlp16
 
 ball = Shape(ShapeKind.SPHERE, (0.5,), pos=(3.0, 0.0, 1.0))
 scene = RayScene([Shape(ShapeKind.PLANE), ball], num_envs=1, num_bodies=0)
 hits = scene.cast(np.array([[[0.0, 0.0, 1.0]]]), np.array([[[1.0, 0.0, 0.0]]]), max_range=20.0)
 assert abs(float(hits.ranges[0, 0]) - 2.5) < 1e-5
-outside = [m for m in sys.modules if m.startswith("omniperception.") and not m.startswith("omniperception.lidar")]
+outside = [m for m in sys.modules if m.startswith("omniperception.") and not m.startswith("omnilidar")]
 assert not outside, outside
 """
 

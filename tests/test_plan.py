@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from omnilidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid
+from omnilidar.launch import SplitLaunch
 
 from omniperception.commands.plan import build_parts, command
-from omniperception.lidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid
-from omniperception.lidar.launch import SplitLaunch
 from omniperception.plan import summary
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,7 +79,7 @@ def test_training_says_what_is_built_and_imports_no_extras(experiment, sees, tmp
     modules, cuda = json.loads(found.removeprefix("FOUND "))
     extras = {"matplotlib", "trimesh", "viser", "onnx", "onnxruntime", "imageio_ffmpeg", "mujoco_lidar", "mujoco_warp"}
     assert not cuda and not extras & set(modules)
-    unneeded = {"omniperception.lidar.kernels", "omniperception.lidar.sensor", "omniperception.env.sensing"}
+    unneeded = {"omnilidar.kernels", "omnilidar.sensor", "omniperception.env.sensing"}
     assert (unneeded <= set(modules)) == sees == bool(unneeded & set(modules))
     (line,) = (line for line in done.stdout.splitlines() if line.startswith("built: "))
     assert ("rays" in line.split(", ")) == sees

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from omnilidar import DEVICES
 
 from omniperception import build, config
 from omniperception.build import build_runner
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
-from omniperception.lidar import DEVICES
 from omniperception.scene.tiled_terrain import TiledTerrainConfig
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -134,7 +134,8 @@ def trained(tmp_path_factory):
 def test_it_learns_the_gait_and_its_export_acts_alike(name, trained):
     pytest.importorskip("onnxruntime", reason="extra deploy")
     pytest.importorskip("onnx", reason="extra export")
-    from omniperception.deploy import ExportedPolicy
+    from omnirobot.runtime import ExportedPolicy
+
     from omniperception.deploy.export import export
     from omniperception.evaluation.exported import ExportedPolicies
 

@@ -175,7 +175,7 @@ class TestStrangers:
             ("rewards/terms/x", {"weight": 1.0, "func": "logging.FileHandler", "filename": "touched", "mode": "w"}),
             ("rewards/terms/x", {"weight": 0.0, "func": "logging.FileHandler"}),
             ("rewards/terms/x", {"weight": 1.0, "func": "omniperception.config.save", "run_dir": "touched"}),
-            ("rewards/terms/x", {"weight": 1.0, "func": "omniperception.lidar.os.system"}),
+            ("rewards/terms/x", {"weight": 1.0, "func": "omnilidar.os.system"}),
             ("observations/groups/command/terms/x", {"func": "os.mkdir", "path": "touched"}),
             ("perception/network", {"type": "os.system", "command": "touch touched"}),
             ("perception/network", {"type": "polar_rings", "rings": {"type": "os.system"}}),

@@ -9,11 +9,11 @@ import pytest
 import torch
 import yaml
 from omegaconf import OmegaConf
+from omnirobot.common.files import try_lock
 
 from omniperception import build, config
 from omniperception.commands import main
 from omniperception.common import provenance
-from omniperception.common.files import try_lock
 from omniperception.learning import CheckpointError, Runner, distributed, load_checkpoint
 from omniperception.learning.checkpoint import checkpoint_path
 from omniperception.learning.ppo import PerceptivePpo

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from omnilidar.sensor import Lidar  # noqa: F401  Warp asks for the processor in a process of its own
 
 from omniperception import build, config
 from omniperception.commands import COMMANDS, main
 from omniperception.common import provenance
 from omniperception.learning import Runner
-from omniperception.lidar.sensor import Lidar  # noqa: F401  Warp asks for the processor in a process of its own
 
 ROOT = Path(__file__).resolve().parents[1]
 GROUPS = sorted(path.name for path in config.CONFIG_DIR.iterdir() if path.is_dir())

@@ -25,10 +25,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from omnirobot.common.cli import Command, argument
+from omnirobot.common.figures import PlotsUnavailable
 
 from benchmarks.harness.table import Table, about, machine_line, report
-from omniperception.cli import Command, argument
-from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
 
 from .baselines import MUJOCO_LIDAR, NEWTON, ONE_MESH

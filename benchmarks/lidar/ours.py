@@ -1,4 +1,4 @@
-"""The benchmark's only door to ``omniperception.lidar``."""
+"""The benchmark's only door to ``omnilidar``."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import fields, replace
 from functools import cache, partial
 
 import numpy as np
+import omnilidar as lidar
 import torch
 
 from benchmarks.harness.memory import buffer_bytes
-from omniperception import lidar
 
 from .methods import Entry
 from .scenes import BenchmarkScene, Scan, Terrain
@@ -44,7 +44,7 @@ def long_scan(num_envs: int, num_rays: int, seed: int = 0) -> Scan:
 
 
 class Ours:
-    """``omniperception.lidar``; the sensor rides on body 0, the obstacles are the bodies after it."""
+    """``omnilidar``; the sensor rides on body 0, the obstacles are the bodies after it."""
 
     rotates_rays = True
 

@@ -23,14 +23,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from omnirobot.common.cli import Command, argument, refuse_arguments
+from omnirobot.common.figures import PlotsUnavailable, new_figure
+from omnirobot.runtime import DeployError
 
 from benchmarks.harness.pareto import Study, plot
 from benchmarks.harness.table import about, machine_line, report
 from omniperception import build, config
-from omniperception.cli import Command, argument, refuse_arguments
-from omniperception.common.figures import PlotsUnavailable, new_figure
 from omniperception.config import ConfigError
-from omniperception.deploy import DeployError
 from omniperception.learning import CheckpointError
 from omniperception.perception import PdSampler
 

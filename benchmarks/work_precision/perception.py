@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from omnilidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
 
 from benchmarks.harness.pareto import Choice, Study
 from benchmarks.harness.rotations import matrices
@@ -22,7 +23,6 @@ from omniperception.config import compose
 from omniperception.env.config import HEIGHT_TARGET
 from omniperception.env.env import OmniEnv
 from omniperception.env.heights import height_grid
-from omniperception.lidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
 from omniperception.perception import Attitude, PdSampler, PerceptionNetwork, ProximitySampler, Sampler
 from omniperception.scene.rays import HitClass
 

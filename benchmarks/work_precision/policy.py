@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from omnirobot.common.shell import command_line
+from omnirobot.runtime import ExportedPolicy
+
 from benchmarks.harness.pareto import Choice, Study
 from benchmarks.harness.timing import paired_timings
 from omniperception import build, config
-from omniperception.common.shell import command_line
-from omniperception.deploy import ExportedPolicy
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.exported import record

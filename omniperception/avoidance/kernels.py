@@ -3,8 +3,7 @@
 import math
 
 import warp as wp
-
-from omniperception.lidar.kernels.sectors import sector_of
+from omnilidar.kernels.sectors import sector_of
 
 
 @wp.func

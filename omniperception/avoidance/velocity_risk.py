@@ -137,9 +137,9 @@ class VelocityRisk:
     def _largest(self, sectors: torch.Tensor, candidates: torch.Tensor) -> torch.Tensor:
         """As :meth:`risk`, without gradients: whose sector makes a risk, and when, is not kept."""
         import warp as wp
+        from omnilidar.launch import constant, launch_over_envs, view
 
         from omniperception.avoidance.kernels import largest_risks
-        from omniperception.lidar.launch import constant, launch_over_envs, view
 
         sectors = sectors.float().contiguous()
         points = sectors.new_empty(*sectors.shape[:2], 2)
@@ -166,9 +166,9 @@ class VelocityRisk:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """As :meth:`_worst`; loads Warp, which a run without obstacles does not."""
         import warp as wp
+        from omnilidar.launch import constant, launch_over_envs, view
 
         from omniperception.avoidance.kernels import worst_sectors
-        from omniperception.lidar.launch import constant, launch_over_envs, view
 
         place, velocity = place.contiguous(), velocity.contiguous()
         sector = torch.zeros(len(place), len(candidates), dtype=torch.int64, device=place.device)

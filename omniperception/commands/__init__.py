@@ -1,12 +1,6 @@
 """The commands of `omniperception`, a module each."""
 
-from __future__ import annotations
-
-import importlib
-import sys
-from collections.abc import Sequence
-
-from omniperception.cli import terminal
+from omnirobot.common.cli import Program
 
 COMMANDS = {
     "demo": "shows the published policy among moving obstacles, in the browser or as a film",
@@ -50,34 +44,11 @@ EXTRAS = {
     **dict.fromkeys(("laspy", "mcap", "mcap_ros2", "pypcd4", "rosbags"), "clouds"),
 }
 """Extra of this package that brings each library."""
+_OF_ROBOT = {"robot": "omnirobot.commands.drive", "replay-bag": "omnirobot.commands.replay"}
 
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Runs `omniperception <command> [key=value ...]`."""
-    with terminal():
-        _run(list(sys.argv[1:] if argv is None else argv))
-
-
-def _run(argv: list[str]) -> None:
-    name, *rest = argv or ["--help"]
-    if name in ("-h", "--help"):
-        width = max(map(len, COMMANDS))
-        lines = (f"  {command:<{width}}  {what}" for command, what in COMMANDS.items())
-        print("\n".join(["usage: omniperception <command> [key=value ...]", "", *lines, ""]))
-        print("omniperception <command> --help explains a command.")
-        return
-    if name not in COMMANDS:
-        _fail(f"{name} is unknown; known: {', '.join(COMMANDS)}")
-    try:
-        command = importlib.import_module(f"omniperception.commands.{name.replace('-', '_')}").command
-        command(rest, f"omniperception {name}")
-    except ModuleNotFoundError as error:
-        library = (error.name or "").partition(".")[0]
-        if library not in EXTRAS:
-            raise
-        _fail(f"{name} needs {library}: pip install 'omniperception[{EXTRAS[library]}]'")
-
-
-def _fail(message: str) -> None:
-    print(f"error: {message}", file=sys.stderr)
-    sys.exit(2)
+main = Program(
+    "omniperception",
+    COMMANDS,
+    {name: _OF_ROBOT.get(name, f"omniperception.commands.{name.replace('-', '_')}") for name in COMMANDS},
+    EXTRAS,
+)

@@ -18,9 +18,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from omnirobot.common.cli import Command, argument, trust
+from omnirobot.common.errors import check_known
+
 from omniperception import config
-from omniperception.cli import Command, argument, trust
-from omniperception.common.errors import check_known
 from omniperception.evaluation.ablation import (
     Ablation,
     Study,

@@ -33,9 +33,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, trust
+from omnirobot.common.figures import PlotsUnavailable
+
 from omniperception import config
-from omniperception.cli import RESULTS, Command, argument, refuse_arguments, trust
-from omniperception.common.figures import PlotsUnavailable
 from omniperception.config import ConfigError
 from omniperception.evaluation.baselines import DRIVEN
 from omniperception.evaluation.suite import (

@@ -9,7 +9,7 @@ Writes into exported/ in the run directory, or into `out`:
     policy.json    names, scales, rates, layout of the observations, sampling, mount of the sensor, provenance
     deploy.yaml    what of it unitree_rl_lab's form has a place for; of a Go2
 
-omniperception.deploy.ExportedPolicy runs it, with sampling and history, from raw points, joint states and IMU.
+omnirobot.runtime.ExportedPolicy runs it, with sampling and history, from raw points, joint states and IMU.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from omnirobot.common.cli import Command, argument, trust
+
 from omniperception import config
-from omniperception.cli import Command, argument, trust
 from omniperception.deploy.deploy_yaml import FILE as DEPLOY_YAML
 from omniperception.deploy.export import FOLDER, FORMATS, export
 from omniperception.learning import CheckpointError

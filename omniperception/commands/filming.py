@@ -8,7 +8,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omniperception.cli import argument
+from omnirobot.common.cli import argument
+
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.evaluation.camera import CAMERAS
 from omniperception.evaluation.video_options import VideoOptions

@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, refuse_overrides, trust
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import PlotsUnavailable, check_figures
 
 from omniperception import build, config
-from omniperception.cli import RESULTS, Command, argument, refuse_arguments, refuse_overrides, trust
-from omniperception.common.errors import ConfigError
-from omniperception.common.figures import PlotsUnavailable, check_figures
 from omniperception.common.tables import markdown
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.evaluation import robustness

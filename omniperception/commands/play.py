@@ -17,10 +17,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
+from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides, trust
+from omnirobot.common.files import write_whole
+
 from omniperception import build, config
-from omniperception.cli import Command, argument, refuse_arguments, refuse_overrides, trust
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
-from omniperception.common.files import write_whole
 from omniperception.common.provenance import provenance
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.report import summary_table, times_line

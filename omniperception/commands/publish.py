@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from omnirobot.common.cli import Command, argument
+
 from omniperception import config
-from omniperception.cli import Command, argument
 from omniperception.learning import CheckpointError
 from omniperception.publish import publish
 

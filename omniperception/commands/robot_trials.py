@@ -21,11 +21,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from omnirobot.common.cli import Command, argument, trust
+from omnirobot.common.errors import check_known
+from omnirobot.runtime.description import DeployError
+
 from omniperception import config
-from omniperception.cli import Command, argument, trust
-from omniperception.common.errors import check_known
-from omniperception.deploy.description import DeployError
-from omniperception.hardware.trials import KNOWN_FAULTS, NO_FAULT, TrialsConfig, results, run, table
+from omniperception.deploy.trials import KNOWN_FAULTS, NO_FAULT, TrialsConfig, results, run, table
 
 
 @dataclass(frozen=True, kw_only=True)

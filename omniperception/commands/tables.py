@@ -17,9 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from omniperception.cli import Command, argument
-from omniperception.common.files import write_whole
-from omniperception.common.shell import command_line
+from omnirobot.common.cli import Command, argument
+from omnirobot.common.files import write_whole
+from omnirobot.common.shell import command_line
+
 from omniperception.config import ConfigError
 from omniperception.evaluation.tables import rendered
 

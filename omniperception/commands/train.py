@@ -26,14 +26,14 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from omnirobot.common.cli import Command, argument, fail, trust
+from omnirobot.common.errors import one_line
+from omnirobot.common.files import try_lock
+from omnirobot.common.shell import command_line
 
 from omniperception import build, config
-from omniperception.cli import Command, argument, fail, trust
 from omniperception.common import provenance
 from omniperception.common.checkpoints import checkpoint_path
-from omniperception.common.errors import one_line
-from omniperception.common.files import try_lock
-from omniperception.common.shell import command_line
 from omniperception.learning import (
     CheckpointError,
     RolloutTooSmall,

@@ -15,9 +15,8 @@ from importlib import metadata
 from pathlib import Path
 
 import torch
-
-from omniperception.common.errors import ConfigError
-from omniperception.common.files import write_whole
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 """The checkout, or the folder that the package is installed in."""

@@ -1,7 +1,1 @@
-"""An exported policy on a robot: NumPy and onnxruntime, without torch, Warp or Hydra."""
-
-from omniperception.deploy.description import DeployError, Description
-from omniperception.deploy.runtime import ExportedPolicy, RobotState
-from omniperception.deploy.safety import SafetyConfig, SafetyStop
-
-__all__ = ["DeployError", "Description", "ExportedPolicy", "RobotState", "SafetyConfig", "SafetyStop"]
+"""From a trained policy to a robot: its export, and a simulated robot on the robot's own wire to try it on."""

@@ -6,10 +6,9 @@ import math
 from collections.abc import Sequence
 
 import yaml
-
-from omniperception.common.errors import repeated
-from omniperception.deploy.description import Description, Group, Joints, Term
-from omniperception.deploy.go2 import MOTORS
+from omnirobot.common.errors import repeated
+from omnirobot.runtime.description import Description, Group, Joints, Term
+from omnirobot.runtime.go2 import MOTORS
 
 FILE = "deploy.yaml"
 

@@ -16,19 +16,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from rsl_rl.models import MLPModel
-from torch import nn
-
-from omniperception import build
-from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
-from omniperception.build import RunConfig
-from omniperception.common.files import write_whole
-from omniperception.common.provenance import provenance
-from omniperception.common.vectors import moved_towards
-from omniperception.config import ConfigError
-from omniperception.deploy.deploy_yaml import FILE as DEPLOY_YAML
-from omniperception.deploy.deploy_yaml import deploy_yaml
-from omniperception.deploy.description import (
+from omnirobot.common.files import write_whole
+from omnirobot.runtime.description import (
     FINGERPRINT,
     Description,
     Group,
@@ -40,6 +29,17 @@ from omniperception.deploy.description import (
     Turn,
     checksum,
 )
+from rsl_rl.models import MLPModel
+from torch import nn
+
+from omniperception import build
+from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
+from omniperception.build import RunConfig
+from omniperception.common.provenance import provenance
+from omniperception.common.vectors import moved_towards
+from omniperception.config import ConfigError
+from omniperception.deploy.deploy_yaml import FILE as DEPLOY_YAML
+from omniperception.deploy.deploy_yaml import deploy_yaml
 from omniperception.env.env import MAX_ACTION, OmniEnv
 from omniperception.env.mdp import observations
 from omniperception.env.mdp.commands import VelocityCommandConfig
@@ -276,7 +276,7 @@ def _perception(config: PerceptionConfig, lidar: SensorConfig | None) -> Percept
 
 
 def sampler_parameters(sampler: Sampler) -> dict:
-    """Kind and parameters of a sampler, as `omniperception.deploy.sampling.make_sampler` takes them."""
+    """Kind and parameters of a sampler, as `omnirobot.runtime.sampling.make_sampler` takes them."""
     if type(sampler) not in (RawSampler, StandingSampler, PdSampler, FpsSampler, ProximitySampler):
         raise ConfigError(f"perception.sampler: a {type(sampler).__name__} cannot be exported")
     if isinstance(sampler, RawSampler):

@@ -7,6 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from omnilidar import DEVICES, Noise
+from omnilidar.noise import NAMES as NOISE_NAMES
+
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, MOTION_TARGET, SECTOR_TARGET
 from omniperception.common.random import MOST_SEEDS
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig
@@ -14,8 +17,6 @@ from omniperception.env.mdp.randomization import DRAWN, RandomizationConfig
 from omniperception.env.mdp.terminations import TerminationsConfig
 from omniperception.env.mdp.terms import ObservationsConfig, RewardsConfig
 from omniperception.env.state import AVOIDANCE, CLOUD, DISTAL_RANGE, LEGS, MEASURED_CLOUD, requirements
-from omniperception.lidar import DEVICES, Noise
-from omniperception.lidar.noise import NAMES as NOISE_NAMES
 from omniperception.scene import (
     MapTerrainConfig,
     ObstaclesConfig,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
+from omnilidar.launch import use_threads
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
@@ -30,7 +31,6 @@ from omniperception.env.mdp.randomization import Randomizer
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 from omniperception.env.metrics import OUTCOMES, EpisodeMetrics
 from omniperception.env.state import CONTACT_SENSORS, EnvState
-from omniperception.lidar.launch import use_threads
 from omniperception.scene import ObstacleField, build_world
 
 MAX_ACTION = 100.0

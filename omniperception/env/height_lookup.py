@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 import warp as wp
+from omnilidar.launch import view
 
 from omniperception.env.heights import MAX_HEIGHT, NUM_HEIGHTS, footprint_grid, height_grid
 from omniperception.env.kinematics import Kinematics
-from omniperception.lidar.launch import view
 from omniperception.scene.ground import Ground
 from omniperception.scene.ground_kernels import base_heights, heights_around
 

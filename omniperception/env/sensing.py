@@ -7,14 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import torch
-
-from omniperception.avoidance.coverage import Coverage, kept_to_covered, least_bins, levelled
-from omniperception.common.rotations import multiply
-from omniperception.common.timing import StageTimer
-from omniperception.env.frame_delivery import FrameDelivery, PastPoses
-from omniperception.env.kinematics import Kinematics
-from omniperception.env.odometry import Odometry, TimedOdometry
-from omniperception.lidar import (
+from omnilidar import (
     DEVICES,
     Lidar,
     LidarConfig,
@@ -26,7 +19,14 @@ from omniperception.lidar import (
     env_slices,
     ray_bytes,
 )
-from omniperception.lidar.launch import constant
+from omnilidar.launch import constant
+
+from omniperception.avoidance.coverage import Coverage, kept_to_covered, least_bins, levelled
+from omniperception.common.rotations import multiply
+from omniperception.common.timing import StageTimer
+from omniperception.env.frame_delivery import FrameDelivery, PastPoses
+from omniperception.env.kinematics import Kinematics
+from omniperception.env.odometry import Odometry, TimedOdometry
 from omniperception.perception import Attitude, Sampler
 from omniperception.scene import RobotConfig
 from omniperception.scene.rays import HitClass, ray_shapes
@@ -44,7 +44,7 @@ class SensorConfig(LidarConfig):
         pattern: makes the scan pattern; None: the device's.
         exclude_geoms: geoms of the robot that its rays pass through: the housing around the sensor.
         mount_body: link that carries the sensor and moves against the base; None: the base.
-        device: name in `omniperception.lidar.DEVICES` of the sensor whose own noise `randomization.lidar_device` puts
+        device: name in `omnilidar.DEVICES` of the sensor whose own noise `randomization.lidar_device` puts
             on, or None.
         distal_below_deg: rays whose elevation in the sensor frame is below this count for `capped_ray_distance`.
         cloud_mb: most memory (MB) for clouds that exist at the same time; where those of all environments take more,

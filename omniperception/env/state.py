@@ -20,6 +20,8 @@ from omniperception.scene.build import FOOT_FORCE, LINK_FORCE, OBSTACLE_CONTACT,
 from omniperception.scene.stepping import stepping_offsets
 
 if TYPE_CHECKING:  # parts that not every task has
+    from omnilidar import LidarFrame
+
     from omniperception.avoidance.avoidance import Avoidance
     from omniperception.avoidance.true_sectors import TrueSectors
     from omniperception.env.height_lookup import HeightLookup
@@ -27,7 +29,6 @@ if TYPE_CHECKING:  # parts that not every task has
     from omniperception.env.mdp.randomization import Randomizer
     from omniperception.env.measurement import MeasurementErrors
     from omniperception.env.sensing import LidarSensing
-    from omniperception.lidar import LidarFrame
     from omniperception.scene import ObstacleField, RobotConfig, SteppingConfig
     from omniperception.sim import Simulator
 

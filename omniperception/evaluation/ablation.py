@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import yaml
+from omnirobot.common.errors import check_known, one_line
+from omnirobot.common.files import write_whole
+from omnirobot.common.signals import interruptible
 
 from omniperception import build, config
-from omniperception.common.errors import check_known, one_line
-from omniperception.common.files import write_whole
-from omniperception.common.signals import interruptible
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record, read, write
 from omniperception.evaluation.study_report import study_table

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import new_figure, plain, save_figure
 
 from omniperception import config
-from omniperception.common.errors import ConfigError
-from omniperception.common.figures import new_figure, plain, save_figure
 from omniperception.evaluation.records import training_of
 
 MAY_DIFFER = ("seed", "logger", config.SEARCH_PATH)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
 import torch
+from omnirobot.common.figures import new_figure, save_figure
 
-from omniperception.common.figures import new_figure, save_figure
 from omniperception.common.rotations import rotate_yaw
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.evaluation.episodes import run_episodes

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from omnirobot.common.figures import new_figure, plain, save_figure
 
-from omniperception.common.figures import new_figure, plain, save_figure
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.report import rate_cell
 from omniperception.evaluation.tracks import Tracks

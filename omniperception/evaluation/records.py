@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from omniperception.common.files import lock, write_whole
+from omnirobot.common.files import lock, write_whole
+
 from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes
 

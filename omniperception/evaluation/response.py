@@ -9,10 +9,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import new_figure, save_figure
 
 from omniperception.avoidance.velocity import COMMAND
-from omniperception.common.errors import ConfigError
-from omniperception.common.figures import new_figure, save_figure
 from omniperception.common.rotations import matrix_of, yaw_quat
 from omniperception.common.vectors import moved_towards
 from omniperception.env.env import OmniEnv, Policy

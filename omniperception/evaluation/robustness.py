@@ -10,9 +10,9 @@ from typing import Any, cast
 
 import torch
 from omegaconf import OmegaConf
+from omnirobot.common.figures import new_figure, save_figure
 
 from omniperception import config
-from omniperception.common.figures import new_figure, save_figure
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
 from omniperception.evaluation.records import Record

@@ -16,16 +16,17 @@ from pathlib import Path
 import torch
 import yaml
 from omegaconf import OmegaConf, open_dict
+from omnilidar.launch import default_num_threads
+from omnirobot.common.errors import check_known, naming, one_line
+from omnirobot.common.figures import check_figures
+from omnirobot.runtime import ExportedPolicy
+from omnirobot.runtime.description import FILE as DESCRIPTION
+from omnirobot.runtime.description import checksum
 
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
-from omniperception.common.errors import check_known, naming, one_line
-from omniperception.common.figures import check_figures
 from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
-from omniperception.deploy import ExportedPolicy
-from omniperception.deploy.description import FILE as DESCRIPTION
-from omniperception.deploy.description import checksum
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.config import EnvConfig
 from omniperception.evaluation.baselines import BASELINES, DRIVEN, Limits, baseline, commanded_ranges, prepared
@@ -37,7 +38,6 @@ from omniperception.evaluation.report import progress_line, table
 from omniperception.evaluation.tracks import Tracks
 from omniperception.evaluation.walking_report import walking_table
 from omniperception.learning import CheckpointError, latest_checkpoint
-from omniperception.lidar.launch import default_num_threads
 
 POLICIES = {
     "run": "the run's policy",

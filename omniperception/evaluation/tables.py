@@ -20,8 +20,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+from omnirobot.common.shell import command_line
 
-from omniperception.common.shell import command_line
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.records import Record, read, training_of

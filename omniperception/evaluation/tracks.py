@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from omnirobot.common.errors import naming
 
-from omniperception.common.errors import naming
 from omniperception.common.random import TrialRandom
 from omniperception.env.env import OmniEnv
 from omniperception.scene.obstacle_field import PARKED_HEIGHT

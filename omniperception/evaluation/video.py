@@ -10,10 +10,10 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 import torch
+from omnirobot.common.errors import naming
 from PIL import Image
 from torch import nn
 
-from omniperception.common.errors import naming
 from omniperception.common.rotations import rotate, rotate_yaw
 from omniperception.env.env import OmniEnv
 from omniperception.env.sensing import split_elevation

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from omniperception.common.errors import ConfigError
+from omnirobot.common.errors import ConfigError
+
 from omniperception.evaluation.camera import CAMERAS
 
 

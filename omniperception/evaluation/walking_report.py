@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
+from omnirobot.common.shell import command_line
 
-from omniperception.common.shell import command_line
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from omnirobot.common.errors import of_a_disk
+from omnirobot.common.files import write_whole
+from omnirobot.common.shell import command_line
 
 from omniperception.common.checkpoints import checkpoint_path, list_checkpoints
-from omniperception.common.errors import of_a_disk
-from omniperception.common.files import write_whole
-from omniperception.common.shell import command_line
 
 FORMAT = "omniperception-checkpoint"
 VERSION = 1

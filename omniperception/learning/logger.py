@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omnirobot.common.errors import naming
 from rsl_rl.utils.log_writer import LogWriter
 
-from omniperception.common.errors import naming
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.progress import ProgressLine, save_progress, say
 

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from omniperception.common.files import write_whole
+from omnirobot.common.files import write_whole
 
 PROGRESS_FILE = "progress.json"
 """In the run directory: completed iterations, those at which training ends, and the newest rates."""

@@ -11,10 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from omnirobot.common.errors import one_line
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from omniperception.common.errors import one_line
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig, first_difference
 from omniperception.env.mixed import MixedEnv

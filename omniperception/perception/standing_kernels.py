@@ -1,9 +1,8 @@
 """The Warp kernel that tells what stands on the ground from what is ground, noise or the robot's own body."""
 
 import warp as wp
-
-from omniperception.lidar.kernels.rotations import to_quat
-from omniperception.lidar.kernels.sectors import levelled, sector_of
+from omnilidar.kernels.rotations import to_quat
+from omnilidar.kernels.sectors import levelled, sector_of
 
 wp.set_module_options({"enable_backward": False})
 

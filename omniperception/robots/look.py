@@ -9,12 +9,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from omnilidar import Lidar, RayScene
+from omnirobot.common.errors import naming
 from PIL import Image
 
-from omniperception.common.errors import naming
 from omniperception.env.sensing import SensorConfig
 from omniperception.evaluation.render import Renderer, View
-from omniperception.lidar import Lidar, RayScene
 from omniperception.scene import World
 from omniperception.scene.rays import HitClass, RayShapes, ray_shapes
 

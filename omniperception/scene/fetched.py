@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from omniperception.common.shell import command_line
+from omnirobot.common.shell import command_line
 
 SCHEME = "fetched:"
 """Begins the `robot.file` of a robot that is downloaded; the rest is its place in the cache."""

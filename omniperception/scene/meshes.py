@@ -10,8 +10,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-
-from omniperception.lidar.mesh_files import read_mesh, unit_said
+from omnilidar.mesh_files import read_mesh, unit_said
 
 
 def _prism(corners: np.ndarray) -> np.ndarray:

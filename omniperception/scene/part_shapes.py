@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 
 import torch
+from omnilidar import quat_from_rpy
 
 from omniperception.common.rotations import matrix_of, multiply, rotate
-from omniperception.lidar import quat_from_rpy
 from omniperception.scene.parts import Part, PartConfig
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from omnirobot.common.errors import repeated
 
-from omniperception.common.errors import repeated
 from omniperception.scene.fetched import SCHEME, fetched
 from omniperception.scene.robot_file import (
     FRAME,

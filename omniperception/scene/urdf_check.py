@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from omniperception.common.errors import repeated, suggest
+from omnirobot.common.errors import repeated, suggest
 
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _OF_JOINTS = ("lower", "upper", "effort", "velocity", "damping", "friction", "multiplier", "offset")

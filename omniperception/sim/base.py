@@ -180,8 +180,8 @@ class SizedGeoms:
     """
 
     def __init__(self, model: mujoco.MjModel, geoms: tuple[int, ...], device: torch.device) -> None:
-        from omniperception.lidar.mujoco import geom_kind  # with what casts rays, which other tasks do without
-        from omniperception.lidar.sizes import ShapeSizes
+        from omnilidar.mujoco import geom_kind  # with what casts rays, which other tasks do without
+        from omnilidar.sizes import ShapeSizes
 
         names = [f"geom {model.geom(k).name}" for k in geoms]
         for name, k in zip(names, geoms, strict=True):

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import mujoco
 import torch
 import warp as wp
+from omnilidar.launch import launch_over_envs, view
 
 from omniperception.common.random import Branch, EnvRandom
 from omniperception.common.rotations import matrix_of, multiply, rotate, rotate_yaw, yaw_of, yaw_quat
-from omniperception.lidar.launch import launch_over_envs, view
 from omniperception.scene import World
 from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.scene.terrain import TerrainConfig

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from omniperception.common.shell import command_line
+from omnirobot.common.shell import command_line
 
 FILE = "response.json"
 """Name of the file in a run directory."""

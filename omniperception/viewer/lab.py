@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-
-from omniperception.env.sensing import SensorConfig
-from omniperception.lidar import (
+from omnilidar import (
     AngularJitter,
     DistanceNoise,
     Dropout,
@@ -25,6 +23,8 @@ from omniperception.lidar import (
     MixedPixels,
     Noise,
 )
+
+from omniperception.env.sensing import SensorConfig
 from omniperception.viewer import charts
 from omniperception.viewer.clock import Clock
 from omniperception.viewer.colours import scale

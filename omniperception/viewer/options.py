@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from omniperception.lidar import RayScene
+    from omnilidar import RayScene
+
     from omniperception.scene import RobotConfig
 
 LOCALHOST = "127.0.0.1"

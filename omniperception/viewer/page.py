@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from omniperception.common.errors import ConfigError
+from omnirobot.common.errors import ConfigError
+
 from omniperception.viewer.options import LOCALHOST, PageOptions, ViewerError
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from omnilidar import Lidar, LidarFrame
 from tensordict import TensorDict
 
 from omniperception import build
@@ -17,7 +18,6 @@ from omniperception.env.state import AVOIDANCE, MEASURED_CLOUD
 from omniperception.evaluation.baselines import BASELINES, Limits, baseline, commanded_ranges
 from omniperception.evaluation.perceived import Perceived, perceived
 from omniperception.learning import Runner, latest_checkpoint
-from omniperception.lidar import Lidar, LidarFrame
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
 from omniperception.scene.rays import RayShapes, ray_shapes
 from omniperception.viewer.drive import Velocity, driven

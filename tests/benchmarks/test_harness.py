@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from omnilidar.kernels.slots import Slots
 
 from benchmarks.harness import timing
 from benchmarks.harness.memory import buffer_bytes
@@ -25,7 +26,6 @@ from benchmarks.harness.reference import (
 from benchmarks.harness.rotations import matrices, quat_about, quat_multiply
 from benchmarks.harness.table import Table, about, write
 from benchmarks.harness.timing import Timing, paired_ratio, paired_timings
-from omniperception.lidar.kernels.slots import Slots
 
 # ---- timer -----------------------------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import omnilidar as lidar
 import pytest
 import torch
 
@@ -19,7 +20,6 @@ from benchmarks.lidar.ours import OURS, Ours, buffer_sizes, feature_cases, mid36
 from benchmarks.lidar.paper import measure_appendix, measure_table
 from benchmarks.lidar.scaling import growth, measure_scaling, plot_scaling, sweeps
 from benchmarks.lidar.scenes import SPEED, environment_mesh, obstacle_scene, spinning_scan, terrain_scene
-from omniperception import lidar
 
 SCAN = spinning_scan(3, channels=4, columns=8)
 TINY = Options(num_envs=2, num_rays=50, num_bodies=8, num_frames=2, rounds=2, num_samples=100)

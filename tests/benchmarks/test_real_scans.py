@@ -6,9 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-
-from benchmarks import real_scans
-from omniperception.lidar import (
+from omnilidar import (
     DEVICES,
     GaussianNoise,
     Lidar,
@@ -20,8 +18,10 @@ from omniperception.lidar import (
     vlp16,
     write_points,
 )
-from omniperception.lidar.clouds import table_of
-from omniperception.lidar.patterns.mid360_series import MEASURED, mid360_model
+from omnilidar.clouds import table_of
+from omnilidar.patterns.mid360_series import MEASURED, mid360_model
+
+from benchmarks import real_scans
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omnilidar import LidarConfig
 
 from benchmarks.work_precision import lidar, perception, physics, policy
 from benchmarks.work_precision.__main__ import command
@@ -18,7 +19,6 @@ from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record, write
-from omniperception.lidar import LidarConfig
 from omniperception.perception import ProximitySampler
 
 ROOT = Path(__file__).resolve().parents[2]

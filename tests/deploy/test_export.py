@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from omnirobot.common.errors import ConfigError
 
-from omniperception.common.errors import ConfigError
 from omniperception.deploy.export import check
 
 

@@ -29,9 +29,10 @@ from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint,
 pytest.importorskip("onnxruntime", reason="extra deploy")
 pytest.importorskip("onnx", reason="extra export")
 
-from omniperception.deploy import DeployError, Description, ExportedPolicy, RobotState
+from omnirobot.runtime import DeployError, Description, ExportedPolicy, RobotState
+from omnirobot.runtime.description import Term
+
 from omniperception.deploy.deploy_yaml import deploy_yaml
-from omniperception.deploy.description import Term
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
 from omniperception.evaluation.exported import ExportedPolicies, raw_points, record, robot_states
 from omniperception.evaluation.suite import Evaluation, World, evaluate
@@ -449,7 +450,7 @@ def test_a_robot_needs_neither_torch_nor_warp_nor_hydra(exported_run):
     folder = exported_run("none") / "exported"
     script = (
         "import sys\n"
-        "from omniperception.deploy import DeployError, ExportedPolicy, RobotState\n"
+        "from omnirobot.runtime import DeployError, ExportedPolicy, RobotState\n"
         f"policy = ExportedPolicy.load({str(folder)!r})\n"
         "pose = policy.description.joints.default_pos\n"
         "policy.step(RobotState(pose, [0]*12, [1,0,0,0], [0]*3, [0]*3), [0]*3)\n"

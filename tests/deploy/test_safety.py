@@ -11,11 +11,11 @@ import torch
 pytest.importorskip("onnxruntime", reason="extra deploy")
 pytest.importorskip("onnx", reason="extra export")
 
-from omniperception.deploy import DeployError, Description, ExportedPolicy, RobotState, SafetyConfig, SafetyStop
-from omniperception.deploy.description import Group, Joints, Lidar, Perception, Term
-from omniperception.deploy.go2 import MOTORS
-from omniperception.deploy.runtime import DEFAULT_SAFETY
-from omniperception.deploy.safety import LidarStatus, Safety
+from omnirobot.runtime import DeployError, Description, ExportedPolicy, RobotState, SafetyConfig, SafetyStop
+from omnirobot.runtime.description import Group, Joints, Lidar, Perception, Term
+from omnirobot.runtime.go2 import MOTORS
+from omnirobot.runtime.runtime import DEFAULT_SAFETY
+from omnirobot.runtime.safety import LidarStatus, Safety
 
 POSE = [0.0, 0.8, -1.5] * 4
 LIMITS = {"lower": [-1.0, -1.5, -2.7] * 4, "upper": [1.0, 3.4, -0.8] * 4}

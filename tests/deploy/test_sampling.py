@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from omnilidar import quat_from_rpy
+from omnirobot.common.errors import ConfigError
+from omnirobot.runtime import DeployError
+from omnirobot.runtime.sampling import Attitude, farthest_points, make_sampler
 
-from omniperception.common.errors import ConfigError
-from omniperception.deploy import DeployError
 from omniperception.deploy.export import sampler_parameters
-from omniperception.deploy.sampling import Attitude, farthest_points, make_sampler
-from omniperception.lidar import quat_from_rpy
 from omniperception.perception import Attitude as TorchAttitude
 from omniperception.perception import FpsSampler, PdSampler, ProximitySampler, RawSampler, StandingSampler
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from omnirobot.common.errors import ConfigError
 
-from omniperception.common.errors import ConfigError
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import yaw_quat
 from omniperception.env.kinematics import Kinematics

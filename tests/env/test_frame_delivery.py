@@ -4,12 +4,12 @@ import math
 
 import pytest
 import torch
+from omnilidar import Lidar
 from stepping import random_actions, still
 
 from omniperception.common.random import EnvRandom
 from omniperception.env.frame_delivery import FrameDelivery
 from omniperception.learning.storage import PerceptiveStorage
-from omniperception.lidar import Lidar
 
 TASK = (
     "experiment=avoid",

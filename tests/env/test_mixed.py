@@ -5,10 +5,10 @@ from itertools import pairwise
 
 import pytest
 import torch
+from omnirobot.common.errors import ConfigError
 from stepping import assert_equal, random_actions
 
 from omniperception import build, config
-from omniperception.common.errors import ConfigError
 from omniperception.env.env import OmniEnv
 from omniperception.env.mixed import MixedEnv, families_of, shares_of
 from omniperception.learning import load_checkpoint, save_checkpoint

@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from omnirobot.runtime.odometry import Odometry as DeployedOdometry
+from omnirobot.runtime.odometry import TimedOdometry as DeployedTimes
+from omnirobot.wire.sensor_clock import FrameAges
 
-from omniperception.deploy.odometry import Odometry as DeployedOdometry
-from omniperception.deploy.odometry import TimedOdometry as DeployedTimes
 from omniperception.env.odometry import Odometry, TimedOdometry
-from omniperception.hardware.sensor_clock import FrameAges
 
 DT = 0.02
 CPU = torch.device("cpu")

@@ -5,11 +5,11 @@ from dataclasses import fields, replace
 import mujoco
 import pytest
 import torch
+from omnilidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
 
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mirror import Mirror
-from omniperception.lidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
 from omniperception.scene.terrain import ground_solrefs
 
 N = 300

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from omnilidar import OUTPUTS, Lidar
 from stepping import OTHERS, assert_equal, outcome, random_actions, still
 
 from omniperception.env.build import build_sampler
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import RewardTerm
 from omniperception.env.state import requires
-from omniperception.lidar import OUTPUTS, Lidar
 
 
 def test_frames_come_at_tick_times_only(make_env):

@@ -8,13 +8,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from omnilidar import launch
+from omnilidar.launch import default_num_threads
 
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp import rewards
 from omniperception.env.mdp.terms import RewardTerm, StatefulTerm
 from omniperception.env.state import AirTimes, requires
-from omniperception.lidar import launch
-from omniperception.lidar.launch import default_num_threads
 
 FEET = {
     "air": RewardTerm(1.0, partial(rewards.foot_air_time, target=0.1, min_speed=0.0)),

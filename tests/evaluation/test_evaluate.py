@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omnirobot.common.figures import PlotsUnavailable
 from PIL import Image
 
 from omniperception import build, config
 from omniperception.build import build_runner
-from omniperception.common.figures import PlotsUnavailable
 from omniperception.common.provenance import provenance
 from omniperception.common.random import EnvRandom
 from omniperception.config import ConfigError

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from omnirobot.common.errors import ConfigError
 
 from omniperception.commands.gait import feet_table
-from omniperception.common.errors import ConfigError
 from omniperception.evaluation.footfall import COMMANDS, Footfall, _bars, draw_footfall, watch
 
 BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk")

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from omnirobot.common.files import lock
 
-from omniperception.common.files import lock
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.outcomes import Episodes

@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from omnirobot.common.errors import ConfigError
 
 from omniperception.commands import main
-from omniperception.common.errors import ConfigError
 from omniperception.evaluation import response
 from omniperception.evaluation.response import Recording, _periodic, around_cycle, driven, falls_by_jump, reach
 from omniperception.evaluation.response_fit import fit, kept, lagged

@@ -6,16 +6,16 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from omnilidar import Shape, ShapeKind
+from omnirobot.common.errors import ConfigError
 from PIL import Image
 
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
-from omniperception.common.errors import ConfigError
 from omniperception.evaluation.camera import CAMERAS, FollowCamera
 from omniperception.evaluation.overlay import legend, sector_plot
 from omniperception.evaluation.render import Arrow, Renderer, View
 from omniperception.evaluation.video import Recorder
 from omniperception.evaluation.video_options import VideoOptions
-from omniperception.lidar import Shape, ShapeKind
 from omniperception.scene.rays import HitClass, RayShapes
 
 WIDTH, HEIGHT = 64, 36

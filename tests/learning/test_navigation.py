@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from omnirobot.common.errors import ConfigError
 
 from omniperception import build, config
 from omniperception.avoidance.velocity_risk import VelocityRisk
-from omniperception.common.errors import ConfigError
 from omniperception.learning.checkpoint import CheckpointError
 from omniperception.learning.read_out import MotionReadOut
 from omniperception.learning.warm_start import take_parts

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omnilidar import Lidar
 from worlds import HEIGHT, LEVEL, MOUNT, PAPER, box, cloud, cylinder, plane, quaternion
 
 from omniperception import build, config
 from omniperception.common.sectors import sector_of
 from omniperception.env.env import OmniEnv
 from omniperception.env.state import MEASURED_CLOUD
-from omniperception.lidar import Lidar
 from omniperception.perception import Attitude
 from omniperception.perception.geometry import (
     NUM_SECTORS,

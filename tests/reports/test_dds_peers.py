@@ -16,12 +16,11 @@ from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.topic import Topic
-
-from omniperception.deploy import DeployError
-from omniperception.hardware import dds, lidar
-from omniperception.hardware.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, REQUEST, Network
-from omniperception.hardware.lidar import LidarSource
-from omniperception.hardware.messages import LOW_CMD, LOW_STATE, Struct, low_cmd, sealed
+from omnirobot.runtime import DeployError
+from omnirobot.wire import dds, lidar
+from omnirobot.wire.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, REQUEST, Network
+from omnirobot.wire.lidar import LidarSource
+from omnirobot.wire.messages import LOW_CMD, LOW_STATE, Struct, low_cmd, sealed
 
 sys.path.append(str(Path(__file__).parents[1] / "hardware"))
 

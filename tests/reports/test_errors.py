@@ -12,12 +12,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from omnirobot.common.figures import new_figure, save_figure
+from omnirobot.common.files import write_whole
 
 from omniperception import config
 from omniperception.commands import COMMANDS, main
 from omniperception.common import provenance
-from omniperception.common.figures import new_figure, save_figure
-from omniperception.common.files import write_whole
 from omniperception.deploy.export import BlindNetwork, write_onnx, write_torchscript
 from omniperception.evaluation.video import Recorder
 from omniperception.learning import CheckpointError, load_checkpoint
@@ -196,9 +196,9 @@ def test_a_folder_where_a_file_should_be_is_named(run_dir, one_line):
 def test_without_a_cache_kernels_are_compiled_for_this_process_alone():
     """A home that cannot be written, as in a container; children have the same folder, which is gone at the end."""
     code = (
-        "import warp as wp; import omniperception.lidar.launch, os, subprocess, sys; wp.init();"
+        "import warp as wp; import omnilidar.launch, os, subprocess, sys; wp.init();"
         "open(wp.config.kernel_cache_dir + '/a', 'w').close(); print(wp.config.kernel_cache_dir, flush=True);"
-        "code = 'import omniperception.lidar.launch, os; print(os.environ[chr(34)])'"
+        "code = 'import omnilidar.launch, os; print(os.environ[chr(34)])'"
         ".replace('chr(34)', repr('WARP_CACHE_PATH')); subprocess.run([sys.executable, '-c', code])"
     )
     plain = {name: value for name, value in os.environ.items() if name not in ("XDG_CACHE_HOME", "WARP_CACHE_PATH")}

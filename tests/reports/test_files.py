@@ -12,16 +12,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from omnilidar import read_points, read_scans, write_points
+from omnilidar.clouds import table_of
+from omnilidar.clouds.pointcloud2 import table_from_message
+from omnirobot.replay.bags import Topics, events
+from omnirobot.replay.recordings import Recording
+from omnirobot.runtime import DeployError
+from omnirobot.runtime.go2 import MOTORS
 
 from benchmarks import real_scans
 from omniperception.commands import main, replay_bag
-from omniperception.common.recordings import Recording
-from omniperception.deploy import DeployError
-from omniperception.deploy.go2 import MOTORS
-from omniperception.hardware.bags import Topics, events
-from omniperception.lidar import read_points, read_scans, write_points
-from omniperception.lidar.clouds import table_of
-from omniperception.lidar.clouds.pointcloud2 import table_from_message
 
 for library in ("mcap_ros2", "rosbags", "pypcd4", "laspy"):
     pytest.importorskip(library, reason="extra clouds")

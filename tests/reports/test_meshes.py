@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from omnilidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh, geom_shapes, read_points
 
 from omniperception.commands import main, scan
 from omniperception.commands.scan import pictures
 from omniperception.commands.scan.room import DemoClass
 from omniperception.config import ConfigError
-from omniperception.lidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh, geom_shapes, read_points
 from omniperception.robots.guess import GUESSED, SURE, guess
 from omniperception.scene.ground import Ground
 from omniperception.scene.map_terrain import HeightMapConfig, PlaceConfig, StartsConfig

@@ -18,15 +18,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import check_figures
+from omnirobot.common.shell import command_line
+from omnirobot.runtime import DeployError, Description, ExportedPolicy
 
 from omniperception import config
 from omniperception.commands import COMMANDS, main
 from omniperception.commands import evaluate as evaluate_command
 from omniperception.commands import robot_fetch as robot_fetch_command
-from omniperception.common.errors import ConfigError
-from omniperception.common.figures import check_figures
-from omniperception.common.shell import command_line
-from omniperception.deploy import DeployError, Description, ExportedPolicy
 from omniperception.evaluation import walking_report
 from omniperception.robots import fetch
 
@@ -51,11 +51,11 @@ CALLS = {
     "omniperception/commands/tables.py": 1,
     "omniperception/commands/train.py": 1,
     "omniperception/config.py": 1,
-    "omniperception/deploy/description.py": 1,
+    "packages/robot/omnirobot/runtime/description.py": 1,
     "omniperception/evaluation/tables.py": 1,
     "omniperception/evaluation/walking_report.py": 1,
     "omniperception/learning/checkpoint.py": 1,
-    "omniperception/hardware/trials.py": 1,
+    "omniperception/deploy/trials.py": 1,
     "omniperception/robots/fetch.py": 1,
     "omniperception/scene/fetched.py": 1,
     "omniperception/sim/planar.py": 1,

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from omnirobot.common.cli import Command
+from omnirobot.common.shell import command_line
 
 from omniperception import config
-from omniperception.cli import Command
 from omniperception.commands import curves, evaluate, main, robot_new
-from omniperception.common.shell import command_line
 from omniperception.evaluation.curves import Curve, draw_curves
 from omniperception.evaluation.video import Recorder
 from omniperception.scene.meshes import check_mesh, mesh_points

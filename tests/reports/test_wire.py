@@ -15,14 +15,13 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1] / "hardware"))
 
 from messages_by_hand import LIVOX, point_cloud2
-
-from omniperception.deploy import DeployError
-from omniperception.hardware import clouds, control, lidar, livox
-from omniperception.hardware.clouds import FrameCutter, Points
-from omniperception.hardware.guard import StateReader
-from omniperception.hardware.lidar import LidarSource
-from omniperception.hardware.livox import Mid360
-from omniperception.hardware.messages import LOW_STATE, sealed
+from omnirobot.drive.guard import StateReader
+from omnirobot.runtime import DeployError
+from omnirobot.wire import clouds, control, lidar, livox
+from omnirobot.wire.clouds import FrameCutter, Points
+from omnirobot.wire.lidar import LidarSource
+from omnirobot.wire.livox import Mid360
+from omnirobot.wire.messages import LOW_STATE, sealed
 
 SEARCH, CONFIGURE = 0x0000, 0x0100
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 from mj_rays import assert_rays_are_those_of_mj_ray
+from omnirobot.common.errors import ConfigError
 from PIL import Image
 
-from omniperception.common.errors import ConfigError
 from omniperception.scene.map_terrain import (
     FloorPlanConfig,
     HeightMapConfig,

@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from omnilidar import ShapeKind
 
 from benchmarks.harness.reference import mujoco_ranges
 from omniperception.evaluation.clearance import Clearance
 from omniperception.evaluation.clearance_kernels import TOLERANCE
-from omniperception.lidar import ShapeKind
 from omniperception.scene.rays import ray_shapes
 
 NUM_ENVS, NUM_RAYS = 3, 1500

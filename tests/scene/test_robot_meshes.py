@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from omnilidar import RayScene
+from omnilidar.mujoco import geom_shapes
 
 from benchmarks import robot_meshes
 from omniperception import build, config
 from omniperception.commands.robot_check import NO_TASK
-from omniperception.lidar import RayScene
-from omniperception.lidar.mujoco import geom_shapes
 from omniperception.robots.stand import flat_world
 from omniperception.scene import RobotConfig
 from omniperception.scene.rays import ray_shapes

@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from omnirobot.common.errors import ConfigError
 
 from omniperception import build, config
 from omniperception.build import load_policy
-from omniperception.common.errors import ConfigError
 from omniperception.env.env import OmniEnv
 from omniperception.scene.build import OBSTACLE_FORCE
 from omniperception.sim.planar_world import PlanarSimulator

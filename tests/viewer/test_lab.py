@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from browser import chromium, control, open_tab, picture, wait_for
+from omnilidar import LidarFrame
 
 from omniperception import build, config
 from omniperception.commands.scan import NO_TASK, lab_room
 from omniperception.commands.scan.room import ROOM, DemoClass, demo_scene
-from omniperception.lidar import LidarFrame
 from omniperception.viewer import PageOptions
 from omniperception.viewer.lab import DT, Bench, Knobs, Lab, Walkers
 

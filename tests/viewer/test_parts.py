@@ -9,9 +9,9 @@ import socket
 
 import numpy as np
 import pytest
+from omnilidar import Shape, ShapeKind
 
 from omniperception import config
-from omniperception.lidar import Shape, ShapeKind
 from omniperception.viewer import PageOptions, ViewerError
 from omniperception.viewer.clock import BEHIND_S, Clock
 from omniperception.viewer.drive import Stick

@@ -18,16 +18,16 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from omnilidar import DEVICES, TriangleMesh
+from omnilidar.mesh_files import AXES, read_mesh, unit_said
+from omnirobot.common.cli import Command, argument, refuse_arguments
+from omnirobot.common.figures import PlotsUnavailable
 
 from omniperception import build, config
-from omniperception.cli import Command, argument, refuse_arguments
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
 from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene, demo_scene, mesh_scene
-from omniperception.common.figures import PlotsUnavailable
 from omniperception.env.config import EnvConfig
 from omniperception.env.sensing import SensorConfig
-from omniperception.lidar import DEVICES, TriangleMesh
-from omniperception.lidar.mesh_files import AXES, read_mesh, unit_said
 from omniperception.scene import RobotConfig
 from omniperception.viewer import PageOptions, ViewerError, serve_lab
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT, Room

@@ -8,11 +8,11 @@ from dataclasses import dataclass, fields
 from operator import attrgetter
 
 import torch
+from omnilidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 
 from omniperception.common.random import EnvRandom
 from omniperception.env.mdp.curriculum import FULL, Curriculum, CurriculumConfig
 from omniperception.env.partial_frames import PartialFramesConfig
-from omniperception.lidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.scene.terrain import ground_solrefs
 from omniperception.sim import Simulator
 

@@ -10,10 +10,10 @@ import math
 from collections.abc import Sequence
 
 import torch
+from omnilidar.launch import constant
 
 from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.env.state import EnvState, requires, rests
-from omniperception.lidar.launch import constant
 
 
 @requires("avoidance")

@@ -3,8 +3,7 @@
 import math
 
 import warp as wp
-
-from omniperception.lidar.kernels.sectors import bearing_in_sectors, sector_at
+from omnilidar.kernels.sectors import bearing_in_sectors, sector_at
 
 FAINT = 1e-6
 """Proximity below which a cell counts as empty; with a decay of 0.5 m, a distance of 6.9 m."""

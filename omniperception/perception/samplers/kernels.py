@@ -8,10 +8,9 @@ device.
 from pathlib import Path
 
 import warp as wp
-
-from omniperception.lidar.kernels.rotations import to_quat
-from omniperception.lidar.kernels.sectors import levelled, sector_of
-from omniperception.lidar.native import function_body
+from omnilidar.kernels.rotations import to_quat
+from omnilidar.kernels.sectors import levelled, sector_of
+from omnilidar.native import function_body
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,0 +1,3 @@
+from omnirobot.commands import main
+
+main()

@@ -1,0 +1,1 @@
+"""What the packages of this repository share without torch: command lines, errors, files."""

@@ -1,0 +1,1 @@
+"""Unitree's messages over DDS, the Livox packets, and clouds."""
