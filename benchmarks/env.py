@@ -24,9 +24,6 @@ from pathlib import Path
 
 import torch
 from mujoco.batch import Batch
-from omnirobot.common.cli import Command, argument
-from omnirobot.runtime import DeployError, ExportedPolicy
-from omnirobot.runtime.latency import measure
 
 from benchmarks.harness.table import Table, about, report
 from benchmarks.harness.timing import Timing, paired_ratio, paired_timings
@@ -37,6 +34,9 @@ from omniperception.deploy.export import FOLDER
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.exported import record
 from omniperception.sim import SimConfig
+from omnirobot.common.cli import Command, argument
+from omnirobot.runtime import DeployError, ExportedPolicy
+from omnirobot.runtime.latency import measure
 
 BLOCK = 25
 """Control steps that are timed at once: a multiple of the LiDAR's period."""

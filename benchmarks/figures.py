@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from omnirobot.common.cli import Command, argument
-from omnirobot.common.figures import PlotsUnavailable, new_figure
 
 from omniperception import build, config
 from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.avoidance.velocity import AvoidanceConfig, avoidance_velocity
+from omnirobot.common.cli import Command, argument
+from omnirobot.common.figures import PlotsUnavailable, new_figure
 
 DISCS = ((0.9, 0.35, 0.3), (-0.2, 0.75, 0.2), (0.6, -1.5, 0.35))
 """Obstacles around the robot of the picture: x, y, radius (m)."""

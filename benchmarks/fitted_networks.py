@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from omnirobot.common.cli import Command, argument
 from torch import nn
 
 from benchmarks.harness.table import Table, about, report
@@ -28,6 +27,7 @@ from omniperception.build import RunConfig
 from omniperception.env.env import OmniEnv
 from omniperception.learning import CheckpointError
 from omniperception.learning.config import PerceptionConfig
+from omnirobot.common.cli import Command, argument
 
 TASK = ("experiment=end_to_end", "obstacles.curriculum=null", "sim.num_threads=1")
 WIDE = AvoidanceConfig(num_sectors=36, threshold=2.0, alpha=1.0, max_speed=1.5)

@@ -28,7 +28,6 @@ from pathlib import Path
 
 import torch
 import warp as wp
-from omnirobot.common.cli import Command, argument
 
 from benchmarks import env as env_benchmark
 from benchmarks.harness.table import Table, about, machine_line, write
@@ -45,6 +44,7 @@ from omniperception.config import ConfigError
 from omniperception.scene import build_world
 from omniperception.scene.build import FOOT_FORCE, OBSTACLE_CONTACT
 from omniperception.sim.mujoco_warp import MujocoWarpSimulator
+from omnirobot.common.cli import Command, argument
 
 ROOT = Path(__file__).resolve().parents[1]
 RAYS_TREE = "mujoco_warp rays"

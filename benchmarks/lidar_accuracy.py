@@ -17,6 +17,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
+
+from benchmarks.harness.reference import mujoco_ranges
+from benchmarks.harness.rotations import matrices, random_unit
+from benchmarks.harness.table import Table, about, report
 from omnilidar import (
     HeightField,
     Lidar,
@@ -30,10 +34,6 @@ from omnilidar import (
 from omnilidar.mujoco import MujocoScene
 from omnirobot.common.cli import Command, argument
 from omnirobot.common.errors import ConfigError
-
-from benchmarks.harness.reference import mujoco_ranges
-from benchmarks.harness.rotations import matrices, random_unit
-from benchmarks.harness.table import Table, about, report
 
 RELATIVE, ABSOLUTE = 1e-5, 1e-5
 """A range is right within this fraction of it plus this many metres."""

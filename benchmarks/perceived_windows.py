@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from omnirobot.common.cli import Command, argument
-from omnirobot.common.figures import new_figure, plain, save_figure
 
 from benchmarks.fitted_networks import Recording, record, scores
 from benchmarks.harness.table import Table, about, report
@@ -23,6 +21,8 @@ from omniperception import build, config
 from omniperception.avoidance.velocity import MOTION_TARGET
 from omniperception.learning import CheckpointError, list_checkpoints, load_checkpoint
 from omniperception.perception import PerceptionNetwork
+from omnirobot.common.cli import Command, argument
+from omnirobot.common.figures import new_figure, plain, save_figure
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from omnirobot.common.cli import Command, argument
 
 from benchmarks.harness.table import Table, about, report
 from benchmarks.harness.timing import Timing, paired_ratio, paired_timings
 from omniperception import build, config
 from omniperception.avoidance.velocity_risk import VelocityRisk
+from omnirobot.common.cli import Command, argument
 
 DECISION_S = 0.1
 

@@ -16,12 +16,12 @@ from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
-from omnilidar import DEVICES, DeviceSpec, PointTable, ScanPattern, read_scans
-from omnilidar.clouds import table_of
-from omnirobot.common.cli import Command, argument
 
 from benchmarks.harness.table import Table, about, report
+from omnilidar import DEVICES, DeviceSpec, PointTable, ScanPattern, read_scans
+from omnilidar.clouds import table_of
 from omniperception.config import ConfigError
+from omnirobot.common.cli import Command, argument
 
 OUSTER = (".pcap", ".osf")
 CHANNELS = ("ring", "channel", "line", "laser")

@@ -18,16 +18,16 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from omnilidar import Lidar, RayScene
-from omnirobot.common.cli import Command, argument
 
 from benchmarks.harness.table import Table, about, report
 from benchmarks.harness.timing import paired_ratio, paired_timings
+from omnilidar import Lidar, RayScene
 from omniperception import build, config
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.env.sensing import SensorConfig
 from omniperception.scene import World, build_world
 from omniperception.scene.rays import HitClass, RayShapes, ray_shapes
+from omnirobot.common.cli import Command, argument
 
 POSES = 4
 """Sets of poses that frames take in turn."""

@@ -14,8 +14,6 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from omnirobot.common.errors import DoesNotFit, suggest
-from omnirobot.common.shell import command_line
 
 from omniperception import config as configs
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET
@@ -42,6 +40,8 @@ from omniperception.scene import Mount, ObstaclesConfig, RobotConfig, SteppingCo
 from omniperception.scene.held_out import held_out
 from omniperception.schema import ANYTHING, make, types_of, words_of
 from omniperception.sim.planar import PlanarConfig
+from omnirobot.common.errors import DoesNotFit, suggest
+from omnirobot.common.shell import command_line
 
 if TYPE_CHECKING:
     from omniperception.env.sensing import SensorConfig

@@ -21,11 +21,11 @@ from hydra.core.override_parser.types import ChoiceSweep, Override, OverrideType
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+
+from omniperception.common.checkpoints import list_checkpoints
 from omnirobot.common.errors import ConfigError, UnknownKey, one_line, suggest
 from omnirobot.common.files import write_whole
 from omnirobot.common.shell import command_line
-
-from omniperception.common.checkpoints import list_checkpoints
 
 _SHIPPED = Path(__file__).resolve().parent / "conf"
 CONFIG_DIR = _SHIPPED if _SHIPPED.is_dir() else _SHIPPED.parents[1] / "conf"

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
-from omnirobot.common.errors import ConfigError
 from tensordict import TensorDict
 
 from omniperception import build, config
 from omniperception.common.random import MOST_SEEDS
 from omniperception.env.env import MAX_ACTION, OmniEnv
+from omnirobot.common.errors import ConfigError
 
 if TYPE_CHECKING:
     import gymnasium

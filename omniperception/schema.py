@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from omnirobot.common.errors import ConfigError, DoesNotFit, UnknownKey, suggest
 
 from omniperception.env.mdp.terms import RewardTerm
+from omnirobot.common.errors import ConfigError, DoesNotFit, UnknownKey, suggest
 
 ANYTHING = None
 """As `trust`: everything that can be imported."""

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from omnirobot.common.cli import Command, argument
 
 from omniperception.config import ConfigError
+from omnirobot.common.cli import Command, argument
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from omnilidar import Lidar, vlp16
 
+from omnilidar import Lidar, vlp16
 from omniperception.build import assemble, build_runner
 from omniperception.config import compose
 

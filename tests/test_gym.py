@@ -5,9 +5,9 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
 
 import omniperception
+from omnirobot.common.errors import ConfigError
 
 gymnasium = pytest.importorskip("gymnasium", reason="extra gym")
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+
 from omnilidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, grid
 from omnilidar.launch import SplitLaunch
-
 from omniperception.commands.plan import build_parts, command
 from omniperception.plan import summary
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from omnilidar import DEVICES
 
+from omnilidar import DEVICES
 from omniperception import build, config
 from omniperception.build import build_runner
 from omniperception.env.env import OmniEnv
@@ -143,3 +143,9 @@ def test_every_variant_of_perception_learns_to_avoid(variant):
     with torch.inference_mode():
         actions = runner.policy(runner.env.get_observations())
     assert actions.shape == (2, 12) and torch.isfinite(actions).all()
+
+
+def test_every_device_is_a_preset_and_other_presets_are_known():
+    presets = {path.stem for path in (config.CONFIG_DIR / "lidar").glob("[!_]*.yaml")}
+    assert presets - set(DEVICES) == {"none", "custom", "depth_camera", "height_scanner"}
+    assert set(DEVICES) <= presets

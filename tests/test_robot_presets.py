@@ -134,10 +134,9 @@ def trained(tmp_path_factory):
 def test_it_learns_the_gait_and_its_export_acts_alike(name, trained):
     pytest.importorskip("onnxruntime", reason="extra deploy")
     pytest.importorskip("onnx", reason="extra export")
-    from omnirobot.runtime import ExportedPolicy
-
     from omniperception.deploy.export import export
     from omniperception.evaluation.exported import ExportedPolicies
+    from omnirobot.runtime import ExportedPolicy
 
     run_dir = trained(name)
     described = export(run_dir, formats=("onnx",))

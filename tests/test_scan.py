@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from omnilidar import TriangleMesh, read_points
 
+from omnilidar import TriangleMesh, read_points
 from omniperception.commands import main, scan
 from omniperception.commands.scan import pictures
 from omniperception.commands.scan.room import ROOM, DemoClass, demo_scene, mesh_scene

@@ -9,7 +9,6 @@ import pytest
 import torch
 import yaml
 from omegaconf import OmegaConf
-from omnirobot.common.files import try_lock
 
 from omniperception import build, config
 from omniperception.commands import main
@@ -17,6 +16,7 @@ from omniperception.common import provenance
 from omniperception.learning import CheckpointError, Runner, distributed, load_checkpoint
 from omniperception.learning.checkpoint import checkpoint_path
 from omniperception.learning.ppo import PerceptivePpo
+from omnirobot.common.files import try_lock
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = (

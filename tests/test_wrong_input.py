@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from omnilidar.sensor import Lidar  # noqa: F401  Warp asks for the processor in a process of its own
 
+from omnilidar.sensor import Lidar  # noqa: F401  Warp asks for the processor in a process of its own
 from omniperception import build, config
 from omniperception.commands import COMMANDS, main
 from omniperception.common import provenance

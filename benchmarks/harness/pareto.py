@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from omnirobot.common.figures import new_figure
-
 from benchmarks.harness.table import Table
+from omnirobot.common.figures import new_figure
 
 AS_GOOD = 1.02
 """An error up to this factor larger counts as equal."""

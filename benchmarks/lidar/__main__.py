@@ -25,11 +25,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from omnirobot.common.cli import Command, argument
-from omnirobot.common.figures import PlotsUnavailable
 
 from benchmarks.harness.table import Table, about, machine_line, report
 from omniperception.config import ConfigError
+from omnirobot.common.cli import Command, argument
+from omnirobot.common.figures import PlotsUnavailable
 
 from .baselines import MUJOCO_LIDAR, NEWTON, ONE_MESH
 from .compare import Options, compare_baselines, compare_terrain, measure_features

@@ -6,9 +6,9 @@ from dataclasses import fields, replace
 from functools import cache, partial
 
 import numpy as np
-import omnilidar as lidar
 import torch
 
+import omnilidar as lidar
 from benchmarks.harness.memory import buffer_bytes
 
 from .methods import Entry

@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.figures import new_figure
-
 from benchmarks.harness.table import Table
 from benchmarks.harness.timing import paired_timings
+from omnirobot.common.figures import new_figure
 
 from .baselines import BASELINES, BATCH_RAY, EMBREE
 from .compare import Options

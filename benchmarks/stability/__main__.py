@@ -23,14 +23,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.cli import Command, argument, refuse_arguments
-from omnirobot.common.figures import PlotsUnavailable
-
 from benchmarks.harness.table import Table, about, report
 from benchmarks.stability import learning, lidar, physics, plots
 from omniperception import build, config
 from omniperception.config import ConfigError
 from omniperception.env.config import EnvConfig
+from omnirobot.common.cli import Command, argument, refuse_arguments
+from omnirobot.common.figures import PlotsUnavailable
 
 BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
 PARTS = ("floating", "standing", "scenes")

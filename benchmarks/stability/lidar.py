@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from omnilidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, TriangleMesh, grid
 
 from benchmarks.harness.meshes import tessellate
 from benchmarks.harness.reference import box_ranges, sphere_ranges, triangle_ranges
 from benchmarks.harness.rotations import matrices, random_unit
+from omnilidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, TriangleMesh, grid
 
 K = ShapeKind
 CUBE = TriangleMesh(*tessellate("box", (1.0, 1.0, 1.0)))

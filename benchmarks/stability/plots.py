@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from omnirobot.common.figures import new_figure
 
 from benchmarks.stability.physics import INTEGRATORS, Map
+from omnirobot.common.figures import new_figure
 
 
 def draw_maps(maps: Sequence[Map], label: str, bounds: tuple[float, float], path: Path) -> None:

@@ -23,9 +23,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from omnirobot.common.cli import Command, argument, refuse_arguments
-from omnirobot.common.figures import PlotsUnavailable, new_figure
-from omnirobot.runtime import DeployError
 
 from benchmarks.harness.pareto import Study, plot
 from benchmarks.harness.table import about, machine_line, report
@@ -33,6 +30,9 @@ from omniperception import build, config
 from omniperception.config import ConfigError
 from omniperception.learning import CheckpointError
 from omniperception.perception import PdSampler
+from omnirobot.common.cli import Command, argument, refuse_arguments
+from omnirobot.common.figures import PlotsUnavailable, new_figure
+from omnirobot.runtime import DeployError
 
 from . import lidar, perception, physics, policy
 

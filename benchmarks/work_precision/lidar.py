@@ -9,6 +9,11 @@ from functools import cached_property, partial
 
 import numpy as np
 import torch
+
+from benchmarks.harness.meshes import join, tessellate_to
+from benchmarks.harness.pareto import Choice, Study
+from benchmarks.harness.rotations import matrices
+from benchmarks.harness.timing import paired_timings
 from omnilidar import (
     Lidar,
     LidarConfig,
@@ -20,11 +25,6 @@ from omnilidar import (
     ShapeKind,
     TriangleMesh,
 )
-
-from benchmarks.harness.meshes import join, tessellate_to
-from benchmarks.harness.pareto import Choice, Study
-from benchmarks.harness.rotations import matrices
-from benchmarks.harness.timing import paired_timings
 from omniperception.build import RunConfig
 
 from .scene import GROUND, OBSTACLE, MovingScene, Truth, dense_directions, moving_scene

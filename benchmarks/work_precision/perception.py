@@ -9,11 +9,11 @@ from functools import partial
 
 import numpy as np
 import torch
-from omnilidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
 
 from benchmarks.harness.pareto import Choice, Study
 from benchmarks.harness.rotations import matrices
 from benchmarks.harness.timing import paired_timings
+from omnilidar import Lidar, ScanPattern, SectorDistances, quat_from_rpy
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.avoidance.velocity import SECTOR_TARGET
 from omniperception.build import RunConfig, assemble

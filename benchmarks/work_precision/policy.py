@@ -10,9 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from omnirobot.common.shell import command_line
-from omnirobot.runtime import ExportedPolicy
-
 from benchmarks.harness.pareto import Choice, Study
 from benchmarks.harness.timing import paired_timings
 from omniperception import build, config
@@ -25,6 +22,8 @@ from omniperception.evaluation.records import read
 from omniperception.evaluation.statistics import rate
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
+from omnirobot.common.shell import command_line
+from omnirobot.runtime import ExportedPolicy
 
 COST = "CPU time of a control step, exported (us)"
 FAILED = "trials without success or with a touch (%)"

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
-from omnilidar import LidarConfig
 
 from benchmarks.harness.reference import compile_model, mujoco_ranges
 from benchmarks.harness.rotations import matrices, quat_about, quat_multiply, unit_vectors
+from omnilidar import LidarConfig
 from omniperception.scene import ObstaclesConfig
 from omniperception.scene.part_shapes import PartShapes, footprint_radius
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import torch
-from omnirobot.common.coverage import BIN_DEG, FRAMES, NUM_BINS, NUM_SECTORS, OPEN_DEG, SHARE, SHUT_DEG
 
 from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.common.rotations import multiply, rotate, yaw_of, yaw_quat
 from omniperception.common.sectors import sector_of
+from omnirobot.common.coverage import BIN_DEG, FRAMES, NUM_BINS, NUM_SECTORS, OPEN_DEG, SHARE, SHUT_DEG
 
 
 class Coverage:

@@ -3,6 +3,7 @@
 import math
 
 import warp as wp
+
 from omnilidar.kernels.sectors import sector_of
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 import warp as wp
-from omnilidar.launch import launch_over_envs, view
 
+from omnilidar.launch import launch_over_envs, view
 from omniperception.avoidance.kernels import nearest_by_sector
 from omniperception.avoidance.sector_motion import nothing_near
 from omniperception.common.rotations import rotate_yaw

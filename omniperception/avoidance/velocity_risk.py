@@ -137,8 +137,8 @@ class VelocityRisk:
     def _largest(self, sectors: torch.Tensor, candidates: torch.Tensor) -> torch.Tensor:
         """As :meth:`risk`, without gradients: whose sector makes a risk, and when, is not kept."""
         import warp as wp
-        from omnilidar.launch import constant, launch_over_envs, view
 
+        from omnilidar.launch import constant, launch_over_envs, view
         from omniperception.avoidance.kernels import largest_risks
 
         sectors = sectors.float().contiguous()
@@ -166,8 +166,8 @@ class VelocityRisk:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """As :meth:`_worst`; loads Warp, which a run without obstacles does not."""
         import warp as wp
-        from omnilidar.launch import constant, launch_over_envs, view
 
+        from omnilidar.launch import constant, launch_over_envs, view
         from omniperception.avoidance.kernels import worst_sectors
 
         place, velocity = place.contiguous(), velocity.contiguous()

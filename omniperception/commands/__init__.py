@@ -36,8 +36,6 @@ EXTRAS = {
     "yaml": "train",
     "matplotlib": "plots",
     "onnx": "export",
-    "onnxruntime": "deploy",
-    "cyclonedds": "robot",
     **dict.fromkeys(("collada", "trimesh"), "meshes"),
     "viser": "viewer",
     **{name: name for name in ("mlflow", "trackio", "wandb")},

@@ -18,9 +18,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from omnirobot.common.cli import Command, argument, trust
-from omnirobot.common.errors import check_known
-
 from omniperception import config
 from omniperception.evaluation.ablation import (
     Ablation,
@@ -33,6 +30,8 @@ from omniperception.evaluation.ablation import (
 )
 from omniperception.evaluation.suite import POLICIES, SPLITS
 from omniperception.learning import CheckpointError
+from omnirobot.common.cli import Command, argument, trust
+from omnirobot.common.errors import check_known
 
 STAGES = ("train", "evaluate", "table", "all")
 

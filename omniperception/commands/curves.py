@@ -11,11 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.cli import PICTURES, Command, argument
-from omnirobot.common.figures import PlotsUnavailable
-
 from omniperception import config
 from omniperception.evaluation.curves import curves_of, draw_curves
+from omnirobot.common.cli import PICTURES, Command, argument
+from omnirobot.common.figures import PlotsUnavailable
 
 TAGS = ("Train/mean_reward", "Metrics/velocity_error")
 

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides
 
 from omniperception import build, config
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT
+from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides
 
 RUN, SCENARIO = "avoider", "scenario=moving"
 

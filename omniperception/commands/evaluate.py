@@ -33,9 +33,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, trust
-from omnirobot.common.figures import PlotsUnavailable
-
 from omniperception import config
 from omniperception.config import ConfigError
 from omniperception.evaluation.baselines import DRIVEN
@@ -51,6 +48,8 @@ from omniperception.evaluation.suite import (
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT
+from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, trust
+from omnirobot.common.figures import PlotsUnavailable
 
 MEASURED = ("trials", "num_envs", "jobs", "plots", "again", "out", "log")
 """Arguments about what is measured."""

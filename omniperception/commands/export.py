@@ -17,12 +17,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.cli import Command, argument, trust
-
 from omniperception import config
 from omniperception.deploy.deploy_yaml import FILE as DEPLOY_YAML
 from omniperception.deploy.export import FOLDER, FORMATS, export
 from omniperception.learning import CheckpointError
+from omnirobot.common.cli import Command, argument, trust
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,11 +8,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnirobot.common.cli import argument
-
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.evaluation.camera import CAMERAS
 from omniperception.evaluation.video_options import VideoOptions
+from omnirobot.common.cli import argument
 
 if TYPE_CHECKING:
     from omniperception.evaluation.video import Recorder

@@ -19,9 +19,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, refuse_overrides, trust
-from omnirobot.common.errors import ConfigError
-from omnirobot.common.figures import PlotsUnavailable, check_figures
 
 from omniperception import build, config
 from omniperception.common.tables import markdown
@@ -48,6 +45,9 @@ from omniperception.evaluation.suite import Evaluation, World
 from omniperception.learning import CheckpointError
 from omniperception.scene.build import FOOT_FORCE
 from omniperception.sim.response import AXES, ConditionResponse, GaitResponse
+from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, refuse_overrides, trust
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import PlotsUnavailable, check_figures
 
 RANGES, KICKS = ("rows", "factors", "preset", "trials", "out"), ("speeds", "bearings", "repeats")
 RESPONSE = ("conditions", "robots", "seconds")

@@ -7,10 +7,9 @@ What is built is listed with a +, what is left out, or what only the recipe `bes
 
 from dataclasses import dataclass, replace
 
-from omnirobot.common.cli import Command, argument
-
 from omniperception import build, config
 from omniperception.plan import parts_of
+from omnirobot.common.cli import Command, argument
 
 
 @dataclass(frozen=True, kw_only=True)

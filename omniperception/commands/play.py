@@ -17,9 +17,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
-from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides, trust
-from omnirobot.common.files import write_whole
-
 from omniperception import build, config
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.common.provenance import provenance
@@ -29,6 +26,8 @@ from omniperception.learning import CheckpointError
 from omniperception.learning.progress import ProgressLine
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT
+from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides, trust
+from omnirobot.common.files import write_whole
 
 
 @dataclass(frozen=True, kw_only=True)

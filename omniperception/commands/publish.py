@@ -11,11 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.cli import Command, argument
-
 from omniperception import config
 from omniperception.learning import CheckpointError
 from omniperception.publish import publish
+from omnirobot.common.cli import Command, argument
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,12 +15,11 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.cli import Command, argument, refuse_overrides
-
 from omniperception import build, config
 from omniperception.robots.look import Sight, draw, look
 from omniperception.robots.stand import NEAR, Standing, flat_world, reached_limits, stand
 from omniperception.scene import World
+from omnirobot.common.cli import Command, argument, refuse_overrides
 
 NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
 """A robot is looked at, no task is run."""

@@ -13,10 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from omniperception.robots.fetch import MJLAB, fetch
 from omnirobot.common.cli import Command, argument, refuse_arguments
 from omnirobot.common.shell import command_line
-
-from omniperception.robots.fetch import MJLAB, fetch
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,14 +16,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.cli import Command, argument
-from omnirobot.common.files import write_whole
-from omnirobot.common.shell import command_line
-
 from omniperception import config
 from omniperception.config import ConfigError
 from omniperception.robots.guess import Options, guess
 from omniperception.robots.preset import table_of, text_of
+from omnirobot.common.cli import Command, argument
+from omnirobot.common.files import write_whole
+from omnirobot.common.shell import command_line
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,13 +19,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omegaconf import OmegaConf
-from omnirobot.common.cli import Command, argument, refuse_overrides, trust
-from omnirobot.runtime.description import DeployError
 
 from omniperception import build, config
 from omniperception.deploy.faults import FAULTS
 from omniperception.deploy.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
 from omniperception.env.env import OmniEnv
+from omnirobot.common.cli import Command, argument, refuse_overrides, trust
+from omnirobot.runtime.description import DeployError
 
 WIRE = {
     "sim": "mujoco",

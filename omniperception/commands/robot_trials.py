@@ -21,12 +21,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from omniperception import config
+from omniperception.deploy.trials import KNOWN_FAULTS, NO_FAULT, TrialsConfig, results, run, table
 from omnirobot.common.cli import Command, argument, trust
 from omnirobot.common.errors import check_known
 from omnirobot.runtime.description import DeployError
-
-from omniperception import config
-from omniperception.deploy.trials import KNOWN_FAULTS, NO_FAULT, TrialsConfig, results, run, table
 
 
 @dataclass(frozen=True, kw_only=True)

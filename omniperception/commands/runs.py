@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnirobot.common.cli import Command, argument
-
 from omniperception import config
 from omniperception.common.tables import markdown
 from omniperception.learning import list_checkpoints
 from omniperception.learning.logger import CONSOLE_METRICS
 from omniperception.learning.progress import load_progress
+from omnirobot.common.cli import Command, argument
 
 
 @dataclass(frozen=True, kw_only=True)

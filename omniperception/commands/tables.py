@@ -17,12 +17,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from omniperception.config import ConfigError
+from omniperception.evaluation.tables import rendered
 from omnirobot.common.cli import Command, argument
 from omnirobot.common.files import write_whole
 from omnirobot.common.shell import command_line
-
-from omniperception.config import ConfigError
-from omniperception.evaluation.tables import rendered
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,10 +26,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omnirobot.common.cli import Command, argument, fail, trust
-from omnirobot.common.errors import one_line
-from omnirobot.common.files import try_lock
-from omnirobot.common.shell import command_line
 
 from omniperception import build, config
 from omniperception.common import provenance
@@ -46,6 +42,10 @@ from omniperception.learning.ppo import check_rollout
 from omniperception.learning.progress import say
 from omniperception.plan import parts_of, summary
 from omniperception.schema import words_of
+from omnirobot.common.cli import Command, argument, fail, trust
+from omnirobot.common.errors import one_line
+from omnirobot.common.files import try_lock
+from omnirobot.common.shell import command_line
 
 ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
 _OF_A_BEGINNING = ("seed", "init", "ppo.critic_warmup", "ppo.init_std", "ppo.start_std")

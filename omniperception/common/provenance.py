@@ -15,6 +15,7 @@ from importlib import metadata
 from pathlib import Path
 
 import torch
+
 from omnirobot.common.errors import ConfigError
 from omnirobot.common.files import write_whole
 

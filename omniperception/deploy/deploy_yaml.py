@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import yaml
+
 from omnirobot.common.errors import repeated
 from omnirobot.runtime.description import Description, Group, Joints, Term
 from omnirobot.runtime.go2 import MOTORS

@@ -16,19 +16,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from omnirobot.common.files import write_whole
-from omnirobot.runtime.description import (
-    FINGERPRINT,
-    Description,
-    Group,
-    Joints,
-    Lidar,
-    Perception,
-    Stepping,
-    Term,
-    Turn,
-    checksum,
-)
 from rsl_rl.models import MLPModel
 from torch import nn
 
@@ -52,6 +39,19 @@ from omniperception.learning.read_out import MotionReadOut
 from omniperception.perception import FpsSampler, PdSampler, ProximitySampler, RawSampler, Sampler, StandingSampler
 from omniperception.scene import RobotConfig
 from omniperception.scene.stepping import stepping_offsets
+from omnirobot.common.files import write_whole
+from omnirobot.runtime.description import (
+    FINGERPRINT,
+    Description,
+    Group,
+    Joints,
+    Lidar,
+    Perception,
+    Stepping,
+    Term,
+    Turn,
+    checksum,
+)
 
 FOLDER = "exported"
 """Folder of a run directory for an exported policy."""

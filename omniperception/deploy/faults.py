@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 
 import numpy as np
+
 from omnirobot.runtime.description import DeployError
 from omnirobot.wire.livox import HEADER, POINT
 from omnirobot.wire.messages import LOW_STATE, sealed

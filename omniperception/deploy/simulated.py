@@ -12,7 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
 from omnilidar import Lidar
+from omniperception.deploy.faults import Faults
+from omniperception.env.env import OmniEnv
 from omnirobot.drive.machine import Request
 from omnirobot.runtime.description import DeployError
 from omnirobot.runtime.go2 import MOTORS
@@ -24,9 +27,6 @@ from omnirobot.wire.livox import (
 )
 from omnirobot.wire.messages import LOW_CMD, LOW_STATE, MOTOR_ON, crc, sealed
 from omnirobot.wire.switcher import SwitcherService
-
-from omniperception.deploy.faults import Faults
-from omniperception.env.env import OmniEnv
 
 STEP_S, CONTROL_STEPS = 0.002, 10
 """Physics step, which is also the period of rt/lowstate, and how many of them make a step of the world."""

@@ -19,12 +19,12 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
-from omnirobot.common.files import write_whole
-from omnirobot.common.shell import command_line
-from omnirobot.runtime.description import FILE, DeployError, checksum
 
 from omniperception.common.statistics import wilson
 from omniperception.deploy.faults import FAULTS, SENSORS
+from omnirobot.common.files import write_whole
+from omnirobot.common.shell import command_line
+from omnirobot.runtime.description import FILE, DeployError, checksum
 
 PROCESS_FAULTS = {
     "kill": "the policy's process is killed (SIGKILL) while the robot walks",

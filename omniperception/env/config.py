@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from omnilidar import DEVICES, Noise
 from omnilidar.noise import NAMES as NOISE_NAMES
-
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, MOTION_TARGET, SECTOR_TARGET
 from omniperception.common.random import MOST_SEEDS
 from omniperception.env.mdp.commands import GoalCommandConfig, VelocityCommandConfig

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
-from omnilidar.launch import use_threads
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from omnilidar.launch import use_threads
 from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
 from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 import warp as wp
-from omnilidar.launch import view
 
+from omnilidar.launch import view
 from omniperception.env.heights import MAX_HEIGHT, NUM_HEIGHTS, footprint_grid, height_grid
 from omniperception.env.kinematics import Kinematics
 from omniperception.scene.ground import Ground

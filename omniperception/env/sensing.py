@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import torch
+
 from omnilidar import (
     DEVICES,
     Lidar,
@@ -20,7 +21,6 @@ from omnilidar import (
     ray_bytes,
 )
 from omnilidar.launch import constant
-
 from omniperception.avoidance.coverage import Coverage, kept_to_covered, least_bins, levelled
 from omniperception.common.rotations import multiply
 from omniperception.common.timing import StageTimer

@@ -21,7 +21,6 @@ from omniperception.scene.stepping import stepping_offsets
 
 if TYPE_CHECKING:  # parts that not every task has
     from omnilidar import LidarFrame
-
     from omniperception.avoidance.avoidance import Avoidance
     from omniperception.avoidance.true_sectors import TrueSectors
     from omniperception.env.height_lookup import HeightLookup

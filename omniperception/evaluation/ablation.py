@@ -10,9 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import yaml
-from omnirobot.common.errors import check_known, one_line
-from omnirobot.common.files import write_whole
-from omnirobot.common.signals import interruptible
 
 from omniperception import build, config
 from omniperception.config import ConfigError
@@ -29,6 +26,9 @@ from omniperception.evaluation.suite import (
     suite_worlds,
 )
 from omniperception.evaluation.tables import by_training
+from omnirobot.common.errors import check_known, one_line
+from omnirobot.common.files import write_whole
+from omnirobot.common.signals import interruptible
 
 _NO_PROXIMAL = ("perception.height_weight=0", "perception.sampler.num_proximal=0", "perception.network.proximal_dim=0")
 _NO_DISTAL = ("perception.sampler.num_distal=0", "perception.network.distal_dim=0")

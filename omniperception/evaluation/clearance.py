@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import torch
 import warp as wp
+
 from omnilidar.launch import launch_over_envs, view
 from omnilidar.mujoco import convex_hull
-
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation import clearance_kernels as kernels
 from omniperception.evaluation.clearance_kernels import BOX, CAPSULE, CYLINDER, HULL

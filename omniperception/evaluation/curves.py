@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
-from omnirobot.common.errors import ConfigError
-from omnirobot.common.figures import new_figure, plain, save_figure
 
 from omniperception import config
 from omniperception.evaluation.records import training_of
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import new_figure, plain, save_figure
 
 MAY_DIFFER = ("seed", "logger", config.SEARCH_PATH)
 """Keys of a configuration in which runs of one curve may differ; those in `init` may be seeds of one training."""

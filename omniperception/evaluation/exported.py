@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from omnilidar import Lidar, LidarFrame
-from omnirobot.runtime import DeployError, ExportedPolicy, RobotState, SafetyStop
-from omnirobot.runtime.latency import Reading
 from tensordict import TensorDict
 
+from omnilidar import Lidar, LidarFrame
 from omniperception.deploy.export import own_quantity
 from omniperception.env.env import OmniEnv
+from omnirobot.runtime import DeployError, ExportedPolicy, RobotState, SafetyStop
+from omnirobot.runtime.latency import Reading
 
 
 class ExportedPolicies:

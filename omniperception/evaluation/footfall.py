@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from omnirobot.common.errors import ConfigError
-from omnirobot.common.figures import new_figure, save_figure
 
 from omniperception.avoidance.velocity import COMMAND
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.mdp.commands import VelocityCommand, VelocityCommandConfig
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import new_figure, save_figure
 
 COMMANDS = (
     (0.0, 0.0, 0.0),

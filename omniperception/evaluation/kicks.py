@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
 import torch
-from omnirobot.common.figures import new_figure, save_figure
 
 from omniperception.common.rotations import rotate_yaw
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.evaluation.episodes import run_episodes
 from omniperception.evaluation.statistics import rate
 from omniperception.evaluation.tally import trial_numbers
+from omnirobot.common.figures import new_figure, save_figure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

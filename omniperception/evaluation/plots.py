@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from omnirobot.common.figures import new_figure, plain, save_figure
 
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.report import rate_cell
 from omniperception.evaluation.tracks import Tracks
+from omnirobot.common.figures import new_figure, plain, save_figure
 
 UNTOUCHED, TOUCHED, FAILED = "#1b7f4d", "#d62728", "#3b6fb6"
 """Colours of ways: reached and untouched; touched, wherever they end; neither touched nor at the goal."""

@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from omnirobot.common.files import lock, write_whole
-
 from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes
+from omnirobot.common.files import lock, write_whole
 
 FORMAT = 1
 FOLDER = "evaluation"

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import torch
-from omnilidar import RayScene
 
+from omnilidar import RayScene
 from omniperception.scene.rays import HitClass, RayShapes
 
 COLOURS = {

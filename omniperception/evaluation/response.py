@@ -9,8 +9,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from omnirobot.common.errors import ConfigError
-from omnirobot.common.figures import new_figure, save_figure
 
 from omniperception.avoidance.velocity import COMMAND
 from omniperception.common.rotations import matrix_of, yaw_quat
@@ -18,6 +16,8 @@ from omniperception.common.vectors import moved_towards
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.mdp.commands import VelocityCommand
 from omniperception.sim.response import AXES, Cycle
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import new_figure, save_figure
 
 ACCELERATION = (6.0, 8.0)
 """How fast (m/s^2, rad/s^2) the asked velocity changes at most: as of policies that add V_avoid to their command."""

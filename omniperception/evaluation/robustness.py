@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import torch
 from omegaconf import OmegaConf
-from omnirobot.common.figures import new_figure, save_figure
 
 from omniperception import config
 from omniperception.common.tables import markdown
@@ -20,6 +19,7 @@ from omniperception.evaluation.report import rate_cell
 from omniperception.evaluation.statistics import rate
 from omniperception.evaluation.suite import Evaluation, Task, measure_all
 from omniperception.evaluation.walking_report import Part
+from omnirobot.common.figures import new_figure, save_figure
 
 NEUTRAL = {"ground_friction": 0.8, "motor_strength": 1.0, "velocity_scale": 1.0}
 """Values about which a range is stretched, where it is not 0: those of a robot and a ground without randomization."""

@@ -16,13 +16,8 @@ from pathlib import Path
 import torch
 import yaml
 from omegaconf import OmegaConf, open_dict
-from omnilidar.launch import default_num_threads
-from omnirobot.common.errors import check_known, naming, one_line
-from omnirobot.common.figures import check_figures
-from omnirobot.runtime import ExportedPolicy
-from omnirobot.runtime.description import FILE as DESCRIPTION
-from omnirobot.runtime.description import checksum
 
+from omnilidar.launch import default_num_threads
 from omniperception import build, config
 from omniperception.build import RunConfig, TrainedPolicy, load_policy
 from omniperception.common.provenance import CHANGES, ROOT, provenance
@@ -38,6 +33,11 @@ from omniperception.evaluation.report import progress_line, table
 from omniperception.evaluation.tracks import Tracks
 from omniperception.evaluation.walking_report import walking_table
 from omniperception.learning import CheckpointError, latest_checkpoint
+from omnirobot.common.errors import check_known, naming, one_line
+from omnirobot.common.figures import check_figures
+from omnirobot.runtime import ExportedPolicy
+from omnirobot.runtime.description import FILE as DESCRIPTION
+from omnirobot.runtime.description import checksum
 
 POLICIES = {
     "run": "the run's policy",

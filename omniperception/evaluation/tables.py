@@ -20,7 +20,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
-from omnirobot.common.shell import command_line
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
@@ -28,6 +27,7 @@ from omniperception.evaluation.records import Record, read, training_of
 from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, table, without_constants
 from omniperception.evaluation.study_report import study_table
 from omniperception.evaluation.walking_report import level_table, run_table, walking_table
+from omnirobot.common.shell import command_line
 
 _BLOCK = re.compile(r"^<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
 _BEGIN = re.compile(r"^<!-- table:", re.MULTILINE)

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from omnirobot.common.errors import naming
 
 from omniperception.common.random import TrialRandom
 from omniperception.env.env import OmniEnv
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
+from omnirobot.common.errors import naming
 
 PERIOD_S = 0.1
 """Time between two points of a way."""

@@ -10,7 +10,6 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 import torch
-from omnirobot.common.errors import naming
 from PIL import Image
 from torch import nn
 
@@ -23,6 +22,7 @@ from omniperception.evaluation.perceived import perceived, true_sectors
 from omniperception.evaluation.render import COMMAND, DISTAL, PROXIMAL, VELOCITY, Arrow, Renderer, View, shown
 from omniperception.evaluation.video_options import VideoOptions
 from omniperception.scene.rays import HitClass, ray_shapes
+from omnirobot.common.errors import naming
 
 FPS = 25
 MIN_ARROW = 0.1

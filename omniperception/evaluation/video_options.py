@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from omnirobot.common.errors import ConfigError
-
 from omniperception.evaluation.camera import CAMERAS
+from omnirobot.common.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
-from omnirobot.common.shell import command_line
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
 from omniperception.evaluation.outcomes import Episodes
 from omniperception.evaluation.records import Record
 from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, without_constants
+from omnirobot.common.shell import command_line
 
 EASY_LEVELS = 5
 """Levels of uneven ground that a robot is expected to pass; tables show the others apart."""

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
+from omniperception.common.checkpoints import checkpoint_path, list_checkpoints
 from omnirobot.common.errors import of_a_disk
 from omnirobot.common.files import write_whole
 from omnirobot.common.shell import command_line
-
-from omniperception.common.checkpoints import checkpoint_path, list_checkpoints
 
 FORMAT = "omniperception-checkpoint"
 VERSION = 1

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omnirobot.common.errors import naming
 from rsl_rl.utils.log_writer import LogWriter
 
 from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.progress import ProgressLine, save_progress, say
+from omnirobot.common.errors import naming
 
 METRICS, ANOMALIES = "Metrics/", "Anomalies/"
 """Keys of ``extras["log"]`` that begin so are shown on the console; anomalies only if there are any."""

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from omnirobot.common.errors import one_line
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
@@ -37,6 +36,7 @@ from omniperception.learning.estimator import estimates_velocity
 from omniperception.learning.logger import Logger
 from omniperception.learning.ppo import PerceptivePpo
 from omniperception.learning.warm_start import estimating, observing_more, perceive_as, start_from, take_parts
+from omnirobot.common.errors import one_line
 
 
 class Runner:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
-from omnilidar.launch import constant, launch_over_envs, view
 
+from omnilidar.launch import constant, launch_over_envs, view
 from omniperception.common.sectors import sector_of, sums_by
 from omniperception.perception.samplers.base import Attitude
 from omniperception.perception.standing_kernels import Settings, find_standing

@@ -1,6 +1,7 @@
 """The Warp kernel that tells what stands on the ground from what is ground, noise or the robot's own body."""
 
 import warp as wp
+
 from omnilidar.kernels.rotations import to_quat
 from omnilidar.kernels.sectors import levelled, sector_of
 

@@ -12,10 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from omniperception.scene.fetched import cache
 from omnirobot.common.errors import ConfigError
 from omnirobot.common.shell import command_line
-
-from omniperception.scene.fetched import cache
 
 
 @dataclass(frozen=True)

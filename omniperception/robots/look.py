@@ -9,14 +9,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from omnilidar import Lidar, RayScene
-from omnirobot.common.errors import naming
 from PIL import Image
 
+from omnilidar import Lidar, RayScene
 from omniperception.env.sensing import SensorConfig
 from omniperception.evaluation.render import Renderer, View
 from omniperception.scene import World
 from omniperception.scene.rays import HitClass, RayShapes, ray_shapes
+from omnirobot.common.errors import naming
 
 FRAMES = 5
 """Frames of the sensor that are looked at, because its pattern need not repeat."""

@@ -7,8 +7,8 @@ import math
 import mujoco
 import torch
 import warp as wp
-from omnilidar.launch import launch_over_envs, view
 
+from omnilidar.launch import launch_over_envs, view
 from omniperception.scene import ground_kernels as kernels
 from omniperception.scene.height_field import EDGE
 from omniperception.scene.map_terrain import MapTerrainConfig

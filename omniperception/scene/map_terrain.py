@@ -13,9 +13,9 @@ from zipfile import BadZipFile
 
 import mujoco
 import numpy as np
-from omnilidar.mesh_files import AXES, read_mesh, unit_said, up_of
 from PIL import Image
 
+from omnilidar.mesh_files import AXES, read_mesh, unit_said, up_of
 from omniperception.scene.height_field import EDGE, add_height_field
 from omniperception.scene.terrain import check_contact
 

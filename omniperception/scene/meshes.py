@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+
 from omnilidar.mesh_files import read_mesh, unit_said
 
 

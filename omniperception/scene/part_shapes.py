@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 import torch
-from omnilidar import quat_from_rpy
 
+from omnilidar import quat_from_rpy
 from omniperception.common.rotations import matrix_of, multiply, rotate
 from omniperception.scene.parts import Part, PartConfig
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import mujoco
+
 from omnilidar import Shape
 from omnilidar.mujoco import geom_shapes
-
 from omniperception.scene.build import World
 from omniperception.scene.robot import RobotConfig
 from omniperception.scene.terrain import GROUND

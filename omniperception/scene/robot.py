@@ -10,7 +10,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from omnirobot.common.errors import repeated
 
 from omniperception.scene.fetched import SCHEME, fetched
 from omniperception.scene.robot_file import (
@@ -23,6 +22,7 @@ from omniperception.scene.robot_file import (
     read_robot,
     rigid_geoms,
 )
+from omnirobot.common.errors import repeated
 
 ByJoint = float | Mapping[str, float]
 """One number for all joints, or one for each by name."""

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch, SimulationError
-from omnilidar.launch import default_num_threads
 
+from omnilidar.launch import default_num_threads
 from omniperception.scene import World
 from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, Failures, JointColumns, Simulator, SizedGeoms
 

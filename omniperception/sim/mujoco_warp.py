@@ -12,8 +12,8 @@ from types import ModuleType
 import mujoco
 import torch
 import warp as wp
-from omnilidar.launch import wp_device
 
+from omnilidar.launch import wp_device
 from omniperception.scene import World
 from omniperception.sim.base import Failure, Failures, JointColumns, SizedGeoms
 from omniperception.sim.kernels import move_kinematic, record, turn_kinematic

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from omnirobot.common.shell import command_line
 
 from omniperception.scene import World
 from omniperception.sim.base import Simulator
 from omniperception.sim.response import GaitResponse, NoResponse
+from omnirobot.common.shell import command_line
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import mujoco
 import torch
 import warp as wp
-from omnilidar.launch import launch_over_envs, view
 
+from omnilidar.launch import launch_over_envs, view
 from omniperception.common.random import Branch, EnvRandom
 from omniperception.common.rotations import matrix_of, multiply, rotate, rotate_yaw, yaw_of, yaw_quat
 from omniperception.scene import World

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+
 from omnilidar import (
     AngularJitter,
     DistanceNoise,
@@ -23,7 +24,6 @@ from omnilidar import (
     MixedPixels,
     Noise,
 )
-
 from omniperception.env.sensing import SensorConfig
 from omniperception.viewer import charts
 from omniperception.viewer.clock import Clock

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from omnilidar import HeightField, Shape, ShapeKind, TriangleMesh, geom_shapes
 
+from omnilidar import HeightField, Shape, ShapeKind, TriangleMesh, geom_shapes
 from omniperception.scene import RobotConfig
 from omniperception.scene.robot_file import compile_robot
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from omnilidar import RayScene
-
     from omniperception.scene import RobotConfig
 
 LOCALHOST = "127.0.0.1"

@@ -11,9 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from omnirobot.common.errors import ConfigError
-
 from omniperception.viewer.options import LOCALHOST, PageOptions, ViewerError
+from omnirobot.common.errors import ConfigError
 
 if TYPE_CHECKING:
     import viser

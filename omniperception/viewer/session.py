@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from omnilidar import Lidar, LidarFrame
 from tensordict import TensorDict
 
+from omnilidar import Lidar, LidarFrame
 from omniperception import build
 from omniperception.config import ConfigError
 from omniperception.env.config import FROM_LIDAR, EnvConfig

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from omnilidar.kernels.slots import Slots
 
 from benchmarks.harness import timing
 from benchmarks.harness.memory import buffer_bytes
@@ -26,6 +25,7 @@ from benchmarks.harness.reference import (
 from benchmarks.harness.rotations import matrices, quat_about, quat_multiply
 from benchmarks.harness.table import Table, about, write
 from benchmarks.harness.timing import Timing, paired_ratio, paired_timings
+from omnilidar.kernels.slots import Slots
 
 # ---- timer -----------------------------------------------------------------------------------------------------------
 

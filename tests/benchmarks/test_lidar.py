@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-import omnilidar as lidar
 import pytest
 import torch
 
+import omnilidar as lidar
 from benchmarks.harness.table import Table
 from benchmarks.harness.timing import Timing
 from benchmarks.lidar.baselines import BASELINES, BATCH_RAY, EMBREE, ONE_MESH, OPEN3D

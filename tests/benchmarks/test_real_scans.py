@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
+from benchmarks import real_scans
 from omnilidar import (
     DEVICES,
     GaussianNoise,
@@ -20,8 +22,6 @@ from omnilidar import (
 )
 from omnilidar.clouds import table_of
 from omnilidar.patterns.mid360_series import MEASURED, mid360_model
-
-from benchmarks import real_scans
 
 
 @pytest.fixture(scope="module")

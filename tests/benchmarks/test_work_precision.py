@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from omnilidar import LidarConfig
 
 from benchmarks.work_precision import lidar, perception, physics, policy
 from benchmarks.work_precision.__main__ import command
 from benchmarks.work_precision.scene import MovingScene, Truth, dense_directions, moving_scene
+from omnilidar import LidarConfig
 from omniperception.commands.export import command as export
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES

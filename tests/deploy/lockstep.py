@@ -8,6 +8,9 @@ import socket
 from collections import defaultdict, deque
 from pathlib import Path
 
+from omniperception import build, config
+from omniperception.deploy.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, SimulatedRobot
+from omniperception.env.env import OmniEnv
 from omnirobot.drive.control import Control, machine_config
 from omnirobot.drive.guard import Guard, GuardConfig, Link, StateReader
 from omnirobot.drive.operator import make_operator
@@ -16,10 +19,6 @@ from omnirobot.runtime import ExportedPolicy
 from omnirobot.wire.dds import LOW_STATE_TOPIC
 from omnirobot.wire.lidar import Frames, LidarSource
 from omnirobot.wire.messages import LOW_STATE
-
-from omniperception import build, config
-from omniperception.deploy.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, SimulatedRobot
-from omniperception.env.env import OmniEnv
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
 
 from omniperception.deploy.export import check
+from omnirobot.common.errors import ConfigError
 
 
 class Network:

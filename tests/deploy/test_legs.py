@@ -2,11 +2,11 @@
 
 import mujoco
 import numpy as np
-from omnirobot.drive.legs import base_velocity, feet
-from omnirobot.runtime.go2 import MOTORS
 
 from omniperception import build, config
 from omniperception.scene import build_world
+from omnirobot.drive.legs import base_velocity, feet
+from omnirobot.runtime.go2 import MOTORS
 
 
 def go2():

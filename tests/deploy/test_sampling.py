@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from omnilidar import quat_from_rpy
-from omnirobot.common.errors import ConfigError
-from omnirobot.runtime import DeployError
-from omnirobot.runtime.sampling import Attitude, farthest_points, make_sampler
 
+from omnilidar import quat_from_rpy
 from omniperception.deploy.export import sampler_parameters
 from omniperception.perception import Attitude as TorchAttitude
 from omniperception.perception import FpsSampler, PdSampler, ProximitySampler, RawSampler, StandingSampler
+from omnirobot.common.errors import ConfigError
+from omnirobot.runtime import DeployError
+from omnirobot.runtime.sampling import Attitude, farthest_points, make_sampler
 
 MAX_RANGE, RAYS = 6.0, 301
 MOUNT_POS, MOUNT_QUAT = (0.29, 0.0, -0.05), quat_from_rpy(0.0, -2.8782, 3.14)

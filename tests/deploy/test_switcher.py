@@ -8,6 +8,7 @@ import time
 
 import pytest
 from lockstep import Memory
+
 from omnirobot.runtime import DeployError
 from omnirobot.wire.switcher import (
     CHECK,

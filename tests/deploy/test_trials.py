@@ -7,10 +7,6 @@ import sys
 import numpy as np
 import pytest
 from lockstep import ROOT
-from omnirobot.common.errors import ConfigError
-from omnirobot.runtime import DeployError
-from omnirobot.wire.livox import read_points, write_points
-from omnirobot.wire.messages import LOW_STATE, crc, sealed
 
 from omniperception import build, config
 from omniperception.commands.robot_sim import world
@@ -18,6 +14,10 @@ from omniperception.deploy import trials
 from omniperception.deploy.faults import FAULTS, Faults
 from omniperception.deploy.trials import KNOWN_FAULTS, TrialsConfig, results, run, table
 from omniperception.sim.mujoco import SimConfig
+from omnirobot.common.errors import ConfigError
+from omnirobot.runtime import DeployError
+from omnirobot.wire.livox import read_points, write_points
+from omnirobot.wire.messages import LOW_STATE, crc, sealed
 
 PACKETS = [write_points(np.full((2, 3), 1.0), 1000 * k, k, 500_000) for k in range(20)]
 

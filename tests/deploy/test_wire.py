@@ -22,6 +22,11 @@ pytest.importorskip("onnx", reason="extra export")
 
 from lockstep import ROOT, Lockstep, Memory
 from messages_by_hand import LIVOX, point_cloud2
+
+from omniperception.commands import main
+from omniperception.deploy.export import export
+from omniperception.deploy.faults import FAULTS, SENSORS
+from omniperception.deploy.trials import results
 from omnirobot.common.signals import interruptible
 from omnirobot.drive import control, guard, lidar
 from omnirobot.drive.control import machine_config, motor_order
@@ -33,11 +38,6 @@ from omnirobot.runtime import DeployError, Description, ExportedPolicy
 from omnirobot.wire.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, Network
 from omnirobot.wire.lidar import Frames, LidarSource
 from omnirobot.wire.messages import LOW_CMD, LOW_STATE, crc, low_cmd, sealed
-
-from omniperception.commands import main
-from omniperception.deploy.export import export
-from omniperception.deploy.faults import FAULTS, SENSORS
-from omniperception.deploy.trials import results
 
 
 @pytest.fixture(scope="session")
@@ -405,7 +405,7 @@ def test_a_bag_of_ros_2_is_replayed_and_drawn(exported, tmp_path, capsys):
     ],
 )
 def test_arguments_that_say_nothing_of_these_points_are_refused(points, unread, monkeypatch, capsys):
-    monkeypatch.setattr("omniperception.commands.robot.run", lambda config: config)
+    monkeypatch.setattr("omnirobot.commands.drive.run", lambda config: config)
     given = {"host=192.168.1.5", "point_port=56302", "topic=rt/cloud", "extrinsic=0,0,0,1,0,0,0"}
     for word in sorted(given):
         if word not in unread:
@@ -502,7 +502,7 @@ def test_the_machine_has_the_motors_order(exported):
 
 def test_the_robots_process_needs_neither_torch_nor_hydra():
     code = (
-        "import sys; import omniperception.commands.robot, omnirobot.drive.guard\n"
+        "import sys; import omnirobot.commands.drive, omnirobot.drive.guard\n"
         "print(sorted({'torch', 'warp', 'hydra', 'mujoco', 'omegaconf', 'yaml', 'rsl_rl'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)

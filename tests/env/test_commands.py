@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
 
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import yaw_quat
@@ -15,6 +14,7 @@ from omniperception.env.mdp.commands import (
     VelocityCommandConfig,
 )
 from omniperception.env.mdp.curriculum import CurriculumConfig
+from omnirobot.common.errors import ConfigError
 
 N = 4000
 

@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from omnilidar import Lidar
 from stepping import random_actions, still
 
+from omnilidar import Lidar
 from omniperception.common.random import EnvRandom
 from omniperception.env.frame_delivery import FrameDelivery
 from omniperception.learning.storage import PerceptiveStorage

@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
 from stepping import assert_equal, random_actions
 
 from omniperception import build, config
@@ -13,6 +12,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.env.mixed import MixedEnv, families_of, shares_of
 from omniperception.learning import load_checkpoint, save_checkpoint
 from omniperception.plan import parts_of
+from omnirobot.common.errors import ConfigError
 
 BLIND = ("experiment=walk", "sim=mujoco", "sim.num_threads=1")
 SEEING = (

@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+
+from omniperception.env.odometry import Odometry, TimedOdometry
 from omnirobot.runtime.odometry import Odometry as DeployedOdometry
 from omnirobot.runtime.odometry import TimedOdometry as DeployedTimes
 from omnirobot.wire.sensor_clock import FrameAges
-
-from omniperception.env.odometry import Odometry, TimedOdometry
 
 DT = 0.02
 CPU = torch.device("cpu")

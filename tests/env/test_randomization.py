@@ -5,8 +5,8 @@ from dataclasses import fields, replace
 import mujoco
 import pytest
 import torch
-from omnilidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
 
+from omnilidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mirror import Mirror

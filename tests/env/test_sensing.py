@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from omnilidar import OUTPUTS, Lidar
 from stepping import OTHERS, assert_equal, outcome, random_actions, still
 
+from omnilidar import OUTPUTS, Lidar
 from omniperception.env.build import build_sampler
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import RewardTerm

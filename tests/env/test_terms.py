@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+
 from omnilidar import launch
 from omnilidar.launch import default_num_threads
-
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp import rewards
 from omniperception.env.mdp.terms import RewardTerm, StatefulTerm

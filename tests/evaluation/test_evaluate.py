@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from omnirobot.common.figures import PlotsUnavailable
 from PIL import Image
 
 from omniperception import build, config
@@ -23,6 +22,7 @@ from omniperception.evaluation.baselines import baseline
 from omniperception.evaluation.records import read
 from omniperception.evaluation.suite import Evaluation, Task, World, evaluate, reported_seed, suite_worlds
 from omniperception.learning import CheckpointError
+from omnirobot.common.figures import PlotsUnavailable
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("num_envs=2", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1")

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
 
 from omniperception.commands.gait import feet_table
 from omniperception.evaluation.footfall import COMMANDS, Footfall, _bars, draw_footfall, watch
+from omnirobot.common.errors import ConfigError
 
 BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk")
 TASK = (*BLIND, "scenario=walk", f"num_envs={len(COMMANDS)}")

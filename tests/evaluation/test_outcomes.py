@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from omnirobot.common.files import lock
 
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
@@ -15,6 +14,7 @@ from omniperception.evaluation.records import Record, merge, read, write
 from omniperception.evaluation.report import difference, table
 from omniperception.evaluation.statistics import quantiles
 from omniperception.evaluation.tables import VIEWS
+from omnirobot.common.files import lock
 
 # outcome, contacts, first contact (s), length (s)
 TRIALS = [

@@ -11,13 +11,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
 
 from omniperception.commands import main
 from omniperception.evaluation import response
 from omniperception.evaluation.response import Recording, _periodic, around_cycle, driven, falls_by_jump, reach
 from omniperception.evaluation.response_fit import fit, kept, lagged
 from omniperception.sim.response import FILE, Cycle, GaitResponse, NoResponse
+from omnirobot.common.errors import ConfigError
 
 GAIT = Path(__file__).resolve().parents[2] / "pretrained" / "gait"
 DT, FINE = 0.02, 20

@@ -6,10 +6,9 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from omnilidar import Shape, ShapeKind
-from omnirobot.common.errors import ConfigError
 from PIL import Image
 
+from omnilidar import Shape, ShapeKind
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.evaluation.camera import CAMERAS, FollowCamera
 from omniperception.evaluation.overlay import legend, sector_plot
@@ -17,6 +16,7 @@ from omniperception.evaluation.render import Arrow, Renderer, View
 from omniperception.evaluation.video import Recorder
 from omniperception.evaluation.video_options import VideoOptions
 from omniperception.scene.rays import HitClass, RayShapes
+from omnirobot.common.errors import ConfigError
 
 WIDTH, HEIGHT = 64, 36
 BALL = Shape(ShapeKind.SPHERE, (0.5,), body=0, class_id=HitClass.ROBOT)

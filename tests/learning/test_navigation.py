@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
 
 from omniperception import build, config
 from omniperception.avoidance.velocity_risk import VelocityRisk
@@ -12,6 +11,7 @@ from omniperception.learning.checkpoint import CheckpointError
 from omniperception.learning.read_out import MotionReadOut
 from omniperception.learning.warm_start import take_parts
 from omniperception.perception.networks.rings import RingPath
+from omnirobot.common.errors import ConfigError
 
 SMALL = ("num_envs=6", "sim.num_threads=1", "ppo.num_mini_batches=2", "ppo.num_steps_per_env=4", "lidar.num_rays=200")
 TOLD = ("experiment=navigate", *SMALL[:-1])

@@ -5,9 +5,9 @@ import pytest
 import torch
 import warp as wp
 from clouds import MAX_RANGE, random_rays, sample
+
 from omnilidar import SectorDistances
 from omnilidar.kernels.sectors import sector_minima
-
 from omniperception.avoidance.kernels import worst_sectors
 from omniperception.perception import FpsSampler, PdSampler, standing_kernels
 from omniperception.perception.networks.kernels import write_rings

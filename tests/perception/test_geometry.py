@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from omnilidar import Lidar
 from worlds import HEIGHT, LEVEL, MOUNT, PAPER, box, cloud, cylinder, plane, quaternion
 
+from omnilidar import Lidar
 from omniperception import build, config
 from omniperception.common.sectors import sector_of
 from omniperception.env.env import OmniEnv

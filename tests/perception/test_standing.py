@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 from clouds import random_rays, sample
-from omnirobot.runtime.sampling import Attitude as RobotAttitude
-from omnirobot.runtime.sampling import make_sampler
 from worlds import LEVEL, PAPER, box, cloud, cylinder, plane
 
 from omniperception.deploy.export import sampler_parameters
 from omniperception.perception import Attitude, StandingSampler
+from omnirobot.runtime.sampling import Attitude as RobotAttitude
+from omnirobot.runtime.sampling import make_sampler
 
 SECTORS, DECAY, EDGES = 36, 0.5, (0.0, 0.15, 0.4, 3.0)
 SETTINGS = {"max_range": 6.0, "band_edges": EDGES, "decay": DECAY}

@@ -12,8 +12,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from omnirobot.common.figures import new_figure, save_figure
-from omnirobot.common.files import write_whole
 
 from omniperception import config
 from omniperception.commands import COMMANDS, main
@@ -22,6 +20,8 @@ from omniperception.deploy.export import BlindNetwork, write_onnx, write_torchsc
 from omniperception.evaluation.video import Recorder
 from omniperception.learning import CheckpointError, load_checkpoint
 from omniperception.scene.robot_file import compile_robot, read_robot
+from omnirobot.common.figures import new_figure, save_figure
+from omnirobot.common.files import write_whole
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from own_robots import BIPED, HEXAPOD

@@ -12,16 +12,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+from benchmarks import real_scans
 from omnilidar import read_points, read_scans, write_points
 from omnilidar.clouds import table_of
 from omnilidar.clouds.pointcloud2 import table_from_message
+from omniperception.commands import main, replay_bag
 from omnirobot.replay.bags import Topics, events
 from omnirobot.replay.recordings import Recording
 from omnirobot.runtime import DeployError
 from omnirobot.runtime.go2 import MOTORS
-
-from benchmarks import real_scans
-from omniperception.commands import main, replay_bag
 
 for library in ("mcap_ros2", "rosbags", "pypcd4", "laspy"):
     pytest.importorskip(library, reason="extra clouds")

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from omnilidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh, geom_shapes, read_points
 
+from omnilidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh, geom_shapes, read_points
 from omniperception.commands import main, scan
 from omniperception.commands.scan import pictures
 from omniperception.commands.scan.room import DemoClass

@@ -18,10 +18,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
-from omnirobot.common.figures import check_figures
-from omnirobot.common.shell import command_line
-from omnirobot.runtime import DeployError, Description, ExportedPolicy
 
 from omniperception import config
 from omniperception.commands import COMMANDS, main
@@ -29,6 +25,10 @@ from omniperception.commands import evaluate as evaluate_command
 from omniperception.commands import robot_fetch as robot_fetch_command
 from omniperception.evaluation import walking_report
 from omniperception.robots import fetch
+from omnirobot.common.errors import ConfigError
+from omnirobot.common.figures import check_figures
+from omnirobot.common.shell import command_line
+from omnirobot.runtime import DeployError, Description, ExportedPolicy
 
 ROOT = Path(__file__).resolve().parents[2]
 SPIDER = ROOT / "tests" / "data" / "spider.urdf"

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from omnirobot.common.coverage import NUM_BINS, NUM_SECTORS
-from omnirobot.runtime.coverage import Coverage as RobotsCoverage
-from omnirobot.runtime.sampling import Attitude
-from omnirobot.wire.livox import read_points, write_points
 
 from omniperception.avoidance.coverage import Coverage, answered_bins, kept_to_covered, least_bins, levelled
 from omniperception.common.random import EnvRandom
 from omniperception.deploy.faults import Faults
 from omniperception.env.partial_frames import PartialFrames, PartialFramesConfig
+from omnirobot.common.coverage import NUM_BINS, NUM_SECTORS
+from omnirobot.runtime.coverage import Coverage as RobotsCoverage
+from omnirobot.runtime.sampling import Attitude
+from omnirobot.wire.livox import read_points, write_points
 
 TASK = (
     *("experiment=avoid", "terrain=flat", "obstacles=crowd", "obstacles.curriculum=null", "randomization=none"),

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from omnirobot.common.cli import Command
-from omnirobot.common.shell import command_line
 
 from omniperception import config
 from omniperception.commands import curves, evaluate, main, robot_new
 from omniperception.evaluation.curves import Curve, draw_curves
 from omniperception.evaluation.video import Recorder
 from omniperception.scene.meshes import check_mesh, mesh_points
+from omnirobot.common.cli import Command
+from omnirobot.common.shell import command_line
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from own_robots import HEXAPOD

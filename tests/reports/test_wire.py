@@ -15,6 +15,7 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1] / "hardware"))
 
 from messages_by_hand import LIVOX, point_cloud2
+
 from omnirobot.drive.guard import StateReader
 from omnirobot.runtime import DeployError
 from omnirobot.wire import clouds, control, lidar, livox

@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 import torch
-from omnilidar import RayScene
 
+from omnilidar import RayScene
 from omniperception.scene.rays import ray_shapes
 
 

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from mj_rays import assert_rays_are_those_of_mj_ray
-from omnirobot.common.errors import ConfigError
 from PIL import Image
 
 from omniperception.scene.map_terrain import (
@@ -17,6 +16,7 @@ from omniperception.scene.map_terrain import (
     free_places,
     read_image,
 )
+from omnirobot.common.errors import ConfigError
 
 CELL = 0.1
 BORDER = 10

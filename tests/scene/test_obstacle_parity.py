@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from omnilidar import ShapeKind
 
 from benchmarks.harness.reference import mujoco_ranges
+from omnilidar import ShapeKind
 from omniperception.evaluation.clearance import Clearance
 from omniperception.evaluation.clearance_kernels import TOLERANCE
 from omniperception.scene.rays import ray_shapes

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from omnilidar import RayScene
-from omnilidar.mujoco import geom_shapes
 
 from benchmarks import robot_meshes
+from omnilidar import RayScene
+from omnilidar.mujoco import geom_shapes
 from omniperception import build, config
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.robots.stand import flat_world

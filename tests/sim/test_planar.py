@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from omnirobot.common.errors import ConfigError
 
 from omniperception import build, config
 from omniperception.build import load_policy
@@ -18,6 +17,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.scene.build import OBSTACLE_FORCE
 from omniperception.sim.planar_world import PlanarSimulator
 from omniperception.sim.response import FILE, GaitResponse, NoResponse
+from omnirobot.common.errors import ConfigError
 
 GAIT = Path(config.SHIPPED_RUNS) / "gait"
 NAVIGATE = (

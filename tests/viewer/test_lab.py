@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from browser import chromium, control, open_tab, picture, wait_for
-from omnilidar import LidarFrame
 
+from omnilidar import LidarFrame
 from omniperception import build, config
 from omniperception.commands.scan import NO_TASK, lab_room
 from omniperception.commands.scan.room import ROOM, DemoClass, demo_scene

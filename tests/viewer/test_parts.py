@@ -9,8 +9,8 @@ import socket
 
 import numpy as np
 import pytest
-from omnilidar import Shape, ShapeKind
 
+from omnilidar import Shape, ShapeKind
 from omniperception import config
 from omniperception.viewer import PageOptions, ViewerError
 from omniperception.viewer.clock import BEHIND_S, Clock

@@ -18,11 +18,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+
 from omnilidar import DEVICES, TriangleMesh
 from omnilidar.mesh_files import AXES, read_mesh, unit_said
-from omnirobot.common.cli import Command, argument, refuse_arguments
-from omnirobot.common.figures import PlotsUnavailable
-
 from omniperception import build, config
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
 from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene, demo_scene, mesh_scene
@@ -31,6 +29,8 @@ from omniperception.env.sensing import SensorConfig
 from omniperception.scene import RobotConfig
 from omniperception.viewer import PageOptions, ViewerError, serve_lab
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT, Room
+from omnirobot.common.cli import Command, argument, refuse_arguments
+from omnirobot.common.figures import PlotsUnavailable
 
 NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
 """A sensor is looked at, no task is run."""

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
 from omnilidar import Lidar, ScanPattern, write_points
 from omnilidar.clouds import table_of
-from omnirobot.common.figures import new_figure, save_figure
-
 from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene
 from omniperception.common.rotations import rotate
 from omniperception.env.sensing import SensorConfig
+from omnirobot.common.figures import new_figure, save_figure
 
 DURATIONS_S = (0.1, 0.5, 1.0)
 CAMERA, TARGET, FOCAL = (-4.3, -6.2, 5.0), (0.85, -0.35, 0.15), 1.34

@@ -10,8 +10,8 @@ from enum import IntEnum
 import mujoco
 import numpy as np
 import torch
-from omnilidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh, geom_shapes
 
+from omnilidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh, geom_shapes
 from omniperception.scene import RobotConfig
 from omniperception.scene.rays import robot_geoms
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 from operator import attrgetter
 
 import torch
-from omnilidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 
+from omnilidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.common.random import EnvRandom
 from omniperception.env.mdp.curriculum import FULL, Curriculum, CurriculumConfig
 from omniperception.env.partial_frames import PartialFramesConfig

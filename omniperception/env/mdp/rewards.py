@@ -10,8 +10,8 @@ import math
 from collections.abc import Sequence
 
 import torch
-from omnilidar.launch import constant
 
+from omnilidar.launch import constant
 from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.env.state import EnvState, requires, rests
 

@@ -3,6 +3,7 @@
 import math
 
 import warp as wp
+
 from omnilidar.kernels.sectors import bearing_in_sectors, sector_at
 
 FAINT = 1e-6

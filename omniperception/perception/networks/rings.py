@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
-from omnilidar.launch import constant, launch_over_envs, view
 from torch import nn
 from torch.nn import functional
 
+from omnilidar.launch import constant, launch_over_envs, view
 from omniperception.common.sectors import bearing_in_sectors, sector_at
 from omniperception.perception.networks.kernels import EMPTY_DISTANCE, FAINT, LATERAL, write_rings
 from omniperception.perception.networks.motion_match import NOTHING, MotionMatch

@@ -8,6 +8,7 @@ device.
 from pathlib import Path
 
 import warp as wp
+
 from omnilidar.kernels.rotations import to_quat
 from omnilidar.kernels.sectors import levelled, sector_of
 from omnilidar.native import function_body

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 
 import torch
 import warp as wp
-from omnilidar.launch import launch_over_envs, view
 
+from omnilidar.launch import launch_over_envs, view
 from omniperception.perception.samplers import kernels, sorting, sorting_kernels
 from omniperception.perception.samplers.base import Sampler
 from omniperception.perception.samplers.kernels import Work

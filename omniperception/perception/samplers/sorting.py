@@ -12,8 +12,8 @@ from functools import lru_cache
 
 import torch
 import warp as wp
-from omnilidar.launch import view
 
+from omnilidar.launch import view
 from omniperception.perception.samplers.kernels import Work
 from omniperception.perception.samplers.sorting_kernels import find_parts, key_rays, sort_each_environment
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import warp as wp
-from omnilidar.launch import constant, launch_over_envs, view
 
+from omnilidar.launch import constant, launch_over_envs, view
 from omniperception.perception.geometry import GeometryConfig, Standing
 from omniperception.perception.samplers.base import Sampler
 from omniperception.perception.samplers.sampling import checked_edges

@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+
 from omnilidar import RayScene, Shape, make_selection
 from omnilidar import ShapeKind as K
 

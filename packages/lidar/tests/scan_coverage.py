@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import torch
+
 from omnilidar import ScanPattern
 from omnilidar.patterns.cells import SphereCells
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import CUBE, CUBE_FACES
+
 from omnilidar import (
     DEVICES,
     AngularJitter,

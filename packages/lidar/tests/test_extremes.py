@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import CUBE, CUBE_FACES, cast, one
+
 from omnilidar import HeightField, Lidar, LidarConfig, RayScene, Shape, ShapeKind, TriangleMesh, grid
 
 K = ShapeKind

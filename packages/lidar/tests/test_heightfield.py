@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import cast, rotate, turn
+
 from omnilidar import HeightField, Lidar, LidarConfig, RayScene, ScanPattern, Shape, ShapeKind, TriangleMesh
 from omnilidar.kernels.march_block import REACHES
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 from lidar_helpers import cast, one
-from omnilidar import RayScene, Shape, ShapeKind
 
 from benchmarks.lidar_accuracy import cases, compare
+from omnilidar import RayScene, Shape, ShapeKind
 
 K = ShapeKind
 

@@ -8,6 +8,7 @@ import time
 import pytest
 import torch
 import warp as wp
+
 from omnilidar import launch
 from omnilidar.launch import CHUNKS_PER_THREAD, MIN_CHUNK_WORK, SplitLaunch, default_num_threads, split
 

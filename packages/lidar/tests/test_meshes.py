@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import CUBE, CUBE_FACES, cast, one, turn
+
+from benchmarks.lidar_accuracy import random_mesh
 from omnilidar import RayScene, Shape, ShapeKind, TriangleMesh
 from omnilidar.kernels.mesh import STACK_SIZE
 from omnilidar.meshes import _build_tree
-
-from benchmarks.lidar_accuracy import random_mesh
 
 
 def mesh_shape(vertices, triangles, **options):

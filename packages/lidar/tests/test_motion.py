@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import closed_shapes, multiply, random_quats, rotate
+
 from omnilidar import GaussianNoise, Lidar, LidarConfig, RayScene, ScanPattern, Shape, ShapeKind, mid360
 
 K = ShapeKind

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from omnilidar import MujocoScene, RayScene, ShapeKind, geom_shapes
 
 from benchmarks.harness.reference import mujoco_ranges
+from omnilidar import MujocoScene, RayScene, ShapeKind, geom_shapes
 
 XML = """
 <mujoco>

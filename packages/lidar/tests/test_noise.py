@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from omnilidar import (
     AngularJitter,
     DistanceNoise,

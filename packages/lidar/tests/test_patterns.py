@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import select_rows
+
 from omnilidar import ScanPattern, grid, make_selection, vlp16, xt32
 
 RATE = 200_000

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+
 from omnilidar import custom, grid, height_scanner
 
 

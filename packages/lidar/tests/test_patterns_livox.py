@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from scan_coverage import angle_to_table, compare
+
 from omnilidar import LIVOX, hap, mid360, mid360_measured
 from omnilidar.patterns.risley import RisleyScanner, Wedge
-from scan_coverage import angle_to_table, compare
 
 needs_table = pytest.mark.skipif(
     importlib.util.find_spec("mujoco_lidar") is None, reason="the extra 'tables' is not installed"

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from scan_coverage import selection_coverage
+
 from omnilidar import ScanPattern, avia, grid, make_selection, mid40, mid360, os1, vlp16, xt16
 from omnilidar.patterns.cells import SphereCells
 from omnilidar.patterns.selection import _one_per_cell, field_cells
-from scan_coverage import selection_coverage
 
 STRATEGIES = ("every_kth", "stratified")
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+
 from omnilidar import airy, hdl32e, hdl64e, os0, os1, os2, ouster, spinning, vlp16, vlp32c, xt16, xt32
 
 MAKERS = {make.__name__: make for make in (hdl64e, hdl32e, vlp16, vlp32c, os1, xt32, xt16, airy)}

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from omnilidar import unitree_l1, unitree_l2
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from lidar_helpers import closed_shapes, random_quats, rotate
+
 from omnilidar import (
     OUTPUTS,
     GaussianNoise,

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import closed_shapes, random_quats, rotate
+
+from benchmarks.lidar_accuracy import random_mesh
 from omnilidar import (
     HeightField,
     Lidar,
@@ -19,8 +21,6 @@ from omnilidar import (
     mid360,
 )
 from omnilidar.scene import PlacedShapes, View
-
-from benchmarks.lidar_accuracy import random_mesh
 
 
 def rays(num_envs, num_rays=1, direction=(1.0, 0.0, 0.0)):

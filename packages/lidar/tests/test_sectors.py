@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from omnilidar import SectorDistances, quat_from_rpy
 from omnilidar import sectors as module
 

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import clock, closed_shapes, random_quats, rotate, select_rows
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
 from omnilidar import (
     OUTPUTS,
     GaussianNoise,
@@ -22,8 +25,6 @@ from omnilidar import (
     quat_from_rpy,
 )
 from omnilidar.patterns import make_selection
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 K = ShapeKind
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from lidar_helpers import CUBE, CUBE_FACES
+
 from omnilidar import Lidar, LidarConfig, MujocoScene, RayScene, ScanPattern, Shape, ShapeKind, TriangleMesh
 
 K = ShapeKind

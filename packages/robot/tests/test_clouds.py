@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 from messages_by_hand import LIVOX, XYZ, point_cloud2, text
+
 from omnirobot.runtime import DeployError
 from omnirobot.wire import lidar
 from omnirobot.wire.clouds import (

@@ -10,6 +10,7 @@ import threading
 
 import numpy as np
 import pytest
+
 from omnirobot.runtime import DeployError
 from omnirobot.wire import livox
 from omnirobot.wire.livox import Message, Mid360, Sensor

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from omnirobot.drive.machine import Machine, MachineConfig, Mode, Request, Sensed
 from omnirobot.runtime import DeployError
 

@@ -8,6 +8,7 @@ import hashlib
 
 import numpy as np
 import pytest
+
 from omnirobot.runtime import DeployError
 from omnirobot.wire.messages import LOW_CMD, LOW_STATE, Struct, crc, low_cmd, remote, sealed
 

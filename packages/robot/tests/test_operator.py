@@ -6,6 +6,7 @@ import socket
 
 import numpy as np
 import pytest
+
 from omnirobot.drive.machine import Request
 from omnirobot.drive.operator import make_operator
 from omnirobot.runtime import DeployError

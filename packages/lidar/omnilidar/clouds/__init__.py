@@ -1,7 +1,7 @@
 """Point clouds in files: tables of named columns, read and written as PCD, PLY, LAS, npz and ROS 2 messages in MCAP.
 
 Libraries of the extra `clouds` do the work where a format is more than a table: pypcd4 to write PCD, laspy for
-LAS, mcap for MCAP, rosbags for bags of ROS 1 and 2, which are read only.
+LAS, mcap for MCAP. Recordings are read by omnirobot's reader: MCAP, and bags of ROS 1 and 2.
 
 Of a file that is cut off or damaged, what can be read is; one line on standard error says what is missing.
 """
@@ -43,6 +43,7 @@ FORMATS = {
         (".bag", ".active", ".db3", ".zstd", "folder"), _Format("recording", "rosbags", many=True, writes=False)
     ),
 }
+_POINTER = b"version https://git-lfs"
 WRITTEN = tuple(suffix for suffix, form in FORMATS.items() if form.writes)
 
 
@@ -58,8 +59,6 @@ def read_scans(path: str | Path, topic: str | None = None) -> Iterator[PointTabl
         ModuleNotFoundError: The library for this format is not installed.
         ValueError: The format is unknown, the file is broken, or the topic has to be named.
     """
-    from omnirobot.common.pointers import refuse_pointer
-
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give a file of points: {', '.join(FORMATS)}")
@@ -69,7 +68,7 @@ def read_scans(path: str | Path, topic: str | None = None) -> Iterator[PointTabl
             if form.many:
                 yield from module.read(path, topic)
             else:
-                refuse_pointer(path)
+                _refuse_pointer(path)
                 yield module.read(path)
         except ValueError as error:  # of what is read, such as a table without x; named where it is not
             raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
@@ -111,6 +110,13 @@ def write_scans(path: str | Path, tables: Sequence[PointTable]) -> None:
         raise ValueError(f"{path}: this format holds one frame and {len(tables)} were given; write them to .mcap")
     with _needing(form, path):
         module.write(path, tables if form.many else tables[0])
+
+
+def _refuse_pointer(path: Path) -> None:
+    """Says how to fetch a file of which only Git LFS's pointer is there."""
+    with path.open("rb") as file:
+        if file.read(len(_POINTER)) == _POINTER:
+            raise ValueError(f"{path} is a pointer of Git LFS, not the file itself: run 'git lfs pull' in its checkout")
 
 
 def _format(suffix: str, path: Path, done: str, known: tuple[str, ...]) -> tuple[_Format, Any]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from omnirobot.common.point_fields import CODES, TYPES
 
 from .table import PADDING, PointTable, column_names
 
 MESSAGE = "sensor_msgs/msg/PointCloud2"
+TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""NumPy's names of PointField's datatypes INT8 to FLOAT64, without byte order."""
+CODES = {np.dtype(kind): code for code, kind in TYPES.items()}
 DEFINITION = """\
 std_msgs/Header header
 uint32 height

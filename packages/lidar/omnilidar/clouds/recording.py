@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from omnirobot.common import custom_msg
 from omnirobot.replay.recordings import Message, Recording
+from omnirobot.wire import custom_msg
 
 from .pointcloud2 import DEFINITION, MESSAGE, message_from_table, table_from_message
 from .table import PointTable

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from omnirobot.common import custom_msg
 from omnirobot.drive.machine import Mode
 from omnirobot.replay.recordings import Message, Recording
 from omnirobot.runtime.description import DeployError
 from omnirobot.runtime.go2 import MOTORS
+from omnirobot.wire import custom_msg
 from omnirobot.wire.clouds import Points, in_one_time, read_custom_msg, read_point_cloud2
 from omnirobot.wire.messages import LOW_STATE
 

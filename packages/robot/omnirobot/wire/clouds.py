@@ -8,11 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnirobot.common import custom_msg, point_fields
 from omnirobot.runtime.description import DeployError
 from omnirobot.runtime.sampling import rotation_matrix
+from omnirobot.wire import custom_msg
 from omnirobot.wire.saying import say
 from omnirobot.wire.sensor_clock import BACK_NS, SensorClock
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""NumPy's names of PointField's datatypes INT8 to FLOAT64, without byte order."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +243,7 @@ def _point_cloud2(data: bytes) -> Points:
     fields = {}
     for _ in range(cdr.read("I")):
         name, offset, kind, _ = cdr.text(), cdr.read("I"), cdr.read("B"), cdr.read("I")
-        fields[name] = ("<" + point_fields.TYPES[kind] if kind in point_fields.TYPES else "V1", offset)
+        fields[name] = ("<" + _TYPES[kind] if kind in _TYPES else "V1", offset)
     big_endian, step, row_step = cdr.read("B"), cdr.read("I"), cdr.read("I")
     time_field = next((name for name in _TIME_FIELDS if name in fields), None)
     if big_endian or not {"x", "y", "z"} <= set(fields) or time_field is None:

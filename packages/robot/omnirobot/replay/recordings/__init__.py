@@ -16,10 +16,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
 
-from omnirobot.common.pointers import refuse_pointer
-
 from . import db3, mcap, rosbag1
 from .message import Channel, Message
+from .pointers import refuse_pointer
 
 __all__ = ["Channel", "Message", "Recording"]
 
