@@ -37,6 +37,18 @@ class TrueSectors:
         self.num_sectors, self._field, self._num_envs, self._device = num_sectors, field, num_envs, device
         self.names = obstacles.geom_names()
 
+    def in_view(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, half_angle: float) -> torch.Tensor:
+        """(num_envs, O) bool: obstacles whose circle reaches into the view of `half_angle` (rad) to either side of
+        straight ahead. Arguments as `measure` has them."""
+        field = self._field
+        if field is None:
+            return torch.zeros(self._num_envs, 0, dtype=torch.bool, device=self._device)
+        place = rotate_yaw(-yaw, field.pos_w[..., :2].float() - base_pos_w[:, None, :2])
+        x, y = place.unbind(-1)
+        distance = torch.hypot(x, y)
+        width = torch.asin((field.radius.float() / distance.clamp(min=1e-6)).clamp(max=1.0))
+        return (torch.atan2(y, x).abs() - width <= half_angle) | (distance <= field.radius)
+
     def measure(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, known: torch.Tensor | None = None) -> torch.Tensor:
         """Distances and velocities at the present state of the obstacles.
 

@@ -443,13 +443,18 @@ class EnvState:
     def sectors(self) -> torch.Tensor:
         """(num_envs, 36, 3) distance (m, infinite without an obstacle) and velocity (m/s, yaw-aligned frame) of the
         nearest true obstacle by azimuth sector; see `TrueSectors`."""
+        return self.true_sectors.measure(self.kinematics.base_pos_w, self.kinematics.yaw)
+
+    @property
+    def true_sectors(self) -> TrueSectors:
+        """What measures `sectors`."""
         if self._true_sectors is None:
             from omniperception.avoidance.navigation import NUM_SECTORS
             from omniperception.avoidance.true_sectors import TrueSectors
 
             world = self._sim.world.obstacles
             self._true_sectors = TrueSectors(NUM_SECTORS, world, self._obstacles, self.num_envs, self.device)
-        return self._true_sectors.measure(self.kinematics.base_pos_w, self.kinematics.yaw)
+        return self._true_sectors
 
     @property
     def asked(self) -> torch.Tensor:

@@ -160,6 +160,9 @@ class SectorErrors:
         lost: share of the sectors that are empty although something is there.
         late: share of the steps in which what is known is one step old.
         lasts_s: time (s) after which a fraction 1/e of an error is left.
+        seen_deg: to either side of straight ahead an obstacle is seen; the body hides what is behind from a LiDAR at
+            the head.
+        remembered_s: time (s) for which an obstacle is known after it was seen last.
     """
 
     distance: float
@@ -168,6 +171,8 @@ class SectorErrors:
     lost: float
     late: float
     lasts_s: float
+    seen_deg: float = 180.0
+    remembered_s: float = 0.8
 
 
 class NavigationView(StatefulTerm):
@@ -196,13 +201,14 @@ class NavigationView(StatefulTerm):
         self.slowed, self.level = torch.ones(2, state.num_envs, device=state.device).unbind(0)
         self.before = torch.zeros_like(state.sectors)
         self.before[..., 0] = torch.inf
+        self.unseen_s = torch.zeros(0, 0, device=state.device)
         if self._errors is not None:
             self.reset(torch.arange(state.num_envs, device=state.device))
 
     def _with_errors(self, state: EnvState, errors: SectorErrors) -> torch.Tensor:
         kept = math.exp(-state.control_dt / errors.lasts_s)
         self.wrong = kept * self.wrong + math.sqrt(1 - kept**2) * torch.randn_like(self.wrong)
-        true, wrong = state.sectors, self.wrong * self.level[:, None, None]
+        true, wrong = self._known(state, errors), self.wrong * self.level[:, None, None]
         distance = true[..., 0] * (1 + errors.distance * wrong[..., 0])
         velocity = true[..., 1:] * self.slowed[:, None, None] + errors.velocity * wrong[..., 1:]
         lost = torch.rand_like(distance) < errors.lost
@@ -211,9 +217,22 @@ class NavigationView(StatefulTerm):
         shown, self.before = torch.where(late, self.before, known), known
         return shown
 
+    def _known(self, state: EnvState, errors: SectorErrors) -> torch.Tensor:
+        """True sectors of what was seen lately."""
+        if errors.seen_deg >= 180.0:
+            return state.sectors
+        kinematics = state.kinematics
+        seen = state.true_sectors.in_view(kinematics.base_pos_w, kinematics.yaw, math.radians(errors.seen_deg))
+        if self.unseen_s.shape != seen.shape:  # the first step
+            self.unseen_s = torch.full(seen.shape, torch.inf, device=seen.device)
+        self.unseen_s = torch.where(seen, 0.0, self.unseen_s + state.control_dt)
+        known = self.unseen_s <= errors.remembered_s
+        return state.true_sectors.measure(kinematics.base_pos_w, kinematics.yaw, known)
+
     def reset(self, env_ids: torch.Tensor) -> None:
         if self._errors is None or self._candidates is None:
             return
+        self.unseen_s = self.unseen_s.index_fill(0, env_ids, torch.inf) if len(self.unseen_s) else self.unseen_s
         low, high = self._errors.slowed
         self.slowed[env_ids] = low + (high - low) * torch.rand(len(env_ids), device=self.slowed.device)
         self.level[env_ids] = torch.rand(len(env_ids), device=self.level.device)
