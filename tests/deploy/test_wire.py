@@ -28,13 +28,14 @@ from omniperception.deploy.export import export
 from omniperception.deploy.faults import FAULTS, SENSORS
 from omniperception.deploy.trials import results
 from omnirobot.common.signals import interruptible
-from omnirobot.drive import control, guard, lidar
+from omnirobot.drive import control, guard
 from omnirobot.drive.control import machine_config, motor_order
 from omnirobot.drive.machine import Mode, Request
 from omnirobot.drive.recording import make_folder
 from omnirobot.replay.bags import Topics, events
 from omnirobot.replay.replay import draw, replay
 from omnirobot.runtime import DeployError, Description, ExportedPolicy
+from omnirobot.wire import lidar
 from omnirobot.wire.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, Network
 from omnirobot.wire.lidar import Frames, LidarSource
 from omnirobot.wire.messages import LOW_CMD, LOW_STATE, crc, low_cmd, sealed

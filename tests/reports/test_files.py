@@ -17,7 +17,8 @@ from benchmarks import real_scans
 from omnilidar import read_points, read_scans, write_points
 from omnilidar.clouds import table_of
 from omnilidar.clouds.pointcloud2 import table_from_message
-from omniperception.commands import main, replay_bag
+from omniperception.commands import main
+from omnirobot.commands import replay as replay_bag
 from omnirobot.replay.bags import Topics, events
 from omnirobot.replay.recordings import Recording
 from omnirobot.runtime import DeployError

@@ -3,22 +3,18 @@
 import binascii
 import socket
 import struct
-import sys
 import threading
 import zlib
 from collections import deque
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1] / "hardware"))
-
 from messages_by_hand import LIVOX, point_cloud2
 
+from omnirobot.drive import control
 from omnirobot.drive.guard import StateReader
 from omnirobot.runtime import DeployError
-from omnirobot.wire import clouds, control, lidar, livox
+from omnirobot.wire import clouds, lidar, livox
 from omnirobot.wire.clouds import FrameCutter, Points
 from omnirobot.wire.lidar import LidarSource
 from omnirobot.wire.livox import Mid360
