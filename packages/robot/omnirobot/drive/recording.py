@@ -20,7 +20,7 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,6 +69,7 @@ class Step:
         seen: (num_rays, 3) m, sensor frame, that the policy was given; None: no frame was complete.
         targets: (12,) rad, in the motors' order; None: the policy has stopped.
         action: (12,) its raw output.
+        stopped: why the policy has stopped while it moved the robot; empty: it has not.
     """
 
     time_s: float
@@ -78,6 +79,7 @@ class Step:
     seen: np.ndarray | None
     targets: np.ndarray | None
     action: np.ndarray
+    stopped: str = ""
 
 
 def nearest_by_sector(
@@ -156,9 +158,6 @@ class Recorder:
     def points(self, now: float, points: Points) -> None:
         """Points (n, 3) m in the sensor's own frame, that have come at `now`, s on the loop's clock."""
         self._queue.put((self._wall_ns(now), points))
-
-    def stop(self, now: float, why: str) -> None:
-        """The policy has stopped; its step, which has no targets, says so too."""
 
     def step(self, step: Step) -> None:
         """A control step."""
@@ -265,14 +264,14 @@ class Recorder:
         stamp = self._made("builtin_interfaces/msg/Time", time_ns // 10**9, time_ns % 10**9)
         return self._made("std_msgs/msg/Header", stamp, frame)
 
-    def _vector(self, values: Sequence[float]) -> Any:
+    def _vector(self, values: Iterable[float]) -> Any:
         return self._made("geometry_msgs/msg/Vector3", *map(float, values))
 
-    def _quaternion(self, values: Sequence[float]) -> Any:
+    def _quaternion(self, values: Iterable[float]) -> Any:
         """Of (w, x, y, z)."""
         w, *xyz = map(float, values)
         return self._made("geometry_msgs/msg/Quaternion", *xyz, w)
 
-    def _transform(self, header: Any, child: str, pos: Sequence[float], quat: Sequence[float]) -> Any:
+    def _transform(self, header: Any, child: str, pos: Iterable[float], quat: Iterable[float]) -> Any:
         transform = self._made("geometry_msgs/msg/Transform", self._vector(pos), self._quaternion(quat))
         return self._made("geometry_msgs/msg/TransformStamped", header, child, transform)
