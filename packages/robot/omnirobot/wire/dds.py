@@ -220,10 +220,7 @@ def _of_struct(kind: Struct, octet: str) -> Any:
     names = {"u2": "uint16", "u4": "uint32", "i2": "int16", "i4": "int32", "f4": "float32"}
 
     def annotation(field: str | Struct, length: int) -> Any:
-        if isinstance(field, Struct):
-            one = _of_struct(field, octet)
-        else:
-            one = getattr(types, names.get(field, octet))
+        one = _of_struct(field, octet) if isinstance(field, Struct) else getattr(types, names.get(field, octet))
         return types.array[one, length] if length else one
 
     return _make(kind.name, {name: annotation(field, length) for name, field, length in kind.fields})
