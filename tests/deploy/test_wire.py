@@ -768,9 +768,3 @@ class TestDds:
             writer.write(LOW_CMD.to_cdr(sealed(low_cmd())))
             time.sleep(0.01)
         assert process.wait(60.0) == 2
-
-
-def test_a_missing_cyclonedds_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cyclonedds", None)
-    with pytest.raises(DeployError, match=r"pip install 'omniperception\[robot\]'"):
-        Network()

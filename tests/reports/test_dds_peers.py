@@ -16,16 +16,13 @@ from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.topic import Topic
+from messages_by_hand import LIVOX, point_cloud2
 
 from omnirobot.runtime import DeployError
 from omnirobot.wire import dds, lidar
 from omnirobot.wire.dds import CUSTOM_MSG, LOW_CMD_TOPIC, LOW_STATE_TOPIC, POINT_CLOUD2, REQUEST, Network
 from omnirobot.wire.lidar import LidarSource
 from omnirobot.wire.messages import LOW_CMD, LOW_STATE, Struct, low_cmd, sealed
-
-sys.path.append(str(Path(__file__).parents[1] / "hardware"))
-
-from messages_by_hand import LIVOX, point_cloud2
 
 PEER = Path(__file__).with_name("old_peer.py")
 OLD = os.environ.get("CYCLONEDDS_0_10_PYTHON", "")

@@ -18,7 +18,7 @@ from omnilidar import read_points, read_scans, write_points
 from omnilidar.clouds import table_of
 from omnilidar.clouds.pointcloud2 import table_from_message
 from omniperception.commands import main
-from omnirobot.commands import replay as replay_command
+from omnirobot.commands import replay as replay_bag
 from omnirobot.replay.bags import Topics, events
 from omnirobot.replay.recordings import Recording
 from omnirobot.runtime import DeployError
@@ -837,8 +837,8 @@ def test_a_bag_of_ros_1_is_replayed(tmp_path):
 def test_the_replay_command_says_what_it_cannot_read(tmp_path, capsys, monkeypatch, name, messages, said):
     seeing = SimpleNamespace(perception=object(), lidar=SimpleNamespace(period_s=0.1), control_period_s=0.02)
     policy = SimpleNamespace(description=seeing, safety=None)
-    monkeypatch.setattr(replay_command.ExportedPolicy, "load", lambda path: policy)
-    monkeypatch.setattr(replay_command, "replay", lambda policy, given, command: list(given))
+    monkeypatch.setattr(replay_bag.ExportedPolicy, "load", lambda path: policy)
+    monkeypatch.setattr(replay_bag, "replay", lambda policy, given, command: list(given))
     if isinstance(messages, list):
         a_db3(tmp_path / name, [*state(), *messages]).close()
     elif messages:

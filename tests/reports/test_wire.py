@@ -3,17 +3,12 @@
 import binascii
 import socket
 import struct
-import sys
 import threading
 import zlib
 from collections import deque
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1] / "hardware"))
-
 from messages_by_hand import LIVOX, point_cloud2
 
 from omnirobot.drive import control

@@ -8,7 +8,7 @@ COMMANDS = {
 }
 EXTRAS = {
     "matplotlib": "plots",
-    **dict.fromkeys(("mcap", "mcap_ros2", "rosbags"), "recordings"),
+    **dict.fromkeys(("mcap", "rosbags"), "recordings"),
 }
 """Extra of this package that brings each library."""
 

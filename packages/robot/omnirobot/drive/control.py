@@ -172,10 +172,9 @@ def machine_config(description: Description) -> MachineConfig:
 
 
 class States(Protocol):
-    """The robot's."""
+    """The robot's, see `guard.StateReader`."""
 
-    def newest(self) -> np.ndarray | None:
-        """() LOW_STATE that has come since the call before; None: none has."""
+    def newest(self) -> np.ndarray | None: ...
 
 
 class FrameSource(Protocol):
@@ -183,8 +182,7 @@ class FrameSource(Protocol):
 
     received: list[Points]
 
-    def new(self) -> list[Frame]:
-        """Complete since the call before."""
+    def new(self) -> list[Frame]: ...
 
 
 class Awaited(Protocol):
@@ -235,8 +233,6 @@ class Listener(Protocol):
     def points(self, now: float, points: Points) -> None: ...
 
     def step(self, step: Step) -> None: ...
-
-    def stop(self, now: float, why: str) -> None: ...
 
 
 class Control:
@@ -304,7 +300,7 @@ class Control:
                 self._begin_odometry()
         given = command if self._mode is Mode.POLICY else np.zeros(3)
         points = self._points(frames, now)
-        targets = self._decide(self._robot_state(self._state), given, points, now)
+        targets, stopped = self._decide(self._robot_state(self._state), given, points)
         is_heard = now - self._heard <= MachineConfig.state_age_s  # from an older state nothing follows
         if targets is not None and is_heard:
             self._link.send_targets(targets)
@@ -312,27 +308,26 @@ class Control:
             mode = f"{self._mode}: {self._link.reason}"
             action = np.zeros(len(MOTORS))
             action[self._motors] = self.policy.action
-            self._listener.step(Step(now, self._state, mode, command, points, targets, action))
+            self._listener.step(Step(now, self._state, mode, command, points, targets, action, stopped))
         return True
 
     def _decide(
-        self, state: RobotState, command: np.ndarray, points: np.ndarray | None, now: float
-    ) -> np.ndarray | None:
-        """(12,) rad, in the motors' order; None: the policy stops, and the guard has been asked to damp."""
+        self, state: RobotState, command: np.ndarray, points: np.ndarray | None
+    ) -> tuple[np.ndarray | None, str]:
+        """(12,) rad, in the motors' order; or why the policy stops while it drives: the guard is asked to damp."""
         try:
             targets = self.policy.step(state, command, points, self._ages.newest_s)
         except SafetyStop as stop:
-            if self._mode in DRIVEN or str(stop) != self._stopped:
+            is_driven = self._mode in DRIVEN
+            if is_driven or str(stop) != self._stopped:
                 say(f"stop: {stop}")
             self._stopped = str(stop)
-            if self._mode in DRIVEN:
+            if is_driven:
                 self._link.ask(Request.DAMP)
-                if self._listener is not None:
-                    self._listener.stop(now, str(stop))
-            return None
+            return None, str(stop) if is_driven else ""
         in_order = np.zeros(len(MOTORS))
         in_order[self._motors] = targets
-        return in_order
+        return in_order, ""
 
     def _points(self, frames: list, now: float) -> np.ndarray | None:
         """The newest frame as training saw it; a period without one is a frame lost."""

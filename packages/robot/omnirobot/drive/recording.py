@@ -20,17 +20,18 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from omnirobot.common.ros import ros_types
 from omnirobot.runtime.description import DeployError, Description
 from omnirobot.runtime.geometry import sector_of
 from omnirobot.runtime.go2 import MOTORS
-from omnirobot.runtime.sampling import rotation_matrix
+from omnirobot.runtime.sampling import rotation_matrix, without_heading
 from omnirobot.wire.clouds import Points
 
 SECTORS = 36
@@ -38,49 +39,10 @@ HEIGHTS = (-0.15, 0.5)
 """m above the base, between which a point counts as an obstacle of /policy/obstacles."""
 OWN = (0.5, 0.3)
 """m ahead and aside, within which a point is the robot's own and none."""
-_SEPARATOR = "=" * 80 + "\n"
 _CLOCK_JUMP_NS = 10**9
 """Where a sensor's clock is as far from the time at which its points come, it has jumped."""
 _CHUNK_BYTES = 256 * 1024
 """A killed process loses as much as has not been written yet."""
-_PARTS = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
-    "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride\n",
-    "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
-    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
-    ),
-    "sensor_msgs/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count\n",
-}
-_KINDS = {
-    "std_msgs/msg/String": "string data\n",
-    "std_msgs/msg/Float32MultiArray": "std_msgs/MultiArrayLayout layout\nfloat32[] data\n",
-    "geometry_msgs/msg/TwistStamped": "std_msgs/Header header\ngeometry_msgs/Twist twist\n",
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
-    "sensor_msgs/msg/JointState": (
-        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
-    ),
-    "sensor_msgs/msg/Imu": (
-        "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
-        "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
-        "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n"
-    ),
-    "sensor_msgs/msg/LaserScan": (
-        "std_msgs/Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\n"
-        "float32 time_increment\nfloat32 scan_time\nfloat32 range_min\nfloat32 range_max\n"
-        "float32[] ranges\nfloat32[] intensities\n"
-    ),
-    "sensor_msgs/msg/PointCloud2": (
-        "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\nbool is_bigendian\n"
-        "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n"
-    ),
-}
-"""Fields of ROS 2's messages (common_interfaces)."""
 TOPICS = {
     "/joint_states": "sensor_msgs/msg/JointState",
     "/imu": "sensor_msgs/msg/Imu",
@@ -95,19 +57,6 @@ TOPICS = {
 }
 
 
-def definition(kind: str) -> str:
-    """A type's fields and those of the types in it, as MCAP wants them."""
-    text, todo, done = _KINDS[kind], [_KINDS[kind]], set()
-    while todo:
-        for line in todo.pop().splitlines():
-            part = line.split()[0].partition("[")[0]
-            if part in _PARTS and part not in done:
-                done.add(part)
-                todo.append(_PARTS[part])
-                text += f"{_SEPARATOR}MSG: {part}\n{_PARTS[part]}"
-    return text
-
-
 @dataclass(frozen=True)
 class Step:
     """One control step.
@@ -120,6 +69,7 @@ class Step:
         seen: (num_rays, 3) m, sensor frame, that the policy was given; None: no frame was complete.
         targets: (12,) rad, in the motors' order; None: the policy has stopped.
         action: (12,) its raw output.
+        stopped: why the policy has stopped while it moved the robot; empty: it has not.
     """
 
     time_s: float
@@ -129,6 +79,7 @@ class Step:
     seen: np.ndarray | None
     targets: np.ndarray | None
     action: np.ndarray
+    stopped: str = ""
 
 
 def nearest_by_sector(
@@ -154,11 +105,8 @@ def levelled(
     points: np.ndarray, base_quat: np.ndarray, mount_pos: Sequence[float], mount_quat: Sequence[float]
 ) -> np.ndarray:
     """(n, 3) m of points (n, 3) in the sensor frame: from the base's origin, x ahead, z upwards."""
-    w, x, y, z = np.asarray(base_quat, float)
-    yaw = math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-    back = rotation_matrix((math.cos(yaw / 2), 0.0, 0.0, -math.sin(yaw / 2)))
-    turn = back @ rotation_matrix((w, x, y, z))
-    return (points @ rotation_matrix(mount_quat).T + np.asarray(mount_pos)) @ turn.T
+    level = without_heading(rotation_matrix(base_quat))
+    return (points @ rotation_matrix(mount_quat).T + np.asarray(mount_pos)) @ level.T
 
 
 def make_folder(path: Path, argument: str) -> None:
@@ -177,9 +125,9 @@ class Recorder:
     def __init__(self, path: Path, description: Description) -> None:
         """Args: path: of the file, whose folder is made; description: of the policy."""
         try:
-            from mcap_ros2.writer import Writer
+            from mcap.writer import Writer
         except ImportError:
-            raise DeployError("record= needs mcap-ros2-support: pip install 'omnirobot[recordings]'") from None
+            raise DeployError("record= needs mcap: pip install 'omnirobot[recordings]'") from None
         if path.suffix != ".mcap":
             raise DeployError(f"record={path}: a file ending in .mcap was expected")
         make_folder(path, "record")
@@ -189,10 +137,14 @@ class Recorder:
             raise DeployError(f"record={path} exists; give another name") from None
         except OSError as error:
             raise DeployError(f"record={path} cannot be written: {error.strerror}") from None
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
-        kinds = set(TOPICS.values())
-        schemas = {kind: self._writer.register_msgdef(kind, definition(kind)) for kind in sorted(kinds)}
-        self._schemas = {topic: schemas[kind] for topic, kind in TOPICS.items()}
+        self._writer, self._types = Writer(self._file, chunk_size=_CHUNK_BYTES), ros_types()
+        self._writer.start("ros2")
+        self._channels, schemas = dict[str, int](), dict[str, int]()
+        for topic, kind in TOPICS.items():
+            if kind not in schemas:
+                definition, _ = self._types.generate_msgdef(kind, ros_version=2)
+                schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schemas[kind])
         self._lidar = description.lidar
         self._start_ns = time.time_ns()
         self._loop_start: float | None = None
@@ -206,9 +158,6 @@ class Recorder:
     def points(self, now: float, points: Points) -> None:
         """Points (n, 3) m in the sensor's own frame, that have come at `now`, s on the loop's clock."""
         self._queue.put((self._wall_ns(now), points))
-
-    def stop(self, now: float, why: str) -> None:
-        """The policy has stopped; its step, which has no targets, says so too."""
 
     def step(self, step: Step) -> None:
         """A control step."""
@@ -245,122 +194,84 @@ class Recorder:
             except Exception as error:  # the robot walks on without a recording; close() tells
                 self._error = error
 
-    def _write(self, topic: str, time_ns: int, message: dict[str, Any]) -> None:
-        self._writer.write_message(topic, self._schemas[topic], message, log_time=time_ns)
+    def _write(self, topic: str, time_ns: int, *parts: Any) -> None:
+        """A message of these parts, in the order of its type's fields."""
+        data = self._types.serialize_cdr(self._made(TOPICS[topic], *parts), TOPICS[topic])
+        self._writer.add_message(self._channels[topic], time_ns, bytes(data), time_ns)
+
+    def _made(self, kind: str, *parts: Any) -> Any:
+        """A part of a message."""
+        return self._types.types[kind](*parts)
 
     def _write_points(self, time_ns: int, points: Points) -> None:
         jumps = np.flatnonzero(np.abs(np.diff(points.times_ns)) > _CLOCK_JUMP_NS) + 1
         for part in np.split(np.arange(len(points.times_ns)), jumps):
             if len(part):
-                self._write_cloud(time_ns, points.points[part], points.times_ns[part])
+                self._write_timed(time_ns, points.points[part], points.times_ns[part])
 
-    def _write_cloud(self, time_ns: int, points: np.ndarray, times_ns: np.ndarray) -> None:
+    def _write_timed(self, time_ns: int, points: np.ndarray, times_ns: np.ndarray) -> None:
         newest = int(times_ns.max())
         if self._sensor_start is None or abs(newest + self._sensor_start - time_ns) > _CLOCK_JUMP_NS:
             self._sensor_start = time_ns - newest
         times = times_ns + self._sensor_start
         rows = np.zeros(len(times), [("xyz", "<f4", 3), ("t", "<u4")])
         rows["xyz"], rows["t"] = points, times - times.min()
-        self._write("/lidar/points", time_ns, _cloud(rows, int(times.min()), "lidar"))
+        self._write_cloud("/lidar/points", time_ns, rows, int(times.min()))
 
     def _write_step(self, time_ns: int, step: Step) -> None:
         imu, motors = step.state["imu_state"], step.state["motor_state"][:12]
-        base = _header(time_ns, "base")
-        quat = imu["quaternion"].tolist()
-        self._write("/imu", time_ns, _imu(base, quat, imu["gyroscope"].tolist(), imu["accelerometer"].tolist()))
+        base, quat, unknown = self._header(time_ns, "base"), self._quaternion(imu["quaternion"]), np.zeros(9)
+        gyro, acceleration = self._vector(imu["gyroscope"]), self._vector(imu["accelerometer"])
+        self._write("/imu", time_ns, base, quat, unknown, gyro, unknown, acceleration, unknown)
         if step.mode != self._mode:
             self._mode = step.mode
-            self._write("/mode", time_ns, {"data": step.mode})
-        command = step.command.tolist()
-        twist = {"linear": _vector((*command[:2], 0.0)), "angular": _vector((0.0, 0.0, command[2]))}
-        self._write("/command", time_ns, {"header": base, "twist": twist})
-        joints = [motors[name].astype(float).tolist() for name in ("q", "dq", "tau_est")]
-        self._write("/joint_states", time_ns, _joints(base, *joints))
-        self._write_outputs(time_ns, base, quat, step)
-
-    def _write_outputs(self, time_ns: int, base: dict, quat: list[float], step: Step) -> None:
+            self._write("/mode", time_ns, step.mode)
+        linear, angular = self._vector((*step.command[:2], 0.0)), self._vector((0.0, 0.0, step.command[2]))
+        self._write("/command", time_ns, base, self._made("geometry_msgs/msg/Twist", linear, angular))
+        joints = [motors[name].astype(float) for name in ("q", "dq", "tau_est")]
+        self._write("/joint_states", time_ns, base, list(MOTORS), *joints)
         if step.targets is not None:
-            self._write("/policy/joint_targets", time_ns, _joints(base, step.targets.tolist(), [], []))
-            layout = {"dim": [], "data_offset": 0}
-            self._write("/policy/action", time_ns, {"layout": layout, "data": step.action.tolist()})
-        transforms = [_transform(_header(time_ns, "odom"), "base", (0.0, 0.0, 0.0), quat)]
+            nothing = np.zeros(0)
+            targets = np.asarray(step.targets, float)
+            self._write("/policy/joint_targets", time_ns, base, list(MOTORS), targets, nothing, nothing)
+            layout = self._made("std_msgs/msg/MultiArrayLayout", [], 0)
+            self._write("/policy/action", time_ns, layout, step.action.astype(np.float32))
+        transforms = [self._transform(self._header(time_ns, "odom"), "base", (0.0, 0.0, 0.0), imu["quaternion"])]
         if self._lidar is not None:
-            transforms.append(_transform(base, "lidar", self._lidar.mount_pos, self._lidar.mount_quat))
-        self._write("/tf", time_ns, {"transforms": transforms})
-        if step.seen is None or self._lidar is None:
-            return
-        rows = np.zeros(len(step.seen), [("xyz", "<f4", 3)])
-        rows["xyz"] = step.seen
-        self._write("/policy/points", time_ns, _cloud(rows[step.seen.any(axis=1)], time_ns, "lidar"))
-        nearest = nearest_by_sector(step.seen, np.array(quat), self._lidar.mount_pos, self._lidar.mount_quat)
-        self._write("/policy/obstacles", time_ns, _scan(base, nearest, self._lidar.max_range))
+            transforms.append(self._transform(base, "lidar", self._lidar.mount_pos, self._lidar.mount_quat))
+        self._write("/tf", time_ns, transforms)
+        if step.seen is not None and self._lidar is not None:
+            hits = step.seen[step.seen.any(axis=1)]
+            rows = np.zeros(len(hits), [("xyz", "<f4", 3)])
+            rows["xyz"] = hits
+            self._write_cloud("/policy/points", time_ns, rows, time_ns)
+            nearest = nearest_by_sector(hits, imu["quaternion"], self._lidar.mount_pos, self._lidar.mount_quat)
+            width = 2 * math.pi / SECTORS
+            angles = (-math.pi + width / 2, math.pi - width / 2, width)
+            ranges = (0.0, float(self._lidar.max_range), nearest.astype(np.float32), np.zeros(0, np.float32))
+            self._write("/policy/obstacles", time_ns, base, *angles, 0.0, 0.0, *ranges)
 
+    def _write_cloud(self, topic: str, time_ns: int, rows: np.ndarray, stamp_ns: int) -> None:
+        """Of records with `xyz` (float32) and perhaps `t` (uint32, ns)."""
+        fields = [self._made("sensor_msgs/msg/PointField", axis, 4 * k, 7, 1) for k, axis in enumerate("xyz")]
+        if "t" in (rows.dtype.names or ()):
+            fields.append(self._made("sensor_msgs/msg/PointField", "t", 12, 6, 1))
+        data, step = np.frombuffer(rows.tobytes(), np.uint8), rows.dtype.itemsize
+        header = self._header(stamp_ns, "lidar")
+        self._write(topic, time_ns, header, 1, len(rows), fields, False, step, len(data), data, True)
 
-def _header(time_ns: int, frame: str) -> dict:
-    return {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}, "frame_id": frame}
+    def _header(self, time_ns: int, frame: str) -> Any:
+        stamp = self._made("builtin_interfaces/msg/Time", time_ns // 10**9, time_ns % 10**9)
+        return self._made("std_msgs/msg/Header", stamp, frame)
 
+    def _vector(self, values: Iterable[float]) -> Any:
+        return self._made("geometry_msgs/msg/Vector3", *map(float, values))
 
-def _vector(values: Sequence[float]) -> dict:
-    return dict(zip("xyz", map(float, values), strict=True))
+    def _quaternion(self, values: Iterable[float]) -> Any:
+        """Of (w, x, y, z)."""
+        w, *xyz = map(float, values)
+        return self._made("geometry_msgs/msg/Quaternion", *xyz, w)
 
-
-def _quaternion(values: Sequence[float]) -> dict:
-    """Of (w, x, y, z)."""
-    return dict(zip("wxyz", map(float, values), strict=True))
-
-
-def _joints(header: dict, position: list, velocity: list, effort: list) -> dict:
-    return {"header": header, "name": list(MOTORS), "position": position, "velocity": velocity, "effort": effort}
-
-
-def _imu(header: dict, quat: list, gyro: list, acceleration: list) -> dict:
-    unknown = [0.0] * 9
-    return {
-        "header": header,
-        "orientation": _quaternion(quat),
-        "orientation_covariance": unknown,
-        "angular_velocity": _vector(gyro),
-        "angular_velocity_covariance": unknown,
-        "linear_acceleration": _vector(acceleration),
-        "linear_acceleration_covariance": unknown,
-    }
-
-
-def _transform(header: dict, child: str, pos: Sequence[float], quat: Sequence[float]) -> dict:
-    transform = {"translation": _vector(pos), "rotation": _quaternion(quat)}
-    return {"header": header, "child_frame_id": child, "transform": transform}
-
-
-def _scan(header: dict, nearest: np.ndarray, max_range: float) -> dict:
-    width = 2 * math.pi / SECTORS
-    return {
-        "header": header,
-        "angle_min": -math.pi + width / 2,
-        "angle_max": math.pi - width / 2,
-        "angle_increment": width,
-        "time_increment": 0.0,
-        "scan_time": 0.0,
-        "range_min": 0.0,
-        "range_max": float(max_range),
-        "ranges": nearest.tolist(),
-        "intensities": [],
-    }
-
-
-def _cloud(rows: np.ndarray, time_ns: int, frame: str) -> dict:
-    """Of records with `xyz` (float32) and perhaps `t` (uint32, ns)."""
-    fields = [{"name": axis, "offset": 4 * k, "datatype": 7, "count": 1} for k, axis in enumerate("xyz")]
-    if "t" in (rows.dtype.names or ()):
-        fields.append({"name": "t", "offset": 12, "datatype": 6, "count": 1})
-    step = rows.dtype.itemsize
-    return {
-        "header": _header(time_ns, frame),
-        "height": 1,
-        "width": len(rows),
-        "fields": fields,
-        "is_bigendian": False,
-        "point_step": step,
-        "row_step": step * len(rows),
-        "data": rows.tobytes(),
-        "is_dense": True,
-    }
+    def _transform(self, header: Any, child: str, pos: Iterable[float], quat: Iterable[float]) -> Any:
+        transform = self._made("geometry_msgs/msg/Transform", self._vector(pos), self._quaternion(quat))
+        return self._made("geometry_msgs/msg/TransformStamped", header, child, transform)

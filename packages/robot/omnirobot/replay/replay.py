@@ -30,15 +30,18 @@ class Replayed:
         steps: each of them.
         lidar: status of the LiDAR at each, as the policy judged it.
         recorded: (steps, 12) rad, targets of the recording, in the motors' order; nan where it has none.
-        stops: of the policy: time (s) and why.
         counts: what limits and frames have counted, by name.
     """
 
     steps: list[Step]
     lidar: list[str]
     recorded: np.ndarray
-    stops: list[tuple[float, str]]
     counts: dict[str, int]
+
+    @property
+    def stops(self) -> list[Step]:
+        """Steps at which the policy has stopped."""
+        return [step for step in self.steps if step.stopped]
 
     def targets(self) -> np.ndarray:
         """(steps, 12) rad, in the motors' order; nan where the policy has stopped."""
@@ -55,7 +58,7 @@ class Replayed:
         lines = [f"{len(self.steps)} steps in {seconds:.1f} s, {len(frames)} frames"]
         if hits:
             lines[0] += f" of {min(hits)} to {max(hits)} points"
-        lines += [f"stopped at {at:.2f} s: {why}" for at, why in self.stops[:3]]
+        lines += [f"stopped at {step.time_s:.2f} s: {step.stopped}" for step in self.stops[:3]]
         if len(self.stops) > 3:
             lines.append(f"... and {len(self.stops) - 3} times more")
         off = abs(self.targets() - self.recorded)
@@ -120,16 +123,12 @@ class _Steps:
 
     def __init__(self) -> None:
         self.steps: list[Step] = []
-        self.stops: list[tuple[float, str]] = []
 
     def points(self, now: float, points: Points) -> None:
         """They are known."""
 
     def step(self, step: Step) -> None:
         self.steps.append(step)
-
-    def stop(self, now: float, why: str) -> None:
-        self.stops.append((now, why))
 
 
 def replay(policy: ExportedPolicy, events: Iterable[Event], command: np.ndarray | None = None) -> Replayed:
@@ -173,7 +172,7 @@ def replay(policy: ExportedPolicy, events: Iterable[Event], command: np.ndarray 
     if not taken.steps:
         raise DeployError("the recording holds no state of the robot")
     counts = ({} if policy.safety is None else dict(policy.safety.counts)) | ends.counts()
-    return Replayed(taken.steps, lidar, np.array(recorded), taken.stops, counts)
+    return Replayed(taken.steps, lidar, np.array(recorded), counts)
 
 
 def draw(replayed: Replayed, policy: ExportedPolicy, path: Path) -> None:
@@ -236,18 +235,10 @@ def _draw_hits(axes, frames: list[Step], times: np.ndarray, replayed: Replayed) 
     for kind, color in (("slowing", "tab:orange"), ("stopped", "tab:red")):
         is_so = np.array([lidar == kind for lidar in replayed.lidar])
         if is_so.any():
-            axes.fill_between(
-                times,
-                0,
-                1,
-                where=is_so,
-                transform=axes.get_xaxis_transform(),
-                color=color,
-                alpha=0.3,
-                label=f"lidar: {kind}",
-            )
-    for k, (at, _) in enumerate(replayed.stops[:20]):
-        axes.axvline(at, color="black", linewidth=0.8, label=None if k else "the policy stops")
+            look = {"color": color, "alpha": 0.3, "label": f"lidar: {kind}"}
+            axes.fill_between(times, 0, 1, where=is_so, transform=axes.get_xaxis_transform(), **look)
+    for k, step in enumerate(replayed.stops[:20]):
+        axes.axvline(step.time_s, color="black", linewidth=0.8, label=None if k else "the policy stops")
     axes.set(title="what it saw", xlabel="s", ylabel="points", ylim=(0, None))
     axes.legend(loc="lower right", fontsize="small")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from omnirobot.common.coverage import BIN_DEG, FRAMES, NUM_BINS, NUM_SECTORS, OPEN_DEG, SHUT_DEG
 from omnirobot.runtime.geometry import sector_of
-from omnirobot.runtime.sampling import Attitude, rotation_matrix, without_heading
+from omnirobot.runtime.sampling import Attitude, is_hit, rotation_matrix, without_heading
 
 _ANGLES = -math.pi + 2.0 * math.pi / NUM_SECTORS * (np.arange(NUM_SECTORS) + 0.5)
 _BEARINGS = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), 1)
@@ -35,12 +35,10 @@ class Coverage:
 
     def add_frame(self, points: np.ndarray, attitude: Attitude) -> None:
         """Takes in a frame (n, 3), m, sensor frame; rows that are zero, too far or not finite are no answers."""
-        distance = np.linalg.norm(points, axis=1)
-        answers = (distance > 0.0) & (distance <= self._max_range)
-        points, distance = points[answers], distance[answers]
+        points = points[is_hit(points, self._max_range)]
         level = without_heading(rotation_matrix(attitude.base_quat)) @ rotation_matrix(attitude.mount_quat)
         places = points @ level.T.astype(np.float32)
-        elevation = np.degrees(np.arcsin(np.clip(places[:, 2] / distance, -1.0, 1.0))) + 90.0
+        elevation = np.degrees(np.arcsin(np.clip(places[:, 2] / np.linalg.norm(points, axis=1), -1.0, 1.0))) + 90.0
         found = np.zeros((NUM_SECTORS, NUM_BINS), bool)
         found[sector_of(places[:, :2], NUM_SECTORS), np.minimum(elevation // BIN_DEG, NUM_BINS - 1).astype(int)] = True
         self._append(found)

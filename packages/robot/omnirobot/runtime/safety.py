@@ -13,7 +13,7 @@ import numpy as np
 
 from omnirobot.runtime.coverage import Coverage
 from omnirobot.runtime.description import DeployError, Description
-from omnirobot.runtime.sampling import Attitude
+from omnirobot.runtime.sampling import Attitude, is_hit
 
 log = logging.getLogger("omnirobot.runtime")
 
@@ -104,8 +104,7 @@ class Safety:
 
     def frame_is_good(self, points: np.ndarray, attitude: Attitude) -> bool:
         """Takes in a frame (n, 3), m; whether it holds enough hits. Counts and names it otherwise."""
-        square = np.einsum("ij,ij->i", points, points)
-        hits = int(np.count_nonzero((square > 0.0) & (square <= self._max_range**2)))
+        hits = int(is_hit(points, self._max_range).sum())
         if hits >= self._min_hits and hits:
             self._age = 0.0
             if self.coverage is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,16 +36,17 @@ class Attitude:
     mount_quat: Sequence[float]
 
 
+@dataclass(kw_only=True)
 class CloudSampler(ABC):
     """Reduces one frame of points to a fixed number.
 
     Attributes:
-        num_points: P.
         max_range: m; points beyond are misses, and sampled points are divided by it.
+        num_points: P.
     """
 
-    num_points: int
     max_range: float
+    num_points: int = field(init=False)
 
     @abstractmethod
     def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
@@ -56,199 +57,173 @@ class CloudSampler(ABC):
 
     def _is_hit(self, points: np.ndarray) -> np.ndarray:
         """(n,) bool."""
-        square = np.einsum("ij,ij->i", points, points)
-        return (square > 0.0) & (square <= np.float32((self.max_range * _ROUNDING) ** 2))  # false for nan
-
-
-class RawSampler(CloudSampler):
-    """Every ray's point in ray order, a miss as zeros."""
-
-    def __init__(self, num_points: int, max_range: float) -> None:
-        """Args: num_points: rays; max_range: m."""
-        self.num_points, self.max_range = num_points, max_range
-
-    def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
-        """See :meth:`CloudSampler.__call__`."""
-        if len(points) != self.num_points:
-            raise DeployError(
-                f"points: this network reads every ray, also misses (as zeros): ({self.num_points}, 3) was expected,"
-                f" ({len(points)}, 3) given; thin() reduces a device's whole frame"
-            )
-        return np.where(self._is_hit(points)[:, None], points * np.float32(1.0 / self.max_range), np.float32(0.0))
-
-
-class PdSampler(CloudSampler):
-    """Proximal points by farthest point sampling, distal points as means of bins, as in training's `PdSampler`."""
-
-    def __init__(
-        self,
-        num_proximal: int,
-        num_distal: int,
-        max_range: float,
-        split: float | None,
-        ring: float,
-    ) -> None:
-        """Configure both halves.
-
-        Args:
-            num_proximal: slots of the proximal half, written first.
-            num_distal: slots of the distal half.
-            max_range: m.
-            split: elevation in the sensor frame above which a point is proximal, rad; None: every point is.
-            ring: height of an elevation ring for sorting, rad.
-        """
-        self.num_points, self.max_range = num_proximal + num_distal, max_range
-        self.num_proximal, self.num_distal = num_proximal, num_distal
-        self.split = np.float32(-math.inf if split is None else split)
-        self.ring = np.float32(ring)
-
-    def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
-        """See :meth:`CloudSampler.__call__`."""
-        points = points[self._is_hit(points)]
-        near = self._is_proximal(points)
-        sampled = np.zeros((self.num_points, 3), np.float32)
-        self._write_proximal(sampled, points[near])
-        self._write_distal(sampled[self.num_proximal :], points, near, attitude)
-        return sampled
-
-    def _is_proximal(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool: the elevation is above the split. Angles, which are slow, decide only where rounding could."""
-        if self.split == -math.inf:
-            return np.ones(len(points), bool)
-        x, y, z = points.T
-        sin, cos = np.sin(self.split), np.cos(self.split)
-        above = z * cos - np.sqrt(x * x + y * y) * sin  # m, from the cone of this elevation
-        near = above > 0.0
-        doubtful = np.flatnonzero(abs(above) < np.float32(1e-6 * self.max_range))
-        near[doubtful] = angles_of(points[doubtful])[0] > self.split
-        return near
-
-    def _write_proximal(self, out: np.ndarray, points: np.ndarray) -> None:
-        if not self.num_proximal:
-            return
-        scaled = self._scaled(points)
-        picked = farthest_points(scaled, self.num_proximal)
-        out[: len(picked)] = scaled[picked[self._ring_order(points[picked])]]
-
-    def _write_distal(self, out: np.ndarray, points: np.ndarray, near: np.ndarray, attitude: Attitude) -> None:
-        """Writes the other half of a frame from hits (n, 3), of which `near` (n,) are proximal."""
-        points = points[~near]
-        bins = min(len(points), self.num_distal)
-        if not bins:
-            return
-        ordered = self._scaled(points)[self._ring_order(points)]
-        edges = np.arange(bins + 1) * len(points) // bins
-        first, size = edges[:-1], np.diff(edges)
-        out[:bins] = np.add.reduceat(ordered, first, axis=0) / size[:, None].astype(np.float32)
+        return is_hit(points, self.max_range * _ROUNDING)
 
     def _scaled(self, points: np.ndarray) -> np.ndarray:
         return points * np.float32(1.0 / self.max_range)
 
+
+@dataclass(kw_only=True)
+class RawSampler(CloudSampler):
+    """Every ray's point in ray order, a miss as zeros."""
+
+    num_points: int
+
+    def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
+        if len(points) != self.num_points:
+            raise DeployError(
+                f"points: this network reads every ray, also misses (as zeros): ({self.num_points}, 3) was expected,"
+                f" ({len(points)}, 3) given; subsample() reduces a device's whole frame"
+            )
+        return np.where(self._is_hit(points)[:, None], self._scaled(points), np.float32(0.0))
+
+
+@dataclass(kw_only=True)
+class _Proximal(CloudSampler):
+    """A proximal half by farthest point sampling, written first, and another one of the other points.
+
+    Attributes:
+        num_proximal: slots of the proximal half.
+        num_distal: slots of the other half.
+        split: elevation in the sensor frame above which a point is proximal, rad; None: every point is.
+        ring: height of an elevation ring for sorting, rad.
+    """
+
+    num_proximal: int
+    num_distal: int
+    split: float | None
+    ring: float
+
+    def __post_init__(self) -> None:
+        self.num_points = self.num_proximal + self.num_distal
+
+    def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
+        points = points[self._is_hit(points)]
+        near = self._is_proximal(points)
+        sampled = np.zeros((self.num_points, 3), np.float32)
+        if self.num_proximal:
+            proximal = points[near]
+            scaled = self._scaled(proximal)
+            picked = farthest_points(scaled, self.num_proximal)
+            sampled[: len(picked)] = scaled[picked[self._ring_order(proximal[picked])]]
+        self._write_distal(sampled[self.num_proximal :], points[~near], attitude)
+        return sampled
+
+    @abstractmethod
+    def _write_distal(self, out: np.ndarray, points: np.ndarray, attitude: Attitude) -> None:
+        """Writes the other half, zeros so far, from the hits (n, 3) that are not proximal."""
+
+    def _is_proximal(self, points: np.ndarray) -> np.ndarray:
+        """(n,) bool: the elevation is above the split. Angles, which are slow, decide only where rounding could."""
+        if self.split is None:
+            return np.ones(len(points), bool)
+        x, y, z = points.T
+        split = np.float32(self.split)
+        above = z * np.cos(split) - np.sqrt(x * x + y * y) * np.sin(split)  # m, from the cone of this elevation
+        near = above > 0.0
+        doubtful = np.flatnonzero(abs(above) < np.float32(1e-6 * self.max_range))
+        near[doubtful] = angles_of(points[doubtful])[0] > split
+        return near
+
     def _ring_order(self, points: np.ndarray) -> np.ndarray:
         """(n,) indices that sort points by ring of elevation, then azimuth."""
-        return np.argsort(sort_keys(*angles_of(points), self.ring), kind="stable")
+        return np.argsort(sort_keys(*angles_of(points), np.float32(self.ring)), kind="stable")
 
 
-class ProximitySampler(PdSampler):
-    """Proximal points as above; the distal half as proximities around the without_heading base, as in training."""
+class PdSampler(_Proximal):
+    """Proximal points, and distal ones as means of bins."""
 
-    def __init__(
-        self,
-        num_proximal: int,
-        num_sectors: int,
-        max_range: float,
-        split: float,
-        ring: float,
-        band_edges: Sequence[float],
-        decay: float,
-        blind: float,
-        body: Sequence[float],
-    ) -> None:
-        """Configure both halves.
+    def _write_distal(self, out: np.ndarray, points: np.ndarray, attitude: Attitude) -> None:
+        bins = min(len(points), self.num_distal)
+        if bins:
+            edges = np.arange(bins + 1) * len(points) // bins
+            sums = np.add.reduceat(self._scaled(points)[self._ring_order(points)], edges[:-1], axis=0)
+            out[:bins] = sums / np.diff(edges)[:, None].astype(np.float32)
+
+
+@dataclass(kw_only=True)
+class _Cells:
+    """Cells of height and azimuth around the levelled base.
+
+    Attributes:
+        num_sectors: azimuth sectors.
+        band_edges: heights that separate the bands, m.
+        decay: distance over which the proximity falls by e, m.
+    """
+
+    num_sectors: int
+    band_edges: Sequence[float]
+    decay: float
+
+    def write_nearest(self, out: np.ndarray, places: np.ndarray, height: np.ndarray) -> None:
+        """Writes the nearest place of each cell: its bearing times its proximity, and the proximity.
 
         Args:
-            num_proximal: slots of the proximal half, written first.
-            num_sectors: azimuth sectors.
-            max_range: m.
-            split: elevation in the sensor frame above which a point is proximal, rad.
-            ring: height of an elevation ring for sorting the proximal half, rad.
-            band_edges: heights that separate the bands, m above the base's origin.
-            decay: distance over which the proximity falls by e, m.
-            blind: nearest distance that counts, m.
-            body: half length and half width of the robot's own body, m.
+            out: (bands * sectors, 3), zeros.
+            places: (n, 2) m, around the base.
+            height: (n,) m of each, within the bands or not.
         """
-        super().__init__(num_proximal, num_sectors * (len(band_edges) - 1), max_range, split, ring)
-        self.num_sectors, self.decay, self.blind = num_sectors, decay, blind
-        self.edges, self.body = np.asarray(band_edges, np.float32), tuple(body)
+        edges = np.asarray(self.band_edges, np.float32)
+        inside = (height >= edges[0]) & (height < edges[-1])
+        places, band = places[inside], np.searchsorted(edges, height[inside], side="right") - 1
+        cell = band * self.num_sectors + sector_of(places, self.num_sectors)
+        horizontal = np.sqrt(np.square(places).sum(1))
+        least = np.full(len(out), np.inf, np.float32)
+        np.minimum.at(least, cell, horizontal)
+        nearest = np.flatnonzero(horizontal == least[cell])[::-1]  # of equally near ones the first measured is kept
+        proximity = np.exp(-horizontal[nearest] / np.float32(self.decay))
+        bearing = places[nearest] * (proximity / np.maximum(horizontal[nearest], np.float32(1e-6)))[:, None]
+        out[cell[nearest]] = np.concatenate((bearing, proximity[:, None]), 1)
 
-    def _write_distal(self, out: np.ndarray, points: np.ndarray, near: np.ndarray, attitude: Attitude) -> None:
-        points = points[~near]
+
+@dataclass(kw_only=True)
+class ProximitySampler(_Proximal, _Cells):
+    """Proximal points, and proximities in cells of the other ones; heights above the base's origin.
+
+    Attributes:
+        blind: nearest distance that counts, m.
+        body: half length and half width of the robot's own body, m.
+    """
+
+    num_distal: int = field(init=False)
+    blind: float
+    body: Sequence[float]
+
+    def __post_init__(self) -> None:
+        self.num_distal = self.num_sectors * (len(self.band_edges) - 1)
+        super().__post_init__()
+
+    def _write_distal(self, out: np.ndarray, points: np.ndarray, attitude: Attitude) -> None:
         level = without_heading(rotation_matrix(attitude.base_quat))
         turn = (level @ rotation_matrix(attitude.mount_quat)).astype(np.float32)
         offset = (level @ np.asarray(attitude.mount_pos, np.float64)).astype(np.float32)
         at = points[np.linalg.norm(points, axis=1) >= np.float32(self.blind)] @ turn.T + offset
-        on_body = (abs(at[:, 0]) < self.body[0]) & (abs(at[:, 1]) < self.body[1])
-        at = at[~on_body & (at[:, 2] >= self.edges[0]) & (at[:, 2] < self.edges[-1])]
-        band = np.searchsorted(self.edges, at[:, 2], side="right") - 1
-        write_nearest(out, at[:, :2], band, self.num_sectors, self.decay)
+        at = at[(abs(at[:, 0]) >= self.body[0]) | (abs(at[:, 1]) >= self.body[1])]
+        self.write_nearest(out, at[:, :2], at[:, 2])
 
 
-class StandingSampler(CloudSampler):
-    """Proximities of what stands on the ground, by band of height and sector, as in training."""
+@dataclass(kw_only=True)
+class StandingSampler(CloudSampler, _Cells):
+    """Proximities in cells of what stands on the ground; heights above it.
 
-    def __init__(
-        self,
-        num_sectors: int,
-        max_range: float,
-        band_edges: Sequence[float],
-        decay: float,
-        geometry: Mapping,
-    ) -> None:
-        """Configure the cells.
+    Attributes:
+        geometry: settings of training's `GeometryConfig`, by name.
+    """
 
-        Args:
-            num_sectors: azimuth sectors.
-            max_range: m.
-            band_edges: heights that separate the bands, m above the ground.
-            decay: distance over which the proximity falls by e, m.
-            geometry: settings of training's `GeometryConfig`, by name.
-        """
-        self.num_points, self.max_range = num_sectors * (len(band_edges) - 1), max_range
-        self.num_sectors, self.decay, self.geometry = num_sectors, decay, dict(geometry)
-        self.edges = np.asarray(band_edges, np.float32)
+    geometry: Mapping
+
+    def __post_init__(self) -> None:
+        self.num_points = self.num_sectors * (len(self.band_edges) - 1)
 
     def __call__(self, points: np.ndarray, attitude: Attitude) -> np.ndarray:
-        """See :meth:`CloudSampler.__call__`."""
         points = points[self._is_hit(points)]
         mount, level = rotation_matrix(attitude.mount_quat), without_heading(rotation_matrix(attitude.base_quat))
         sensor = np.asarray(attitude.mount_pos, np.float64)
         in_base = points @ mount.T.astype(np.float32) + sensor.astype(np.float32)
         places, height = standing(in_base, np.linalg.norm(points, axis=1), level, sensor, self.geometry)
-        counts = (height >= self.edges[0]) & (height < self.edges[-1])
-        band = np.searchsorted(self.edges, height[counts], side="right") - 1
         sampled = np.zeros((self.num_points, 3), np.float32)
-        write_nearest(sampled, places[counts, :2], band, self.num_sectors, self.decay)
+        self.write_nearest(sampled, places[:, :2], height)
         return sampled
-
-
-def write_nearest(out: np.ndarray, places: np.ndarray, band: np.ndarray, num_sectors: int, decay: float) -> None:
-    """Writes the nearest place of each cell: its bearing times its proximity, and the proximity.
-
-    Args:
-        out: (bands * S, 3), zeros.
-        places: (n, 2) m, around the base.
-        band: (n,) of each place.
-        num_sectors: S.
-        decay: distance over which the proximity falls by e, m.
-    """
-    cell = band * num_sectors + sector_of(places, num_sectors)
-    horizontal = np.sqrt(np.square(places).sum(1))
-    least = np.full(len(out), np.inf, np.float32)
-    np.minimum.at(least, cell, horizontal)
-    nearest = np.flatnonzero(horizontal == least[cell])[::-1]  # of equally near ones the first measured is kept
-    proximity = np.exp(-horizontal[nearest] / np.float32(decay))
-    bearing = places[nearest] * (proximity / np.maximum(horizontal[nearest], np.float32(1e-6)))[:, None]
-    out[cell[nearest]] = np.concatenate((bearing, proximity[:, None]), 1)
 
 
 _KINDS = {"raw": RawSampler, "pd": PdSampler, "proximity": ProximitySampler, "standing": StandingSampler}
@@ -257,13 +232,13 @@ _KINDS = {"raw": RawSampler, "pd": PdSampler, "proximity": ProximitySampler, "st
 def make_sampler(parameters: Mapping) -> CloudSampler:
     """The sampler that a description names: its `kind`, one of `_KINDS`, and its arguments."""
     arguments = dict(parameters)
-    kind = arguments.pop("kind", None)
-    if kind not in _KINDS:
-        raise DeployError(f"sampler '{kind}' is unknown; known: {', '.join(_KINDS)}")
-    try:
-        return _KINDS[kind](**arguments)
-    except TypeError as error:
-        raise DeployError(f"sampler '{kind}': {error}; export the policy again") from None
+    return _KINDS[arguments.pop("kind")](**arguments)
+
+
+def is_hit(points: np.ndarray, max_range: float) -> np.ndarray:
+    """(n,) bool of points (n, 3), m: finite, not zero and within the range."""
+    square = np.einsum("ij,ij->i", points, points)
+    return (square > 0.0) & (square <= np.float32(max_range**2))  # false for nan
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:

@@ -40,13 +40,6 @@ _NETWORK = """<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterfac
 </Domain></CycloneDDS>"""
 
 
-def _library() -> None:
-    try:
-        import cyclonedds  # noqa: F401
-    except ImportError:
-        raise DeployError("talking to a robot needs cyclonedds: pip install omnirobot") from None
-
-
 class Network:
     """A participant of a DDS domain.
 
@@ -58,7 +51,6 @@ class Network:
 
     def __init__(self, interface: str = "lo", domain: int = 0) -> None:
         """Args: interface: network interface; domain: 0 on a robot."""
-        _library()
         from cyclonedds.core import DDSException
         from cyclonedds.domain import Domain, DomainParticipant
 
@@ -225,17 +217,10 @@ def _type(kind: Struct | str, octet: str = _OCTETS[0]) -> Any:
 @cache
 def _of_struct(kind: Struct, octet: str) -> Any:
     types = _idl_types()
-    scalars = {
-        "u1": getattr(types, octet),
-        "u2": types.uint16,
-        "u4": types.uint32,
-        "i2": types.int16,
-        "i4": types.int32,
-        "f4": types.float32,
-    }
+    names = {"u2": "uint16", "u4": "uint32", "i2": "int16", "i4": "int32", "f4": "float32"}
 
     def annotation(field: str | Struct, length: int) -> Any:
-        one = _of_struct(field, octet) if isinstance(field, Struct) else scalars[field]
+        one = _of_struct(field, octet) if isinstance(field, Struct) else getattr(types, names.get(field, octet))
         return types.array[one, length] if length else one
 
     return _make(kind.name, {name: annotation(field, length) for name, field, length in kind.fields})
@@ -263,28 +248,14 @@ def _variable(octet: str) -> dict[str, Any]:
     byte = getattr(types, octet)
     stamp = _make("builtin_interfaces.msg.dds_.Time_", {"sec": types.int32, "nanosec": types.uint32})
     header = _make("std_msgs.msg.dds_.Header_", {"stamp": stamp, "frame_id": str})
-    field_types = {"name": str, "offset": types.uint32, "datatype": byte, "count": types.uint32}
-    field = _make("sensor_msgs.msg.dds_.PointField_", field_types)
-    cloud = {
-        "header": header,
-        "height": types.uint32,
-        "width": types.uint32,
-        "fields": types.sequence[field],
-        "is_bigendian": bool,
-        "point_step": types.uint32,
-        "row_step": types.uint32,
-        "data": types.sequence[byte],
-        "is_dense": bool,
-    }
-    point_types = {"offset_time": types.uint32, "x": types.float32, "y": types.float32, "z": types.float32}
-    point_types |= {"reflectivity": byte, "tag": byte, "line": byte}
-    custom = {
-        "header": header,
-        "timebase": types.uint64,
-        "point_num": types.uint32,
-        "lidar_id": byte,
-        "rsvd": types.array[byte, 3],
-    }
+    u32, f32 = types.uint32, types.float32
+    field_types = {"name": str, "offset": u32, "datatype": byte, "count": u32}
+    fields = types.sequence[_make("sensor_msgs.msg.dds_.PointField_", field_types)]
+    cloud = {"header": header, "height": u32, "width": u32, "fields": fields, "is_bigendian": bool}
+    cloud |= {"point_step": u32, "row_step": u32, "data": types.sequence[byte], "is_dense": bool}
+    point_types = {"offset_time": u32, "x": f32, "y": f32, "z": f32, "reflectivity": byte, "tag": byte, "line": byte}
+    custom = {"header": header, "timebase": types.uint64, "point_num": u32}
+    custom |= {"lidar_id": byte, "rsvd": types.array[byte, 3]}
     made = {POINT_CLOUD2: _make(POINT_CLOUD2, cloud)}
     for name in _CUSTOM_MSGS:
         point = _make(name.replace("CustomMsg_", "CustomPoint_"), point_types)
@@ -300,14 +271,3 @@ def _variable(octet: str) -> dict[str, Any]:
     made[REQUEST] = _make(REQUEST, {"header": asked, "parameter": str, "binary": binary})
     made[RESPONSE] = _make(RESPONSE, {"header": answered, "data": str, "binary": binary})
     return made
-
-
-__all__ = [
-    "CUSTOM_MSG",
-    "LOW_CMD_TOPIC",
-    "LOW_STATE_TOPIC",
-    "POINT_CLOUD2",
-    "REQUEST",
-    "RESPONSE",
-    "Network",
-]

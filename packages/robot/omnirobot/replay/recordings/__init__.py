@@ -6,6 +6,7 @@ missing and how much was read.
 
 from __future__ import annotations
 
+import importlib
 import re
 import shutil
 import sys
@@ -16,14 +17,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
 
-from . import db3, mcap, rosbag1
 from .message import Channel, Message
-from .pointers import refuse_pointer
 
 __all__ = ["Channel", "Message", "Recording"]
 
-_READERS: dict[str, ModuleType] = {".mcap": mcap, ".db3": db3, ".bag": rosbag1, ".active": rosbag1}
-"""By suffix; .bag.active is what a killed recorder of ROS 1 leaves."""
+_READERS = {".mcap": "mcap", ".db3": "db3", ".bag": "rosbag1", ".active": "rosbag1"}
+"""Module by suffix; .bag.active is what a killed recorder of ROS 1 leaves."""
+_POINTER = b"version https://git-lfs"
+"""Begins what lies in a checkout in place of a large file that has not been fetched."""
 _ROS_2 = r"[^/'\":\n]+\.(?:db3|mcap)(?:\.zstd)?"
 """Name of a file of a bag of ROS 2."""
 _IN_METADATA = re.compile(rf"^\s*-\s*['\"]?(?:[^'\":\n]*/)?({_ROS_2})['\"]?\s*$", re.M)
@@ -131,9 +132,12 @@ def _plain(file: Path) -> Iterator[tuple[ModuleType, Path]]:
             raise ValueError(f"is no recording; {', '.join(_READERS)} or the folder of a bag of ROS 2 were expected")
         if not file.stat().st_size:
             raise ValueError("is empty")
-        refuse_pointer(file)
+        with file.open("rb") as content:
+            if content.read(len(_POINTER)) == _POINTER:
+                raise ValueError("is a pointer of Git LFS, not the file itself: run 'git lfs pull' in its checkout")
+        module = importlib.import_module(f".{reader}", __name__)
         with TemporaryDirectory() if packed else nullcontext() as folder:
-            yield reader, file if folder is None else _unpack(file, Path(folder) / name)
+            yield module, file if folder is None else _unpack(file, Path(folder) / name)
     except ValueError as error:
         raise error if str(file) in str(error) else ValueError(f"{file} {error}") from error
 

@@ -50,7 +50,8 @@ def messages(path: Path, faults: list[str]) -> Iterator[Message]:
                     yield Message(channels[topic], time_ns, data)
     except sqlite3.DatabaseError:
         faults.append("is cut off or damaged, as a killed recorder leaves it")
-        yield from _found(path, last)
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            yield from _found(_Rows(content), last)
 
 
 def _opened(path: Path) -> sqlite3.Connection:
@@ -63,19 +64,17 @@ def _channels(base: sqlite3.Connection) -> dict[int, Channel]:
     return {number: Channel(*about) for number, *about in base.execute(TOPICS)}
 
 
-def _found(path: Path, last: int) -> Iterator[Message]:
+def _found(rows: _Rows, last: int) -> Iterator[Message]:
     """Messages behind a row, wherever in the file they are: the tree that leads to them is broken."""
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        rows = _Rows(content)
-        channels = {
-            number: Channel(name, kind, encoding)
-            for number, (_, name, kind, encoding, *_) in rows.like(type(None), str, str, str)
-            if name.startswith("/")  # else it is a type's definition
-        }
-        for number, (_, topic, time_ns, data) in rows.like(type(None), int, int, bytes):
-            if number > last and topic in channels:
-                last = number
-                yield Message(channels[topic], time_ns, data)
+    channels = {
+        number: Channel(name, kind, encoding)
+        for number, (_, name, kind, encoding, *_) in rows.like(type(None), str, str, str)
+        if name.startswith("/")  # else it is a type's definition
+    }
+    for number, (_, topic, time_ns, data) in rows.like(type(None), int, int, bytes):
+        if number > last and topic in channels:
+            last = number
+            yield Message(channels[topic], time_ns, data)
 
 
 class _Rows:
@@ -92,11 +91,11 @@ class _Rows:
         """Numbers and values of the whole rows that begin with values of these types."""
         for number, start, size in self._cells:
             try:
-                length, kinds = self._kinds(start)
+                at, kinds = self._kinds(start)
             except IndexError:  # behind the cut
                 continue
-            if tuple(map(_type, kinds[: len(types)])) == types and len(content := self._payload(start, size)) == size:
-                yield number, _values(content[length:], kinds)
+            if tuple(map(_type, kinds[: len(types)])) == types and len(row := self._payload(start, size)) == size:
+                yield number, _values(row[at - start :], kinds)
 
     def _on_page(self, start: int) -> Iterator[tuple[int, int, int]]:
         """Number, place and size of each row."""
@@ -112,21 +111,19 @@ class _Rows:
             yield number, at, size
 
     def _kinds(self, start: int) -> tuple[int, list[int]]:
-        """How long a row's head is, and the types in it."""
+        """Where a row's values begin, and the types of them."""
         length, at = self._varint(start)
         kinds = []
         while at < start + length:
             kind, at = self._varint(at)
             kinds.append(kind)
-        return length, kinds
+        return start + length, kinds
 
     def _payload(self, start: int, size: int) -> bytes:
         """A row of that many bytes, or what is there of it: what no page has room for is in a chain of others."""
         most, least = self._usable - 35, (self._usable - 12) * 32 // 255 - 23
-        local = size
-        if size > most:
-            local = least + (size - least) % (self._usable - 4)
-            local = local if local <= most else least
+        local = size if size <= most else least + (size - least) % (self._usable - 4)
+        local = least if local > most else local
         parts, left, pointer = [self._content[start : start + local]], size - local, start + local
         while left > 0 and (page := self._number(pointer, 4)):
             pointer = (page - 1) * self._page
@@ -150,14 +147,12 @@ class _Rows:
 
 def _type(kind: int) -> type | None:
     """Of a value in a row; None: another than bags have."""
-    if kind == 0:
-        return type(None)
     if kind in INTEGERS:
         return int
-    return None if kind < 12 else (bytes, str)[kind % 2]
+    return type(None) if kind == 0 else None if kind < 12 else (bytes, str)[kind % 2]
 
 
-def _values(content: bytes, kinds: list[int]) -> list[Any]:
+def _values(content: bytes, kinds: list[int]) -> Any:
     values: list[Any] = []
     for kind in kinds:
         size = INTEGERS[kind] if kind in INTEGERS else max(kind - 12, 0) // 2

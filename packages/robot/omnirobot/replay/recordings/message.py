@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import bz2
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
+
+from omnirobot.common.ros import ros_types
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """Begins what zstd has packed, such as each message of a bag in the mode "message"."""
@@ -61,7 +64,8 @@ class Message:
             ValueError: It is damaged.
         """
         if self.channel.encoding == "ros1":
-            return bytes(self._with(_to_cdr, self.raw))
+            with self._parsing():
+                return bytes(_types(self.channel).ros1_to_cdr(self.raw, self.kind))
         return (unpacked(self.raw, "zstd") or b"") if self.raw.startswith(ZSTD) else self.raw
 
     def decode(self) -> Any:
@@ -70,14 +74,17 @@ class Message:
         Raises:
             ValueError: It is damaged.
         """
-        return self._with(_decoder, self.data)
+        data = self.data
+        with self._parsing():
+            return _types(self.channel).deserialize_cdr(data, self.kind)
 
-    def _with(self, made: Callable[[Channel], Callable[[bytes], Any]], data: bytes) -> Any:
+    @contextmanager
+    def _parsing(self) -> Iterator[None]:
         try:
-            return made(self.channel)(data)
+            yield
         except ModuleNotFoundError:
             raise
-        except Exception as error:  # the libraries raise whatever their parsing meets
+        except Exception as error:  # rosbags raises whatever its parsing meets
             raise ValueError(f"{self.topic}: a message is damaged, or no {self.kind}") from error
 
 
@@ -101,40 +108,13 @@ def unpacked(data: bytes, how: str) -> bytes | None:
 
 
 @cache
-def _decoder(channel: Channel) -> Callable[[bytes], Any]:
-    if channel.encoding == "cdr" and channel.definition:
-        from mcap.records import Schema
-        from mcap_ros2.decoder import DecoderFactory
-
-        schema = Schema(id=1, name=channel.kind, encoding="ros2msg", data=channel.definition.encode())
-        made = DecoderFactory().decoder_for("cdr", schema)
-        assert made is not None  # what it does not know has no definition here
-        return made
-    store = _types(channel)
-    return lambda data: store.deserialize_cdr(data, channel.kind)
-
-
-@cache
-def _to_cdr(channel: Channel) -> Callable[[bytes], Any]:
-    store = _types(channel)
-    return lambda data: store.ros1_to_cdr(data, channel.kind)
-
-
 def _types(channel: Channel) -> Any:
-    """ROS's own types and those of a definition."""
+    """ROS's own types and, where it is none of these, that of a channel."""
     from rosbags.typesys import get_types_from_msg
 
-    store = _own_types()
-    if channel.kind not in store.types and channel.definition:
-        given = get_types_from_msg(channel.definition, channel.kind)
-        store = _own_types.__wrapped__()  # a new one, as another file may mean something else by this name
-        store.register({kind: fields for kind, fields in given.items() if kind not in store.types})
+    if channel.kind in ros_types().types or not channel.definition:
+        return ros_types()
+    given = get_types_from_msg(channel.definition, channel.kind)
+    store = ros_types.__wrapped__()  # a new one, as another file may mean something else by this name
+    store.register({kind: fields for kind, fields in given.items() if kind not in store.types})
     return store
-
-
-@cache
-def _own_types() -> Any:
-    """ROS's own types, which take a while to make."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_HUMBLE)

@@ -1,4 +1,4 @@
-"""Bags of ROS 1, from their first record to their last: no index is needed (wiki.ros.org/Bags/Format/2.0)."""
+"""Bags of ROS 1, record by record, so that one that is cut off is read up to the cut (wiki.ros.org/Bags/Format/2.0)."""
 
 from __future__ import annotations
 
@@ -10,78 +10,58 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO
 
+from rosbags.rosbag1 import Reader, ReaderError
+
 from .message import Channel, Message, as_in_ros_2, unpacked
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, CHUNK, CHUNK_INFO, CONNECTION = b"\x02", b"\x05", b"\x06", b"\x07"
+MESSAGE, CHUNK, CONNECTION = b"\x02", b"\x05", b"\x07"
 
 Fields = dict[bytes, bytes]
-
-
-class _Channels:
-    """Connections that a file has named so far."""
-
-    def __init__(self) -> None:
-        self.by_id: dict[bytes, Channel] = {}
-
-    def take(self, fields: Fields, content: bytes) -> Message | None:
-        """Takes down a record; the message where it is one.
-
-        Raises:
-            struct.error, KeyError, UnicodeDecodeError: It is damaged.
-        """
-        kind = fields.get(b"op")
-        if kind == MESSAGE:
-            seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
-            return Message(self.by_id[fields[b"conn"]], seconds * 10**9 + nanoseconds, content)
-        if kind == CONNECTION:
-            about = _fields(content)
-            name, definition = about[b"type"].decode(), about[b"message_definition"].decode("utf-8", "replace")
-            self.by_id[fields[b"conn"]] = Channel(fields[b"topic"].decode(), as_in_ros_2(name), "ros1", definition)
-        return None
 
 
 def index(path: Path) -> Counter[Channel] | None:
     """How many messages each topic has, as the end of the file says; None where that is missing."""
     with path.open("rb") as file:
         first = file.readline(80)
-        if first != MAGIC:
-            raise ValueError(
-                "is not a readable bag: it is older than version 2.0 (rosbag migrate)"
-                if first.startswith(b"#ROSBAG V")
-                else "is not a readable bag of ROS 1: it does not begin as one"
-            )
-        start = _index_at(file)
-        if not 0 < start < file.seek(0, os.SEEK_END):
-            return None
-        file.seek(start)
-        channels, counts = _Channels(), Counter[Channel]()
-        try:
-            for fields, content, _ in _records(file):
-                channels.take(fields, content)
-                if fields[b"op"] == CHUNK_INFO:
-                    for number, count in struct.iter_unpack("<4sI", content):
-                        counts[channels.by_id[number]] += count
-        except (struct.error, KeyError, UnicodeDecodeError):
-            return None
+    if first != MAGIC:
+        older = first.startswith(b"#ROSBAG V")
+        raise ValueError(
+            "is not a readable bag: it is older than version 2.0 (rosbag migrate)"
+            if older
+            else "is not a readable bag of ROS 1: it does not begin as one"
+        )
+    counts = Counter[Channel]()
+    try:
+        with Reader(path) as bag:
+            for connection in bag.connections:
+                counts[Channel(connection.topic, as_in_ros_2(connection.msgtype), "ros1")] += connection.msgcount
+    except (ReaderError, ValueError):
+        return None
     return counts or None
 
 
 def messages(path: Path, faults: list[str]) -> Iterator[Message]:
     """Messages in the order of the file; of a chunk that is cut off, those before the cut."""
-    channels, damaged = _Channels(), 0
+    channels, damaged = dict[bytes, Channel](), 0
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         index_at = _index_at(file)
         for fields, content, whole in _opened(file):
+            kind = fields.get(b"op")
             try:
-                message = channels.take(fields, content) if whole else None
+                if kind == MESSAGE and whole:
+                    seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+                    yield Message(channels[fields[b"conn"]], seconds * 10**9 + nanoseconds, content)
+                elif kind == CONNECTION and whole:
+                    about = _fields(content)
+                    name, definition = about[b"type"].decode(), about[b"message_definition"].decode("utf-8", "replace")
+                    channels[fields[b"conn"]] = Channel(
+                        fields[b"topic"].decode(), as_in_ros_2(name), "ros1", definition
+                    )
             except (struct.error, KeyError, UnicodeDecodeError):
-                message, damaged = None, damaged + 1
-            if message is not None:
-                yield message
-            elif fields.get(b"op") == CHUNK:
                 damaged += 1
+            damaged += kind == CHUNK
         end = file.tell()
     if not index_at:
         faults.append("has no index, as a killed recorder leaves it (rosbag reindex writes one)")
