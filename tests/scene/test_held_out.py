@@ -34,7 +34,7 @@ def drawn(obstacles, num_envs=200):
     field = ObstacleField(obstacles, pos, quat, EnvRandom(3, num_envs))
     field.reset(torch.arange(num_envs), torch.zeros(num_envs, 2))
     for k, part in enumerate(parts):
-        if not part.group.has_poses:
+        if not obstacles.obstacles()[part.obstacle].group.has_poses:
             yield from ((part.kind, tuple(size), part) for size in field.size[field.active[:, k], k].tolist())
 
 

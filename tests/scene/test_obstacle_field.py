@@ -29,8 +29,7 @@ def reset(field, robot=(0.0, 0.0), command=(0.0, 0.0), goal=None):
     n = field.pos_w.shape[0]
     goal = None if goal is None else torch.tensor(goal).expand(n, 2)
     env_ids, robot = torch.arange(n), torch.tensor(robot).expand(n, 2)
-    field.reset(env_ids, robot, goal)
-    field.approach(env_ids, robot, torch.tensor(command).expand(n, 2))
+    field.reset(env_ids, robot, goal, lambda: torch.tensor(command).expand(n, 2))
 
 
 class TestRanges:

@@ -329,9 +329,10 @@ class TestObstacles:
     def test_stand_on_the_ground_where_they_are_and_not_on_the_robot(self, make_env, preset):
         env = make_env(*SMALL, f"obstacles={preset}", num_envs=10, blind=True)
         field = env.obstacles
-        half, bottom = field.half_height, torch.tensor([part.group.bottom[0] for part in field.parts])
+        groups = [own.group for own in field.config.obstacles()]  # each has one part
+        half, bottom = field.half_height, torch.tensor([group.bottom[0] for group in groups])
         off = field.pos_w[..., :2] - env.sim.qpos[:, None, :2]
-        placed = [k for k, part in enumerate(field.parts) if part.group.poses is None]
+        placed = [k for k, group in enumerate(groups) if group.poses is None]
         assert (off.norm(dim=-1) - field.radius)[:, placed].min() >= field.config.clearance - 1e-6
         for _ in range(2):
             for i in range(10):
