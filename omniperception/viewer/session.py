@@ -35,7 +35,7 @@ DRAG_SPEED = 3.0
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialEnd:
     """The end of a trial.
 
     Attributes:
@@ -77,7 +77,7 @@ class Session:
         self._runner.load_policy(self.checkpoint)
         self.policy: Policy = self._contender()
         self.rewards: dict[str, float] = {}
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[TrialEnd] = []
         self.shapes: RayShapes = ray_shapes(self.env.world)
         self._touched = self._given_up = False
         self._held: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
@@ -113,7 +113,7 @@ class Session:
         if bool(env.done[0]):
             cause = next(name for name, happened in env.outcomes.items() if happened[0])
             cause, self._given_up = BY_HAND if self._given_up and cause == "time_out" else cause, False
-            self.outcomes.append(Outcome(cause, self._touched))
+            self.outcomes.append(TrialEnd(cause, self._touched))
             self._touched = False
             self._held.clear()
 

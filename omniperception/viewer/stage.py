@@ -17,6 +17,7 @@ from omniperception.evaluation.perceived import Perceived
 from omniperception.scene.rays import HitClass
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, HEIGHTS, OBSTACLE, PROXIMAL, SECTORS, TERRAIN, scale
 from omniperception.viewer.meshes import grid_surface, robot_looks, triangles
+from omniperception.viewer.page import add_points, show_points
 from omniperception.viewer.session import Session
 
 if TYPE_CHECKING:
@@ -118,15 +119,7 @@ class Stage:
                 plane_opacity=1.0,
                 shadow_opacity=0.3,
             )
-        self._points = self.scene.add_point_cloud(
-            f"{ROOT}/points",
-            np.zeros((1, 3), np.float32),
-            (0, 0, 0),
-            point_size=self.point_size,
-            point_shape="circle",
-            precision="float32",
-            point_shading="flat",
-        )
+        self._points = add_points(self.scene, f"{ROOT}/points", self.point_size)
         self._arrows = {
             name: self.scene.add_arrows(
                 f"{ROOT}/arrows/{name}",
@@ -223,10 +216,8 @@ class Stage:
         points = cloud.points_w[0, hit].numpy(force=True)
         with self._server.atomic():
             self._points.visible = True
-            self._points.point_size = self.point_size
             self._points.position = (0.0, 0.0, self.point_size / 2)  # on what they lie on, not half in it
-            self._points.points = np.ascontiguousarray(points, np.float32)
-            self._points.colors = self._point_colours(hit, points)
+            show_points(self._points, points, self._point_colours(hit, points), self.point_size)
         return len(points)
 
     def _point_colours(self, hit: torch.Tensor, points: np.ndarray) -> np.ndarray:
