@@ -180,9 +180,7 @@ class MujocoWarpSimulator(Failures):
     ) -> None:
         if num_steps != self._num_steps:
             self._allocate_steps(num_steps)
-        finite = torch.isfinite(joint_target).all(1)
-        self.mark_failed(~finite, Failure.ACTION)
-        self._ctrl.copy_(torch.where(finite[:, None], joint_target.float(), self._ctrl))
+        self._ctrl.copy_(self.finite_targets(joint_target, self._ctrl))
         if mocap_path is None:
             self._launch("steps", self._steps)
             return
@@ -192,11 +190,6 @@ class MujocoWarpSimulator(Failures):
         else:
             self._turns().copy_(mocap_turn)
             self._launch("steps along the path, turning", self._steps_turning)
-
-    def detect_failures(self) -> None:
-        """Looks at speed and position; the engine itself has no warnings."""
-        speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
-        self.mark_beyond_limits(speed, distance)
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self.qpos[env_ids], self.qvel[env_ids] = self._joints.engine_state(qpos.float(), qvel.float())
