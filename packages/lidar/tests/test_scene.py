@@ -20,7 +20,7 @@ from omnilidar import (
     TriangleMesh,
     mid360,
 )
-from omnilidar.scene import PlacedShapes, View
+from omnilidar.scene import PlacedShapes, SensorView
 
 
 def rays(num_envs, num_rays=1, direction=(1.0, 0.0, 0.0)):
@@ -118,7 +118,7 @@ def random_crowd(num_shapes, seed, num_envs=2):
 @pytest.mark.parametrize("num_shapes", [1, 2, 40, 1000])
 def test_a_view_has_everything_in_reach_nearest_first(num_shapes):
     scene = random_crowd(num_shapes, seed=num_shapes)
-    placed = PlacedShapes(scene, (), View(pos=(0.3, 0.2, 0.1), max_range=4.0))
+    placed = PlacedShapes(scene, (), SensorView(pos=(0.3, 0.2, 0.1), max_range=4.0))
     placed.refresh()
     origin = torch.tensor([0.3, 0.2, 0.1])
     for env in range(scene.num_envs):
@@ -138,7 +138,7 @@ def test_a_view_has_everything_in_reach_nearest_first(num_shapes):
 def test_what_is_left_out_is_outside_the_elevations(window):
     """A direction within the window that hits a shape proves that the shape must be in the view."""
     scene = random_crowd(200, seed=7, num_envs=1)
-    placed = PlacedShapes(scene, (), View(elevation=window))
+    placed = PlacedShapes(scene, (), SensorView(elevation=window))
     placed.refresh()
     viewed = set(placed.slots.shape.numpy()[0, : int(placed.slots.count.numpy()[0])].tolist())
     generator = torch.Generator().manual_seed(1)
