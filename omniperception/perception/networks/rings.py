@@ -291,10 +291,9 @@ class RingPath(nn.Module):
         hit."""
         cells = rings.unflatten(1, (self.shape.history, -1, self.shape.channels))
         proximity, band = cells[:, :, :, -2].max(2)
-        bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (
-            LATERAL * proximity.clamp(min=LEAST_PROXIMITY)
-        )
-        reach = -self.shape.decays[-1] * proximity.clamp(min=LEAST_PROXIMITY).log()
+        known = proximity.clamp(min=LEAST_PROXIMITY)
+        bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (LATERAL * known)
+        reach = -self.shape.decays[-1] * known.log()
         distance = torch.where(proximity > LEAST_PROXIMITY, reach, FAR)
         nearness = _NEARNESS * (1.0 - distance / _REACH).clamp(min=0.0)
         return torch.cat(
