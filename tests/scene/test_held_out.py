@@ -1,7 +1,5 @@
 """The test split: what no training scene has, in every preset, and no way for a training to see it."""
 
-import math
-
 import pytest
 import torch
 
@@ -121,24 +119,6 @@ def test_as_many_of_a_group_take_part_in_an_episode(kind, count, present):
     assert drawn.float().mean().item() == pytest.approx(sum(present) / 2, abs=0.15)
 
 
-def test_wedges_are_for_what_is_long():
-    groups = {"wall": ObstacleGroup("box", 2, [[0.03, 0.08], [1.0, 2.5], [0.4, 0.6]])}
-    groups["crate"] = ObstacleGroup("box", 2, [[0.2, 0.3], [0.2, 0.3], [0.2, 0.3]])
-    files = [group.file for group in held_out(ObstaclesConfig(groups)).groups.values()]
-    assert files == ["wedge", None, "hexagon", None]
-
-
-def test_it_runs(make_env):
-    env = make_env("obstacles=all", "obstacles.split=test", num_envs=2)
-    for _ in range(6):
-        env.step(torch.zeros(2, 12))
-    assert math.isfinite(float(env.sim.qpos.sum()))
-    kinds = {part.kind for part in env.obstacles.parts}
-    assert {"mesh", "capsule", "box", "cylinder"} <= kinds
-    counts = env.obstacles.root_active.sum(1)
-    assert (counts == scene("all").num_obstacles).all()
-
-
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_no_recipe_sees_it(experiment):
     run = build.assemble(config.compose([f"experiment={experiment}", "init=null"]))
@@ -161,11 +141,6 @@ def test_going_on_with_a_run_refuses_it(tmp_path):
     config.save(run.composed, tmp_path)
     with pytest.raises(ConfigError, match="is for reports"):
         train.main(train.Arguments(run=str(tmp_path)), ["obstacles.split=test"])
-
-
-def test_another_split_is_unknown():
-    with pytest.raises(ValueError, match=r"obstacles.split=train must be dev or test"):
-        ObstaclesConfig(split="train")
 
 
 def test_what_has_no_held_out_kind_is_one_line(tmp_path):

@@ -187,25 +187,6 @@ class TestPath:
         assert not field.active.any() and (field.pos_w[..., 2] == PARKED_HEIGHT).all()
 
 
-def started_on_the_robot():
-    return built({"person": ObstacleGroup("cylinder", 1, POST, [1.0, 1.0], approach=ApproachConfig(0.1, [0.7, 3.0]))})
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: ApproachConfig(-1, [3.0, 4.0]), r"within=-1"),
-        (lambda: ApproachConfig(0.1, [4.0, 3.0]), r"distance=\[4\.0, 3\.0\]"),
-        (lambda: FreePathConfig(0.0, 1.0), r"obstacles\.free_path\."),
-        (lambda: FreePathConfig(1.0, -1.0), r"obstacles\.free_path\."),
-        (started_on_the_robot, "lets those of person start on the robot"),
-    ],
-)
-def test_wrong_settings_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_spacing_is_kept_between_what_stands():
     field = built(
         {

@@ -52,29 +52,13 @@ def test_odd_counts(num_envs, num_rays, num_bodies, shapes):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([], 0, 0), "num_envs=0"),
-        (([], 1, -1), "num_bodies=-1"),
         (([Shape(ShapeKind.SPHERE, (1.0,), body=1)], 1, 1), r"shapes\[0\].body=1 must be < num_bodies=1"),
-        (([], 1, 0, "cpu", 0), "num_threads=0"),
         (([], 1, 0, "cpu", 1, torch.float16), r"pose_dtype=torch.float16 must be torch.float32 or torch.float64"),
     ],
 )
 def test_wrong_scenes_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         RayScene(*arguments)
-
-
-@pytest.mark.parametrize(
-    ("num_envs", "options", "message"),
-    [
-        (1, {}, "num_envs=2"),
-        (2, {"exclude_shapes": (0,)}, "exclude_shapes"),
-        (2, {"max_range": -1}, "max_range=-1"),
-    ],
-)
-def test_wrong_rays_are_refused(num_envs, options, message):
-    with pytest.raises(ValueError, match=message):
-        RayScene([], 2, 0).cast(*rays(num_envs), **options)
 
 
 # --- visibility ------------------------------------------------------------------------------------------------
