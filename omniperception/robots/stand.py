@@ -33,7 +33,7 @@ class Stance:
         height: of the base (m).
         tilt: of the base (rad).
         speed: of the base (m/s).
-        drift: horizontal way of the base (m).
+        drift: horizontal displacement of the base (m).
         sag: by joint, angle beyond the target (rad).
         contacts: by pair of geoms, force along the normal (N).
         saturated: joints whose torque is at its limit.

@@ -127,7 +127,7 @@ class ObstacleField:
         return self._poses.world
 
     def routes(self, env_ids: torch.Tensor) -> torch.Tensor:
-        """(n, R, 2) m, ways through the worlds that environments (n,) have."""
+        """(n, R, 2) m, paths through the worlds that environments (n,) have."""
         assert self._poses.routes is not None
         return self._poses.routes[self.world[env_ids, 0]]
 
@@ -235,7 +235,7 @@ class ObstacleField:
         return (self._path, None) if self.articulation is None else self._articulate(dt)
 
     def _articulate(self, dt: float) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """The way of the parts along that of their obstacles, and the parts at its end."""
+        """The path of the parts along that of their obstacles, and the parts at its end."""
         parts, speed = self.articulation, self.root_velocity_w.norm(dim=-1)
         assert parts is not None
         for step in range(self._path.shape[1]):

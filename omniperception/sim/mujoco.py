@@ -153,7 +153,7 @@ class MujocoSimulator(Failures):
             self._torque.numpy()[:] = self._actuator_force
 
     def _roll_out(self, num_steps: int, mocap_path: torch.Tensor | None, mocap_turn: torch.Tensor | None) -> None:
-        """Steps with the kinematic bodies on their way, recording the requested fields after every step."""
+        """Steps with the kinematic bodies on their paths, recording the requested fields after every step."""
         if self._records and next(iter(self._records.values())).shape[1] != num_steps:
             self._records = self._allocate_records(num_steps)
         control, spec = self._control(num_steps, mocap_path, mocap_turn)

@@ -112,7 +112,7 @@ class Capacity:
 class MujocoWarpSimulator(Failures):
     """`num_envs` worlds on one device; every tensor is a view of the engine's own float32 memory.
 
-    A call of `step` is one CUDA graph on a GPU: the obstacles' way, the physics steps and the recording of what
+    A call of `step` is one CUDA graph on a GPU: the obstacles' path, the physics steps and the recording of what
     is read after each of them. Only these synchronise the host with the device: `anomalies`, `state_dict` and
     `load_state_dict`.
 

@@ -316,16 +316,16 @@ def spare_kinds(env: OmniEnv) -> list[str]:
 
 def _watched(task: EnvConfig, policy: str) -> EnvConfig:
     """The task such that it can be driven, looked at and added to; its observations are the same."""
-    besides = [*task.extra_requirements]
+    extra = [*task.extra_requirements]
     if task.lidar is not None:
-        besides += [AVOIDANCE, MEASURED_CLOUD]
-    assert set(besides) - set(task.extra_requirements) <= FROM_LIDAR
+        extra += [AVOIDANCE, MEASURED_CLOUD]
+    assert set(extra) - set(task.extra_requirements) <= FROM_LIDAR
     return replace(
         task,
         num_envs=1,
         commands=driven(task),
         obstacles=with_spares(task.obstacles),
-        extra_requirements=tuple(dict.fromkeys(besides)),
+        extra_requirements=tuple(dict.fromkeys(extra)),
         network_sees_frames=task.network_sees_frames and policy not in BASELINES,
         skip_curricula=True,
         trials=True,

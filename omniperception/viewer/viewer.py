@@ -67,8 +67,7 @@ class Viewer(Page):
         self._charts_due = self._look_due = self._lists_due = 0.0
         self._frames_drawn, self._shown_points = 0, 0
         self._redraw = True
-        self.stage = Stage(self.server)
-        self.stage.show(self.session)
+        self.stage = Stage(self.server, self.session)
         self.stage.on_drag = self._obstacle_dragged
         self.stage.on_take_away = self._obstacle_taken
         self.stage.on_push = lambda direction: self.ask(lambda: self.push(direction))
