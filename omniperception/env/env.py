@@ -283,10 +283,12 @@ class OmniEnv(TaskEnv):
     def _move(self, obstacles: ObstacleField) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Moves the obstacles through the control step; see `ObstacleField.travel`."""
         sim, robot_xy_w = self.config.sim, self.sim.qpos[:, :2]
-        if obstacles.any_approaches:
-            commanded = rotate_yaw(self.state.kinematics.yaw, self.command.value[:, :2])
-            obstacles.restart_approaching(robot_xy_w, commanded)
-        return obstacles.travel(sim.timestep, sim.decimation, robot_xy_w)
+        return obstacles.travel(
+            sim.timestep,
+            sim.decimation,
+            robot_xy_w,
+            lambda: rotate_yaw(self.state.kinematics.yaw, self.command.value[:, :2]),
+        )
 
     def _follow_sensors(self) -> None:
         """Updates LiDAR and avoidance velocity in each control step, and casts a frame where one is due."""

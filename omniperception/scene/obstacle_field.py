@@ -48,7 +48,6 @@ class ObstacleField:
         root_velocity_w: (num_envs, O, 2) m/s.
         root_active: (num_envs, O) bool.
         root_radius: (num_envs, O) m, of the circle around all that an obstacle covers, however it swings.
-        any_approaches: whether some come at the robot, and `restart_approaching` has to be called in every step.
         varying: indices of the parts whose sizes differ between environments.
         level: share of obstacles and of their speed that the curriculum lets in, 0 to 1; fixed ones are always there.
     """
@@ -93,7 +92,6 @@ class ObstacleField:
         loose = [k for k, part in enumerate(self.parts) if groups[part.obstacle].poses is None]
         self.free = slice(None) if len(loose) == len(self.parts) else torch.tensor(loose, device=device)
         self._approach = Approach(groups, random, pos_w)
-        self.any_approaches = self._approach.any
         wanders = any(group.motion is not None for group in groups)
         self._wander = Wander(groups, n, random, pos_w) if wanders else None
         self._placed = self._approach.which | self._poses.which
@@ -191,7 +189,7 @@ class ObstacleField:
         if self._ground is not None:
             self._above_ground[env_ids] = above_ground
         velocity = torch.zeros_like(robot) if command is None else command().to(self._dtype)
-        if self.any_approaches:
+        if self._approach.any:
             self._start_approach(env_ids, self._approach.which & active, robot, velocity)
         if self._ground is not None:
             self.root_pos_w[env_ids, :, 2] = self._over_ground(env_ids)
@@ -211,13 +209,23 @@ class ObstacleField:
         elif self._any_moves:
             bounce(xy, self.root_velocity_w, self._placement.bounds, ~self._placed)
 
-    def travel(self, dt: float, num_steps: int, robot_xy_w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def travel(
+        self,
+        dt: float,
+        num_steps: int,
+        robot_xy_w: torch.Tensor,
+        command: Callable[[], torch.Tensor] | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Moves every obstacle by `num_steps` steps of `dt` (s); see `advance`.
+
+        With `command`, which gives (num_envs, 2) in m/s as in `reset`, those that have passed their robot start again.
 
         Returns:
             (num_envs, num_steps, P, 3) m, where the parts are after each step, on the ground, and
             (num_envs, num_steps, P, 4) their orientations, None where they keep them; the same memory in every call.
         """
+        if command is not None and self._approach.any:
+            self.restart_approaching(robot_xy_w, command())
         if self._path.shape[1] != num_steps:
             self._allocate_path(num_steps)
         if self._wander is not None:

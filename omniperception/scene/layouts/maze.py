@@ -60,7 +60,7 @@ class MazeLayout:
         if any(not 0 <= lane < self.columns for lane in self.lanes):
             raise ValueError(f"obstacles: lanes={list(self.lanes)} of a maze must lie in 0 to {self.columns - 1}")
         check_not_negative(self, "depth")
-        most = min((self.columns - 1) * (self.rows - 1), len(self._inner_edges()))  # all cells are reached
+        most = min((self.columns - 1) * (self.rows - 1), len(self._inner_edges()))  # a path to every cell remains
         if not 0 <= self.walls <= most:
             raise ValueError(f"obstacles: walls={self.walls} of a maze must lie in 0 to {most}")
         check_worlds(self)
