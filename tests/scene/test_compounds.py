@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from fields import make_field
 
-from omniperception.common.random import EnvRandom
-from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig, PartConfig, SwingConfig
+from omniperception.scene import ObstacleGroup, ObstaclesConfig, PartConfig, SwingConfig
 
 LEG = {"kind": "capsule", "size": [0.07, 0.36], "hang": 0.43}
 AMPLITUDE, PER_METRE = 25.0, 0.7
@@ -43,9 +43,7 @@ N, DT = 6, 0.005
 
 
 def field_of(groups=GROUPS, num_envs=N, seed=0, **settings):
-    config = ObstaclesConfig(groups, **settings)
-    pos, quat = (torch.zeros(num_envs, len(config.parts()), n, dtype=torch.float64) for n in (3, 4))
-    field = ObstacleField(config, pos, quat, EnvRandom(seed, num_envs))
+    field = make_field(ObstaclesConfig(groups, **settings), num_envs, seed)
     field.reset(torch.arange(num_envs), torch.full((num_envs, 2), 50.0))
     return field
 

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+from fields import make_field
 
 from omniperception import build, config
 from omniperception.commands import train
-from omniperception.common.random import EnvRandom
 from omniperception.config import CONFIG_DIR, ConfigError
-from omniperception.scene import ApproachConfig, ObstacleField, ObstacleGroup, ObstaclesConfig, PartConfig
+from omniperception.scene import ApproachConfig, ObstacleGroup, ObstaclesConfig, PartConfig
 from omniperception.scene.held_out import VARIANTS, held_out
 
 PRESETS = sorted(path.stem for path in (CONFIG_DIR / "obstacles").glob("*.yaml") if path.stem != "none")
@@ -27,11 +27,9 @@ def trained_on():
 
 def drawn(obstacles, num_envs=200):
     """(kind, size, moves) of all parts that take part in some episodes, but those with fixed poses."""
-    parts = obstacles.parts()
-    pos, quat = (torch.zeros(num_envs, len(parts), n, dtype=torch.float64) for n in (3, 4))
-    field = ObstacleField(obstacles, pos, quat, EnvRandom(3, num_envs))
+    field = make_field(obstacles, num_envs, seed=3)
     field.reset(torch.arange(num_envs), torch.zeros(num_envs, 2))
-    for k, part in enumerate(parts):
+    for k, part in enumerate(field.parts):
         if not obstacles.obstacles()[part.obstacle].group.has_poses:
             yield from ((part.kind, tuple(size), part) for size in field.size[field.active[:, k], k].tolist())
 
@@ -111,8 +109,7 @@ def test_sizes_by_hand():
 def test_as_many_of_a_group_take_part_in_an_episode(kind, count, present):
     size = [[0.2, 0.3], [0.4, 0.5], [0.4, 0.5]][: 3 if kind == "box" else 2]
     obstacles = held_out(ObstaclesConfig({"thing": ObstacleGroup(kind, count, size, present=present)}))
-    pos, quat = (torch.zeros(400, len(obstacles.parts()), n, dtype=torch.float64) for n in (3, 4))
-    field = ObstacleField(obstacles, pos, quat, EnvRandom(3, 400))
+    field = make_field(obstacles, 400, seed=3)
     field.reset(torch.arange(400), torch.full((400, 2), 50.0))
     drawn = field.root_active.sum(1)
     assert (drawn.min().item(), drawn.max().item()) == present

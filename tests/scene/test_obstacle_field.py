@@ -6,10 +6,11 @@ from collections import deque
 import numpy as np
 import pytest
 import torch
+from fields import make_field
 
 from omniperception import build, config
 from omniperception.common.random import EnvRandom
-from omniperception.scene import ApproachConfig, FreePathConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.scene import ApproachConfig, FreePathConfig, ObstacleGroup, ObstaclesConfig
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
 from omniperception.scene.obstacle_motion import LOSE_SIGHT, passing_velocity
 from omniperception.scene.placement import bent_path, distance_to_path
@@ -19,10 +20,7 @@ POST = [[0.3, 0.3], [0.5, 0.5]]
 
 def built(groups, num_envs=500, seed=0, **settings):
     settings = {"area": (-5.0, 5.0, -4.0, 4.0), "clearance": 0.5, **settings}
-    config = ObstaclesConfig(groups, **settings)
-    count = len(config.parts())
-    pos, quat = (torch.zeros(num_envs, count, n, dtype=torch.float64) for n in (3, 4))
-    return ObstacleField(config, pos, quat, EnvRandom(seed, num_envs))
+    return make_field(ObstaclesConfig(groups, **settings), num_envs, seed)
 
 
 def reset(field, robot=(0.0, 0.0), command=(0.0, 0.0), goal=None):
@@ -238,8 +236,7 @@ class TestFeasible:
     def test_every_scene_of_the_hardest_test(self):
         run = build.assemble(config.compose(["experiment=walk", "scenario=abs_hard"])).env
         count, n = run.obstacles.num_obstacles, 60
-        pos, quat = (torch.zeros(n, count, k, dtype=torch.float64) for k in (3, 4))
-        field = ObstacleField(run.obstacles, pos, quat, EnvRandom(7, n))
+        field = make_field(run.obstacles, n, seed=7)
         uniform = EnvRandom(8, n).uniform(torch.arange(n), (4,))
         start = uniform[:, :2] * 0.2 - 0.1
         goal = uniform[:, 2:] * torch.tensor([1.5, 3.0]) + torch.tensor([6.0, -1.5])

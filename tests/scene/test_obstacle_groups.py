@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from fields import make_field
 
-from omniperception.common.random import EnvRandom
-from omniperception.scene import MotionConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.scene import MotionConfig, ObstacleGroup, ObstaclesConfig
 from omniperception.scene.meshes import MESHES, mesh_points
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
 from omniperception.scene.poses import LAYOUT_SEEDS
@@ -19,8 +19,7 @@ POST = [[0.1, 0.1], [0.5, 0.5]]
 
 def field_of(groups, num_envs=400, seed=0, robot=(50.0, 50.0), **settings):
     config = ObstaclesConfig(groups, **{"area": (-1e6, 1e6, -1e6, 1e6), **settings})
-    pos, quat = (torch.zeros(num_envs, len(config.parts()), n, dtype=torch.float64) for n in (3, 4))
-    field = ObstacleField(config, pos, quat, EnvRandom(seed, num_envs))
+    field = make_field(config, num_envs, seed)
     field.reset(torch.arange(num_envs), torch.tensor(robot).expand(num_envs, 2))
     return field
 

@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from fields import make_field
 from mj_rays import assert_rays_are_those_of_mj_ray
 
-from omniperception.common.random import EnvRandom
-from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig, thing_file
+from omniperception.scene import ObstacleGroup, ObstaclesConfig, thing_file
 from omniperception.scene.meshes import compiled, mesh_points
 
 DOOR = """
@@ -63,9 +63,7 @@ def files(tmp_path, monkeypatch):
 
 
 def field_of(group):
-    config = ObstaclesConfig({"own": group})
-    pos, quat = (torch.zeros(N, len(config.parts()), n, dtype=torch.float64) for n in (3, 4))
-    field = ObstacleField(config, pos, quat, EnvRandom(3, N))
+    field = make_field(ObstaclesConfig({"own": group}), N, seed=3)
     field.reset(torch.arange(N), torch.full((N, 2), 50.0))
     return field
 

@@ -3,12 +3,11 @@
 import pytest
 import torch
 import yaml
+from fields import make_field
 
 from omniperception import build, config
-from omniperception.common.random import EnvRandom
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.suite import suite_worlds
-from omniperception.scene import ObstacleField
 
 BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
 WORLDS = sorted({world.name for world in suite_worlds("held_out")})
@@ -20,9 +19,7 @@ def assembled(*overrides, num_envs=3):
 
 def field_of(task, num_envs):
     """The obstacles of many trials, without physics."""
-    parts = len(task.obstacles.parts())
-    poses = (torch.zeros(num_envs, parts, n, dtype=torch.float64) for n in (3, 4))
-    field = ObstacleField(task.obstacles, *poses, EnvRandom(task.seed, num_envs))
+    field = make_field(task.obstacles, num_envs, task.seed)
     goal = torch.tensor([task.commands.goal_x[0], 0.0]).expand(num_envs, 2)
     start = torch.zeros(num_envs, 2)
     field.reset(torch.arange(num_envs), start, goal)
