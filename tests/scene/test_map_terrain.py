@@ -14,6 +14,7 @@ from omniperception.scene.map_terrain import (
     StartsConfig,
     connected,
     free_places,
+    read_image,
 )
 from omnirobot.common.errors import ConfigError
 
@@ -252,3 +253,11 @@ def test_what_is_wrong_with_a_file_is_said_in_one_line(files, make_env, override
     with pytest.raises((ConfigError, ValueError), match=message) as error:
         make_env(*given, *BLIND, num_envs=1)
     assert "\n" not in str(error.value)
+
+
+def test_what_is_transparent_is_white_at_16_bits_too(tmp_path):
+    values = np.full((4, 4), 30_000, np.uint16)
+    values[0] = 0
+    Image.fromarray(values).save(tmp_path / "deep.png", transparency=0)
+    brightness = read_image(str(tmp_path / "deep.png"))
+    assert (brightness[-1] == 1.0).all() and np.allclose(brightness[:-1], 30_000 / 65_535)
