@@ -23,6 +23,7 @@ from omnilidar import (
     MixedPixels,
     Noise,
 )
+from omniperception.common.rotations import multiply, rotate, yaw_quat
 from omniperception.env.sensing import SensorConfig
 from omniperception.viewer import charts
 from omniperception.viewer.colours import scale
@@ -204,11 +205,11 @@ class Bench:
     def _move(self) -> None:
         knobs, scene = self.knobs, self._room.scene
         self._walkers.advance(knobs.walk * DT)
+        headings = yaw_quat(torch.tensor(self._walkers.heading)).to(scene.body_quat)
         for k, body in enumerate(self._room.movers):
             x, y = self._walkers.pos[k]
-            half = self._walkers.heading[k] / 2
             scene.body_pos[0, body] = scene.body_pos.new_tensor([x, y, 0.0])
-            scene.body_quat[0, body] = scene.body_quat.new_tensor([math.cos(half), 0.0, 0.0, math.sin(half)])
+            scene.body_quat[0, body] = headings[k]
         self._along += knobs.drive * DT
         self._turned += knobs.turn * DT
         self._place_robot()
@@ -217,15 +218,10 @@ class Bench:
         """The robot on a circle of 1 m about the place where it stood, turned about its own base."""
         scene, (pos, quat) = self._room.scene, self._rest
         base = pos[self._own == self._room.bodies[self._room.robot.base]][0]
-        angle = self._turned
-        cos, sin = math.cos(angle), math.sin(angle)
-        offset = pos - base
-        x, y = cos * offset[:, 0] - sin * offset[:, 1], sin * offset[:, 0] + cos * offset[:, 1]
+        turn = yaw_quat(torch.tensor(self._turned)).to(quat).expand_as(quat)
         shift = base.new_tensor([math.sin(self._along), 1.0 - math.cos(self._along), 0.0])
-        scene.body_pos[0, self._own] = base + shift + torch.stack((x, y, offset[:, 2]), 1)
-        c, s = math.cos(angle / 2), math.sin(angle / 2)
-        w, i, j, k = quat.unbind(1)
-        scene.body_quat[0, self._own] = torch.stack((c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w), 1)
+        scene.body_pos[0, self._own] = base + shift + rotate(turn, pos - base)
+        scene.body_quat[0, self._own] = multiply(turn, quat)
 
 
 class Lab(Page):
