@@ -287,16 +287,10 @@ def test_any_name_of_a_joint_is_written_so_that_it_is_read(tmp_path, name):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["robot-new"], "file=... must be given"),
         (["robot-new", "none.xml"], "file=none.xml is no file"),
-        (["robot-new", "biped.xml", "name=a-b"], "name=a-b must be letters"),
         (["robot-new", "biped.xml", "joints=elbow"], "joints=elbow are no hinges or slides of biped.xml; known: tail"),
-        (["robot-new", "biped.xml", "lidar=nose"], "lidar=nose is no link of biped.xml; known: torso"),
         (["robot-new", "ghost.xml"], "no geom collides"),
-        (["robot-new", "biped.xml", "frequency=0"], "frequency=0 must be a number above 0"),
-        (["robot-check", "wolf"], "robot=wolf is unknown"),
         (["robot-check", "go2", "robot=anymal"], "robot=anymal: this command sets robot=go2 itself"),
-        (["robot-check", "go2", "lidar=sonar"], "lidar=sonar is unknown"),
     ],
 )
 def test_wrong_input_is_one_line(words, message, tmp_path, monkeypatch, capsys):

@@ -95,9 +95,7 @@ def test_the_command_scans_a_mesh_file(command, capsys, tmp_path):
     ("arguments", "message"),
     [
         (("mesh=none.stl",), "mesh none.stl does not exist"),
-        (("mesh=broken.stl",), "mesh broken.stl"),
         (("mesh=broken.stl", "at=1,2"), "at=1.0,2.0 must be three numbers"),
-        (("cloud=e57",), "cloud=e57 must be one of ply, pcd, las, npz, mcap"),
     ],
 )
 def test_a_mesh_that_is_none_is_one_line(command, capsys, tmp_path, monkeypatch, arguments, message):

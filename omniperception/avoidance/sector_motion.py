@@ -9,7 +9,7 @@ import torch
 NEARNESS_RANGE = 4.0
 """Distance (m) from which on an obstacle counts as not near at all."""
 
-FAINT = 0.05
+LEAST_NEARNESS = 0.05
 """Nearness below which a regressed sector counts as empty."""
 
 VELOCITY_WEIGHT = 1.0
@@ -52,7 +52,7 @@ def decode(motion: torch.Tensor) -> torch.Tensor:
     radial = sector_bearings(motion.shape[1], motion.device)
     across = torch.stack((-radial[:, 1], radial[:, 0]), -1)
     nearness = motion[..., 0].clamp(max=1.0)
-    distance = torch.where(nearness < FAINT, torch.inf, NEARNESS_RANGE * (1 - nearness))
+    distance = torch.where(nearness < LEAST_NEARNESS, torch.inf, NEARNESS_RANGE * (1 - nearness))
     velocity = motion[..., 1:2] * radial + motion[..., 2:] * across
     return torch.cat((distance[..., None], velocity), -1)
 

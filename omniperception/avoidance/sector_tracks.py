@@ -9,10 +9,7 @@ import torch
 from torch.nn import functional
 
 from omniperception.common.rotations import rotate_yaw
-from omniperception.common.sectors import sector_of, sums_by
-
-_NOWHERE = 1e3
-"""Coordinate (m) of what is not there."""
+from omniperception.common.sectors import FAR, sector_of, sums_by
 
 
 @dataclass(frozen=True)
@@ -75,16 +72,16 @@ class SectorTracks:
         self._pos = torch.zeros(num_envs, 2 * num_sectors, 2, device=device)
         self._vel = torch.zeros_like(self._pos)
         self._matches = torch.full(self._pos.shape[:2], -1, device=device)  # -1: no track
-        self._past = torch.full((num_envs, config.look_back, num_sectors, 2), _NOWHERE, device=device)
-        self._place = torch.full((num_envs, num_sectors, 2), _NOWHERE, device=device)  # what counts as an obstacle
+        self._past = torch.full((num_envs, config.look_back, num_sectors, 2), FAR, device=device)
+        self._place = torch.full((num_envs, num_sectors, 2), FAR, device=device)  # what counts as an obstacle
         self._place_vel = torch.zeros_like(self._place)
         self._unseen = torch.zeros(num_envs, num_sectors, dtype=torch.int64, device=device)
 
     def reset(self, ended: torch.Tensor) -> None:
         """Forgets everything in environments (n,) bool."""
         self._matches = self._matches.masked_fill(ended[:, None], -1)
-        self._past = self._past.masked_fill(ended[:, None, None, None], _NOWHERE)
-        self._place = self._place.masked_fill(ended[:, None, None], _NOWHERE)
+        self._past = self._past.masked_fill(ended[:, None, None, None], FAR)
+        self._place = self._place.masked_fill(ended[:, None, None], FAR)
 
     def advance(self, moved: torch.Tensor, dt: float) -> None:
         """Takes in that the base has moved by (n, 3) x, y (m), yaw (rad), in its frame before, in `dt` (s)."""
@@ -112,7 +109,7 @@ class SectorTracks:
         """
         distance = torch.where(fresh[:, None], distance, math.inf)
         seen = distance.isfinite()
-        place = torch.where(seen[..., None], place, _NOWHERE)
+        place = torch.where(seen[..., None], place, FAR)
         clusters = _Clusters(place, seen, self.config.link + self._width(distance))
         velocity = self._match(clusters, fresh)
         moves = (clusters.extent < self.config.widest) & ~self._stands(clusters, distance)
@@ -124,7 +121,7 @@ class SectorTracks:
 
     def _width(self, distance: torch.Tensor) -> torch.Tensor:
         """(n, S) m: width of sectors at a distance (m)."""
-        return 2.0 * math.pi / self._sectors * distance.clamp(max=_NOWHERE)
+        return 2.0 * math.pi / self._sectors * distance.clamp(max=FAR)
 
     def _match(self, clusters: _Clusters, fresh: torch.Tensor) -> torch.Tensor:
         """(n, S, 2) velocities of the clusters, which become the tracks."""
@@ -168,7 +165,7 @@ class SectorTracks:
         ages = torch.cat((torch.zeros_like(age), age), 1)
         far = torch.cat((distance, torch.where(lasts, was, math.inf)), 1)
         nearest, who = _nearest(places, far, self._sectors)
-        self._place = torch.where(nearest.isfinite()[..., None], places.gather(1, _pairs(who)), _NOWHERE)
+        self._place = torch.where(nearest.isfinite()[..., None], places.gather(1, _pairs(who)), FAR)
         self._place_vel = torch.cat((velocity, self._place_vel), 1).gather(1, _pairs(who))
         self._unseen = ages.gather(1, who)
 
@@ -213,10 +210,10 @@ def _nearest(places: torch.Tensor, distance: torch.Tensor, num_sectors: int) -> 
 
     Args:
         places: (n, k, 2) m.
-        distance: (n, k) m; `_NOWHERE` and beyond, for what is not there.
+        distance: (n, k) m; `FAR` and beyond, for what is not there.
         num_sectors: S.
     """
-    distance = torch.where(distance < 0.5 * _NOWHERE, distance, math.inf)
+    distance = torch.where(distance < 0.5 * FAR, distance, math.inf)
     sector = sector_of(places, num_sectors)
     nearest = distance.new_full((len(distance), num_sectors), math.inf).scatter_reduce_(1, sector, distance, "amin")
     wins = distance.isfinite() & (distance <= nearest.gather(1, sector))

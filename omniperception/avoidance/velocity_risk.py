@@ -10,9 +10,7 @@ from functools import lru_cache
 import torch
 
 from omniperception.avoidance.sector_motion import sector_bearings
-
-_OUT_OF_REACH = 100.0
-"""Distance (m) of an empty sector."""
+from omniperception.common.sectors import FAR
 
 _SLOW = 0.1
 """Commanded speed (m/s) below which the direction counts less."""
@@ -122,7 +120,7 @@ class VelocityRisk:
         if not traced and not torch.is_grad_enabled():
             return self._largest(sectors, candidates)
         bearings = sector_bearings(sectors.shape[1], sectors.device)
-        place = sectors[..., :1].clamp(max=_OUT_OF_REACH) * bearings
+        place = sectors[..., :1].clamp(max=FAR) * bearings
         velocity = sectors[..., 1:]
         with torch.no_grad():
             if traced:
@@ -185,7 +183,7 @@ class VelocityRisk:
             self.robot_half_length,
             self.decay,
             self.time_constant,
-            _OUT_OF_REACH,
+            FAR,
             view(points, wp.vec2),
             view(sectors, wp.int32),
             view(least, wp.float32),

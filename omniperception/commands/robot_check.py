@@ -17,7 +17,7 @@ from pathlib import Path
 
 from omniperception import build, config
 from omniperception.robots.look import Sight, draw, look
-from omniperception.robots.stand import NEAR, Standing, flat_world, reached_limits, stand
+from omniperception.robots.stand import NEAR, Stance, flat_world, reached_limits, stand
 from omniperception.scene import World
 from omnirobot.common.cli import Command, argument, refuse_overrides
 
@@ -58,7 +58,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         sys.exit(1)
 
 
-def _on_standing(world: World, found: Standing, seconds: float) -> str:
+def _on_standing(world: World, found: Stance, seconds: float) -> str:
     verdict = "stands" if found.steady else "DOES NOT STAND"
     lines = [
         f"after {seconds:g} s it {verdict}: base at {found.height:.3f} m (base_height {world.robot.base_height:g} m),"
@@ -71,7 +71,7 @@ def _on_standing(world: World, found: Standing, seconds: float) -> str:
     return "\n".join(lines)
 
 
-def _on_contacts(world: World, found: Standing) -> str:
+def _on_contacts(world: World, found: Stance) -> str:
     feet = {geom for foot in world.robot.feet for geom in foot}
     lines = ["contacts (N):"]
     for (first, second), force in sorted(found.contacts.items()):
@@ -80,7 +80,7 @@ def _on_contacts(world: World, found: Standing) -> str:
     return "\n".join(lines if found.contacts else ["contacts: none"])
 
 
-def _on_joints(world: World, found: Standing) -> str:
+def _on_joints(world: World, found: Stance) -> str:
     """A table in the order of actions."""
     robot, model, reach = world.robot, world.model, reached_limits(world)
     rows = [("action", "joint", "place in file", "default", "sag", "range", "reached", "")]

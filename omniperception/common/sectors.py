@@ -6,6 +6,9 @@ import math
 
 import torch
 
+FAR = 1e3
+"""Distance (m) of no obstacle where a computation needs a finite number; elsewhere it is infinite."""
+
 
 def bearing_in_sectors(places: torch.Tensor, num_sectors: int) -> torch.Tensor:
     """(...) azimuth from -pi on of places (..., 2), in widths of a sector."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from rsl_rl.env import VecEnv
@@ -282,10 +283,12 @@ class OmniEnv(TaskEnv):
     def _move(self, obstacles: ObstacleField) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Moves the obstacles through the control step; see `ObstacleField.travel`."""
         sim, robot_xy_w = self.config.sim, self.sim.qpos[:, :2]
-        if obstacles.any_approaches:
-            commanded = rotate_yaw(self.state.kinematics.yaw, self.command.value[:, :2])
-            obstacles.restart_approaching(robot_xy_w, commanded)
-        return obstacles.travel(sim.timestep, sim.decimation, robot_xy_w)
+        return obstacles.travel(
+            sim.timestep,
+            sim.decimation,
+            robot_xy_w,
+            lambda: rotate_yaw(self.state.kinematics.yaw, self.command.value[:, :2]),
+        )
 
     def _follow_sensors(self) -> None:
         """Updates LiDAR and avoidance velocity in each control step, and casts a frame where one is due."""
@@ -379,11 +382,9 @@ class OmniEnv(TaskEnv):
         self.command.reset(env_ids, self.state.kinematics)
         if self.obstacles is not None:
             goal = None if self.command.goal_w is None else self.command.goal_w[env_ids]
-            self.obstacles.reset(env_ids, pose[:, :2], goal)
+            command = partial(self._first_command, self.obstacles, env_ids, pose[:, 2])
+            self.obstacles.reset(env_ids, pose[:, :2], goal, command)
             self._resize(self.obstacles, env_ids)
-            if isinstance(self.command, GoalCommand) and self.command.config.route_ahead is not None:
-                self.command.follow(env_ids, self.obstacles.routes(env_ids), self.state.kinematics)
-            self.obstacles.approach(env_ids, pose[:, :2], rotate_yaw(pose[:, 2], self.command.value[env_ids, :2]))
         self.episode_length_buf.index_fill_(0, env_ids, 0)
         self.metrics.reset(env_ids)
         if self.sensing is not None:
@@ -394,6 +395,12 @@ class OmniEnv(TaskEnv):
             self._frame_heights = self._frame_heights.index_fill(0, env_ids, 0.0)
         for manager in self._managers().values():
             manager.reset(env_ids)
+
+    def _first_command(self, obstacles: ObstacleField, env_ids: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
+        """(n, 2) m/s, environment frame: what is commanded in the worlds that have been drawn for environments (n,)."""
+        if isinstance(self.command, GoalCommand) and self.command.config.route_ahead is not None:
+            self.command.follow(env_ids, obstacles.routes(env_ids), self.state.kinematics)
+        return rotate_yaw(yaw, self.command.value[env_ids, :2])
 
     def _completed(self, env_ids: torch.Tensor, interrupted: bool) -> torch.Tensor | None:
         """(n,) bool: whether episodes that end now commanded no more; None before the first ones."""

@@ -13,7 +13,7 @@ from omniperception.env.mirror import joint_twins
 from omniperception.robots.body import Body
 from omniperception.robots.gains import REACH, SAG, Gains, gains_of
 from omniperception.robots.pose import BENT, Foot, feet_of, first_pose, standing_pose
-from omniperception.robots.stand import Standing, flat_world, stand
+from omniperception.robots.stand import Stance, flat_world, stand
 from omniperception.scene import RobotConfig
 from omniperception.scene.robot_file import FRAME, compile_robot, drop_unseen, parse, read_robot, weighs_as_water
 from omniperception.schema import make
@@ -69,7 +69,7 @@ class Guess:
 
     preset: Mapping[str, object]
     findings: tuple[Finding, ...]
-    standing: Standing
+    standing: Stance
     notes: tuple[str, ...]
 
 

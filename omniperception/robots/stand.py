@@ -26,14 +26,14 @@ NEAR = 0.05
 
 
 @dataclass(frozen=True)
-class Standing:
+class Stance:
     """A robot that has held its default pose for a while.
 
     Attributes:
         height: of the base (m).
         tilt: of the base (rad).
         speed: of the base (m/s).
-        drift: horizontal way of the base (m).
+        drift: horizontal displacement of the base (m).
         sag: by joint, angle beyond the target (rad).
         contacts: by pair of geoms, force along the normal (N).
         saturated: joints whose torque is at its limit.
@@ -57,7 +57,7 @@ def flat_world(robot: RobotConfig) -> World:
     return world
 
 
-def stand(world: World, seconds: float = 2.0) -> tuple[Standing, mujoco.MjData]:
+def stand(world: World, seconds: float = 2.0) -> tuple[Stance, mujoco.MjData]:
     """Lets the robot down in its default pose and has the gains hold it."""
     model, robot = world.model, world.robot
     data = _in_default_pose(world, robot.base_height + GAP)
@@ -68,7 +68,7 @@ def stand(world: World, seconds: float = 2.0) -> tuple[Standing, mujoco.MjData]:
     angles = {name: float(data.joint(name).qpos[0]) for name in robot.joints}
     limits = np.array(robot.by_joint("torque_limits"))
     saturated = np.abs(data.actuator_force) > 0.99 * limits
-    found = Standing(
+    found = Stance(
         height=height,
         tilt=tilt,
         speed=speed,

@@ -49,7 +49,7 @@ class Articulation:
         self._per_metre = column([swing.per_metre if swing else 0.0 for swing in swings])
         self._phase = torch.deg2rad(column([swing.phase_deg if swing else 0.0 for swing in swings]))
         self.swings = any(swings)
-        self.turns = self.swings or any(part.form is not None and part.group.moves for part in parts)
+        self.turns = self.swings or any(part.form is not None and part.moves for part in parts)
         self._is_whole = torch.tensor([part.form is None for part in parts], device=device)
         self.scale = torch.ones(num_envs, num_obstacles, dtype=dtype, device=device)
         self.lift = torch.zeros(num_envs, len(parts), dtype=dtype, device=device)

@@ -93,7 +93,7 @@ class Ground:
         return heights.reshape(xy_w.shape[:-1])
 
     def lift(self, path: torch.Tensor, above: torch.Tensor, there: torch.Tensor, elsewhere: float) -> None:
-        """Puts bodies on their way onto the ground, in place.
+        """Puts bodies along a path onto the ground, in place.
 
         Args:
             path: (num_envs, T, B, 3) float64 or float32, m, in the environments' frames; its heights are written.

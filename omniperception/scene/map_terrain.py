@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from omnilidar.mesh_files import AXES, read_mesh, unit_said, up_of
+from omnilidar.mesh_files import AXES, read_mesh, unit_hint, up_of
 from omniperception.scene.height_field import EDGE, add_height_field
 from omniperception.scene.terrain import check_contact
 
@@ -273,7 +273,7 @@ class PlaceConfig(MapTerrainConfig):
         corners = vertices[triangles]
         if self.up is None:
             self._check_upright(corners)
-        said = unit_said(self.file, corners, self.scale, "terrain.scale")
+        said = unit_hint(self.file, corners, self.scale, "terrain.scale")
         low, high = corners.min((0, 1)), corners.max((0, 1))
         cols, rows = (int((high[k] - low[k]) / self.cell + 1e-6) + 1 for k in (0, 1))
         if cols * rows > MAX_POINTS:

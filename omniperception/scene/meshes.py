@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from omnilidar.mesh_files import read_mesh, unit_said
+from omnilidar.mesh_files import read_mesh, unit_hint
 
 
 def _prism(corners: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ def check_mesh(file: str) -> None:
 def own_size(file: str) -> tuple[float, float, float]:
     """Half extents (m) of a mesh as its file has it; warns where they are probably in another unit."""
     half = mesh_points(file)[1]
-    if file not in MESHES and (said := unit_said(file, np.array((np.negative(half), half)), 1.0)):
+    if file not in MESHES and (said := unit_hint(file, np.array((np.negative(half), half)), 1.0)):
         warnings.warn(f"obstacles: {said}: an obstacle takes half of each as its size", stacklevel=2)
     return half
 

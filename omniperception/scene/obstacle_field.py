@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -48,7 +48,6 @@ class ObstacleField:
         root_velocity_w: (num_envs, O, 2) m/s.
         root_active: (num_envs, O) bool.
         root_radius: (num_envs, O) m, of the circle around all that an obstacle covers, however it swings.
-        any_approaches: whether some come at the robot, and `restart_approaching` has to be called.
         varying: indices of the parts whose sizes differ between environments.
         level: share of obstacles and of their speed that the curriculum lets in, 0 to 1; fixed ones are always there.
     """
@@ -90,10 +89,9 @@ class ObstacleField:
         self._poses, self._presence = Poses(config, random, pos_w), Presence(config, random)
         self._placement = Placement(config, random, pos_w, self._poses.areas is not None)
         self.any_fixed = bool(self._poses.fixed.any())
-        loose = [k for k, part in enumerate(self.parts) if part.group.poses is None]
+        loose = [k for k, part in enumerate(self.parts) if groups[part.obstacle].poses is None]
         self.free = slice(None) if len(loose) == len(self.parts) else torch.tensor(loose, device=device)
         self._approach = Approach(groups, random, pos_w)
-        self.any_approaches = self._approach.any
         wanders = any(group.motion is not None for group in groups)
         self._wander = Wander(groups, n, random, pos_w) if wanders else None
         self._placed = self._approach.which | self._poses.which
@@ -127,7 +125,7 @@ class ObstacleField:
         return self._poses.world
 
     def routes(self, env_ids: torch.Tensor) -> torch.Tensor:
-        """(n, R, 2) m, ways through the worlds that environments (n,) have."""
+        """(n, R, 2) m, paths through the worlds that environments (n,) have."""
         assert self._poses.routes is not None
         return self._poses.routes[self.world[env_ids, 0]]
 
@@ -150,13 +148,16 @@ class ObstacleField:
         env_ids: torch.Tensor,
         robot_xy_w: torch.Tensor,
         goal_w: torch.Tensor | None = None,
+        command: Callable[[], torch.Tensor] | None = None,
     ) -> None:
-        """Places the obstacles of some environments again, in newly drawn sizes; `approach` has to follow.
+        """Places the obstacles of some environments again, in newly drawn sizes.
 
         Args:
             env_ids: (n,) which environments.
             robot_xy_w: (n, 2) where the robot stands, m.
             goal_w: (n, 2) where it is to go, m; only a free path needs it.
+            command: gives the velocity (n, 2) in m/s, environment frame, past which obstacles approach. It is called
+                once their world is drawn, since a command may follow a route through it. None: the robot stands.
         """
         robot = robot_xy_w.to(self._dtype)
         u = self._random.uniform(env_ids, (9, self.root_pos_w.shape[1])).to(self._dtype)
@@ -187,18 +188,9 @@ class ObstacleField:
             self._wander.reset(env_ids, heading)
         if self._ground is not None:
             self._above_ground[env_ids] = above_ground
-        self._stand(env_ids)
-
-    def approach(self, env_ids: torch.Tensor, robot_xy_w: torch.Tensor, command_w: torch.Tensor) -> None:
-        """Sends the approaching obstacles of environments (n,) that have been reset past their robots, commanded to go
-        `command_w` (n, 2) in m/s: a command may follow a route through the world that `reset` has drawn."""
-        if self.any_approaches:
-            which = self._approach.which & self.root_active[env_ids]
-            self._start_approach(env_ids, which, robot_xy_w.to(self._dtype), command_w.to(self._dtype))
-            self._stand(env_ids)
-
-    def _stand(self, env_ids: torch.Tensor) -> None:
-        """Puts obstacles (n, O) and their parts onto the ground below them, as they face."""
+        velocity = torch.zeros_like(robot) if command is None else command().to(self._dtype)
+        if self._approach.any:
+            self._start_approach(env_ids, self._approach.which & active, robot, velocity)
         if self._ground is not None:
             self.root_pos_w[env_ids, :, 2] = self._over_ground(env_ids)
         self._face(env_ids)
@@ -217,13 +209,23 @@ class ObstacleField:
         elif self._any_moves:
             bounce(xy, self.root_velocity_w, self._placement.bounds, ~self._placed)
 
-    def travel(self, dt: float, num_steps: int, robot_xy_w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def travel(
+        self,
+        dt: float,
+        num_steps: int,
+        robot_xy_w: torch.Tensor,
+        command: Callable[[], torch.Tensor] | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Moves every obstacle by `num_steps` steps of `dt` (s); see `advance`.
+
+        With `command`, which gives (num_envs, 2) in m/s as in `reset`, those that have passed their robot start again.
 
         Returns:
             (num_envs, num_steps, P, 3) m, where the parts are after each step, on the ground, and
             (num_envs, num_steps, P, 4) their orientations, None where they keep them; the same memory in every call.
         """
+        if command is not None and self._approach.any:
+            self.restart_approaching(robot_xy_w, command())
         if self._path.shape[1] != num_steps:
             self._allocate_path(num_steps)
         if self._wander is not None:
@@ -241,7 +243,7 @@ class ObstacleField:
         return (self._path, None) if self.articulation is None else self._articulate(dt)
 
     def _articulate(self, dt: float) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """The way of the parts along that of their obstacles, and the parts at its end."""
+        """The path of the parts along that of their obstacles, and the parts at its end."""
         parts, speed = self.articulation, self.root_velocity_w.norm(dim=-1)
         assert parts is not None
         for step in range(self._path.shape[1]):

@@ -254,20 +254,15 @@ class ObstacleGroup:
             index: its number in the group.
         """
         if self.kind != COMPOUND:
-            return (Part(name, obstacle, self, self.kind, self.sizes_of(index), self.file_of(index)),)
+            sizes = self.sizes_of(index)
+            varies = self.layout is not None or any(low < high for low, high in sizes)
+            return (Part(name, obstacle, self.kind, sizes, self.file_of(index), None, self.moves, varies),)
         low, high = self.scale
-        return tuple(
-            Part(
-                f"{name}_{key}",
-                obstacle,
-                self,
-                form.kind,
-                tuple((low * size, high * size) for size in form.size),
-                form.file,
-                form,
-            )
-            for key, form in self.parts_of(index).items()
-        )
+        parts = []
+        for key, form in self.parts_of(index).items():
+            sizes = tuple((low * size, high * size) for size in form.size)
+            parts.append(Part(f"{name}_{key}", obstacle, form.kind, sizes, form.file, form, self.moves, low < high))
+        return tuple(parts)
 
 
 def checked_area(name: str, bounds: Sequence[float]) -> tuple[float, float, float, float]:

@@ -57,10 +57,10 @@ class ObstacleCurriculumConfig:
 
 @dataclass(frozen=True)
 class FreePathConfig:
-    """A way from the robot's start to its goal that no standing obstacle blocks, drawn at every reset.
+    """A path from the robot's start to its goal that no standing obstacle blocks, drawn at every reset.
 
     It is the set of points within width / 2 of a line with two bends: from the start over one point each at a third
-    and at two thirds of the way, both off the straight line by up to `bend` to either side, to the goal.
+    and at two thirds of it, both off the straight line by up to `bend` to either side, to the goal.
 
     Attributes:
         width: (m).
@@ -92,7 +92,7 @@ class ObstaclesConfig:
         curriculum: None: everything is there from the first step.
         spacing: free distance (m) kept at a reset between the edges of any two standing obstacles that are placed, so
             that a robot fits through; 0 lets them overlap. Those with poses are not placed, and keep none.
-        free_path: a way to the goal that standing obstacles that are placed keep free; None for none.
+        free_path: a path to the goal that standing obstacles that are placed keep free; None for none.
         headroom: spacing and free path do not count obstacles that hang at least this high (m).
         split: 'dev' or 'test': the scenes for choosing anything, and those for reports, which no training may see.
             `build.assemble` turns those of 'test' into `held_out` ones; here it chooses the worlds of layouts.
@@ -147,8 +147,7 @@ class ObstaclesConfig:
 
     @property
     def route_end(self) -> tuple[float, float] | None:
-        """Where (m) ways through the obstacles' worlds lead, to be followed by `commands.route_ahead`; None: there are
-        none."""
+        """Where (m) routes through the obstacles' worlds lead, for `commands.route_ahead`; None: there are none."""
         layouts = [group.layout for group in self.groups.values() if group.layout is not None]
         return layouts[0].goal if len(layouts) == 1 and isinstance(layouts[0], MazeLayout) else None
 

@@ -5,14 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import mujoco
 
 from omniperception.scene.meshes import check_mesh, mesh_points, own_size
-
-if TYPE_CHECKING:
-    from omniperception.scene.obstacles import ObstacleGroup
 
 SIZES = {
     "box": ("half x", "half y", "half z"),
@@ -143,25 +139,22 @@ class Part:
     Attributes:
         name: of the body and of the geom.
         obstacle: index of the obstacle that it belongs to.
-        group: of that obstacle.
         kind: one of `SIZES`.
         size: one (low, high) range (m) per size; within a compound all sizes vary together.
         file: of a mesh.
         form: how it belongs to its compound; None where it is the whole obstacle.
+        moves: whether its obstacle moves.
+        varies: whether its size differs between environments.
     """
 
     name: str
     obstacle: int
-    group: ObstacleGroup
     kind: str
     size: tuple[tuple[float, float], ...]
     file: str | None = None
     form: PartConfig | None = None
-
-    @property
-    def varies(self) -> bool:
-        """Tell whether its size differs between environments."""
-        return self.group.layout is not None or any(low < high for low, high in self.size)
+    moves: bool = False
+    varies: bool = False
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Adds body and geom, as large as the part can be."""

@@ -171,11 +171,11 @@ def choose_apart(
 
 
 def bent_path(start: torch.Tensor, goal: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
-    """Corners (n, 4, 2) of a line from start (n, 2) to goal (n, 2) over points at one and two thirds of the way,
+    """Corners (n, 4, 2) of a line from start (n, 2) to goal (n, 2) over points at one and two thirds of it,
     which lie `offset` (n, 2) m to the left of the straight line."""
-    way = goal - start
-    left = torch.stack((-way[:, 1], way[:, 0]), -1) / way.norm(dim=1, keepdim=True).clamp(min=1e-9)
-    corners = [start, *(start + (k + 1) / 3 * way + offset[:, k, None] * left for k in (0, 1)), goal]
+    span = goal - start
+    left = torch.stack((-span[:, 1], span[:, 0]), -1) / span.norm(dim=1, keepdim=True).clamp(min=1e-9)
+    corners = [start, *(start + (k + 1) / 3 * span + offset[:, k, None] * left for k in (0, 1)), goal]
     return torch.stack(corners, 1)
 
 

@@ -20,7 +20,7 @@ class Poses:
         fixed: (O,) bool, those with fixed poses.
         any: whether there are some.
         world: (num_envs, L) int64, which world of each of the L layouts an environment has.
-        routes: (W, R, 2) m, ways through the worlds; None: they have none.
+        routes: (W, R, 2) m, paths through the worlds; None: they have none.
         areas: (W, 4) x_low, x_high, y_low, y_high in m of the worlds of a layout of corridors; None without one.
     """
 
@@ -34,26 +34,24 @@ class Poses:
         poses = like.new_tensor([o.pose or (0.0, 0.0, 0.0) for o in obstacles])
         poses[:, 2] = torch.deg2rad(poses[:, 2])
         self._pose = poses
-        self._tables: list[tuple[int, torch.Tensor]] = []
-        names = [own.name for own in obstacles]
-        part_names = config.geom_names()
-        self._columns: list[tuple[slice, slice]] = []
+        self._layouts: list[tuple[int, torch.Tensor, slice, slice]] = []
+        names, part_names = [own.name for own in obstacles], config.geom_names()
         self.areas: torch.Tensor | None = None
+        self.routes: torch.Tensor | None = None
         self._area_of = 0  # the layout that has areas
         for name, group in config.groups.items():
-            if group.layout is not None:
-                if isinstance(group.layout, CorridorLayout):
-                    self._area_of = len(self._tables)
-                    self.areas = like.new_tensor(group.layout.areas(LAYOUT_SEEDS[config.split], group.layout.worlds))
-                table = like.new_tensor(group.layout.table(LAYOUT_SEEDS[config.split], group.layout.worlds))
-                own, part = names.index(f"obstacle_{name}_0"), part_names.index(f"obstacle_{name}_0")
-                self._columns.append((slice(own, own + group.count), slice(part, part + group.count)))
-                self._tables.append((group.layout.worlds, table))
-        self.world = torch.zeros(len(like), len(self._tables), dtype=torch.int64, device=like.device)
-        self.routes: torch.Tensor | None = None
-        for group in config.groups.values() if config.route_end is not None else ():
-            if isinstance(group.layout, MazeLayout):
-                self.routes = like.new_tensor(group.layout.routes(LAYOUT_SEEDS[config.split], group.layout.worlds))
+            layout, seed = group.layout, LAYOUT_SEEDS[config.split]
+            if layout is None:
+                continue
+            if isinstance(layout, CorridorLayout):
+                self._area_of = len(self._layouts)
+                self.areas = like.new_tensor(layout.areas(seed, layout.worlds))
+            if isinstance(layout, MazeLayout) and config.route_end is not None:
+                self.routes = like.new_tensor(layout.routes(seed, layout.worlds))
+            table, count = like.new_tensor(layout.table(seed, layout.worlds)), group.count
+            own, part = (among.index(f"obstacle_{name}_0") for among in (names, part_names))
+            self._layouts.append((layout.worlds, table, slice(own, own + count), slice(part, part + count)))
+        self.world = torch.zeros(len(like), len(self._layouts), dtype=torch.int64, device=like.device)
 
     def draw(self, env_ids: torch.Tensor, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Poses (n, O, 3), x and y in m and yaw in rad, of environments (n,), and which of them there are (n, O).
@@ -62,11 +60,11 @@ class Poses:
         """
         pose = self._pose.expand(len(env_ids), -1, -1)
         there = self.which.expand(len(env_ids), -1)
-        if not self._tables:
+        if not self._layouts:
             return pose, there
         pose, there = pose.clone(), there.clone()
-        u = self._random.uniform(env_ids, (len(self._tables),))
-        for k, ((worlds, table), (own, parts)) in enumerate(zip(self._tables, self._columns, strict=True)):
+        u = self._random.uniform(env_ids, (len(self._layouts),))
+        for k, (worlds, table, own, parts) in enumerate(self._layouts):
             self.world[env_ids, k] = (u[:, k] * worlds).long()
             rows = table[self.world[env_ids, k]]
             there[:, own] = rows[..., 0].isfinite()

@@ -47,7 +47,7 @@ class Mount:
 
 
 @dataclass(frozen=True)
-class Place:
+class SensorPose:
     """Where a sensor is.
 
     Attributes:
@@ -320,12 +320,12 @@ class RobotConfig:
                 )
         return tuple(name for name in given if name in built)
 
-    def place(self, mount: Mount) -> Place:
+    def place(self, mount: Mount) -> SensorPose:
         """A mount in the frame of the moving link that carries it."""
         pos, quat = np.array(mount.pos, np.float64), np.empty(4)
         mujoco.mju_euler2Quat(quat, np.array(mount.rpy, np.float64), "XYZ")
         if mount.body is None or mount.body == self.base:
-            return Place(None, _vector(pos), _quaternion(quat))
+            return SensorPose(None, _vector(pos), _quaternion(quat))
         model = self.compiled()
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -338,7 +338,7 @@ class RobotConfig:
         mujoco.mju_rotVecQuat(at, link_pos - data.xpos[carrier], back)
         mujoco.mju_rotVecQuat(pos, pos.copy(), turn)
         mujoco.mju_mulQuat(moved, turn, quat)
-        return Place(None if carrier == base else model.body(carrier).name, _vector(at + pos), _quaternion(moved))
+        return SensorPose(None if carrier == base else model.body(carrier).name, _vector(at + pos), _quaternion(moved))
 
     def height_of(self, link: str | None) -> float:
         """Height (m) of a moving link's origin above the ground in the default pose; of the base's for None."""

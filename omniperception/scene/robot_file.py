@@ -131,10 +131,10 @@ def lock(spec: mujoco.MjSpec, angles: Mapping[str, float], path: str | Path) -> 
 def _motion(model: mujoco.MjModel, name: str, angle: float) -> tuple[np.ndarray, np.ndarray]:
     """How a joint moves its link, in the link's frame: (3,) m and a quaternion."""
     joint, turn = model.joint(name), np.array((1.0, 0.0, 0.0, 0.0))
-    way = angle - float(model.qpos0[joint.qposadr[0]])
+    travel = angle - float(model.qpos0[joint.qposadr[0]])
     if joint.type[0] == _SLIDE:
-        return way * joint.axis, turn
-    mujoco.mju_axisAngle2Quat(turn, joint.axis, way)
+        return travel * joint.axis, turn
+    mujoco.mju_axisAngle2Quat(turn, joint.axis, travel)
     return joint.pos - _rotated(joint.pos, turn), turn
 
 

@@ -15,7 +15,7 @@ ROWS = 40
 _DAMPING = 1e-6
 _ITERATIONS = 30
 _LARGEST = 0.3
-"""rad: a joint's way in an iteration."""
+"""rad: most that a joint turns in an iteration."""
 _TOLERANCE = 1e-3
 """m: of where a foot is lifted to."""
 
@@ -126,11 +126,11 @@ class _Legs:
         return moves[:, dofs], turns[:, dofs]
 
 
-def _step(moves: np.ndarray, turns: np.ndarray, way: np.ndarray, turned: np.ndarray) -> np.ndarray:
-    """(J,) rad, at most _LARGEST: change of angles that moves a foot by `way` (3,) m and, where that leaves a choice,
-    turns it by `turned` (3,) rad."""
+def _step(moves: np.ndarray, turns: np.ndarray, offset: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """(J,) rad, at most _LARGEST: change of angles that moves a foot by `offset` (3,) m and, where that leaves a
+    choice, turns it by `turned` (3,) rad."""
     inverse = _damped_inverse(moves)
-    step = inverse @ way
+    step = inverse @ offset
     free = np.eye(len(step)) - inverse @ moves
     step += free @ _damped_inverse(turns @ free) @ (turned - turns @ step)
     return step * min(1.0, _LARGEST / max(float(np.abs(step).max()), _LARGEST))

@@ -153,6 +153,9 @@ class Simulator(Protocol):
 class Failures:
     """The part of a simulator that keeps which simulations failed."""
 
+    device: torch.device
+    qpos: torch.Tensor
+    qvel: torch.Tensor
     failure: torch.Tensor
 
     @property
@@ -164,8 +167,19 @@ class Failures:
         """See :meth:`Simulator.mark_failed`."""
         self.failure.copy_(torch.where(which & (self.failure == Failure.NONE), int(cause), self.failure))
 
-    def mark_beyond_limits(self, speed: torch.Tensor, distance: torch.Tensor) -> None:
-        """Marks simulations by their largest velocity and position (num_envs,), which are not finite or too large."""
+    def finite_targets(self, target: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+        """Targets (num_envs, k); of simulations where one is not finite, which have failed, the last ones."""
+        finite = torch.isfinite(target).all(1)
+        if self.device.type == "cpu" and bool(finite.all()):
+            return target
+        self.mark_failed(~finite, Failure.ACTION)
+        return torch.where(finite[:, None], target.to(last.dtype), last)
+
+    def detect_failures(self) -> None:
+        """See :meth:`Simulator.detect_failures`; looks at the largest velocity and position."""
+        speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
+        if self.device.type == "cpu" and bool(((speed < MAX_SPEED) & (distance < MAX_DISTANCE)).all()):
+            return
         self.mark_failed(~torch.isfinite(speed + distance), Failure.NOT_FINITE)
         self.mark_failed(speed >= MAX_SPEED, Failure.TOO_FAST)
         self.mark_failed(distance >= MAX_DISTANCE, Failure.TOO_FAR)

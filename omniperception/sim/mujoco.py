@@ -11,7 +11,7 @@ from mujoco.batch import Batch, SimulationError
 
 from omnilidar.launch import default_num_threads
 from omniperception.scene import World
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, Failures, JointColumns, Simulator, SizedGeoms
+from omniperception.sim.base import Failure, Failures, JointColumns, Simulator, SizedGeoms
 
 _INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -139,9 +139,7 @@ class MujocoSimulator(Failures):
         mocap_path: torch.Tensor | None = None,
         mocap_turn: torch.Tensor | None = None,
     ) -> None:
-        if not bool(torch.isfinite(joint_target).all()):
-            joint_target = self._finite_targets(joint_target)
-        self._ctrl.copy_(joint_target)
+        self._ctrl.copy_(self.finite_targets(joint_target, self._ctrl))
         try:
             if mocap_path is None and not self._record:
                 self.batch.step(nstep=num_steps)
@@ -154,14 +152,8 @@ class MujocoSimulator(Failures):
         if self._torque is not None:  # any later call, such as `forward` for poses, overwrites the engine's array
             self._torque.numpy()[:] = self._actuator_force
 
-    def _finite_targets(self, joint_target: torch.Tensor) -> torch.Tensor:
-        """Marks simulations whose targets are not finite; for them the last ones hold, which the engine can take."""
-        finite = torch.isfinite(joint_target).all(1)
-        self.mark_failed(~finite, Failure.ACTION)
-        return torch.where(finite[:, None], joint_target.double(), self._ctrl)
-
     def _roll_out(self, num_steps: int, mocap_path: torch.Tensor | None, mocap_turn: torch.Tensor | None) -> None:
-        """Steps with the kinematic bodies on their way, recording the requested fields after every step."""
+        """Steps with the kinematic bodies on their paths, recording the requested fields after every step."""
         if self._records and next(iter(self._records.values())).shape[1] != num_steps:
             self._records = self._allocate_records(num_steps)
         control, spec = self._control(num_steps, mocap_path, mocap_turn)
@@ -189,12 +181,11 @@ class MujocoSimulator(Failures):
         return {name: np.zeros((self.num_envs, num_steps, widths[name])) for name in self._record}
 
     def detect_failures(self) -> None:
-        """Looks at speed, position and the engine's warnings, at which a simulation stops until the call's end."""
-        speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
-        warned = torch.from_numpy(self.batch.warning[..., 1].any(1))
-        if not bool(((speed < MAX_SPEED) & (distance < MAX_DISTANCE) & ~warned).all()):
-            self.mark_beyond_limits(speed, distance)
-            self.mark_failed(warned, Failure.ENGINE)
+        """Also looks at the engine's warnings, at which a simulation stops until the call's end."""
+        super().detect_failures()
+        warned = self.batch.warning[..., 1].any(1)
+        if warned.any():
+            self.mark_failed(torch.from_numpy(warned), Failure.ENGINE)
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         kept = [poses[env_ids].clone() for poses in self._kinematic]

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 
 import mujoco
@@ -112,7 +113,7 @@ class Capacity:
 class MujocoWarpSimulator(Failures):
     """`num_envs` worlds on one device; every tensor is a view of the engine's own float32 memory.
 
-    A call of `step` is one CUDA graph on a GPU: the obstacles' way, the physics steps and the recording of what
+    A call of `step` is one CUDA graph on a GPU: the obstacles' path, the physics steps and the recording of what
     is read after each of them. Only these synchronise the host with the device: `anomalies`, `state_dict` and
     `load_state_dict`.
 
@@ -180,23 +181,13 @@ class MujocoWarpSimulator(Failures):
     ) -> None:
         if num_steps != self._num_steps:
             self._allocate_steps(num_steps)
-        finite = torch.isfinite(joint_target).all(1)
-        self.mark_failed(~finite, Failure.ACTION)
-        self._ctrl.copy_(torch.where(finite[:, None], joint_target.float(), self._ctrl))
-        if mocap_path is None:
-            self._launch("steps", self._steps)
-            return
-        self._path.copy_(mocap_path)
-        if mocap_turn is None:
-            self._launch("steps along the path", self._steps_along_path)
-        else:
+        self._ctrl.copy_(self.finite_targets(joint_target, self._ctrl))
+        moves, turns = mocap_path is not None, mocap_turn is not None
+        if mocap_path is not None:
+            self._path.copy_(mocap_path)
+        if mocap_turn is not None:
             self._turns().copy_(mocap_turn)
-            self._launch("steps along the path, turning", self._steps_turning)
-
-    def detect_failures(self) -> None:
-        """Looks at speed and position; the engine itself has no warnings."""
-        speed, distance = self.qvel.abs().amax(1), self.qpos.abs().amax(1)
-        self.mark_beyond_limits(speed, distance)
+        self._launch(f"steps, {moves=}, {turns=}", partial(self._steps, moves, turns))
 
     def reset(self, env_ids: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self.qpos[env_ids], self.qvel[env_ids] = self._joints.engine_state(qpos.float(), qvel.float())
@@ -301,21 +292,12 @@ class MujocoWarpSimulator(Failures):
 
     # ---- what runs on the device -------------------------------------------------------------------------------------
 
-    def _steps(self) -> None:
+    def _steps(self, moves: bool, turns: bool) -> None:
         for step in range(self._num_steps):
-            self._engine.step(self.model, self.data)
-            self._record(step)
-
-    def _steps_along_path(self) -> None:
-        for step in range(self._num_steps):
-            self._move(move_kinematic, step, self._wp_path, self.data.mocap_pos)
-            self._engine.step(self.model, self.data)
-            self._record(step)
-
-    def _steps_turning(self) -> None:
-        for step in range(self._num_steps):
-            self._move(move_kinematic, step, self._wp_path, self.data.mocap_pos)
-            self._move(turn_kinematic, step, self._wp_turn, self.data.mocap_quat)
+            if moves:
+                self._move(move_kinematic, step, self._wp_path, self.data.mocap_pos)
+            if turns:
+                self._move(turn_kinematic, step, self._wp_turn, self.data.mocap_quat)
             self._engine.step(self.model, self.data)
             self._record(step)
 

@@ -15,7 +15,7 @@ from omniperception.common.rotations import matrix_of, multiply, rotate, rotate_
 from omniperception.scene import World
 from omniperception.scene.build import OBSTACLE_CONTACT, OBSTACLE_FORCE
 from omniperception.scene.terrain import TerrainConfig
-from omniperception.sim.base import MAX_DISTANCE, MAX_SPEED, Failure, Failures
+from omniperception.sim.base import Failure, Failures
 from omniperception.sim.planar_kernels import walk
 from omniperception.sim.response import AXES, GaitResponse
 
@@ -132,7 +132,7 @@ class PlanarSimulator(Failures):
         mocap_turn: torch.Tensor | None = None,
     ) -> None:
         """Follows velocities (num_envs, 3) for `num_steps` steps; see the class."""
-        target = self._finite(joint_target.float()).clamp(self._low, self._high)
+        target = self.finite_targets(joint_target.float(), self._before).clamp(self._low, self._high)
         u = self._random.uniform(self._all_envs, (7,))
         self._error = self._kept * self._error + self._noise * (1 - self._kept.square()).sqrt() * _normal(u[:, :3])
         self._throw_over(target, u[:, 3])
@@ -144,13 +144,6 @@ class PlanarSimulator(Failures):
         self._before.copy_(target)
         self._clock += num_steps * self.config.timestep
         self._pose(self._all_envs, _normal(u[:, 4:]) * self._wobble)
-
-    def _finite(self, target: torch.Tensor) -> torch.Tensor:
-        finite = torch.isfinite(target).all(1)
-        if not bool(finite.all()):
-            self.mark_failed(~finite, Failure.ACTION)
-            target = torch.where(finite[:, None], target, self._before)
-        return target
 
     def _throw_over(self, target: torch.Tensor, u: torch.Tensor) -> None:
         """Robots that are asked for a jump fall as often as they were seen to; `u` (num_envs,) uniform in [0, 1)."""
@@ -285,11 +278,6 @@ class PlanarSimulator(Failures):
 
     def anomalies(self) -> dict[str, float]:
         return {}
-
-    def detect_failures(self) -> None:
-        speed, distance = self.qvel.abs().amax(1), self.qpos[:, :3].abs().amax(1)
-        if not bool(((speed < MAX_SPEED) & (distance < MAX_DISTANCE)).all()):
-            self.mark_beyond_limits(speed, distance)
 
     def state_dict(self) -> dict:
         return {"fields": {}, **{name: getattr(self, name).clone() for name in _STATE}}

@@ -17,21 +17,25 @@ class Clock:
     Attributes:
         speed: simulated seconds per second that are asked for.
         reached: simulated seconds per second over about the last second; 0 at first.
-        pictures_hz: pictures a second over about the last second.
+        pictures_hz, clouds_hz: pictures and clouds of points a second over about the last second.
+        clouds: clouds shown within that second so far; whoever shows one counts it.
         dropped: pictures left out because steps were late, since the start.
     """
 
     def __init__(self, dt: float, picture_hz: float, now: Callable[[], float] = time.monotonic) -> None:
         """Args: dt: control step (s); picture_hz: pictures a second; now: s of some clock."""
         self.dt, self._period, self._now = dt, 1.0 / picture_hz, now
-        self.speed, self.reached, self.pictures_hz, self.dropped = 1.0, 0.0, 0.0, 0
+        self.speed, self.reached, self.pictures_hz, self.clouds_hz, self.dropped = 1.0, 0.0, 0.0, 0.0, 0
         self.start()
 
     def start(self) -> None:
         """Begins again, as after a pause."""
         now = self._now()
         self._due, self._picture_due, self._drawn = now, now, now
-        self._window, self._steps, self._pictures = now, 0, 0
+        self._begin_window(now)
+
+    def _begin_window(self, now: float) -> None:
+        self._window, self._steps, self._pictures, self.clouds = now, 0, 0, 0
 
     def stepped(self) -> float:
         """Notes a control step; returns for how long (s) to wait now."""
@@ -42,8 +46,9 @@ class Clock:
             self._due = now
         elapsed = now - self._window
         if elapsed >= 1.0:
-            self.reached, self.pictures_hz = self._steps * self.dt / elapsed, self._pictures / elapsed
-            self._window, self._steps, self._pictures = now, 0, 0
+            self.reached = self._steps * self.dt / elapsed
+            self.pictures_hz, self.clouds_hz = self._pictures / elapsed, self.clouds / elapsed
+            self._begin_window(now)
         return max(self._due - now, 0.0)
 
     def picture_is_due(self) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,17 +23,16 @@ from omnilidar import (
     MixedPixels,
     Noise,
 )
+from omniperception.common.rotations import multiply, rotate, yaw_quat
 from omniperception.env.sensing import SensorConfig
 from omniperception.viewer import charts
-from omniperception.viewer.clock import Clock
 from omniperception.viewer.colours import scale
 from omniperception.viewer.meshes import triangles
 from omniperception.viewer.options import PageOptions, Room
-from omniperception.viewer.page import Page, check_free, open_page
+from omniperception.viewer.page import Page, add_points, check_free, show_points
 
 DT = 0.02
 """Time (s) between two poses of everything."""
-PICTURE_HZ, STATUS_HZ = 25.0, 2.0
 MOST_RAYS = 20_000
 OUTPUTS = (
     *("points_w", "points_s", "ranges", "true_ranges", "valid", "class_id", "shape_id", "time_s", "intensity"),
@@ -207,11 +205,11 @@ class Bench:
     def _move(self) -> None:
         knobs, scene = self.knobs, self._room.scene
         self._walkers.advance(knobs.walk * DT)
+        headings = yaw_quat(torch.tensor(self._walkers.heading)).to(scene.body_quat)
         for k, body in enumerate(self._room.movers):
             x, y = self._walkers.pos[k]
-            half = self._walkers.heading[k] / 2
             scene.body_pos[0, body] = scene.body_pos.new_tensor([x, y, 0.0])
-            scene.body_quat[0, body] = scene.body_quat.new_tensor([math.cos(half), 0.0, 0.0, math.sin(half)])
+            scene.body_quat[0, body] = headings[k]
         self._along += knobs.drive * DT
         self._turned += knobs.turn * DT
         self._place_robot()
@@ -220,15 +218,10 @@ class Bench:
         """The robot on a circle of 1 m about the place where it stood, turned about its own base."""
         scene, (pos, quat) = self._room.scene, self._rest
         base = pos[self._own == self._room.bodies[self._room.robot.base]][0]
-        angle = self._turned
-        cos, sin = math.cos(angle), math.sin(angle)
-        offset = pos - base
-        x, y = cos * offset[:, 0] - sin * offset[:, 1], sin * offset[:, 0] + cos * offset[:, 1]
+        turn = yaw_quat(torch.tensor(self._turned)).to(quat).expand_as(quat)
         shift = base.new_tensor([math.sin(self._along), 1.0 - math.cos(self._along), 0.0])
-        scene.body_pos[0, self._own] = base + shift + torch.stack((x, y, offset[:, 2]), 1)
-        c, s = math.cos(angle / 2), math.sin(angle / 2)
-        w, i, j, k = quat.unbind(1)
-        scene.body_quat[0, self._own] = torch.stack((c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w), 1)
+        scene.body_pos[0, self._own] = base + shift + rotate(turn, pos - base)
+        scene.body_quat[0, self._own] = multiply(turn, quat)
 
 
 class Lab(Page):
@@ -236,45 +229,33 @@ class Lab(Page):
 
     Attributes:
         bench: the sensor and what is around it.
-        clock: paces the steps.
     """
 
     def __init__(
         self, room: Room, sensors: Mapping[str, Callable[[], SensorConfig]], out: Path, options: PageOptions
     ) -> None:
-        self._room, self._sensors, self._out, self._options = room, sensors, out, options
+        self._room, self._sensors, self._out = room, sensors, out
         check_free(options)
         self.name = next(iter(sensors))
         sensor = sensors[self.name]()
         self.bench = Bench(room, sensor, Knobs.of(sensor))
-        super().__init__(open_page(options, "Scan lab"))
-        self.clock = Clock(DT, PICTURE_HZ)
+        super().__init__(options, "Scan lab", DT)
         self.coloured_by, self.point_size = COLOURED_BY[0], 0.02
         self._sliders: dict[str, Any] = {}
         self._bodies: list[tuple[int, Any]] = []
-        self._window, self.points_hz = (time.monotonic(), 0), 0.0
         self._build_scene()
         self._build_controls()
 
-    # ---- the loop ----------------------------------------------------------------------------------------------------
-
-    def run(self) -> None:
-        """Steps and draws until Ctrl-C, `stop`, or the time is up."""
-        end = math.inf if self._options.stop_after_s is None else time.monotonic() + self._options.stop_after_s
-        self.clock.start()
-        try:
-            while not self._stopped and time.monotonic() < end:
-                self.serve_requests()
-                if self.bench.step():
-                    self._draw_points()
-                wait = self.clock.stepped()
-                if self.server.get_clients() and self.clock.picture_is_due():
-                    self._draw_bodies()
-                self._draw_status()
-                if wait > 0:
-                    time.sleep(wait)
-        except KeyboardInterrupt:
-            print("viewer: ended")
+    def advance(self) -> float:
+        self.serve_requests()
+        if self.bench.step():
+            self._draw_points()
+        wait = self.clock.stepped()
+        if self.server.get_clients() and self.clock.picture_is_due():
+            self._draw_bodies()
+        if self.status_is_due():
+            self._draw_status()
+        return wait
 
     # ---- what a person asks for --------------------------------------------------------------------------------------
 
@@ -336,21 +317,13 @@ class Lab(Page):
                 flat_shading=True,
                 opacity=0.35 if shape.body < 0 else None,
             )
-        self._points = scene.add_point_cloud(
-            "/points",
-            np.zeros((1, 3), np.float32),
-            (0, 0, 0),
-            point_size=self.point_size,
-            point_shape="circle",
-            precision="float32",
-            point_shading="flat",
-        )
+        self._points = add_points(scene, "/points", self.point_size)
 
     def _build_controls(self) -> None:
         gui = self.server.gui
         self._status = gui.add_html("")
         sensor = gui.add_dropdown("sensor", tuple(dict.fromkeys(self._sensors)), initial_value=self.name)
-        self._on(sensor, self.choose)
+        self.on_change(sensor, self.choose)
         with gui.add_folder("Scan"):
             self._slider("num_rays", "rays a frame", 100, MOST_RAYS, 100)
             self._slider("period_s", "period (s)", DT, 0.5, DT)
@@ -365,16 +338,16 @@ class Lab(Page):
             self._slider("mixed_deg", "mixed, beam (deg)", 0.0, 2.0, 0.05)
         with gui.add_folder("Motion"):
             box = gui.add_checkbox("points at their own time", self.bench.knobs.distortion, hint="motion distortion")
-            self._on(box, partial(self.set, "distortion"))
+            self.on_change(box, partial(self.set, "distortion"))
             self._sliders["distortion"] = box
             self._slider("drive", "robot drives (m/s)", 0.0, 3.0, 0.1)
             self._slider("turn", "robot turns (rad/s)", -4.0, 4.0, 0.1)
             self._slider("walk", "people walk (m/s)", 0.0, 3.0, 0.1)
         with gui.add_folder("See"):
             colour = gui.add_dropdown("points coloured by", COLOURED_BY)
-            self._on(colour, partial(setattr, self, "coloured_by"))
+            self.on_change(colour, partial(setattr, self, "coloured_by"))
             size = gui.add_slider("point size (m)", 0.005, 0.08, 0.005, self.point_size)
-            self._on(size, partial(setattr, self, "point_size"))
+            self.on_change(size, partial(setattr, self, "point_size"))
             gui.add_html(charts.legend({name: _rgb(self._room.colours[k]) for k, name in self._room.names.items()}))
         with gui.add_folder("Export"):
             form = gui.add_dropdown("format", FORMATS)
@@ -384,17 +357,8 @@ class Lab(Page):
     def _slider(self, key: str, label: str, low: float, high: float, step: float) -> None:
         value = min(max(getattr(self.bench.knobs, key), low), high)
         slider = self.server.gui.add_slider(label, low, high, step, value)
-        self._on(slider, partial(self.set, key))
+        self.on_change(slider, partial(self.set, key))
         self._sliders[key] = slider
-
-    def _on(self, handle: Any, act: Callable[[Any], None]) -> None:
-        """Has a change by a person served between two steps; changes by the lab itself are none."""
-
-        def changed(event: Any) -> None:
-            if event.client is not None:
-                self.ask(partial(act, handle.value))
-
-        handle.on_update(changed)
 
     def _hand_over(self, suffix: str, client: Any) -> None:
         path = self.export(suffix)
@@ -416,11 +380,8 @@ class Lab(Page):
         hit = frame.valid[0]
         points = frame.points_w[0, hit].numpy(force=True)
         with self.server.atomic():
-            self._points.point_size = self.point_size
-            self._points.points = np.ascontiguousarray(points, np.float32)
-            self._points.colors = self._colours(frame, hit, points)
-        started, count = self._window
-        self._window = started, count + 1
+            show_points(self._points, points, self._colours(frame, hit, points), self.point_size)
+        self.clock.clouds += 1
 
     def _colours(self, frame: LidarFrame, hit: torch.Tensor, points: np.ndarray) -> np.ndarray:
         def column(name: str) -> np.ndarray:
@@ -440,19 +401,12 @@ class Lab(Page):
         return table[column("class_id")]
 
     def _draw_status(self) -> None:
-        now = time.monotonic()
-        if now < self._status_due or not self.server.get_clients():
-            return
-        self._status_due = now + 1.0 / STATUS_HZ
-        started, count = self._window
-        if now - started >= 1.0:
-            self.points_hz, self._window = count / (now - started), (now, 0)
         frame, clock = self.bench.frame, self.clock
         hits = 0 if frame is None or frame.valid is None else int(frame.valid.sum())
         lines = [
             f"{self.name}: {hits:,} of {0 if frame is None else frame.num_rays:,} rays hit",
-            f"real time x {clock.reached:.2f} · {self.points_hz:.0f} scans/s shown · {clock.dropped} pictures dropped",
-            "" if self._options.is_local else "everybody who reaches this machine can take hold",
+            f"real time x {clock.reached:.2f} · {clock.clouds_hz:.0f} scans/s shown · {clock.dropped} pictures dropped",
+            self.warning,
             self.message,
         ]
         self._status.content = charts.lines(lines)

@@ -1,16 +1,22 @@
-"""Opens the page: checks address and port, says where it is and who can reach it."""
+"""The page and its loop: where it listens, who can reach it, what it does between two steps."""
 
 from __future__ import annotations
 
 import errno
 import logging
+import math
 import queue
 import socket
+import time
 import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from omniperception.viewer.clock import Clock
 from omniperception.viewer.options import LOCALHOST, PageOptions, ViewerError
 from omnirobot.common.errors import ConfigError
 
@@ -18,6 +24,7 @@ if TYPE_CHECKING:
     import viser
 
 PANEL_PIXELS = 440
+PICTURE_HZ, STATUS_HZ = 25.0, 2.0
 
 
 class Page:
@@ -25,16 +32,35 @@ class Page:
 
     Attributes:
         server: the page's.
+        clock: paces the steps.
         message: the newest line for whoever looks.
         refused: errors of a request that are told and do not end the loop.
     """
 
     refused: tuple[type[Exception], ...] = (ConfigError, ValueError, ImportError, OSError)
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self.server, self.message = server, ""
+    def __init__(self, options: PageOptions, title: str, dt: float) -> None:
+        """Opens the page of a simulation with steps of `dt` (s)."""
+        self._options, self.server, self.message = options, open_page(options, title), ""
+        self.clock = Clock(dt, PICTURE_HZ)
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
         self._stopped, self._status_due = False, 0.0
+
+    def run(self) -> None:
+        """Steps and draws until Ctrl-C, `stop`, or the time is up."""
+        end = math.inf if self._options.stop_after_s is None else time.monotonic() + self._options.stop_after_s
+        self.clock.start()
+        try:
+            while not self._stopped and time.monotonic() < end:
+                wait = self.advance()
+                if wait > 0:
+                    time.sleep(wait)
+        except KeyboardInterrupt:
+            print("viewer: ended")
+
+    def advance(self) -> float:
+        """Serves requests, does one step and draws; returns for how long (s) to wait."""
+        raise NotImplementedError
 
     def stop(self) -> None:
         """Ends `run`; from any thread."""
@@ -48,6 +74,32 @@ class Page:
     def ask(self, request: Callable[[], None]) -> None:
         """Has something done between two steps; from any thread."""
         self._requests.put(request)
+
+    def on_change(self, handle: Any, act: Callable[[Any], None]) -> None:
+        """Has a change of a control by a person served between two steps; changes by the page itself are none."""
+
+        def changed(event: Any) -> None:
+            if event.client is not None:
+                self.ask(partial(act, handle.value))
+
+        handle.on_update(changed)
+
+    def on_click(self, button: Any, act: Callable[[], None]) -> None:
+        """Has a click on a button served between two steps."""
+        button.on_click(lambda _: self.ask(act))
+
+    def status_is_due(self) -> bool:
+        """Tell whether to write the status now; always after a new message."""
+        now = time.monotonic()
+        if now < self._status_due or not self.server.get_clients():
+            return False
+        self._status_due = now + 1.0 / STATUS_HZ
+        return True
+
+    @property
+    def warning(self) -> str:
+        """Who can take hold, where it is not this machine alone."""
+        return "" if self._options.is_local else "everybody who reaches this machine can take hold"
 
     def say(self, line: str) -> None:
         """Shows a line to whoever looks, on the page and in the terminal."""
@@ -64,6 +116,18 @@ class Page:
             except self.refused as error:
                 self.say(f"refused: {' '.join(str(error).split())}")
         return served
+
+
+def add_points(scene: viser.SceneApi, name: str, size: float) -> viser.PointCloudHandle:
+    """A cloud of points of `size` (m), empty but for one."""
+    style: Any = {"point_shape": "circle", "precision": "float32", "point_shading": "flat"}
+    return scene.add_point_cloud(name, np.zeros((1, 3), np.float32), (0, 0, 0), point_size=size, **style)
+
+
+def show_points(handle: viser.PointCloudHandle, points: np.ndarray, colours: np.ndarray, size: float) -> None:
+    """Gives a cloud new points (P, 3) in m of colours (P, 3) and `size` (m)."""
+    handle.point_size = size
+    handle.points, handle.colors = np.ascontiguousarray(points, np.float32), colours
 
 
 def open_page(options: PageOptions, title: str) -> viser.ViserServer:

@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omniperception.config import OUTPUTS, SHIPPED_RUNS, find_runs
 from omniperception.evaluation.baselines import BASELINES
 from omniperception.evaluation.perceived import Perceived
+from omniperception.learning.checkpoint import list_checkpoints
 from omniperception.viewer import charts
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, PROXIMAL
 from omniperception.viewer.drive import MAX_SPEED, MAX_YAW_RATE, Velocity
-from omniperception.viewer.options import SWITCHED
+from omniperception.viewer.page import Page
 from omniperception.viewer.session import MOST_POINTS, Session, spare_kinds
-from omniperception.viewer.stage import POINT_COLOURS
-
-if TYPE_CHECKING:
-    from omniperception.viewer.viewer import Viewer
+from omniperception.viewer.stage import POINT_COLOURS, Stage
 
 OWN = "(the run's own)"
 STEP, TURN = 0.2, 0.25
 """By how much (m/s, rad/s) a key changes the command."""
 SPEEDS = {"1": 1.0, "1/2": 0.5, "1/4": 0.25, "1/10": 0.1}
+PUSH_SPEED = 0.8
+"""m/s by which a push changes the robot's velocity at first."""
 SHOWN = ("robot", "obstacles", "points", "sectors", "arrows", "heights")
 SMOOTHING = 0.2
 """Share of the newest value in the bars of rewards."""
@@ -36,6 +37,27 @@ KEYS = (
 )
 
 
+@dataclass(frozen=True)
+class Callbacks:
+    """What becomes of a person's use of the controls; called between two steps."""
+
+    drive: Callable[[Velocity | None], None]
+    nudge: Callable[..., None]
+    pause: Callable[[bool], None]
+    set_speed: Callable[[float], None]
+    single_step: Callable[[], None]
+    new_trial: Callable[[], None]
+    set_push_speed: Callable[[float], None]
+    push_aside: Callable[[], None]
+    bring: Callable[[str], None]
+    look_at_robot: Callable[[], None]
+    choose_run: Callable[[Path], None]
+    choose_checkpoint: Callable[[Path], None]
+    follow: Callable[[bool], None]
+    choose_policy: Callable[[str], None]
+    choose_preset: Callable[[str, str | None], None]
+
+
 class Panels:
     """Controls of the page.
 
@@ -43,8 +65,12 @@ class Panels:
         num_rays: rays shown of a frame; None: those of the policy.
     """
 
-    def __init__(self, viewer: Viewer) -> None:
-        self._viewer, self._gui = viewer, viewer.server.gui
+    def __init__(
+        self, page: Page, act: Callbacks, stage: Stage, session: Session, presets: Mapping[str, tuple[str, ...]]
+    ) -> None:
+        """`presets` by group; `show_choices` has to follow."""
+        self._page, self._act, self._stage, self._session = page, act, stage, session
+        self._gui = page.server.gui
         self.num_rays: int | None = None
         self._rewards: dict[str, float] = {}
         self._status = self._gui.add_html("")
@@ -55,7 +81,7 @@ class Panels:
         with tabs.add_tab("Drive"):
             self._build_drive()
         with tabs.add_tab("Task"):
-            self._build_task()
+            self._build_task(presets)
         with tabs.add_tab("View"):
             self._build_view()
         with tabs.add_tab("Rewards"):
@@ -65,7 +91,7 @@ class Panels:
     # ---- building ----------------------------------------------------------------------------------------------------
 
     def _build_drive(self) -> None:
-        gui, viewer = self._gui, self._viewer
+        gui, act = self._gui, self._act
         self._driven = gui.add_checkbox("I command", False, hint="or else the task does")
         self._sliders = [
             gui.add_slider(name, min=-most, max=most, step=0.05, initial_value=0.0)
@@ -75,136 +101,120 @@ class Panels:
                 ("turn left (rad/s)", MAX_YAW_RATE),
             )
         ]
-        self._on(self._driven, lambda on: viewer.drive(viewer.stick.value if on else None))
+        self._page.on_change(self._driven, lambda on: act.drive(self._stick() if on else None))
         for slider in self._sliders:
-            self._on(slider, lambda _: viewer.drive(self._stick()))
+            self._page.on_change(slider, lambda _: act.drive(self._stick()))
         gui.add_markdown(KEYS)
         with gui.add_folder("Time"):
             self._pause = gui.add_checkbox("pause", False)
-            self._on(self._pause, viewer.pause)
+            self._page.on_change(self._pause, act.pause)
             speed = gui.add_button_group("speed", tuple(SPEEDS))
-            self._on_click(speed, lambda: viewer.set_speed(SPEEDS[speed.value]))
-            self._on_click(gui.add_button("one step (N)"), viewer.single_step)
-            self._on_click(gui.add_button("new trial (R)"), viewer.new_trial)
+            self._page.on_click(speed, lambda: act.set_speed(SPEEDS[speed.value]))
+            self._page.on_click(gui.add_button("one step (N)"), act.single_step)
+            self._page.on_click(gui.add_button("new trial (R)"), act.new_trial)
         with gui.add_folder("Disturb"):
-            push = gui.add_slider("push by (m/s)", min=0.1, max=3.0, step=0.1, initial_value=viewer.push_speed)
-            self._on(push, lambda value: setattr(viewer, "push_speed", value))
-            self._on_click(gui.add_button("push to its left (P)"), viewer.push_aside)
-            self._kind = gui.add_dropdown("obstacle", spare_kinds(viewer.session.env))
-            self._on_click(gui.add_button("bring it (B)"), lambda: viewer.bring(self._kind.value))
+            push = gui.add_slider("push by (m/s)", min=0.1, max=3.0, step=0.1, initial_value=PUSH_SPEED)
+            self._page.on_change(push, act.set_push_speed)
+            self._page.on_click(gui.add_button("push to its left (P)"), act.push_aside)
+            self._kind = gui.add_dropdown("obstacle", spare_kinds(self._session.env))
+            self._page.on_click(gui.add_button("bring it (B)"), lambda: act.bring(self._kind.value))
             gui.add_markdown("Drag obstacles with the mouse; shift-click takes one away; click on the robot pushes it.")
 
-    def _build_task(self) -> None:
-        gui, viewer = self._gui, self._viewer
-        runs = _runs(viewer.session.shown.run_dir)
-        self._run = gui.add_dropdown("run", runs, initial_value=runs[0])
-        self._on(self._run, lambda name: viewer.choose_run(Path(name)))
+    def _build_task(self, presets: Mapping[str, tuple[str, ...]]) -> None:
+        gui, act, on_change = self._gui, self._act, self._page.on_change
+        self._run = gui.add_dropdown("run", _runs(self._session.shown.run_dir))
+        on_change(self._run, lambda name: act.choose_run(Path(name)))
         self._checkpoint = gui.add_dropdown("checkpoint", self._checkpoint_names())
-        self._on(self._checkpoint, self._choose_checkpoint)
-        self._weights = gui.add_text(
-            "weights file", str(viewer.session.checkpoint), hint="any checkpoint of this network"
-        )
-        self._on_click(gui.add_button("load weights file"), lambda: viewer.choose_checkpoint(Path(self._weights.value)))
+        on_change(self._checkpoint, self._choose_checkpoint)
+        self._weights = gui.add_text("weights file", "", hint="any checkpoint of this network")
+        load = gui.add_button("load weights file")
+        self._page.on_click(load, lambda: act.choose_checkpoint(Path(self._weights.value)))
         self._follow = gui.add_checkbox("follow the newest checkpoint", False, hint="of a training that goes on")
-        self._on(self._follow, lambda on: setattr(viewer, "follows", on))
-        self._policy = gui.add_dropdown("policy", ("run", *BASELINES), initial_value=viewer.session.shown.policy)
-        self._on(self._policy, viewer.choose_policy)
-        self._presets = {}
-        for group in SWITCHED:
-            names = (OWN, *viewer.presets(group))
-            chosen = viewer.choices[group]
-            dropdown = gui.add_dropdown(group, names, initial_value=chosen if chosen in names else OWN)
-            self._on(dropdown, partial(self._choose, group))
-            self._presets[group] = dropdown
+        on_change(self._follow, act.follow)
+        self._policy = gui.add_dropdown("policy", ("run", *BASELINES))
+        on_change(self._policy, act.choose_policy)
+        self._presets = {group: gui.add_dropdown(group, (OWN, *names)) for group, names in presets.items()}
+        for group, dropdown in self._presets.items():
+            on_change(dropdown, partial(self._choose, group))
 
     def _build_view(self) -> None:
-        gui, stage = self._gui, self._viewer.stage
-        self._on_click(gui.add_button("look at the robot (V)"), self._viewer.look_at_robot)
+        gui, stage = self._gui, self._stage
+        self._page.on_click(gui.add_button("look at the robot (V)"), self._act.look_at_robot)
         follow = gui.add_checkbox("keep the robot in the middle", stage.follows)
-        self._on(follow, lambda on: setattr(stage, "follows", on))
+        self._page.on_change(follow, lambda on: setattr(stage, "follows", on))
         for name in SHOWN:
             box = gui.add_checkbox(name, name in stage.shows)
-            self._on(box, partial(self._show, name))
-        self._on(gui.add_checkbox("shadows", False, hint="for browsers with a graphics card"), stage.cast_shadows)
+            self._page.on_change(box, partial(self._show, name))
+        self._page.on_change(
+            gui.add_checkbox("shadows", False, hint="for browsers with a graphics card"), stage.cast_shadows
+        )
         colour = gui.add_dropdown("points coloured by", POINT_COLOURS, initial_value=stage.points_by)
-        self._on(colour, self._colour_points)
+        self._page.on_change(colour, self._colour_points)
         size = gui.add_slider("point size (m)", min=0.005, max=0.08, step=0.005, initial_value=stage.point_size)
-        self._on(size, lambda value: setattr(stage, "point_size", value))
+        self._page.on_change(size, lambda value: setattr(stage, "point_size", value))
         rays = gui.add_dropdown("rays shown", ("those of the policy", "the whole sensor"))
-        self._on(rays, self._choose_rays)
+        self._page.on_change(rays, self._choose_rays)
         self._legend = gui.add_html(_point_legend(stage.points_by))
 
     def _build_keys(self) -> None:
-        viewer = self._viewer
+        act = self._act
         keys: dict[str, tuple[str, Callable[[], None]]] = {  # W A S D Q E and arrows are viser's: they move the view
-            "I": ("faster ahead", lambda: viewer.nudge(ahead=STEP)),
-            "K": ("slower, then back", lambda: viewer.nudge(ahead=-STEP)),
-            "J": ("to the left", lambda: viewer.nudge(aside=STEP)),
-            "L": ("to the right", lambda: viewer.nudge(aside=-STEP)),
-            "U": ("turn left", lambda: viewer.nudge(turn=TURN)),
-            "O": ("turn right", lambda: viewer.nudge(turn=-TURN)),
-            "X": ("stand", lambda: viewer.drive((0.0, 0.0, 0.0))),
-            "T": ("the task commands", lambda: viewer.drive(None)),
-            "space": ("pause or go on", lambda: viewer.pause(not viewer.paused)),
-            "N": ("one control step", viewer.single_step),
-            "R": ("new trial", viewer.new_trial),
-            "P": ("push the robot to its left", viewer.push_aside),
-            "V": ("look at the robot", viewer.look_at_robot),
-            "B": ("bring the obstacle", lambda: viewer.bring(self._kind.value)),
+            "I": ("faster ahead", lambda: act.nudge(ahead=STEP)),
+            "K": ("slower, then back", lambda: act.nudge(ahead=-STEP)),
+            "J": ("to the left", lambda: act.nudge(aside=STEP)),
+            "L": ("to the right", lambda: act.nudge(aside=-STEP)),
+            "U": ("turn left", lambda: act.nudge(turn=TURN)),
+            "O": ("turn right", lambda: act.nudge(turn=-TURN)),
+            "X": ("stand", lambda: act.drive((0.0, 0.0, 0.0))),
+            "T": ("the task commands", lambda: act.drive(None)),
+            "space": ("pause or go on", lambda: act.pause(not self._pause.value)),
+            "N": ("one control step", act.single_step),
+            "R": ("new trial", act.new_trial),
+            "P": ("push the robot to its left", act.push_aside),
+            "V": ("look at the robot", act.look_at_robot),
+            "B": ("bring the obstacle", lambda: act.bring(self._kind.value)),
         }
-        for key, (label, act) in keys.items():
+        for key, (label, done) in keys.items():
             command = self._gui.add_command(label, hotkey=key)  # type: ignore[arg-type]  # viser's literals
-            command.on_trigger(partial(self._pressed, act))
+            command.on_trigger(partial(self._pressed, done))
 
     def _pressed(self, act: Callable[[], None], event: Any) -> None:
-        self._viewer.ask(act)
-
-    def _on(self, handle: Any, act: Callable[[Any], None]) -> None:
-        """Has a change by a person served between two steps; changes by the viewer itself are none."""
-
-        def changed(event: Any) -> None:
-            if event.client is not None:
-                value = handle.value
-                self._viewer.ask(partial(act, value))
-
-        handle.on_update(changed)
-
-    def _on_click(self, handle: Any, act: Callable[[], None]) -> None:
-        handle.on_click(lambda _: self._viewer.ask(act))
+        self._page.ask(act)
 
     def _stick(self) -> Velocity:
         ahead, aside, turn = (float(slider.value) for slider in self._sliders)
         return ahead, aside, turn
 
     def _choose(self, group: str, name: str) -> None:
-        self._viewer.choose(group, None if name == OWN else name)
+        self._act.choose_preset(group, None if name == OWN else name)
 
     def _show(self, name: str, on: bool) -> None:
-        (self._viewer.stage.shows.add if on else self._viewer.stage.shows.discard)(name)
+        (self._stage.shows.add if on else self._stage.shows.discard)(name)
 
     def _colour_points(self, name: str) -> None:
-        self._viewer.stage.points_by = name
+        self._stage.points_by = name
         self._legend.content = _point_legend(name)
 
     def _choose_rays(self, name: str) -> None:
         self.num_rays = MOST_POINTS if name == "the whole sensor" else None
-        self._viewer.session.show_cloud(self.num_rays)
+        self._session.show_cloud(self.num_rays)
 
     def _choose_checkpoint(self, name: str) -> None:
-        for path in self._viewer.checkpoints():
+        run_dir = self._session.shown.run_dir
+        for path in list_checkpoints(run_dir):
             if path.name == name:
-                return self._viewer.choose_checkpoint(path)
-        raise ValueError(f"{name} is gone: {self._viewer.session.shown.run_dir} keeps its newest checkpoints only")
+                return self._act.choose_checkpoint(path)
+        raise ValueError(f"{name} is gone: {run_dir} keeps its newest checkpoints only")
 
     def _checkpoint_names(self) -> tuple[str, ...]:
-        return tuple(path.name for path in self._viewer.checkpoints()) or ("none",)
+        return tuple(path.name for path in list_checkpoints(self._session.shown.run_dir)[::-1]) or ("none",)
 
     # ---- showing what is the case ------------------------------------------------------------------------------------
 
     def show_drive(self, velocity: Velocity | None) -> None:
         """The stick as it is."""
         self._set(self._driven, velocity is not None)
-        for slider, value in zip(self._sliders, velocity or (0.0, 0.0, 0.0), strict=True):
+        for slider, value in zip(self._sliders, velocity or self._stick(), strict=True):
             self._set(slider, value)
 
     def show_pause(self, paused: bool) -> None:
@@ -219,12 +229,13 @@ class Panels:
         """Whose weights walk."""
         names = self._checkpoint_names()
         self._checkpoint.options = names
-        if path.name in names and path.parent.parent == self._viewer.session.shown.run_dir:
+        if path.name in names and path.parent.parent == self._session.shown.run_dir:
             self._set(self._checkpoint, path.name)
         self._set(self._weights, str(path))
 
     def show_choices(self, choices: dict[str, str | None], session: Session) -> None:
         """The task as it is."""
+        self._session = session
         for group, dropdown in self._presets.items():
             self._set(dropdown, choices.get(group) or OWN)
         self._set(self._policy, session.shown.policy)
@@ -246,13 +257,12 @@ class Panels:
 
     def draw_status(self, points: int) -> None:
         """Who walks where, how fast time runs and what was left out."""
-        viewer, session = self._viewer, self._viewer.session
-        clock = viewer.clock
-        shown = "paused" if viewer.paused else f"real time x {clock.reached:.2f}"
-        slow = not viewer.paused and 0.0 < clock.reached < 0.95 * clock.speed
+        session, clock, paused = self._session, self._page.clock, self._pause.value
+        shown = "paused" if paused else f"real time x {clock.reached:.2f}"
+        slow = not paused and 0.0 < clock.reached < 0.95 * clock.speed
         colour = "#c62f2f" if slow else "#2c7a3f"
         asked = "" if clock.speed == 1.0 else f" (asked for {clock.speed:g})"
-        cloud = f"{points:,} points x {viewer.points_hz:.0f}/s"
+        cloud = f"{points:,} points x {clock.clouds_hz:.0f}/s"
         rate = f"{clock.pictures_hz:.0f} pictures/s, {clock.dropped} dropped · {cloud}"
         ends: dict[str, int] = {}
         for outcome in session.outcomes:
@@ -261,18 +271,15 @@ class Panels:
         trials = f"trial {len(session.outcomes) + 1}, {session.time_s:.1f} s"
         if ends:
             trials += " · ended: " + ", ".join(f"{n} {cause}" for cause, n in ends.items()) + f", {touched} touched"
-        warning = (
-            "" if viewer.reached_by_this_machine_alone else _line("everybody who reaches this machine can take hold")
-        )
         self._status.content = (
             f'<div style="padding:6px 12px;font-size:12px;line-height:1.5"><b style="color:{colour}">{shown}</b>{asked}'
             f" · {rate}<br>{html.escape(trials)}<br>{html.escape(_short(session.checkpoint))}"
-            f"{warning}{_line(viewer.message)}</div>"
+            f"{_line(self._page.warning)}{_line(self._page.message)}</div>"
         )
 
     def draw_charts(self, perceived: Perceived | None, true: Perceived) -> None:
         """Risk of velocities and bars of reward terms."""
-        env, session = self._viewer.session.env, self._viewer.session
+        session, env = self._session, self._session.env
         risk = env.config.rewards.avoidance.risk
         command = {"command": env.command.value[0, :2].tolist()}
         command["velocity"] = env.state.kinematics.base_lin_vel_yaw[0].tolist()[:2]

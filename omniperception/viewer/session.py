@@ -35,7 +35,7 @@ DRAG_SPEED = 3.0
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialEnd:
     """The end of a trial.
 
     Attributes:
@@ -77,7 +77,7 @@ class Session:
         self._runner.load_policy(self.checkpoint)
         self.policy: Policy = self._contender()
         self.rewards: dict[str, float] = {}
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[TrialEnd] = []
         self.shapes: RayShapes = ray_shapes(self.env.world)
         self._touched = self._given_up = False
         self._held: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
@@ -113,7 +113,7 @@ class Session:
         if bool(env.done[0]):
             cause = next(name for name, happened in env.outcomes.items() if happened[0])
             cause, self._given_up = BY_HAND if self._given_up and cause == "time_out" else cause, False
-            self.outcomes.append(Outcome(cause, self._touched))
+            self.outcomes.append(TrialEnd(cause, self._touched))
             self._touched = False
             self._held.clear()
 
@@ -316,16 +316,16 @@ def spare_kinds(env: OmniEnv) -> list[str]:
 
 def _watched(task: EnvConfig, policy: str) -> EnvConfig:
     """The task such that it can be driven, looked at and added to; its observations are the same."""
-    besides = [*task.extra_requirements]
+    extra = [*task.extra_requirements]
     if task.lidar is not None:
-        besides += [AVOIDANCE, MEASURED_CLOUD]
-    assert set(besides) - set(task.extra_requirements) <= FROM_LIDAR
+        extra += [AVOIDANCE, MEASURED_CLOUD]
+    assert set(extra) - set(task.extra_requirements) <= FROM_LIDAR
     return replace(
         task,
         num_envs=1,
         commands=driven(task),
         obstacles=with_spares(task.obstacles),
-        extra_requirements=tuple(dict.fromkeys(besides)),
+        extra_requirements=tuple(dict.fromkeys(extra)),
         network_sees_frames=task.network_sees_frames and policy not in BASELINES,
         skip_curricula=True,
         trials=True,

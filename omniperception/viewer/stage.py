@@ -17,6 +17,7 @@ from omniperception.evaluation.perceived import Perceived
 from omniperception.scene.rays import HitClass
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, HEIGHTS, OBSTACLE, PROXIMAL, SECTORS, TERRAIN, scale
 from omniperception.viewer.meshes import grid_surface, robot_looks, triangles
+from omniperception.viewer.page import add_points, show_points
 from omniperception.viewer.session import Session
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Stage:
         origin: (2,) place (m, environment frame) in the page's middle.
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self.scene = server, server.scene
         self.follows, self.points_by, self.point_size = True, POINT_COLOURS[0], 0.025
         self.shows = {"points", "sectors", "arrows", "obstacles", "robot"}
@@ -58,13 +59,9 @@ class Stage:
         self.on_take_away: OnClick = lambda part: None
         self.on_push: Callable[[tuple[float, float]], None] = lambda direction: None
         self.on_stick: Callable[[tuple[float, float]], None] = lambda xy: None
-        self._session: Session | None = None
-        self._links: list[Any] = []
-        self._obstacles: dict[int, Any] = {}
-        self._poses: dict[int, tuple] = {}
-        self._sizes: dict[int, tuple[float, ...]] = {}
         self.cast_shadows(False)
         server.initial_camera.position, server.initial_camera.look_at = EYE, TARGET
+        self.show(session)
 
     def cast_shadows(self, on: bool) -> None:
         """Shadows are nice, and much to ask of a browser without a graphics card."""
@@ -72,7 +69,6 @@ class Stage:
 
     def look(self, clients: Iterable[Any]) -> None:
         """Has browsers look at the robot from where they did at the beginning."""
-        assert self._session is not None
         x, y = self._session.env.state.kinematics.base_pos_w[0, :2].tolist()
         at = np.array([x - self.origin[0], y - self.origin[1], 0.0])
         for client in clients:
@@ -86,7 +82,10 @@ class Stage:
         self.scene.remove_by_name(ROOT)
         self._session, env = session, session.env
         self._root = self.scene.add_frame(ROOT, show_axes=False)
-        self._links, self._obstacles, self._poses, self._sizes = [], {}, {}, {}
+        self._links: list[Any] = []
+        self._obstacles: dict[int, Any] = {}
+        self._poses: dict[int, tuple] = {}
+        self._sizes: dict[int, tuple[float, ...]] = {}
         self._obstacle_shapes = [
             k for k, shape in enumerate(session.shapes.shapes) if shape.class_id == HitClass.OBSTACLE
         ]
@@ -118,15 +117,7 @@ class Stage:
                 plane_opacity=1.0,
                 shadow_opacity=0.3,
             )
-        self._points = self.scene.add_point_cloud(
-            f"{ROOT}/points",
-            np.zeros((1, 3), np.float32),
-            (0, 0, 0),
-            point_size=self.point_size,
-            point_shape="circle",
-            precision="float32",
-            point_shading="flat",
-        )
+        self._points = add_points(self.scene, f"{ROOT}/points", self.point_size)
         self._arrows = {
             name: self.scene.add_arrows(
                 f"{ROOT}/arrows/{name}",
@@ -160,7 +151,6 @@ class Stage:
             self._build_obstacle(k, self._size(k))
 
     def _build_obstacle(self, shape: int, size: tuple[float, ...]) -> None:
-        assert self._session is not None
         mesh = triangles(self._session.shapes.shapes[shape], size)
         if mesh is None:
             return
@@ -184,7 +174,6 @@ class Stage:
 
     def _size(self, shape: int) -> tuple[float, ...]:
         """Size of an obstacle's part in this trial, as its shape has it."""
-        assert self._session is not None
         field, own = self._session.env.obstacles, self._session.shapes.shapes[shape]
         assert field is not None
         part = self._part_of[shape]
@@ -196,7 +185,6 @@ class Stage:
 
     def draw(self, perceived: Perceived | None, true: Perceived, stick: bool) -> None:
         """Shows the session as it is now; `stick`: whether a person drives."""
-        assert self._session is not None
         env = self._session.env
         with self._server.atomic(), torch.no_grad():
             base = env.state.kinematics.base_pos_w[0].numpy(force=True)
@@ -213,7 +201,6 @@ class Stage:
 
     def draw_points(self) -> int:
         """Shows the newest cloud; returns how many points it has."""
-        assert self._session is not None
         cloud = self._session.cloud
         if cloud is None or "points" not in self.shows:
             self._points.visible = False
@@ -223,14 +210,12 @@ class Stage:
         points = cloud.points_w[0, hit].numpy(force=True)
         with self._server.atomic():
             self._points.visible = True
-            self._points.point_size = self.point_size
             self._points.position = (0.0, 0.0, self.point_size / 2)  # on what they lie on, not half in it
-            self._points.points = np.ascontiguousarray(points, np.float32)
-            self._points.colors = self._point_colours(hit, points)
+            show_points(self._points, points, self._point_colours(hit, points), self.point_size)
         return len(points)
 
     def _point_colours(self, hit: torch.Tensor, points: np.ndarray) -> np.ndarray:
-        assert self._session is not None and self._session.cloud is not None
+        assert self._session.cloud is not None
         cloud, sensor = self._session.cloud, self._session.env.config.lidar
         assert sensor is not None
         if self.points_by == "what it hit":
@@ -252,7 +237,6 @@ class Stage:
         return np.where(proximal[:, None], np.array(PROXIMAL), np.array(DISTAL)).astype(np.uint8)
 
     def _draw_robot(self) -> None:
-        assert self._session is not None
         pos, quat = self._session.env.sim.body_poses(self._link_bodies)
         visible = "robot" in self.shows
         for handle, at, turned in zip(self._links, pos[0].tolist(), quat[0].tolist(), strict=True):
@@ -262,7 +246,6 @@ class Stage:
 
     def _draw_ground(self) -> None:
         """A ground that is not flat, around the origin; each trial may have another tile."""
-        assert self._session is not None
         ground, trial = self._session.env.ground, len(self._session.outcomes)
         if ground is None or trial == self._ground_trial:
             return
@@ -276,7 +259,6 @@ class Stage:
         )
 
     def _draw_obstacles(self) -> None:
-        assert self._session is not None
         field, visible = self._session.env.obstacles, "obstacles" in self.shows
         if field is None:
             return
@@ -298,7 +280,6 @@ class Stage:
                 self._poses[shape] = pose
 
     def _draw_arrows(self, perceived: Perceived | None, true: Perceived, stick: bool) -> None:
-        assert self._session is not None
         env, state = self._session.env, self._session.env.state
         base = state.kinematics.base_pos_w[0].numpy(force=True)
         yaw = float(state.kinematics.yaw[0])
@@ -328,7 +309,7 @@ class Stage:
         handle = self._lines[name]
         there = "sectors" in self.shows and seen is not None and seen.sectors is not None
         if there:
-            assert self._session is not None and seen is not None and seen.sectors is not None
+            assert seen is not None and seen.sectors is not None
             state = self._session.env.state
             base = state.kinematics.base_pos_w[0].numpy(force=True)
             floor = float(base[2] - state.base_height[0]) + (2.0 if name == "perceived" else 1.0) * OVER_GROUND
@@ -343,7 +324,7 @@ class Stage:
         handle = self._heights[name]
         there = "heights" in self.shows and seen is not None and seen.heights is not None
         if there:
-            assert self._session is not None and seen is not None and seen.heights is not None
+            assert seen is not None and seen.heights is not None
             kinematics = self._session.env.state.kinematics
             base, yaw = kinematics.base_pos_w[0].numpy(force=True), float(kinematics.yaw[0])
             grid = height_grid().numpy()

@@ -7,6 +7,7 @@ import queue
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,14 @@ from omniperception import config
 from omniperception.config import ConfigError
 from omniperception.evaluation.perceived import true
 from omniperception.learning import CheckpointError, latest_checkpoint
-from omniperception.learning.checkpoint import list_checkpoints
-from omniperception.viewer.clock import Clock
 from omniperception.viewer.drive import Stick, Velocity
 from omniperception.viewer.options import SWITCHED, PageOptions, Shown
-from omniperception.viewer.page import Page, check_free, open_page
-from omniperception.viewer.panels import Panels
+from omniperception.viewer.page import Page, check_free
+from omniperception.viewer.panels import PUSH_SPEED, Callbacks, Panels
 from omniperception.viewer.session import Session
 from omniperception.viewer.stage import STICK_REACH, Stage, turned
 
-PICTURE_HZ, CHART_HZ, STATUS_HZ = 25.0, 5.0, 2.0
+CHART_HZ = 5.0
 LOOK_S = 2.0
 """How often (s) a followed run is asked for a newer checkpoint."""
 LISTS_S = 10.0
@@ -42,7 +41,6 @@ class Viewer(Page):
     Attributes:
         session: the run and its task.
         stage, panels: the scene and the controls of the page.
-        clock: paces the steps.
         paused: whether time stands.
         stick: what a person commands.
         push_speed: m/s by which a push changes the robot's velocity.
@@ -61,51 +59,62 @@ class Viewer(Page):
         self._threads = torch.get_num_threads()
         chosen, rest = _split(shown.overrides)
         self._choices, self._rest = chosen, rest
-        self._options = options
         check_free(options)
         self.session = Session(replace(shown, overrides=self._overrides()))
-        super().__init__(open_page(options, "OmniPerception"))
+        super().__init__(options, "OmniPerception", self.session.env.control_dt)
         self.paused, self._single = False, 0
-        self.stick, self.push_speed, self.follows = Stick(), 0.8, False
-        self.clock = Clock(self.session.env.control_dt, PICTURE_HZ)
+        self.stick, self.push_speed, self.follows = Stick(), PUSH_SPEED, False
         self._charts_due = self._look_due = self._lists_due = 0.0
-        self._frames_drawn, self._shown_points, self._frames_window = 0, 0, (time.monotonic(), 0)
-        self.points_hz = 0.0
+        self._frames_drawn, self._shown_points = 0, 0
         self._redraw = True
-        self.stage = Stage(self.server)
-        self.stage.show(self.session)
+        self.stage = Stage(self.server, self.session)
         self.stage.on_drag = self._obstacle_dragged
         self.stage.on_take_away = self._obstacle_taken
         self.stage.on_push = lambda direction: self.ask(lambda: self.push(direction))
         self.stage.on_stick = lambda xy: self.ask(lambda: self._stick_dragged(xy))
-        self.panels = Panels(self)
+        self.panels = Panels(self, self._callbacks(), self.stage, self.session, self._presets())
+        self.panels.show_choices(self.choices, self.session)
         self.server.on_client_connect(lambda client: self.ask(self._draw_again))
+
+    def _callbacks(self) -> Callbacks:
+        return Callbacks(
+            drive=self.drive,
+            nudge=self.nudge,
+            pause=self.pause,
+            set_speed=self.set_speed,
+            single_step=self.single_step,
+            new_trial=self.new_trial,
+            set_push_speed=partial(setattr, self, "push_speed"),
+            push_aside=self.push_aside,
+            bring=self.bring,
+            look_at_robot=self.look_at_robot,
+            choose_run=self.choose_run,
+            choose_checkpoint=self.choose_checkpoint,
+            follow=partial(setattr, self, "follows"),
+            choose_policy=self.choose_policy,
+            choose_preset=self.choose,
+        )
 
     # ---- the loop ----------------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Steps and draws until Ctrl-C, `stop`, or the time is up."""
-        end = math.inf if self._options.stop_after_s is None else time.monotonic() + self._options.stop_after_s
         torch.set_num_threads(1)  # tensors of one environment
-        self.clock.start()
         try:
-            while not self._stopped and time.monotonic() < end:
-                self._redraw |= self.serve_requests()
-                if self.paused and not self._single:
-                    self._draw_if_due(paused=True)
-                    time.sleep(0.02)
-                    continue
-                self._single = max(self._single - 1, 0)
-                self.session.step()
-                wait = self.clock.stepped()
-                self._draw_if_due()
-                self._look_for_weights()
-                if wait > 0:
-                    time.sleep(wait)
-        except KeyboardInterrupt:
-            print("viewer: ended")
+            super().run()
         finally:
             torch.set_num_threads(self._threads)
+
+    def advance(self) -> float:
+        self._redraw |= self.serve_requests()
+        if self.paused and not self._single:
+            self._draw_if_due(paused=True)
+            return 0.02
+        self._single = max(self._single - 1, 0)
+        self.session.step()
+        wait = self.clock.stepped()
+        self._draw_if_due()
+        self._look_for_weights()
+        return wait
 
     # ---- drawing -----------------------------------------------------------------------------------------------------
 
@@ -120,19 +129,14 @@ class Viewer(Page):
             self.stage.draw(perceived, there, self.session.driven is not None)
             if self.session.frames != self._frames_drawn or redraw:
                 self._frames_drawn, self._shown_points = self.session.frames, self.stage.draw_points()
-                started, count = self._frames_window
-                self._frames_window = started, count + 1
+                self.clock.clouds += 1
             if now >= self._charts_due or redraw:
                 self._charts_due = now + 1.0 / CHART_HZ
                 self.panels.draw_charts(perceived, there)
         if now >= self._lists_due:
             self._lists_due = now + LISTS_S
             self.panels.renew_lists()
-        if now >= self._status_due:
-            self._status_due = now + 1.0 / STATUS_HZ
-            started, count = self._frames_window
-            if now - started >= 1.0:
-                self.points_hz, self._frames_window = count / (now - started), (now, 0)
+        if self.status_is_due():
             self.panels.draw_status(self._shown_points)
 
     def _draw_again(self) -> None:
@@ -280,19 +284,14 @@ class Viewer(Page):
         return ", ".join(chosen) or "the task that it was trained in"
 
     @property
-    def reached_by_this_machine_alone(self) -> bool:
-        """Tell whether the page listens on localhost."""
-        return self._options.is_local
-
-    @property
     def choices(self) -> dict[str, str | None]:
         """Presets that are chosen, by group; None: the run's own."""
         return {group: self._choices.get(group) for group in SWITCHED}
 
-    def presets(self, group: str) -> tuple[str, ...]:
-        """Presets of a group, those in the run's own folders and in --config-dir included."""
-        run = config.read(self.session.shown.run_dir)
-        return config.presets(group, config.search_path(self._rest, run))
+    def _presets(self) -> dict[str, tuple[str, ...]]:
+        """Presets by group, those in the run's own folders and in --config-dir included."""
+        path = config.search_path(self._rest, config.read(self.session.shown.run_dir))
+        return {group: config.presets(group, path) for group in SWITCHED}
 
     def _look_for_weights(self) -> None:
         now = time.monotonic()
@@ -307,10 +306,6 @@ class Viewer(Page):
             self.follows = False
             self.say(f"refused: {' '.join(str(error).split())}; following ends")
             self.panels.show_follow(False)
-
-    def checkpoints(self) -> list[Path]:
-        """Checkpoints of the run, the newest first."""
-        return list_checkpoints(self.session.shown.run_dir)[::-1]
 
     # ---- for whoever asks --------------------------------------------------------------------------------------------
 

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from omniperception.common.sectors import FAR
 from omniperception.perception import MotionMatch
-from omniperception.perception.networks.motion_match import NOTHING
 
 SECTORS, HISTORY = 36, 5
 MATCH = MotionMatch(speeds=(0.75, 1.5), num_directions=12, width=0.4, period_s=0.1)
@@ -21,7 +21,7 @@ def sector_of(x, y):
 
 def seen(place, velocity):
     """(1, H, S) distances and (1, S) bearings of a point, and its sector in the newest frame."""
-    distance, bearing = torch.full((1, HISTORY, SECTORS), NOTHING), torch.zeros(1, SECTORS)
+    distance, bearing = torch.full((1, HISTORY, SECTORS), FAR), torch.zeros(1, SECTORS)
     for k in range(HISTORY):
         age = 0.1 * (HISTORY - 1 - k)
         x, y = place[0] - velocity[0] * age, place[1] - velocity[1] * age
@@ -35,7 +35,7 @@ def test_ages_of_the_frames_count_where_they_are_known():
     """A point that comes at 1.5 m/s, seen at odd times: only with them does its velocity fit."""
     ages = [0.55, 0.37, 0.2, 0.05, 0.0]
     place = (2.0, 0.17)  # the middle of a sector, nearly
-    distance, bearing = torch.full((1, HISTORY, SECTORS), NOTHING), torch.zeros(1, SECTORS)
+    distance, bearing = torch.full((1, HISTORY, SECTORS), FAR), torch.zeros(1, SECTORS)
     middle = math.radians(5.0)
     for k, age in enumerate(ages):
         x, y = place[0] + 1.5 * age * math.cos(middle), place[1] + 1.5 * age * math.sin(middle)
@@ -66,7 +66,7 @@ def test_the_velocity_of_a_point_fits_all_frames(place, index):
 
 
 def test_a_match_fades_with_distance():
-    distance, bearing = torch.full((1, 2, SECTORS), NOTHING), torch.zeros(1, SECTORS)
+    distance, bearing = torch.full((1, 2, SECTORS), FAR), torch.zeros(1, SECTORS)
     distance[0, 1, 18], distance[0, 0, 18] = 2.0, 2.1
     assert MATCH(distance, bearing, VELOCITIES)[0, 0, 18].item() == pytest.approx(1 - 0.1 / 0.4, abs=1e-5)
     distance[0, 0, 18] = 2.4

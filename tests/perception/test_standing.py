@@ -105,12 +105,3 @@ def test_the_heading_does_not_matter():
     first = sample(sampler(), rays, Attitude(turned[:1].repeat(2, 1), (0.3, 0.0, -0.1), (1.0, 0.0, 0.0, 0.0)))
     other = sample(sampler(), rays, Attitude(turned[1:].repeat(2, 1), (0.3, 0.0, -0.1), (1.0, 0.0, 0.0, 0.0)))
     torch.testing.assert_close(first, other, atol=1e-4, rtol=0.0)
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [({"band_edges": [0.0]}, "band_edges"), ({"decay": 0.0}, "decay=0.0"), ({}, "needs the attitude")],
-)
-def test_impossible_settings_are_refused(change, named):
-    with pytest.raises(ValueError, match=named):
-        sample(sampler(**change), random_rays(2, 20))

@@ -6,10 +6,11 @@ from collections import deque
 import numpy as np
 import pytest
 import torch
+from fields import make_field
 
 from omniperception import build, config
 from omniperception.common.random import EnvRandom
-from omniperception.scene import ApproachConfig, FreePathConfig, ObstacleField, ObstacleGroup, ObstaclesConfig
+from omniperception.scene import ApproachConfig, FreePathConfig, ObstacleGroup, ObstaclesConfig
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
 from omniperception.scene.obstacle_motion import LOSE_SIGHT, passing_velocity
 from omniperception.scene.placement import bent_path, distance_to_path
@@ -19,18 +20,14 @@ POST = [[0.3, 0.3], [0.5, 0.5]]
 
 def built(groups, num_envs=500, seed=0, **settings):
     settings = {"area": (-5.0, 5.0, -4.0, 4.0), "clearance": 0.5, **settings}
-    config = ObstaclesConfig(groups, **settings)
-    count = len(config.parts())
-    pos, quat = (torch.zeros(num_envs, count, n, dtype=torch.float64) for n in (3, 4))
-    return ObstacleField(config, pos, quat, EnvRandom(seed, num_envs))
+    return make_field(ObstaclesConfig(groups, **settings), num_envs, seed)
 
 
 def reset(field, robot=(0.0, 0.0), command=(0.0, 0.0), goal=None):
     n = field.pos_w.shape[0]
     goal = None if goal is None else torch.tensor(goal).expand(n, 2)
     env_ids, robot = torch.arange(n), torch.tensor(robot).expand(n, 2)
-    field.reset(env_ids, robot, goal)
-    field.approach(env_ids, robot, torch.tensor(command).expand(n, 2))
+    field.reset(env_ids, robot, goal, lambda: torch.tensor(command).expand(n, 2))
 
 
 class TestRanges:
@@ -188,25 +185,6 @@ class TestPath:
         assert not field.active.any() and (field.pos_w[..., 2] == PARKED_HEIGHT).all()
 
 
-def started_on_the_robot():
-    return built({"person": ObstacleGroup("cylinder", 1, POST, [1.0, 1.0], approach=ApproachConfig(0.1, [0.7, 3.0]))})
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: ApproachConfig(-1, [3.0, 4.0]), r"within=-1"),
-        (lambda: ApproachConfig(0.1, [4.0, 3.0]), r"distance=\[4\.0, 3\.0\]"),
-        (lambda: FreePathConfig(0.0, 1.0), r"obstacles\.free_path\."),
-        (lambda: FreePathConfig(1.0, -1.0), r"obstacles\.free_path\."),
-        (started_on_the_robot, "lets those of person start on the robot"),
-    ],
-)
-def test_wrong_settings_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_spacing_is_kept_between_what_stands():
     field = built(
         {
@@ -258,8 +236,7 @@ class TestFeasible:
     def test_every_scene_of_the_hardest_test(self):
         run = build.assemble(config.compose(["experiment=walk", "scenario=abs_hard"])).env
         count, n = run.obstacles.num_obstacles, 60
-        pos, quat = (torch.zeros(n, count, k, dtype=torch.float64) for k in (3, 4))
-        field = ObstacleField(run.obstacles, pos, quat, EnvRandom(7, n))
+        field = make_field(run.obstacles, n, seed=7)
         uniform = EnvRandom(8, n).uniform(torch.arange(n), (4,))
         start = uniform[:, :2] * 0.2 - 0.1
         goal = uniform[:, 2:] * torch.tensor([1.5, 3.0]) + torch.tensor([6.0, -1.5])

@@ -52,16 +52,6 @@ def test_shapes_are_the_models_geoms_with_their_classes(world):
     assert all((c == HitClass.OBSTACLE) == n.startswith("obstacle_") for n, c in classes.items())
 
 
-def test_every_part_is_a_body_of_its_own(make_config):
-    run = make_config("obstacles=corridor", "commands=corridor")
-    world = build_world(run.env.robot, run.env.terrain, run.env.obstacles)
-    shapes = ray_shapes(world)
-    wall = shapes.shapes[shapes.geom_names.index("obstacle_wall_0")]
-    assert shapes.bodies[wall.body] == world.model.body("obstacle_wall_0").id and wall.pos == (0.0, 0.0, 0.0)
-    assert wall.class_id == HitClass.OBSTACLE
-    assert len(shapes.bodies) == 13 + 15  # base, four legs of three links, six walkers, nine pieces of wall
-
-
 def test_unknown_excluded_geoms_are_named(world):
     with pytest.raises(ValueError, match=r"exclude_geoms names nose; known: .*trunk"):
         ray_shapes(world, ("nose",))

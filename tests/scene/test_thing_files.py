@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from fields import make_field
 from mj_rays import assert_rays_are_those_of_mj_ray
 
-from omniperception.common.random import EnvRandom
-from omniperception.scene import ObstacleField, ObstacleGroup, ObstaclesConfig, thing_file
-from omniperception.scene.meshes import compiled, mesh_points, mesh_vertices
+from omniperception.scene import ObstacleGroup, ObstaclesConfig, thing_file
+from omniperception.scene.meshes import compiled, mesh_points
 
 DOOR = """
 <mujoco>
@@ -63,9 +63,7 @@ def files(tmp_path, monkeypatch):
 
 
 def field_of(group):
-    config = ObstaclesConfig({"own": group})
-    pos, quat = (torch.zeros(N, len(config.parts()), n, dtype=torch.float64) for n in (3, 4))
-    field = ObstacleField(config, pos, quat, EnvRandom(3, N))
+    field = make_field(ObstaclesConfig({"own": group}), N, seed=3)
     field.reset(torch.arange(N), torch.full((N, 2), 50.0))
     return field
 
@@ -144,27 +142,3 @@ def test_what_is_wrong_with_a_file_is_said_in_one_line(files, change, message):
     with pytest.raises(ValueError, match=message) as error:
         ObstacleGroup("compound", 1, file="door.xml")
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("group", "message"),
-    [
-        ({"kind": "compound", "file": "none.xml"}, "file=none.xml does not exist"),
-        ({"kind": "compound", "file": "ramp.obj"}, "a compound with file=ramp.obj"),
-        ({"kind": "mesh", "file": "none.obj"}, "file=none.obj is neither a packaged mesh"),
-        ({"kind": "mesh", "files": ["ramp.obj", "slab.obj"]}, "at least as many obstacles as files"),
-        (
-            {"kind": "compound", "file": "door.xml", "swing_frequency": -1.0},
-            "swing_frequency=-1.0 must",
-        ),
-    ],
-)
-def test_wrong_groups_are_refused(files, group, message):
-    with pytest.raises(ValueError, match=message):
-        ObstacleGroup(count=1, **group)
-
-
-def test_a_mesh_that_a_file_has_not_is_refused(files):
-    (files / "door.xml").write_text(DOOR)
-    with pytest.raises(ValueError, match="file=door.xml#nope: it has meshes knob"):
-        mesh_vertices("door.xml", "nope")

@@ -3,12 +3,11 @@
 import pytest
 import torch
 import yaml
+from fields import make_field
 
 from omniperception import build, config
-from omniperception.common.random import EnvRandom
 from omniperception.env.env import OmniEnv
 from omniperception.evaluation.suite import suite_worlds
-from omniperception.scene import ObstacleField
 
 BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
 WORLDS = sorted({world.name for world in suite_worlds("held_out")})
@@ -20,9 +19,7 @@ def assembled(*overrides, num_envs=3):
 
 def field_of(task, num_envs):
     """The obstacles of many trials, without physics."""
-    parts = len(task.obstacles.parts())
-    poses = (torch.zeros(num_envs, parts, n, dtype=torch.float64) for n in (3, 4))
-    field = ObstacleField(task.obstacles, *poses, EnvRandom(task.seed, num_envs))
+    field = make_field(task.obstacles, num_envs, task.seed)
     goal = torch.tensor([task.commands.goal_x[0], 0.0]).expand(num_envs, 2)
     start = torch.zeros(num_envs, 2)
     field.reset(torch.arange(num_envs), start, goal)
@@ -70,21 +67,3 @@ def test_obstacles_find_their_places_and_worlds_stay_small(world):
         [part.name.removeprefix("obstacle_").rpartition("_")[0] not in optional for part in field.parts]
     )
     assert not there.any() or field.active[:, there].double().mean() > 0.95
-
-
-@pytest.mark.parametrize("world", WORLDS)
-def test_time_limits(world):
-    """Two and a half times the free way in the first seven, one and a half times in the others."""
-    task = assembled(f"scenario={world}", num_envs=1)
-    way = {"maze": 26.0, "dynamic_maze": 26.0, "corridor": 12.0, "corridor_hard": 12.0}.get(
-        world, task.commands.goal_x[1]
-    )
-    limit, speed = task.terminations.episode_length_s, task.commands.speed
-    if world in ("corridor", "static", "aerial", "small", "moving", "rod"):
-        assert limit == pytest.approx(2.5 * way / speed)
-    elif world == "hold":
-        assert limit > task.commands.hold_s == 20.0
-    elif world == "barn":
-        assert limit == pytest.approx(2 * way / speed)
-    elif world != "abs_hard":
-        assert limit == pytest.approx(1.5 * way / speed)

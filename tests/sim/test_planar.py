@@ -15,7 +15,6 @@ from omniperception import build, config
 from omniperception.build import load_policy
 from omniperception.env.env import OmniEnv
 from omniperception.scene.build import OBSTACLE_FORCE
-from omniperception.sim.planar_world import PlanarSimulator
 from omniperception.sim.response import FILE, GaitResponse, NoResponse
 from omnirobot.common.errors import ConfigError
 
@@ -340,8 +339,3 @@ class TestBadInput:
         run = build.assemble(config.compose(["experiment=navigate", "obstacles=none", "num_envs=2", *overrides]))
         with pytest.raises((ConfigError, ValueError, NoResponse), match=said):
             build.build_runner(run, None)
-
-
-def test_the_simulator_is_the_planar_one(tmp_path):
-    env = planar(steady(tmp_path))
-    assert isinstance(env.sim, PlanarSimulator) and env.num_actions == 3

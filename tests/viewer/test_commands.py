@@ -69,11 +69,8 @@ def test_with_a_display_the_demo_opens_the_browser(monkeypatch, line, scenario):
     ("line", "expected"),
     [
         (("play", RUN, "viewer=web", "trials=5"), "trials= would mean nothing: viewer=web counts and films nothing;"),
-        (("play", RUN, "viewer=web", "camera=side"), "camera= would mean nothing"),
         (("play", RUN, "viewer=web", "num_envs=4"), "num_envs=4: this command sets num_envs=1 itself"),
-        (("demo", "viewer=web", "video_s=3"), "video_s= would mean nothing: viewer=web films nothing; leave it out"),
         (("demo", "viewer=video", "num_envs=4"), "num_envs=4: this command sets num_envs=1 itself; leave it out"),
-        (("demo", "viewer=web", "+num_envs=4"), "+num_envs=4: this command sets num_envs=1 itself"),
     ],
 )
 def test_what_would_be_ignored_is_refused(capsys, line, expected):
@@ -85,11 +82,6 @@ def test_the_test_split_is_not_looked_at(capsys):
     assert "viewer=web shows split=dev" in message
     message = said(capsys, "play", RUN, "viewer=web", "obstacles.split=test")
     assert "obstacles.split=test is for reports" in message and "no page may see it" in message
-
-
-def test_what_nothing_would_read_is_refused(capsys):
-    assert "out= would mean nothing" in said(capsys, "evaluate", RUN, "viewer=web", "out=x.json")
-    assert "video_s= would mean nothing" in said(capsys, "play", RUN, "viewer=none", "video_s=1")
 
 
 def test_a_missing_library_names_the_extra(capsys, monkeypatch):

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from omnilidar import DEVICES, TriangleMesh
-from omnilidar.mesh_files import AXES, read_mesh, unit_said
+from omnilidar.mesh_files import AXES, read_mesh, unit_hint
 from omniperception import build, config
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
 from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene, demo_scene, mesh_scene
@@ -151,7 +151,7 @@ def _surroundings(arguments: Arguments, robot: RobotConfig, walkers: int = 0) ->
         raise config.ConfigError(f"at={','.join(map(str, arguments.at))} must be three numbers, x,y,z in metres")
     vertices, triangles = read_mesh(arguments.mesh, arguments.scale, arguments.up)
     at, low, high = np.array(arguments.at), vertices[triangles].min((0, 1)), vertices[triangles].max((0, 1))
-    said = unit_said(arguments.mesh, vertices[triangles], arguments.scale)
+    said = unit_hint(arguments.mesh, vertices[triangles], arguments.scale)
     beside = float(np.linalg.norm(np.maximum(low - at, at - high).clip(min=0.0)))
     if beside > BESIDE:
         spans = ", ".join(f"{axis} {a:.10g} to {b:.10g}" for axis, a, b in zip("xyz", low, high, strict=True))

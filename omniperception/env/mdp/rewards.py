@@ -13,6 +13,7 @@ import torch
 
 from omnilidar.launch import constant
 from omniperception.avoidance.sector_motion import sector_bearings
+from omniperception.common.sectors import FAR
 from omniperception.env.state import EnvState, requires, rests
 
 
@@ -260,7 +261,7 @@ def time_to_collision(state: EnvState, radius: float, scale_s: float) -> torch.T
     """exp(-t / `scale_s`), t (s) until a disc of `radius` (m) meets the obstacle of a sector if both keep their
     velocities; 0 where it meets none."""
     sectors = state.sectors
-    distance = sectors[..., 0].clamp(max=50.0)
+    distance = sectors[..., 0].clamp(max=FAR)
     place = distance[..., None] * sector_bearings(sectors.shape[1], sectors.device)
     velocity = sectors[..., 1:] - state.kinematics.base_lin_vel_yaw[:, None]
     speed2 = velocity.square().sum(-1)

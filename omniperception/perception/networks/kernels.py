@@ -5,12 +5,10 @@ import math
 import warp as wp
 
 from omnilidar.kernels.sectors import bearing_in_sectors, sector_at
+from omniperception.common.sectors import FAR
 
-FAINT = 1e-6
+LEAST_PROXIMITY = 1e-6
 """Proximity below which a cell counts as empty; with a decay of 0.5 m, a distance of 6.9 m."""
-
-EMPTY_DISTANCE = 1e3
-"""Distance (m) of an empty cell."""
 
 LATERAL = 5.0
 """Scale of the sine of the bearing within a sector, which is at most 0.09 for 36 of them."""
@@ -50,10 +48,10 @@ def write_rings(
             sin = wp.sin(yaw[env, frame] + back)
             for band in range(bands):
                 for sector in range(num_sectors):
-                    nearest[env, band, sector] = wp.static(EMPTY_DISTANCE)
+                    nearest[env, band, sector] = wp.static(FAR)
             for cell in range(bands * num_sectors):
                 c = cells[env, frame, cell]
-                if c[2] > wp.static(FAINT):
+                if c[2] > wp.static(LEAST_PROXIMITY):
                     far = -decay * wp.log(c[2]) / c[2]
                     x = far * (cos * c[0] - sin * c[1]) + shift[0]
                     y = far * (sin * c[0] + cos * c[1]) + shift[1]

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-NOTHING = 50.0
-"""Distance (m) of an empty sector."""
+from omniperception.common.sectors import FAR
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class MotionMatch:
         """Scores of all candidates, in operations that can be exported.
 
         Args:
-            distance: (n, H, S) nearest hit of each sector, metres, NOTHING without one; oldest frame first, all frames
+            distance: (n, H, S) nearest hit of each sector, metres, FAR without one; oldest frame first, all frames
                 from the pose of the newest.
             bearing: (n, S) azimuth of the newest frame's hits from the middle of their sectors, radians.
             velocities: (K, 2), those of :meth:`velocities`.
@@ -80,5 +79,5 @@ class MotionMatch:
             beside = (torch.atan2(y, x) * (sectors / (2 * math.pi))).round().long()
             there = distance[:, k].gather(1, ((own + beside) % sectors).flatten(1)).view_as(x)
             off = (there - (x * x + y * y).sqrt()).abs() / self.width
-            scores.append((1.0 - off).clamp(min=0.0) * (now < NOTHING)[:, None])
+            scores.append((1.0 - off).clamp(min=0.0) * (now < FAR)[:, None])
         return torch.cat(scores, 1)

@@ -13,9 +13,9 @@ from torch import nn
 from torch.nn import functional
 
 from omnilidar.launch import constant, launch_over_envs, view
-from omniperception.common.sectors import bearing_in_sectors, sector_at
-from omniperception.perception.networks.kernels import EMPTY_DISTANCE, FAINT, LATERAL, write_rings
-from omniperception.perception.networks.motion_match import NOTHING, MotionMatch
+from omniperception.common.sectors import FAR, bearing_in_sectors, sector_at
+from omniperception.perception.networks.kernels import LATERAL, LEAST_PROXIMITY, write_rings
+from omniperception.perception.networks.motion_match import MotionMatch
 from omniperception.perception.networks.windows import valid_frames, window_count
 
 MOTION_CHANNELS = 3
@@ -95,8 +95,8 @@ def _moved_rings(
 ) -> torch.Tensor:
     """:func:`moved_rings` in operations that can be exported."""
     bearing, proximity = cells[..., :2], cells[..., 2]
-    hit = proximity > FAINT
-    known = proximity.clamp(min=FAINT)
+    hit = proximity > LEAST_PROXIMITY
+    known = proximity.clamp(min=LEAST_PROXIMITY)
     places = bearing / known[..., None] * (-shape.decay * known.log())[..., None]
     places, hit = places.unflatten(2, (-1, shape.num_sectors)), hit.unflatten(2, (-1, shape.num_sectors))
     origin, yaw = _poses(moved)
@@ -106,11 +106,11 @@ def _moved_rings(
     newest = slice(shape.history - 1, None)
     here = _turned(-heading[:, newest, None, None, None], windows - base[:, newest, None, None, None])
     hit = _windows(hit, shape.history) & valid_frames(count, shape.history)[..., None, None]
-    distance = torch.where(hit, here.square().sum(-1).sqrt(), EMPTY_DISTANCE)
+    distance = torch.where(hit, here.square().sum(-1).sqrt(), FAR)
     turned = bearing_in_sectors(here, shape.num_sectors)
     sector = sector_at(turned, shape.num_sectors)
     empty = 0.0 * distance  # not zeros_like, whose shape an exporter takes for a constant
-    nearest = (empty + EMPTY_DISTANCE).scatter_reduce(-1, sector, distance, "amin")
+    nearest = (empty + FAR).scatter_reduce(-1, sector, distance, "amin")
     is_nearest = (distance <= nearest.gather(-1, sector)) & hit
     within = (turned - sector - 0.5) * (2 * math.pi / shape.num_sectors)
     lateral = empty.scatter_reduce(-1, sector, torch.where(is_nearest, within, 0.0), "sum")
@@ -291,9 +291,10 @@ class RingPath(nn.Module):
         hit."""
         cells = rings.unflatten(1, (self.shape.history, -1, self.shape.channels))
         proximity, band = cells[:, :, :, -2].max(2)
-        bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (LATERAL * proximity.clamp(min=FAINT))
-        reach = -self.shape.decays[-1] * proximity.clamp(min=FAINT).log()
-        distance = torch.where(proximity > FAINT, reach, NOTHING)
+        known = proximity.clamp(min=LEAST_PROXIMITY)
+        bearing = cells[:, :, :, -1].gather(2, band[:, :, None])[:, :, 0] / (LATERAL * known)
+        reach = -self.shape.decays[-1] * known.log()
+        distance = torch.where(proximity > LEAST_PROXIMITY, reach, FAR)
         nearness = _NEARNESS * (1.0 - distance / _REACH).clamp(min=0.0)
         return torch.cat(
             (match(distance, bearing[:, -1], self._velocities, ages), nearness, 2.0 * LATERAL * bearing), 1

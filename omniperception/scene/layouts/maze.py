@@ -19,7 +19,7 @@ class MazeLayout:
     """Walls on the edges of a grid of square cells, inside a closed border.
 
     The robot starts at the origin, in the middle of the first column's middle cell; the goal is the middle of the last
-    column's middle cell, which a way always leads to. As the maze that REASAN (Yuan et al. 2025, arXiv 2512.09537)
+    column's middle cell, which a path always leads to. As the maze that REASAN (Yuan et al. 2025, arXiv 2512.09537)
     is tested in: 10 x 5 cells of 2 m, on average 27 of the 85 inner edges with a wall, made of pillars 0.15 to 0.4 m
     thick and 0.3 to 2 m high. There the ten mazes are drawn by hand and the pillars stand up to 0.15 m apart.
 
@@ -60,7 +60,7 @@ class MazeLayout:
         if any(not 0 <= lane < self.columns for lane in self.lanes):
             raise ValueError(f"obstacles: lanes={list(self.lanes)} of a maze must lie in 0 to {self.columns - 1}")
         check_not_negative(self, "depth")
-        most = min((self.columns - 1) * (self.rows - 1), len(self._inner_edges()))  # a way to every cell leaves so many
+        most = min((self.columns - 1) * (self.rows - 1), len(self._inner_edges()))  # a path to every cell remains
         if not 0 <= self.walls <= most:
             raise ValueError(f"obstacles: walls={self.walls} of a maze must lie in 0 to {most}")
         check_worlds(self)
@@ -79,28 +79,28 @@ class MazeLayout:
         return np.stack([self._world(stream(seed, world)) for world in range(num_worlds)])
 
     def routes(self, seed: int, num_worlds: int) -> np.ndarray:
-        """(num_worlds, R, 2) m: a shortest way through the middles of cells from the robot's to the goal, in
+        """(num_worlds, R, 2) m: a shortest path through the middles of cells from the robot's to the goal, in
         `ROUTE_PIECES` pieces from one to the next; the goal is repeated up to the length of the longest."""
-        ways = [self._walls_and_way(stream(seed, world))[1] for world in range(num_worlds)]
-        longest = max(len(way) for way in ways)
-        cells = np.array([way + way[-1:] * (longest - len(way)) for way in ways], dtype=np.float64)
+        paths = [self._walls_and_path(stream(seed, world))[1] for world in range(num_worlds)]
+        longest = max(len(path) for path in paths)
+        cells = np.array([path + path[-1:] * (longest - len(path)) for path in paths], dtype=np.float64)
         share = np.arange(ROUTE_PIECES)[:, None] / ROUTE_PIECES
         pieces = cells[:, :-1, None] + share * np.diff(cells, axis=1)[:, :, None]  # (num_worlds, cells, pieces, 2)
         points = np.concatenate((pieces.reshape(num_worlds, -1, 2), cells[:, -1:]), 1)
         return (points - [0, self.rows // 2]) * self.cell
 
-    def _walls_and_way(self, rng: np.random.Generator) -> tuple[list[tuple[int, int, int]], list[tuple[int, int]]]:
+    def _walls_and_path(self, rng: np.random.Generator) -> tuple[list[tuple[int, int, int]], list[tuple[int, int]]]:
         """Edges with a wall, and cells (column, row) from the start's to the goal's."""
         edges = self._inner_edges()
         while True:
             chosen = rng.choice(len(edges), self.walls, replace=False)
             walls = [edges[k] for k in sorted(chosen)]
-            way = self._way(walls)
-            if way:
-                return walls, way
+            path = self._path(walls)
+            if path:
+                return walls, path
 
     def _world(self, rng: np.random.Generator) -> np.ndarray:
-        walls, _ = self._walls_and_way(rng)
+        walls, _ = self._walls_and_path(rng)
         segments = np.array([self._segment(edge) for edge in walls] + self._border(), dtype=np.float64)
         num = len(segments)
         thickness, height = draw(rng, self.thickness, num), draw(rng, self.height, num)
@@ -113,8 +113,8 @@ class MazeLayout:
         beside = [(i, j, 1) for i in range(self.columns) for j in range(self.rows - 1) if i not in self.lanes]
         return ahead + beside
 
-    def _way(self, walls: Sequence[tuple[int, int, int]]) -> list[tuple[int, int]]:
-        """Cells of a shortest way from the start's to the goal's; empty where none leads there."""
+    def _path(self, walls: Sequence[tuple[int, int, int]]) -> list[tuple[int, int]]:
+        """Cells of a shortest path from the start's to the goal's; empty where none leads there."""
         closed, middle = set(walls), self.rows // 2
         before: dict[tuple[int, int], tuple[int, int] | None] = {(0, middle): None}
         front = [(0, middle)]  # grows at its end: nearer cells come first
@@ -129,12 +129,12 @@ class MazeLayout:
                 if inside and edge not in closed and cell not in before:
                     before[cell] = (i, j)
                     front.append(cell)
-        way: list[tuple[int, int]] = []
+        path: list[tuple[int, int]] = []
         last = (self.columns - 1, middle) if (self.columns - 1, middle) in before else None
         while last is not None:
-            way.append(last)
+            path.append(last)
             last = before[last]
-        return way[::-1]
+        return path[::-1]
 
     def _segment(self, edge: tuple[int, int, int]) -> tuple[float, float, float, float]:
         """(x, y, yaw, half length) of an edge."""

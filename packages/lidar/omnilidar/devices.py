@@ -40,6 +40,7 @@ class DeviceSpec:
 
     Attributes:
         name: Maker and model.
+        source: Where the numbers are from.
         pattern: Makes its scan pattern.
         horizontal_fov_deg: Width of the field of view, 360 for a spinning sensor.
         elevation_deg: Lowest and highest elevation.
@@ -50,22 +51,21 @@ class DeviceSpec:
         max_range: Range at 10 % reflectivity, or the one range that the maker gives, metres.
         range_sigma: Standard deviation of a range, metres.
         angle_sigma_deg: Standard deviation of a direction, degrees; None where none is given.
-        source: Where the numbers are from.
         measured: What recordings of the device show, within the ranges that they cover; empty where there are none.
     """
 
     name: str
+    source: str
     pattern: Callable[[], ScanPattern]
     horizontal_fov_deg: float
     elevation_deg: tuple[float, float]
     channels: int
     points_per_second: float
-    frame_hz: float
     min_range: float
     max_range: float
     range_sigma: float
     angle_sigma_deg: float | None
-    source: str
+    frame_hz: float = 10.0
     measured: tuple[Noise, ...] = ()
 
     @property
@@ -81,83 +81,88 @@ class DeviceSpec:
         return tuple(models)
 
 
-_OUSTER = {
-    "OS0": (os0, 45.0, 0.5, 35.0, 0.02),
-    "OS1": (os1, 22.5, 0.5, 90.0, 0.01),
-    "OS2": (os2, 11.25, 0.8, 200.0, 0.03),
-}
-_OUSTER_SOURCE = (
-    "Ouster {} datasheet, Rev 7; precision depends on range, a middle value; minimum range 0.3-0.5 m by firmware"
+_COLUMNS = (
+    *("pattern", "horizontal_fov_deg", "elevation_deg", "channels", "points_per_second", "min_range"),
+    *("max_range", "range_sigma", "angle_sigma_deg"),
 )
-
-
-def _ouster(model: str, channels: int) -> DeviceSpec:
-    pattern, half, near, far, sigma = _OUSTER[model]
-    return DeviceSpec(
-        f"Ouster {model}-{channels}",
-        partial(pattern, channels),
-        360.0,
-        (-half, half),
-        channels,
-        channels * 10_240.0,
-        10.0,
-        near,
-        far,
-        sigma,
-        0.01,
-        _OUSTER_SOURCE.format(model),
-    )
-
-
-def _livox(name: str, pattern: Callable, *specs, source: str) -> DeviceSpec:
-    width, elevation, lasers, rate, near, far, sigma, angle_sigma = specs
-    return DeviceSpec(
-        f"Livox {name}", pattern, width, elevation, lasers, rate, 10.0, near, far, sigma, angle_sigma, source
-    )
-
-
 # fmt: off
-DEVICES: dict[str, DeviceSpec] = {
-    "mid360": _livox("Mid-360", mid360, 360.0, (-7.0, 52.0), 4, 200_000.0, 0.1, 40.0, 0.02, 0.15,
-                     source="Livox Mid-360 user manual v1.0, specifications: sigma at 10 m"),
-    "mid360_measured": _livox("Mid-360, as one was measured", mid360_measured, 360.0, (-7.1, 52.5), 4, 200_000.0, 0.1,
-                              40.0, 0.02, 0.15, source="two frames of one Livox device (docs/lab/fidelity.md); ranges "
-                                                       "and sigmas: Livox Mid-360 user manual v1.0"),
-    "avia": _livox("Avia", avia, 70.4, (-38.6, 38.6), 6, 240_000.0, 1.0, 190.0, 0.02, 0.05,
-                   source="Livox Avia user manual, specifications: sigma at 20 m"),
-    "hap": _livox("HAP", hap, 120.0, (-12.5, 12.5), 6, 452_000.0, 0.5, 150.0, 0.02, 0.1,
-                  source="Livox HAP (TX) user manual, table 1.2.1: sigma at 20 m and 80 %"),
-    "horizon": _livox("Horizon", horizon, 81.7, (-12.55, 12.55), 6, 240_000.0, 0.5, 90.0, 0.02, 0.05,
-                      source="Livox Horizon user manual v1.0, specifications: sigma at 20 m; not re-checked"),
-    "mid40": _livox("Mid-40", mid40, 38.4, (-19.2, 19.2), 1, 100_000.0, 1.0, 90.0, 0.02, 0.1,
-                    source="Livox Mid series user manual v1.0, specifications: sigma at 20 m; not re-checked"),
-    "mid70": _livox("Mid-70", mid70, 70.4, (-35.2, 35.2), 1, 100_000.0, 0.05, 90.0, 0.02, 0.1,
-                    source="Livox Mid-70 user manual v1.2, specifications: sigma at 25 m; not re-checked"),
-    "tele15": _livox("Tele-15", tele15, 14.5, (-8.1, 8.1), 6, 240_000.0, 3.0, 320.0, 0.02, 0.03,
-                     source="Livox Tele-15 user manual v1.0, specifications: sigma at 20 m; not re-checked"),
-    "hdl64e": DeviceSpec("Velodyne HDL-64E", hdl64e, 360.0, (-24.33, 2.0), 64, 4e6 / 3.0, 10.0, 0.9, 120.0, 0.02, None,
-                         "Velodyne HDL-64E S2 user's manual; reflectivity of the range not given; not re-checked"),
-    "hdl32e": DeviceSpec("Velodyne HDL-32E", hdl32e, 360.0, (-30.67, 10.67), 32, 32 / 46.08e-6, 10.0, 1.0, 100.0, 0.02,
-                         None, "Velodyne HDL-32E user's manual: vertical angles, firing order; range sigma at 25 m"),
-    "vlp16": DeviceSpec("Velodyne VLP-16", vlp16, 360.0, (-15.0, 15.0), 16, 16 / 55.296e-6, 10.0, 0.5, 100.0, 0.03,
-                        None, "Velodyne VLP-16 user manual 63-9243: angles, firing times; ranges not re-checked"),
-    "vlp32c": DeviceSpec("Velodyne VLP-32C", vlp32c, 360.0, (-25.0, 15.0), 32, 32 / 55.296e-6, 10.0, 1.0, 200.0, 0.03,
-                         None, "Velodyne VLP-32C user manual 63-9325: angles, firing times; ranges not re-checked"),
-    **{f"{model.lower()}_{channels}": _ouster(model, channels) for model in _OUSTER for channels in (128, 64, 32)},
-    "xt32": DeviceSpec("Hesai XT32", xt32, 360.0, (-16.0, 15.0), 32, 640_000.0, 10.0, 0.05, 80.0, 0.005, None,
-                       "Hesai PandarXT user manual and SDK (angles, firing times); ranges not re-checked"),
-    "xt16": DeviceSpec("Hesai XT16", xt16, 360.0, (-15.0, 15.0), 16, 320_000.0, 10.0, 0.05, 80.0, 0.005, None,
-                       "Hesai PandarXT-16 user manual and SDK (angles, firing times); ranges not re-checked"),
-    "unitree_l1": DeviceSpec("Unitree L1", unitree_l1, 360.0, (0.0, 90.0), 1, 21_600.0, 10.0, 0.05, 30.0, 0.02, None,
-                             "Unitree 4D LiDAR-L1 user manual (field of view, 21,600 points/s); SDK unilidar_sdk: 120 "
-                             "points per sweep, geometry; range at 90 %, turns/s, sigma: product page, not re-checked"),
-    "unitree_l2": DeviceSpec("Unitree L2", unitree_l2, 360.0, (0.0, 90.0), 1, 63_936.0, 10.0, 0.05, 30.0, 0.02, None,
-                             "Unitree SDK unilidar_sdk2: geometry, standard field of view of 180 deg; user manual and "
-                             "product page, not re-checked: 64,000 points/s, sweeps and turns/s, range at 90 %, sigma"),
-    "airy": DeviceSpec("RoboSense Airy", airy, 360.0, (0.0, 90.0), 96, 864_000.0, 10.0, 0.1, 30.0, 0.02, None,
-                       "RoboSense Airy product page and driver (rs_driver); ranges not re-checked"),
+_TABLE = {
+    # preset           pattern             fov    elevation        lasers points/s        near  far    sigma  angle
+    "mid360":          (mid360,            360.0, (-7.0, 52.0),    4,     200_000.0,      0.1,  40.0,  0.02,  0.15),
+    "mid360_measured": (mid360_measured,   360.0, (-7.1, 52.5),    4,     200_000.0,      0.1,  40.0,  0.02,  0.15),
+    "avia":            (avia,              70.4,  (-38.6, 38.6),   6,     240_000.0,      1.0,  190.0, 0.02,  0.05),
+    "hap":             (hap,               120.0, (-12.5, 12.5),   6,     452_000.0,      0.5,  150.0, 0.02,  0.1),
+    "horizon":         (horizon,           81.7,  (-12.55, 12.55), 6,     240_000.0,      0.5,  90.0,  0.02,  0.05),
+    "mid40":           (mid40,             38.4,  (-19.2, 19.2),   1,     100_000.0,      1.0,  90.0,  0.02,  0.1),
+    "mid70":           (mid70,             70.4,  (-35.2, 35.2),   1,     100_000.0,      0.05, 90.0,  0.02,  0.1),
+    "tele15":          (tele15,            14.5,  (-8.1, 8.1),     6,     240_000.0,      3.0,  320.0, 0.02,  0.03),
+    "hdl64e":          (hdl64e,            360.0, (-24.33, 2.0),   64,    4e6 / 3.0,      0.9,  120.0, 0.02,  None),
+    "hdl32e":          (hdl32e,            360.0, (-30.67, 10.67), 32,    32 / 46.08e-6,  1.0,  100.0, 0.02,  None),
+    "vlp16":           (vlp16,             360.0, (-15.0, 15.0),   16,    16 / 55.296e-6, 0.5,  100.0, 0.03,  None),
+    "vlp32c":          (vlp32c,            360.0, (-25.0, 15.0),   32,    32 / 55.296e-6, 1.0,  200.0, 0.03,  None),
+    "os0_128":         (partial(os0, 128), 360.0, (-45.0, 45.0),   128,   1_310_720.0,    0.5,  35.0,  0.02,  0.01),
+    "os0_64":          (partial(os0, 64),  360.0, (-45.0, 45.0),   64,    655_360.0,      0.5,  35.0,  0.02,  0.01),
+    "os0_32":          (partial(os0, 32),  360.0, (-45.0, 45.0),   32,    327_680.0,      0.5,  35.0,  0.02,  0.01),
+    "os1_128":         (partial(os1, 128), 360.0, (-22.5, 22.5),   128,   1_310_720.0,    0.5,  90.0,  0.01,  0.01),
+    "os1_64":          (partial(os1, 64),  360.0, (-22.5, 22.5),   64,    655_360.0,      0.5,  90.0,  0.01,  0.01),
+    "os1_32":          (partial(os1, 32),  360.0, (-22.5, 22.5),   32,    327_680.0,      0.5,  90.0,  0.01,  0.01),
+    "os2_128":         (partial(os2, 128), 360.0, (-11.25, 11.25), 128,   1_310_720.0,    0.8,  200.0, 0.03,  0.01),
+    "os2_64":          (partial(os2, 64),  360.0, (-11.25, 11.25), 64,    655_360.0,      0.8,  200.0, 0.03,  0.01),
+    "os2_32":          (partial(os2, 32),  360.0, (-11.25, 11.25), 32,    327_680.0,      0.8,  200.0, 0.03,  0.01),
+    "xt32":            (xt32,              360.0, (-16.0, 15.0),   32,    640_000.0,      0.05, 80.0,  0.005, None),
+    "xt16":            (xt16,              360.0, (-15.0, 15.0),   16,    320_000.0,      0.05, 80.0,  0.005, None),
+    "unitree_l1":      (unitree_l1,        360.0, (0.0, 90.0),     1,     21_600.0,       0.05, 30.0,  0.02,  None),
+    "unitree_l2":      (unitree_l2,        360.0, (0.0, 90.0),     1,     63_936.0,       0.05, 30.0,  0.02,  None),
+    "airy":            (airy,              360.0, (0.0, 90.0),     96,    864_000.0,      0.1,  30.0,  0.02,  None),
 }
 # fmt: on
+_OUSTER = "Ouster {} datasheet, Rev 7; precision depends on range, a middle value; minimum range 0.3-0.5 m by firmware"
+_NAMES_AND_SOURCES = {
+    "mid360": ("Livox Mid-360", "Livox Mid-360 user manual v1.0, specifications: sigma at 10 m"),
+    "mid360_measured": (
+        "Livox Mid-360, as one was measured",
+        "two frames of one Livox device (docs/lab/fidelity.md); ranges and sigmas: Livox Mid-360 user manual v1.0",
+    ),
+    "avia": ("Livox Avia", "Livox Avia user manual, specifications: sigma at 20 m"),
+    "hap": ("Livox HAP", "Livox HAP (TX) user manual, table 1.2.1: sigma at 20 m and 80 %"),
+    "horizon": ("Livox Horizon", "Livox Horizon user manual v1.0, specifications: sigma at 20 m; not re-checked"),
+    "mid40": ("Livox Mid-40", "Livox Mid series user manual v1.0, specifications: sigma at 20 m; not re-checked"),
+    "mid70": ("Livox Mid-70", "Livox Mid-70 user manual v1.2, specifications: sigma at 25 m; not re-checked"),
+    "tele15": ("Livox Tele-15", "Livox Tele-15 user manual v1.0, specifications: sigma at 20 m; not re-checked"),
+    "hdl64e": (
+        "Velodyne HDL-64E",
+        "Velodyne HDL-64E S2 user's manual; reflectivity of the range not given; not re-checked",
+    ),
+    "hdl32e": (
+        "Velodyne HDL-32E",
+        "Velodyne HDL-32E user's manual: vertical angles, firing order; range sigma at 25 m",
+    ),
+    "vlp16": ("Velodyne VLP-16", "Velodyne VLP-16 user manual 63-9243: angles, firing times; ranges not re-checked"),
+    "vlp32c": ("Velodyne VLP-32C", "Velodyne VLP-32C user manual 63-9325: angles, firing times; ranges not re-checked"),
+    "xt32": ("Hesai XT32", "Hesai PandarXT user manual and SDK (angles, firing times); ranges not re-checked"),
+    "xt16": ("Hesai XT16", "Hesai PandarXT-16 user manual and SDK (angles, firing times); ranges not re-checked"),
+    "unitree_l1": (
+        "Unitree L1",
+        "Unitree 4D LiDAR-L1 user manual (field of view, 21,600 points/s); SDK unilidar_sdk: 120 points per "
+        "sweep, geometry; range at 90 %, turns/s, sigma: product page, not re-checked",
+    ),
+    "unitree_l2": (
+        "Unitree L2",
+        "Unitree SDK unilidar_sdk2: geometry, standard field of view of 180 deg; user manual and product page, "
+        "not re-checked: 64,000 points/s, sweeps and turns/s, range at 90 %, sigma",
+    ),
+    "airy": ("RoboSense Airy", "RoboSense Airy product page and driver (rs_driver); ranges not re-checked"),
+    **{
+        f"os{k}_{channels}": (f"Ouster OS{k}-{channels}", _OUSTER.format(f"OS{k}"))
+        for k in range(3)
+        for channels in (128, 64, 32)
+    },
+}
+
+DEVICES: dict[str, DeviceSpec] = {
+    preset: DeviceSpec(*_NAMES_AND_SOURCES[preset], **dict(zip(_COLUMNS, row, strict=True)))  # type: ignore[arg-type]
+    for preset, row in _TABLE.items()
+}
 """Every commercial sensor, by the name of its preset."""
 
 _NO_MISSES = (0.0,)

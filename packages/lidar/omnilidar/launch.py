@@ -66,7 +66,7 @@ MIN_CHUNK_WORK = 65536
 
 
 @contextlib.contextmanager
-def compiling_is_said(kernel: wp.Kernel) -> Iterator[None]:
+def announce_compiling(kernel: wp.Kernel) -> Iterator[None]:
     """Says what takes so long where a kernel is compiled, which Warp does once for each form and keeps on the disk.
 
     Args:
@@ -137,7 +137,7 @@ class SplitLaunch:
         self.cuda_device = device if device.type == "cuda" else None
         threads = 1 if self.cuda_device else num_threads
         chunks = split(num_envs, work_per_env, threads) if num_envs else []
-        with compiling_is_said(kernel):
+        with announce_compiling(kernel):
             self.commands = [
                 wp.launch(
                     kernel,

@@ -72,7 +72,7 @@ def read_mesh(path: str | Path, scale: float = 1.0, up: str | None = None) -> Me
         raise ValueError(f"mesh {path} has {broken.sum()} triangles with corners that are not finite; take them out")
     in_float32 = path.suffix.lower() == ".dae" or bool((corners == corners.astype(np.float32)).all())
     if in_float32 and far_origin(scale * corners) is not None:
-        said = f"mesh {path} {far_said(scale * corners)}, and is kept in such numbers"
+        said = f"mesh {path} {far_hint(scale * corners)}, and is kept in such numbers"
         warnings.warn(f"{said}: export it near its origin, or as OBJ", stacklevel=3)
     order, signs = AXES[up or up_of(path)]
     return vertices[:, order] * signs * scale, triangles
@@ -90,7 +90,7 @@ def up_of(path: str | Path) -> str:
     return {"X_UP": "x", "Z_UP": "z"}.get(said.strip(), "y")
 
 
-def unit_said(path: str | Path, corners: np.ndarray, scale: float, key: str = "scale") -> str:
+def unit_hint(path: str | Path, corners: np.ndarray, scale: float, key: str = "scale") -> str:
     """Which scale a mesh probably needs: for its unit, named where its format defines none, or for its size.
 
     Args:
@@ -133,7 +133,7 @@ def far_origin(corners: np.ndarray) -> np.ndarray | None:
     return np.round((low + high) / 2.0) if _apart(reach) > 1e-3 and (high - low).max() < reach / 8.0 else None
 
 
-def far_said(corners: np.ndarray) -> str:
+def far_hint(corners: np.ndarray) -> str:
     """Where corners for which there is a ``far_origin`` lie."""
     reach = float(np.abs(corners).max())
     return f"lies {reach:.0f} m from its origin, where numbers of float32 are {_apart(reach):.2g} m apart"

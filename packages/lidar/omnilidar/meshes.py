@@ -11,7 +11,7 @@ import warp as wp
 
 from .kernels.mesh import STACK_SIZE
 from .kernels.tree import NUM_BINS, split_triangles, widen_tree
-from .mesh_files import far_origin, far_said, read_mesh, unit_said
+from .mesh_files import far_hint, far_origin, read_mesh, unit_hint
 
 HEURISTIC_DEPTH = 48
 """Below this depth of the binary tree, ranges of triangles are halved: no input makes a descent too deep."""
@@ -73,7 +73,7 @@ class TriangleMesh:
         far = far_origin(corners)
         if far is not None:
             raise ValueError(
-                f"mesh.vertices: the mesh {far_said(corners)}: subtract an origin in float64 first, such as"
+                f"mesh.vertices: the mesh {far_hint(corners)}: subtract an origin in float64 first, such as"
                 f" {tuple(far.tolist())}, and add it to shape.pos"
             )
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -104,14 +104,14 @@ class TriangleMesh:
                 wrong.
         """
         vertices, triangles = read_mesh(path, scale, up)
-        if said := unit_said(path, vertices[triangles], scale):
+        if said := unit_hint(path, vertices[triangles], scale):
             warnings.warn(said, stacklevel=2)
         vertices = vertices - np.asarray(origin, np.float64)
         far = far_origin(vertices[triangles])
         if far is not None:
             near = tuple((far + origin).tolist())
             raise ValueError(
-                f"mesh {path} {far_said(vertices[triangles])}: give origin={near}, and add it to shape.pos"
+                f"mesh {path} {far_hint(vertices[triangles])}: give origin={near}, and add it to shape.pos"
             )
         found = cls(vertices, triangles)
         if not len(found.triangles):

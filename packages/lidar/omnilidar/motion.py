@@ -8,7 +8,7 @@ import warp as wp
 
 from .kernels.motion import Track, bound_swept_shapes, record_poses
 from .launch import SplitLaunch
-from .scene import RayScene, View, empty_slots
+from .scene import RayScene, SensorView, empty_slots
 
 
 class PoseTrack:
@@ -104,7 +104,7 @@ class SweptShapes:
         slots: The shapes as the kernels read them, without poses: every ray computes them for its own time.
     """
 
-    def __init__(self, scene: RayScene, exclude_shapes: Sequence[int], view: View, track: PoseTrack) -> None:
+    def __init__(self, scene: RayScene, exclude_shapes: Sequence[int], view: SensorView, track: PoseTrack) -> None:
         self._scene, self._view, self._track = scene, view, track
         self.slots, viewed = empty_slots(scene, exclude_shapes, view)
         self._num_viewed = len(viewed)

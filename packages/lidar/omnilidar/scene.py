@@ -43,7 +43,7 @@ class RayHits:
 
 
 @dataclass(frozen=True)
-class View:
+class SensorView:
     """From where, how far and in which elevations a sensor looks; what is outside need not be tested.
 
     Attributes:
@@ -79,8 +79,8 @@ class PlacedShapes:
         group: Centre and radius of a sphere around each GROUP_SIZE slots, (num_envs, G) vec4d; None with a view.
     """
 
-    def __init__(self, scene: "RayScene", exclude_shapes: Sequence[int], view: View | None) -> None:
-        self._scene, self._view = scene, view or View()
+    def __init__(self, scene: "RayScene", exclude_shapes: Sequence[int], view: SensorView | None) -> None:
+        self._scene, self._view = scene, view or SensorView()
         self.slots, viewed = empty_slots(scene, exclude_shapes, self._view)
         shape, device = self.slots.shape.shape, scene.wp_device
         self.slots.axes = wp.zeros(shape, dtype=wp.mat33, device=device)
@@ -142,7 +142,7 @@ def check_kept(pos: torch.Tensor, dtype: torch.dtype) -> None:
             )
 
 
-def empty_slots(scene: "RayScene", exclude_shapes: Sequence[int], view: View) -> tuple[Slots, list[int]]:
+def empty_slots(scene: "RayScene", exclude_shapes: Sequence[int], view: SensorView) -> tuple[Slots, list[int]]:
     """Slots for the shapes of a scene that are not excluded, and the indices of these shapes."""
     excluded = scene.check_shape_ids(exclude_shapes)
     viewed = [k for k in range(len(scene.shapes)) if k not in excluded]

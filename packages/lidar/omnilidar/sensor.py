@@ -23,7 +23,7 @@ from .patterns import ROW_SLACK, ScanPattern, make_selection
 from .patterns.selection import Strategy
 from .rotations import quat_from_rpy
 from .scan_table import ScanTable
-from .scene import PlacedShapes, RayScene, View
+from .scene import PlacedShapes, RayScene, SensorView
 from .shapes import ShapeKind, finite_tuple
 
 _COVERED = 0.8
@@ -324,7 +324,7 @@ class Lidar:
         """As many rows of ``frame``."""
         return LidarFrame(**{name: getattr(self.frame, name)[:count] for name in self.outputs})
 
-    def _place(self, mount_body: int, exclude_shapes: Sequence[int]) -> tuple[View, PlacedShapes | SweptShapes]:
+    def _place(self, mount_body: int, exclude_shapes: Sequence[int]) -> tuple[SensorView, PlacedShapes | SweptShapes]:
         """Pose from which the sensor looks, and what places the shapes that it may see."""
         config, reach = self.config, self._reach()
         elevation = None
@@ -332,7 +332,7 @@ class Lidar:
             angles = torch.asin(self.pattern.directions_s[:, 2].double().clamp(-1.0, 1.0))
             margin = max_deviation(tuple(self._noise.values()))
             elevation = (float(angles.min()) - margin, float(angles.max()) + margin)
-        view = View(mount_body, config.mount_pos, config.quat, config.max_range, reach, elevation)
+        view = SensorView(mount_body, config.mount_pos, config.quat, config.max_range, reach, elevation)
         if not config.motion_segments:
             return view, PlacedShapes(self.scene, exclude_shapes, view)
         self._track = PoseTrack(self.scene, config.motion_segments, config.motion_jump)

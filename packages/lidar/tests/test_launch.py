@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from omnilidar import launch
-from omnilidar.launch import CHUNKS_PER_THREAD, MIN_CHUNK_WORK, SplitLaunch, default_num_threads, split
+from omnilidar.launch import MIN_CHUNK_WORK, SplitLaunch, default_num_threads, split
 
 
 @pytest.mark.parametrize(("num_envs", "work", "threads"), [(1, 1, 2), (7, MIN_CHUNK_WORK, 2), (1000, 500, 3)])
@@ -18,13 +18,6 @@ def test_every_environment_is_in_one_chunk(num_envs, work, threads):
     chunks = split(num_envs, work, threads)
     assert [env for first, count in chunks for env in range(first, first + count)] == list(range(num_envs))
     assert all(count > 0 for _, count in chunks)
-
-
-def test_work_that_is_not_worth_a_thread_stays_together():
-    assert len(split(100, MIN_CHUNK_WORK // 100, 8)) == 1
-    assert len(split(100, MIN_CHUNK_WORK, 1)) == 1
-    assert len(split(100, -(-MIN_CHUNK_WORK // 25), 8)) == 4
-    assert len(split(100, MIN_CHUNK_WORK, 8)) == 8 * CHUNKS_PER_THREAD
 
 
 @pytest.mark.parametrize(("processes", "expected"), [(None, 4), ("1", 4), ("2", 2), ("3", 1), ("16", 1)])

@@ -231,11 +231,3 @@ def test_vertices_written_in_place_and_those_that_are_not_finite():
         assert cast(scene, *ray).ranges.tolist() == [[4.0], [6.0]]
     scene.update_vertices(0, torch.from_numpy(CUBE))
     assert cast(scene, *ray).ranges.tolist() == [[4.0], [4.0]]
-
-
-def test_wrong_vertices_are_refused():
-    scene = RayScene([Shape(ShapeKind.DEFORMABLE, asset=TriangleMesh(CUBE, CUBE_FACES))], 2, 0)
-    with pytest.raises(ValueError, match=r"\(7, 3\) must be \(2, 8, 3\) or \(8, 3\)"):
-        scene.update_vertices(0, torch.zeros(7, 3))
-    with pytest.raises(ValueError, match=r"shape_id=1 must be a deformable shape, one of \[0\]"):
-        scene.vertices(1)

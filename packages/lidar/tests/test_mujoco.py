@@ -106,20 +106,6 @@ def test_poses_of_environments_come_from_arrays(model):
     np.testing.assert_array_equal(scene.body_quat.numpy(), xquat[:, list(scene.body_ids)])
 
 
-def test_poses_of_another_model_are_refused(model):
-    scene = MujocoScene(model, num_envs=3)
-    pos, quat = torch.zeros(model.nbody, 3), torch.zeros(model.nbody, 4)
-    for xpos, xquat, name in (
-        (pos[:1], quat, "xpos"),
-        (pos[:-1], quat, "xpos"),
-        (pos, torch.zeros(2, model.nbody, 4), "xquat"),
-        (pos, quat[:, :3], "xquat"),
-        (torch.zeros(1, model.nbody, 3), quat, "xpos"),
-    ):
-        with pytest.raises(ValueError, match=f"{name} must be"):
-            scene.copy_poses(xpos, xquat)
-
-
 def test_a_signed_distance_field_is_refused(model):
     copy = mujoco.MjModel.from_xml_string(XML)
     copy.geom_type[copy.geom("ball").id] = mujoco.mjtGeom.mjGEOM_SDF

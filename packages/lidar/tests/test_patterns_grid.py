@@ -34,10 +34,7 @@ def test_height_scanner_is_a_grid_of_vertical_rays():
     ("make", "arguments", "message"),
     [
         (grid, (3, 3, 180.0), "fov_deg=180"),
-        (grid, (0, 3, 90.0), "width=0"),
         (height_scanner, (1.65, 1.0, 0.1), "size_x=1.65 must be a multiple of lidar.pattern.spacing=0.1"),
-        (height_scanner, (1.6, -1.0, 0.1), "lidar.pattern.size_y=-1.0"),
-        (height_scanner, (1.6, 1.0, 0.0), "lidar.pattern.spacing=0.0 must be a positive length"),
     ],
 )
 def test_wrong_grids_are_refused(make, arguments, message):
@@ -75,21 +72,13 @@ def test_a_users_table(tmp_path, name, header, rows):
     ("name", "content", "unit", "message"),
     [
         ("absent.csv", None, "rad", "does not exist \\(working directory: .*\\); give a .npy or .csv file"),
-        ("scan.txt", "0,0\n", "rad", "must end in .npy or .csv"),
-        ("scan.csv", "0,0,0\n1,1,1\n", "rad", r"holds \(2, 3\), expected \(M, 2\)"),
         ("scan.csv", "0,0\n1,x\n", "rad", r"row 1 is \[1.0, nan\], expected two numbers"),
         ("scan.csv", "0,0\n1\n", "rad", "cannot be read as numbers"),
-        ("scan.csv", "0,0,\n1,1\n2,2\n", "rad", "cannot be read as numbers"),
         ("scan.csv", "0.1O,0.2\n1,1\n2,2\n", "rad", r"row 0 is \[nan, 0.2\], expected two numbers"),
-        ("scan.csv", "nan,nan\n1,1\n", "rad", r"row 0 is \[nan, nan\], expected two numbers"),
-        ("scan.csv", '"10","20"\n1,1\n', "rad", r"row 0 is \[nan, nan\], expected two numbers"),
         ("scan.csv", "", "rad", "cannot be read as numbers: it is empty"),
         ("scan.csv", "Elevation,Azimuth\n0.1,0.2\n", "rad", "its columns are elevation, azimuth; azimuth, elevation"),
         ("scan.csv", "0,30\n", "rad", "elevation of 30 rad is beyond a right angle.*may have to be deg"),
-        ("scan.csv", "0,100\n", "deg", "elevation of 100 deg is beyond a right angle"),
         ("scan.csv", "0,0\n", "turns", "lidar.pattern.unit='turns' must be deg or rad"),
-        ("scan.npy", "no array", "rad", "cannot be read as numbers"),
-        ("scan.npy", "", "rad", "cannot be read as numbers"),
     ],
 )
 def test_wrong_files_are_refused_in_one_line(tmp_path, name, content, unit, message):

@@ -1,7 +1,5 @@
 """Spinning sensors: channel tables, columns, firing times, and angles as functions of time."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -136,14 +134,8 @@ def test_a_ray_looks_where_its_laser_is_at_its_time():
     ("make", "message"),
     [
         (lambda: ouster("OS7"), "model='OS7' must be one of OS0, OS1, OS2"),
-        (lambda: os1(48), "lidar.pattern.channels=48 must be 32, 64 or 128"),
-        (lambda: os1(64, "1024x5"), "lidar.pattern.mode='1024x5' must be one of 512x10"),
         (lambda: vlp16(30.0), "lidar.pattern.frame_hz=30.0 must be in 5..20"),
-        (lambda: spinning([], 10.0, 1e-4), "elevation_deg"),
-        (lambda: spinning([95.0], 10.0, 1e-4), "within -90..90"),
-        (lambda: spinning([0.0], math.nan, 1e-4), "frame_hz=nan must be positive"),
         (lambda: spinning([0.0], 10.0, 1e-4, [2e-4]), "fire_s must lie within"),
-        (lambda: spinning([0.0], 1.0, 10.0), "cycle_s=10.0 must be shorter than a turn"),
     ],
 )
 def test_wrong_devices_are_refused_in_one_line(make, message):

@@ -77,12 +77,6 @@ def test_pitch_is_levelled_and_the_mount_offset_counts():
     assert distances[18] == pytest.approx(math.hypot(0.5 + 2.0 * math.cos(pitch), 0.01), rel=1e-5)
 
 
-@pytest.mark.parametrize(("option", "value"), [("num_sectors", 0), ("max_distance", 0.0)])
-def test_wrong_arguments_are_refused(option, value):
-    with pytest.raises(ValueError, match=f"{option}=0"):
-        sectors([(1.0, 0.0, 0.0)], [OBSTACLE], **{option: value})
-
-
 @pytest.mark.parametrize(
     ("name", "given"), [("directions_s", torch.zeros(2, 3, 3)), ("class_id", torch.zeros(2, 4, dtype=torch.int32))]
 )
