@@ -27,9 +27,9 @@ from omniperception.evaluation.ablation import (
     load_study,
     write_tables,
 )
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record, read, write
-from omniperception.evaluation.study_report import study_table
+from omniperception.evaluation.report.records import Record, read, write
+from omniperception.evaluation.report.studies import study_table
+from omniperception.evaluation.trials.outcomes import Episodes
 
 STUDY = Study(experiment="avoid", variants=["fps_gru"], seeds=[1], scenarios=["corridor"], trials=2)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import config
-from omniperception.evaluation.curves import curves_of, draw_curves
+from omniperception.evaluation.report.curves import curves_of, draw_curves
 from omnirobot.common.cli import PICTURES, Command, argument
 from omnirobot.common.figures import PlotsUnavailable
 

@@ -35,7 +35,6 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.config import ConfigError
-from omniperception.evaluation.baselines import DRIVEN
 from omniperception.evaluation.suite import (
     POLICIES,
     SPLITS,
@@ -45,6 +44,7 @@ from omniperception.evaluation.suite import (
     held_out_scenarios,
     suite_worlds,
 )
+from omniperception.evaluation.trials.baselines import DRIVEN
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT

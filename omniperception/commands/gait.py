@@ -23,12 +23,11 @@ import torch
 from omniperception import build, config
 from omniperception.common.tables import markdown
 from omniperception.env.env import OmniEnv, Policy
-from omniperception.evaluation import robustness
-from omniperception.evaluation.footfall import COMMANDS, SETTLES_S, SHOWN_S, Footfall, draw_footfall, watch
-from omniperception.evaluation.kicks import AFTER_S, WATCHED_S, KickResults, draw_kicks, kick
-from omniperception.evaluation.records import FOLDER, merge
-from omniperception.evaluation.response import COMMANDS as CYCLES
-from omniperception.evaluation.response import (
+from omniperception.evaluation.gait import robustness
+from omniperception.evaluation.gait.footfall import COMMANDS, SETTLES_S, SHOWN_S, Footfall, draw_footfall, watch
+from omniperception.evaluation.gait.kicks import AFTER_S, WATCHED_S, KickResults, draw_kicks, kick
+from omniperception.evaluation.gait.response import COMMANDS as CYCLES
+from omniperception.evaluation.gait.response import (
     COPIES,
     STEP_S,
     Recording,
@@ -39,8 +38,9 @@ from omniperception.evaluation.response import (
     gait_frequency,
     record,
 )
-from omniperception.evaluation.response_fit import SETTLES_S as UNSETTLED_S
-from omniperception.evaluation.response_fit import fit, kept
+from omniperception.evaluation.gait.response_fit import SETTLES_S as UNSETTLED_S
+from omniperception.evaluation.gait.response_fit import fit, kept
+from omniperception.evaluation.report.records import FOLDER, merge
 from omniperception.evaluation.suite import Evaluation, World
 from omniperception.learning import CheckpointError
 from omniperception.scene.build import FOOT_FORCE

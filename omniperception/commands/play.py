@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 from omniperception import build, config
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.common.provenance import provenance
-from omniperception.evaluation.episodes import run_episodes
-from omniperception.evaluation.report import summary_table, times_line
+from omniperception.evaluation.report.tables import summary_table, times_line
+from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.learning import CheckpointError
 from omniperception.learning.progress import ProgressLine
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve

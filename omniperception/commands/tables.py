@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception.config import ConfigError
-from omniperception.evaluation.tables import rendered
+from omniperception.evaluation.report.pages import rendered
 from omnirobot.common.cli import Command, argument
 from omnirobot.common.files import write_whole
 from omnirobot.common.shell import command_line

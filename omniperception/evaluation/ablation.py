@@ -13,8 +13,9 @@ import yaml
 
 from omniperception import build, config
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import Record, read, write
-from omniperception.evaluation.study_report import study_table
+from omniperception.evaluation.report.pages import by_training
+from omniperception.evaluation.report.records import Record, read, write
+from omniperception.evaluation.report.studies import study_table
 from omniperception.evaluation.suite import (
     POLICIES,
     SPLITS,
@@ -25,7 +26,6 @@ from omniperception.evaluation.suite import (
     measure_all,
     suite_worlds,
 )
-from omniperception.evaluation.tables import by_training
 from omnirobot.common.errors import check_known, one_line
 from omnirobot.common.files import write_whole
 from omnirobot.common.signals import interruptible

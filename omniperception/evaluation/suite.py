@@ -24,14 +24,14 @@ from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.config import EnvConfig
-from omniperception.evaluation.baselines import BASELINES, DRIVEN, Limits, baseline, commanded_ranges, prepared
-from omniperception.evaluation.episodes import run_episodes
-from omniperception.evaluation.exported import ExportedPolicies
-from omniperception.evaluation.plots import draw_worlds
-from omniperception.evaluation.records import FOLDER, Record, merge, read, write
-from omniperception.evaluation.report import progress_line, table
-from omniperception.evaluation.tracks import Tracks
-from omniperception.evaluation.walking_report import walking_table
+from omniperception.evaluation.report.gaits import walking_table
+from omniperception.evaluation.report.plots import draw_worlds
+from omniperception.evaluation.report.records import FOLDER, Record, merge, read, write
+from omniperception.evaluation.report.tables import progress_line, table
+from omniperception.evaluation.trials.baselines import BASELINES, DRIVEN, Limits, baseline, commanded_ranges, prepared
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.exported import ExportedPolicies
+from omniperception.evaluation.trials.tracks import Tracks
 from omniperception.learning import CheckpointError, latest_checkpoint
 from omnirobot.common.errors import check_known, naming, one_line
 from omnirobot.common.figures import check_figures

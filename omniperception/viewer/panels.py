@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omniperception.config import OUTPUTS, SHIPPED_RUNS, find_runs
-from omniperception.evaluation.baselines import BASELINES
-from omniperception.evaluation.perceived import Perceived
+from omniperception.evaluation.film.perceived import Perceived
+from omniperception.evaluation.trials.baselines import BASELINES
 from omniperception.viewer import charts
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, PROXIMAL
 from omniperception.viewer.drive import MAX_SPEED, MAX_YAW_RATE, Velocity

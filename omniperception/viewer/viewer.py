@@ -14,7 +14,7 @@ import torch
 
 from omniperception import config
 from omniperception.config import ConfigError
-from omniperception.evaluation.perceived import true
+from omniperception.evaluation.film.perceived import true
 from omniperception.learning import CheckpointError, latest_checkpoint
 from omniperception.learning.checkpoint import list_checkpoints
 from omniperception.viewer.clock import Clock

@@ -10,7 +10,7 @@ import torch
 from omniperception import build, config
 from omniperception.avoidance.velocity import AvoidanceConfig
 from omniperception.build import TrainedPolicy, load_policy
-from omniperception.evaluation.baselines import StopConfig, baseline, blind, free_share, oracle, prepared
+from omniperception.evaluation.trials.baselines import StopConfig, baseline, blind, free_share, oracle, prepared
 
 ROOT = Path(__file__).resolve().parents[2]
 AVOIDER = ROOT / "pretrained/avoider"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.evaluation.clearance import Clearance, Geoms, clearances
-from omniperception.evaluation.clearance_kernels import BOX, TOLERANCE
+from omniperception.evaluation.trials.clearance import Clearance, Geoms, clearances
+from omniperception.evaluation.trials.clearance_kernels import BOX, TOLERANCE
 
 BLIND = ("experiment=walk", "rewards=walk")
 

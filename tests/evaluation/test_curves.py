@@ -7,7 +7,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from omniperception import config
 from omniperception.commands import main
-from omniperception.evaluation.curves import Curve, by_recipe, curves_of
+from omniperception.evaluation.report.curves import Curve, by_recipe, curves_of
 
 TAG = "Metrics/velocity_error"
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from omniperception.evaluation import run_episodes
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.report import summary_table, times_line
+from omniperception.evaluation.report.tables import summary_table, times_line
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.outcomes import Episodes
 
 SHORT = "terminations.episode_length_s=0.4"  # 20 control steps
 BLIND = ("lidar=none", "obstacles=none", "rewards=walk", "observations=walk")

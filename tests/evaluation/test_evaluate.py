@@ -18,9 +18,9 @@ from omniperception.common.provenance import provenance
 from omniperception.common.random import EnvRandom
 from omniperception.config import ConfigError
 from omniperception.evaluation import suite
-from omniperception.evaluation.baselines import baseline
-from omniperception.evaluation.records import read
+from omniperception.evaluation.report.records import read
 from omniperception.evaluation.suite import Evaluation, Task, World, evaluate, reported_seed, suite_worlds
+from omniperception.evaluation.trials.baselines import baseline
 from omniperception.learning import CheckpointError
 from omnirobot.common.figures import PlotsUnavailable
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from omniperception.commands.gait import feet_table
-from omniperception.evaluation.footfall import COMMANDS, Footfall, _bars, draw_footfall, watch
+from omniperception.evaluation.gait.footfall import COMMANDS, Footfall, _bars, draw_footfall, watch
 from omnirobot.common.errors import ConfigError
 
 BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk")

@@ -9,11 +9,11 @@ import torch
 
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record, merge, read, write
-from omniperception.evaluation.report import difference, table
-from omniperception.evaluation.statistics import quantiles
-from omniperception.evaluation.tables import VIEWS
+from omniperception.evaluation.report.pages import VIEWS
+from omniperception.evaluation.report.records import Record, merge, read, write
+from omniperception.evaluation.report.tables import difference, table
+from omniperception.evaluation.trials.outcomes import Episodes
+from omniperception.evaluation.trials.statistics import quantiles
 from omnirobot.common.files import lock
 
 # outcome, contacts, first contact (s), length (s)

@@ -60,7 +60,7 @@ def test_files_are_named_for_the_scenario():
 def test_a_missing_library_is_one_line(run_dir, capsys, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("omniperception.evaluation.") and "video" in name]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delitem(sys.modules, "omniperception.evaluation.overlay", raising=False)
+    monkeypatch.delitem(sys.modules, "omniperception.evaluation.film.overlay", raising=False)
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(SystemExit, match="2"):
         main(["play", f"run={run_dir}", "trials=2"])

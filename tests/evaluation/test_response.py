@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from omniperception.commands import main
-from omniperception.evaluation import response
-from omniperception.evaluation.response import Recording, _periodic, around_cycle, driven, falls_by_jump, reach
-from omniperception.evaluation.response_fit import fit, kept, lagged
+from omniperception.evaluation.gait import response
+from omniperception.evaluation.gait.response import Recording, _periodic, around_cycle, driven, falls_by_jump, reach
+from omniperception.evaluation.gait.response_fit import fit, kept, lagged
 from omniperception.sim.response import FILE, Cycle, GaitResponse, NoResponse
 from omnirobot.common.errors import ConfigError
 

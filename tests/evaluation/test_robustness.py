@@ -9,8 +9,8 @@ import yaml
 from omniperception import config
 from omniperception.commands.gait import kicks_table
 from omniperception.config import ConfigError
-from omniperception.evaluation.kicks import AFTER_S, KickResults, Kicks
-from omniperception.evaluation.robustness import measure, rows_of_the_robot, stretched, stretches
+from omniperception.evaluation.gait.kicks import AFTER_S, KickResults, Kicks
+from omniperception.evaluation.gait.robustness import measure, rows_of_the_robot, stretched, stretches
 from omniperception.evaluation.suite import Evaluation, World
 from omniperception.scene.build import FOOT_FORCE
 

@@ -5,9 +5,9 @@ import torch
 
 from omniperception import build, config
 from omniperception.config import ConfigError
-from omniperception.evaluation import run_episodes
-from omniperception.evaluation.outcomes import CLEARANCE_CAP
-from omniperception.evaluation.tracks import PERIOD_S
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.outcomes import CLEARANCE_CAP
+from omniperception.evaluation.trials.tracks import PERIOD_S
 
 BLIND = ("experiment=walk", "rewards=walk")
 SHORT = "terminations.episode_length_s=0.4"

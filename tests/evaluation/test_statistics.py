@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from omniperception.evaluation import wilson
-from omniperception.evaluation.statistics import paired_difference, pooled
+from omniperception.common.statistics import wilson
+from omniperception.evaluation.trials.statistics import paired_difference, pooled
 
 
 @pytest.mark.parametrize(

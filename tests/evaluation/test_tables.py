@@ -9,8 +9,8 @@ import torch
 
 from omniperception.commands.tables import Arguments, main
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import Record, read, write
-from omniperception.evaluation.tables import rendered
+from omniperception.evaluation.report.pages import rendered
+from omniperception.evaluation.report.records import Record, read, write
 
 from .test_outcomes import episodes
 

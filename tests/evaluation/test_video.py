@@ -10,11 +10,11 @@ from PIL import Image
 
 from omnilidar import Shape, ShapeKind
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
-from omniperception.evaluation.camera import CAMERAS, FollowCamera
-from omniperception.evaluation.overlay import legend, sector_plot
-from omniperception.evaluation.render import Arrow, Renderer, View
-from omniperception.evaluation.video import Recorder
-from omniperception.evaluation.video_options import VideoOptions
+from omniperception.evaluation.film.camera import CAMERAS, FollowCamera
+from omniperception.evaluation.film.overlay import legend, sector_plot
+from omniperception.evaluation.film.render import Arrow, Renderer, View
+from omniperception.evaluation.film.video import Recorder
+from omniperception.evaluation.film.video_options import VideoOptions
 from omniperception.scene.rays import HitClass, RayShapes
 from omnirobot.common.errors import ConfigError
 

@@ -9,11 +9,11 @@ import torch
 
 from omniperception.env.mdp.commands import SETTLE_S
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.episodes import run_episodes
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.walking import AT_STOP, COLUMNS
-from omniperception.evaluation.walking_report import Part, grounds, level_table, run_table, walking_table
+from omniperception.evaluation.report.gaits import Part, grounds, level_table, run_table, walking_table
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.outcomes import Episodes
+from omniperception.evaluation.trials.walking import AT_STOP, COLUMNS
 
 BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk", "num_envs=3")
 

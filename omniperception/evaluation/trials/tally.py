@@ -10,9 +10,9 @@ from omniperception.common.random import TrialRandom
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.commands import GoalCommand, GoalCommandConfig
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.clearance import Clearance
-from omniperception.evaluation.outcomes import CLEARANCE_CAP, GRAVITY, Episodes
-from omniperception.evaluation.tracks import Tracks
+from omniperception.evaluation.trials.clearance import Clearance
+from omniperception.evaluation.trials.outcomes import CLEARANCE_CAP, GRAVITY, Episodes
+from omniperception.evaluation.trials.tracks import Tracks
 
 CLEARANCE_EVERY = 2
 """Control steps between two measurements of the clearance."""

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.report.tables import check_apart, grouped, headline, rate_cell
 
 RATES = {
     "untouched": "reached, untouched",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from omniperception.evaluation.camera import CAMERAS
+from omniperception.evaluation.film.camera import CAMERAS
 from omnirobot.common.errors import ConfigError
 
 

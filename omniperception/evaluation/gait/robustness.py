@@ -14,11 +14,11 @@ from omegaconf import OmegaConf
 from omniperception import config
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import rate_cell
-from omniperception.evaluation.statistics import rate
+from omniperception.evaluation.report.gaits import Part
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.report.tables import rate_cell
 from omniperception.evaluation.suite import Evaluation, Task, measure_all
-from omniperception.evaluation.walking_report import Part
+from omniperception.evaluation.trials.statistics import rate
 from omnirobot.common.figures import new_figure, save_figure
 
 NEUTRAL = {"ground_friction": 0.8, "motor_strength": 1.0, "velocity_scale": 1.0}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from omniperception.config import ConfigError
-from omniperception.evaluation.outcomes import Episodes
+from omniperception.evaluation.trials.outcomes import Episodes
 from omnirobot.common.files import lock, write_whole
 
 FORMAT = 1

@@ -8,10 +8,10 @@ import torch
 
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.mdp.commands import VelocityCommand
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.tally import Tally
-from omniperception.evaluation.tracks import TrackRecorder
-from omniperception.evaluation.walking import WalkingTally
+from omniperception.evaluation.trials.outcomes import Episodes
+from omniperception.evaluation.trials.tally import Tally
+from omniperception.evaluation.trials.tracks import TrackRecorder
+from omniperception.evaluation.trials.walking import WalkingTally
 from omniperception.scene.build import FOOT_FORCE
 
 

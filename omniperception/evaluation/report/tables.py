@@ -8,9 +8,9 @@ import torch
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.statistics import paired_difference, pooled, quantiles
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.trials.outcomes import Episodes
+from omniperception.evaluation.trials.statistics import paired_difference, pooled, quantiles
 
 REFERENCE = "histogram"
 """Policy that the others' differences are taken to: the best known without learning."""

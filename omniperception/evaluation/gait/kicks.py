@@ -10,9 +10,9 @@ import torch
 
 from omniperception.common.rotations import rotate_yaw
 from omniperception.env.env import OmniEnv, Policy
-from omniperception.evaluation.episodes import run_episodes
-from omniperception.evaluation.statistics import rate
-from omniperception.evaluation.tally import trial_numbers
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.statistics import rate
+from omniperception.evaluation.trials.tally import trial_numbers
 from omnirobot.common.figures import new_figure, save_figure
 
 if TYPE_CHECKING:

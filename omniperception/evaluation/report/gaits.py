@@ -9,9 +9,9 @@ import torch
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, without_constants
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.report.tables import check_apart, grouped, headline, rate_cell, without_constants
+from omniperception.evaluation.trials.outcomes import Episodes
 from omnirobot.common.shell import command_line
 
 EASY_LEVELS = 5

@@ -23,10 +23,10 @@ import torch
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
-from omniperception.evaluation.records import Record, read, training_of
-from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell, table, without_constants
-from omniperception.evaluation.study_report import study_table
-from omniperception.evaluation.walking_report import level_table, run_table, walking_table
+from omniperception.evaluation.report.gaits import level_table, run_table, walking_table
+from omniperception.evaluation.report.records import Record, read, training_of
+from omniperception.evaluation.report.studies import study_table
+from omniperception.evaluation.report.tables import check_apart, grouped, headline, rate_cell, table, without_constants
 from omnirobot.common.shell import command_line
 
 _BLOCK = re.compile(r"^<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.statistics import quantiles, rate
-from omniperception.evaluation.tracks import Tracks
+from omniperception.evaluation.trials.statistics import quantiles, rate
+from omniperception.evaluation.trials.tracks import Tracks
 
 CLEARANCE_CAP = 1.0
 """Clearances (m) beyond this are reported as this."""

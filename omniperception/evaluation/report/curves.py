@@ -13,7 +13,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from omniperception import config
-from omniperception.evaluation.records import training_of
+from omniperception.evaluation.report.records import training_of
 from omnirobot.common.errors import ConfigError
 from omnirobot.common.figures import new_figure, plain, save_figure
 

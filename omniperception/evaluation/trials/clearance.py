@@ -12,8 +12,8 @@ import warp as wp
 from omnilidar.launch import launch_over_envs, view
 from omnilidar.mujoco import convex_hull
 from omniperception.env.env import OmniEnv
-from omniperception.evaluation import clearance_kernels as kernels
-from omniperception.evaluation.clearance_kernels import BOX, CAPSULE, CYLINDER, HULL
+from omniperception.evaluation.trials import clearance_kernels as kernels
+from omniperception.evaluation.trials.clearance_kernels import BOX, CAPSULE, CYLINDER, HULL
 
 _KINDS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: CAPSULE,

@@ -16,11 +16,11 @@ from torch import nn
 from omniperception.common.rotations import rotate, rotate_yaw
 from omniperception.env.env import OmniEnv
 from omniperception.env.sensing import split_elevation
-from omniperception.evaluation.camera import FollowCamera
-from omniperception.evaluation.overlay import PERCEIVED, TRUE, legend, sector_plot
-from omniperception.evaluation.perceived import perceived, true_sectors
-from omniperception.evaluation.render import COMMAND, DISTAL, PROXIMAL, VELOCITY, Arrow, Renderer, View, shown
-from omniperception.evaluation.video_options import VideoOptions
+from omniperception.evaluation.film.camera import FollowCamera
+from omniperception.evaluation.film.overlay import PERCEIVED, TRUE, legend, sector_plot
+from omniperception.evaluation.film.perceived import perceived, true_sectors
+from omniperception.evaluation.film.render import COMMAND, DISTAL, PROXIMAL, VELOCITY, Arrow, Renderer, View, shown
+from omniperception.evaluation.film.video_options import VideoOptions
 from omniperception.scene.rays import HitClass, ray_shapes
 from omnirobot.common.errors import naming
 

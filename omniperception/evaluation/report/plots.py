@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import rate_cell
-from omniperception.evaluation.tracks import Tracks
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.report.tables import rate_cell
+from omniperception.evaluation.trials.tracks import Tracks
 from omnirobot.common.figures import new_figure, plain, save_figure
 
 UNTOUCHED, TOUCHED, FAILED = "#1b7f4d", "#d62728", "#3b6fb6"

@@ -8,8 +8,8 @@ import torch
 
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.commands import VelocityCommand
-from omniperception.evaluation.outcomes import GRAVITY
-from omniperception.evaluation.tally import trial_numbers
+from omniperception.evaluation.trials.outcomes import GRAVITY
+from omniperception.evaluation.trials.tally import trial_numbers
 
 AT_LIMIT = 0.999
 """Share of its limit from which on a torque counts as limited."""
