@@ -97,11 +97,13 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     picture.parent.mkdir(exist_ok=True)
     check_figures()
     if arguments.what == "kicks":
-        results = kicked(arguments, run_dir, overrides)
+        trained = policy_on_free_ground(arguments, run_dir, overrides)
+        results = kick(trained.env, trained.policy, arguments.speeds, arguments.bearings, arguments.repeats)
         print(kicks_table(results, arguments.speeds))
         draw_kicks(results, arguments.speeds, arguments.bearings, picture)
     elif arguments.what == "feet":
-        footfall = watched(arguments, run_dir, overrides)
+        trained = policy_on_free_ground(arguments, run_dir, overrides)
+        footfall = watch(trained.env, trained.policy)
         draw_footfall(footfall, picture)
         print(feet_table(footfall))
     elif arguments.what == "response":
@@ -110,16 +112,10 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         draw_response(recordings, picture)
         print(f"wrote {response.save(run_dir)}")
     else:
-        evaluation = Evaluation(
-            [run_dir],
-            [World("walk")],
-            trials=arguments.trials,
-            overrides=tuple(overrides),
-            out=arguments.out,
-            trust=arguments.trust,
-        )
+        given = {"trials": arguments.trials, "overrides": tuple(overrides), "trust": arguments.trust}
         folders = config.search_path(overrides, config.read(run_dir))
         rows = arguments.rows or robustness.rows_of_the_robot(arguments.preset, folders)
+        evaluation = Evaluation([run_dir], [World("walk")], out=arguments.out, **given)
         found = robustness.measure(robustness.stretches(evaluation, arguments.preset, rows, arguments.factors))
         print(robustness.table(found))
         robustness.draw(found, picture)
@@ -127,18 +123,6 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
             merge(arguments.out, [record for _, record in found])
             print(f"added to {arguments.out}")
     print(f"wrote {picture}")
-
-
-def kicked(arguments: Arguments, run_dir: Path, overrides: list[str]) -> KickResults:
-    """Kicks the run's policy."""
-    trained = policy_on_free_ground(arguments, run_dir, overrides)
-    return kick(trained.env, trained.policy, arguments.speeds, arguments.bearings, arguments.repeats)
-
-
-def watched(arguments: Arguments, run_dir: Path, overrides: list[str]) -> Footfall:
-    """Watches the feet of the run's policy."""
-    trained = policy_on_free_ground(arguments, run_dir, overrides)
-    return watch(trained.env, trained.policy)
 
 
 def answered(

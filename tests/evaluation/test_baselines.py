@@ -10,7 +10,7 @@ import torch
 from omniperception import build, config
 from omniperception.avoidance.velocity import AvoidanceConfig
 from omniperception.build import TrainedPolicy, load_policy
-from omniperception.evaluation.trials.baselines import StopConfig, baseline, blind, free_share, oracle, prepared
+from omniperception.evaluation.trials.baselines import StopConfig, baseline, blind, free_share, prepared
 
 ROOT = Path(__file__).resolve().parents[2]
 AVOIDER = ROOT / "pretrained/avoider"
@@ -48,30 +48,19 @@ class TestBlind:
             before["frame_count"] = torch.zeros_like(before["frame_count"])
             assert torch.allclose(policy(felt), seeing.policy(before), atol=1e-6)
 
-    def test_nobody_measures_whether_something_is_near(self):
-        pd_risknet = config.find_run("pretrained/pd_risknet_taught")
-        seeing, unseeing = (trained(name, "scenario=corridor", run_dir=pd_risknet) for name in ("run", "blind"))
-        for each in (seeing, unseeing):
-            each.env.step(torch.zeros(4, 12))
-        assert seeing.env.no_obstacle_near is not None and unseeing.env.no_obstacle_near is None
-
-    def test_a_task_that_shows_frames_is_refused(self):
-        avoider = trained("run", "scenario=corridor")
-        with pytest.raises(ValueError, match="EnvConfig.network_sees_frames=False"):
-            blind(avoider.env, avoider.policy)
-        with pytest.raises(ValueError, match="EnvConfig.network_sees_frames=False"):
-            oracle(avoider.env, avoider.policy, CONTROLLER, None)
-
     def test_a_policy_without_a_lidar_is_blind_already(self, make_env):
         env = make_env(*BLIND, "scenario=static", "num_envs=2")
         with pytest.raises(ValueError, match="leave policy=blind out"):
             blind(env, None)
+        shown = trained("run", "scenario=corridor")  # which sees frames
+        with pytest.raises(ValueError, match="EnvConfig.network_sees_frames=False"):
+            baseline("oracle", shown.env, shown.policy, CONTROLLER, None)
 
 
 class TestOracle:
     def commanded(self, env, limits):
         heard = []
-        policy = oracle(env, lambda obs: heard.append(obs["command"].clone()), CONTROLLER, limits)
+        policy = baseline("oracle", env, lambda obs: heard.append(obs["command"].clone()), CONTROLLER, limits)
         policy(env.get_observations())
         return heard[0]
 

@@ -40,13 +40,6 @@ def test_runs_that_differ_by_their_seed_are_one_curve(tmp_path):
     assert alone.values.tolist() == [[9.0]]
 
 
-def test_a_run_whose_overrides_all_others_have_is_named_by_its_directory(tmp_path):
-    runs = [make_run(tmp_path / name, 1, [1.0], num_envs=n) for name, n in (("few", 4), ("more", 8))]
-    config.save_recipe(["experiment=walk"], runs[0])
-    config.save_recipe(["experiment=walk", "num_envs=8"], runs[1])
-    assert list(by_recipe(runs)) == [str(runs[0]), "num_envs=8"]
-
-
 def test_a_running_mean_has_fewer_values_at_the_beginning():
     curve = Curve("", np.arange(4), np.array([[1.0, 3.0, 5.0, 7.0]]))
     np.testing.assert_allclose(curve.smoothed(3), [[1.0, 2.0, 3.0, 5.0]])

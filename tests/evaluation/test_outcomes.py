@@ -93,12 +93,6 @@ def test_without_a_goal_who_stays_to_the_end_succeeds():
     assert "time_out" not in summary["rates"]
 
 
-def test_a_touch_that_ends_a_trial_has_a_rate_of_its_own():
-    ended = replace(episodes(), outcome=torch.full((8,), OUTCOMES.index("collision_end")))
-    assert ended.summary()["rates"]["collision_end"]["rate"] == 1.0
-    assert "collision_end" not in episodes().summary()["rates"]
-
-
 def test_figures_by_hand():
     summary = episodes(clearance=torch.linspace(0, 0.7, 8)).summary()
     assert summary["time_over_free_time"]["median"] == 12.0 / 8.0  # of the three that arrived: 10, 12 and 14 s
@@ -196,13 +190,6 @@ def test_the_difference_over_all_worlds_is_that_of_their_trials():
     assert rows["run: difference to histogram"][2] == "not the same trials"
 
 
-def test_seeds_are_pooled_and_their_spread_is_shown():
-    never = torch.zeros(8, dtype=torch.int64)
-    text = table([record(), record(run="runs/b", contacts=never)])
-    assert cells(text)[2][2] == "31.2 [14.2, 55.6] (25.0 to 37.5)"  # 2 + 3 of 16
-    assert "8 trials of each of 2 runs" in text
-
-
 @pytest.mark.parametrize("other", [{"split": "test"}, {"facts": {"overrides": ["a=1"]}}, {"facts": {"walker": "b"}}])
 def test_two_results_of_a_run_are_no_two_trainings(other):
     """A table of all figures, and one by policy."""
@@ -211,12 +198,6 @@ def test_two_results_of_a_run_are_no_two_trainings(other):
     for render in (table, VIEWS["policies"]):
         with pytest.raises(ConfigError, match="is there twice"):
             render([first, second])
-
-
-def test_a_mean_over_worlds_is_of_those_that_have_the_figure():
-    walked = replace(record(has_goal=False), world="walk")
-    assert "time_out" not in walked.episodes.happened()
-    assert "nan" not in table([record(), walked]).splitlines()[-1]
 
 
 def test_other_trials_have_no_paired_difference():

@@ -105,14 +105,6 @@ def test_trainings_stand_beside_each_other_and_all_worlds_below(data):
     assert [cell.strip() for cell in row.split("|")][2:-1] == ["12.5 [5.0, 28.1] (0.0 to 25.0)", "–"]
 
 
-def test_several_seeds_have_their_spread_in_every_view(data):
-    seeds = [record(run="a/seed1"), record(run="a/seed2", touches=[1] * 8)]
-    write(data / "seeds.json.gz", seeds)
-    for view in ("conditions", "policies", "worlds"):
-        text = rendered(page(f"seeds view={view}"), data)
-        assert "(least to most of the runs)" in text and "12.5 [3.5, 36.0] (0.0 to 25.0)" in text, view
-
-
 @pytest.mark.parametrize(
     ("what", "message"),
     [
@@ -127,14 +119,6 @@ def test_several_seeds_have_their_spread_in_every_view(data):
 def test_what_cannot_be_shown_is_refused(data, what, message):
     with pytest.raises(ConfigError, match=message):
         rendered(page(what), data)
-
-
-def test_a_comment_within_a_line_is_text(data):
-    text = "A page holds `<!-- table: first -->` and `<!-- end -->`.\n"
-    assert rendered(text, data) == text
-
-
-def test_an_open_end_is_refused(data):
     with pytest.raises(ConfigError, match="no <!-- end -->"):
         rendered("<!-- table: first -->\nforgotten", data)
 

@@ -160,8 +160,3 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     for stood, cell in (((none, still), "0.500"), ((none, none), "–")):
         told = [replace(a, episodes=replace(episodes, walking=b)) for a, b in zip((first, second), stood, strict=True)]
         assert walking_table(told).splitlines()[-1].split("|")[-2].strip() == cell
-
-
-def test_commands_to_a_goal_have_no_figures_of_a_gait(make_env):
-    env = make_env("scenario=static", "terminations.episode_length_s=0.1", *BLIND)
-    assert run_episodes(env, lambda obs: torch.zeros(3, 12), 3).walking is None

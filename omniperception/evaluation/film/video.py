@@ -37,12 +37,7 @@ LEAST_INSET = 40
 
 @dataclass(frozen=True)
 class Moment:
-    """What a panel shows.
-
-    Attributes:
-        view: the scene.
-        perceived, true: (S, 3) obstacles by sector, `Perceived.sectors`; None where the policy perceives none.
-    """
+    """What a panel shows: the scene, and obstacles by sector as perceived and true, where the policy perceives any."""
 
     view: View
     perceived: np.ndarray | None = None
@@ -205,18 +200,16 @@ class Recorder:
     def _points(self, env_id: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Points (P, 3) (m, environment frame) of the episode's newest frame, and which are proximal."""
         sensing, device = self._env.sensing, self._env.device
+        nothing = torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         if sensing is None or sensing.sliced or sensing.frame is None or sensing.tick < self._blind_until[env_id]:
-            return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
+            return nothing
         frame, config = sensing.frame, sensing.config
         if frame.ranges is None or frame.directions_s is None or frame.elevation is None:  # no network looks at points
-            return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
+            return nothing
         hit = frame.ranges[env_id].isfinite()
         points_s = frame.directions_s[env_id, hit] * frame.ranges[env_id, hit, None]
         points_c = rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
-        at, turned = (
-            sensing.scene.body_pos[env_id, sensing.carrier],
-            sensing.scene.body_quat[env_id, sensing.carrier],
-        )
+        at, turned = (pose[env_id, sensing.carrier] for pose in (sensing.scene.body_pos, sensing.scene.body_quat))
         return rotate(turned, points_c) + at, frame.elevation[env_id, hit] > split_elevation(sensing.sampler, config)
 
     def _interest(self, env_id: int) -> float:

@@ -72,16 +72,8 @@ class KickResults:
     def shares(self, speeds: Sequence[float], num_bearings: int) -> torch.Tensor:
         """(len(speeds), num_bearings) share survived by size and direction."""
         of = torch.arange(len(self.speed)) % num_bearings
-        return torch.tensor(
-            [
-                [
-                    float(self.survived[there].double().mean())
-                    for b in range(num_bearings)
-                    for there in [self.kicked & (self.speed == speed) & (of == b)]
-                ]
-                for speed in speeds
-            ]
-        )
+        there = [[self.kicked & (self.speed == v) & (of == b) for b in range(num_bearings)] for v in speeds]
+        return torch.tensor([[float(self.survived[one].double().mean()) for one in row] for row in there])
 
 
 def kick(env: OmniEnv, policy: Policy, speeds: Sequence[float], num_bearings: int, repeats: int) -> KickResults:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 
@@ -16,65 +17,44 @@ from omnirobot.common.shell import command_line
 
 EASY_LEVELS = 5
 """Levels of uneven ground that a robot is expected to pass; tables show the others apart."""
-HEADINGS = (
-    *("falls, %", "velocity error, m/s", "yaw rate error, rad/s", "steps at a torque limit, %", "at a joint's stop, %"),
-    *("fastest joint, rad/s", "target change, rad", "foot slip, m/s", "swing height, m", "impact / weight"),
-    *("cost of transport", "standing speed, m/s"),
-)
-
-
 KEYS = ("world", "terrain", "ground", "condition", "policy")
 """What a row is of."""
 
 
-def walking_table(records: Sequence[Record]) -> str:
+def walking_table(records: Sequence[Record], kinds: bool = True, apart: bool = False) -> str:
     """All figures: a row for each world and ground, runs of several training seeds together.
 
-    Raises:
-        ConfigError: see `check_apart`.
-    """
-    return _table(records, KEYS, _rows(records, grounds))
-
-
-def level_table(records: Sequence[Record]) -> str:
-    """The same with all kinds of ground together: a row for each world, and for easy and hard levels.
+    Args:
+        records: with figures of a gait.
+        kinds: whether each kind of ground has a row of its own, besides easy and hard levels.
+        apart: whether each run has: of other robots, by other recipes.
 
     Raises:
         ConfigError: see `check_apart`.
     """
-    return _table(records, KEYS, _rows(records, _levels))
-
-
-def run_table(records: Sequence[Record]) -> str:
-    """As :func:`level_table`, each run by itself: of other robots, by other recipes.
-
-    Raises:
-        ConfigError: see `check_apart`.
-    """
-    rows = [[run, *row] for (run,), own in grouped(records, "run").items() for row in _rows(own, _levels)]
-    return _table(records, ("run", *KEYS), rows)
-
-
-def _table(records: Sequence[Record], keys: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return f"{headline(records, apart='run' in keys)}\n\n{markdown(*without_constants(keys, HEADINGS, rows))}\n"
-
-
-def _levels(record: Record) -> dict[str, torch.Tensor]:
-    return {name: there for name, there in grounds(record).items() if "," not in name}
-
-
-def _rows(records: Sequence[Record], parts_of: Callable[[Record], dict[str, torch.Tensor]]) -> list[list[str]]:
     check_apart(records)
-    rows = []
-    for (world, terrain, condition, policy), seeds in grouped(
-        records, "world", "terrain", "condition", "policy"
-    ).items():
-        by_seed = [parts_of(record) for record in seeds]  # other seeds, other tiles
-        for ground in dict.fromkeys(name for found in by_seed for name in found):
-            there = zip(seeds, by_seed, strict=True)
-            parts = [Part(record, found[ground]) for record, found in there if ground in found]
-            rows.append([world, terrain, ground, condition, policy, *figures(parts)])
-    return rows
+    keys, rows = (("run",) if apart else ()) + KEYS, []
+    by_run = grouped(records, "run").values() if apart else [list(records)]
+    for own in by_run:
+        for (world, terrain, condition, policy), seeds in grouped(
+            own, "world", "terrain", "condition", "policy"
+        ).items():
+            by_seed = [grounds(record) for record in seeds]  # other seeds, other tiles
+            for ground in dict.fromkeys(name for found in by_seed for name in found if kinds or "," not in name):
+                there = zip(seeds, by_seed, strict=True)
+                parts = [Part(record, found[ground]) for record, found in there if ground in found]
+                cells = [
+                    rate_cell([part.fell for part in parts]),
+                    *(_cell([figure(part) for part in parts], digits) for figure, digits in FIGURES.values()),
+                ]
+                row = [world, terrain, ground, condition, policy, *cells]
+                rows.append([seeds[0].run, *row] if apart else row)
+    heads, rows = without_constants(keys, ("falls, %", *FIGURES), rows)
+    return f"{headline(records, apart)}\n\n{markdown(heads, rows)}\n"
+
+
+level_table = partial(walking_table, kinds=False)
+run_table = partial(walking_table, kinds=False, apart=True)
 
 
 def grounds(record: Record) -> dict[str, torch.Tensor]:
@@ -97,65 +77,59 @@ class Part:
     """Some of a record's trials.
 
     Attributes:
+        walking: (num_trials,) figures of a gait by name.
+        wanted: (num_trials,) bool: which trials.
         fell: (n,) bool.
     """
 
     def __init__(self, record: Record, wanted: torch.Tensor) -> None:
         self._episodes: Episodes = record.episodes
-        self._walking, self._wanted = _walking(record), wanted
+        self.walking, self.wanted = _walking(record), wanted
         self.fell = (record.episodes.ended("fall") | record.episodes.ended("diverged"))[wanted]
 
     def mean(self, name: str, weight: torch.Tensor | None = None) -> float:
         """Mean of a figure over the trials that have it, weighted by (num_trials,) or evenly."""
-        values = self._walking[name][self._wanted]
-        weight = torch.ones_like(values) if weight is None else weight[self._wanted]
+        values = self.walking[name][self.wanted]
+        weight = torch.ones_like(values) if weight is None else weight[self.wanted]
         there = values.isfinite() & (weight > 0)
         return float((values * weight)[there].sum() / weight[there].sum()) if bool(there.any()) else float("nan")
 
     def settled(self, name: str) -> float:
         """Mean over all control steps later than `commands.SETTLE_S` after a command."""
-        return self.mean(name, self._walking["settled_s"])
+        return self.mean(name, self.walking["settled_s"])
 
     def share(self, name: str) -> float:
         """Mean over all control steps."""
         return self.mean(name, self._episodes.length_s)
 
-    def standing(self) -> float:
-        return self.mean("standing_speed", self._walking["standing_s"])
-
-    def largest(self, name: str) -> float:
-        return float(self._walking[name][self._wanted].max())
-
     def cost_of_transport(self) -> float:
-        energy, path = self._episodes.energy[self._wanted].sum(), self._episodes.path[self._wanted].sum()
+        energy, path = self._episodes.energy[self.wanted].sum(), self._episodes.path[self.wanted].sum()
         return float(energy / (self._episodes.weight * path))
 
 
-def figures(parts: Sequence[Part]) -> list[str]:
-    """The cells of HEADINGS, of one run or of several training seeds."""
+FIGURES: dict[str, tuple[Callable[[Part], float], int]] = {
+    "velocity error, m/s": (lambda part: part.settled("settled_velocity_error"), 3),
+    "yaw rate error, rad/s": (lambda part: part.settled("settled_yaw_rate_error"), 3),
+    "steps at a torque limit, %": (lambda part: 100 * part.share("torque_limited"), 2),
+    "at a joint's stop, %": (lambda part: 100 * part.share("at_stop"), 2),
+    "fastest joint, rad/s": (lambda part: float(part.walking["joint_speed"][part.wanted].max()), 1),
+    "target change, rad": (lambda part: part.share("target_change"), 3),
+    "foot slip, m/s": (lambda part: part.mean("foot_slip"), 3),
+    "swing height, m": (lambda part: part.mean("swing_height"), 3),
+    "impact / weight": (lambda part: part.mean("impact"), 2),
+    "cost of transport": (Part.cost_of_transport, 2),
+    "standing speed, m/s": (lambda part: part.mean("standing_speed", part.walking["standing_s"]), 3),
+}
+"""Figures, and the digits that are shown; falls stand before them."""
 
-    def cell(values: list[float], digits: int) -> str:
-        values = [value for value in values if math.isfinite(value)]
-        if not values:
-            return "–"
-        mean = sum(values) / len(values)
-        spread = f" ({min(values):.{digits}f} to {max(values):.{digits}f})" if len(values) > 1 else ""
-        return f"{mean:.{digits}f}{spread}"
 
-    return [
-        rate_cell([part.fell for part in parts]),
-        cell([part.settled("settled_velocity_error") for part in parts], 3),
-        cell([part.settled("settled_yaw_rate_error") for part in parts], 3),
-        cell([100 * part.share("torque_limited") for part in parts], 2),
-        cell([100 * part.share("at_stop") for part in parts], 2),
-        cell([part.largest("joint_speed") for part in parts], 1),
-        cell([part.share("target_change") for part in parts], 3),
-        cell([part.mean("foot_slip") for part in parts], 3),
-        cell([part.mean("swing_height") for part in parts], 3),
-        cell([part.mean("impact") for part in parts], 2),
-        cell([part.cost_of_transport() for part in parts], 2),
-        cell([part.standing() for part in parts], 3),
-    ]
+def _cell(values: list[float], digits: int) -> str:
+    """Mean and range of what is a number."""
+    values = [value for value in values if math.isfinite(value)]
+    if not values:
+        return "–"
+    spread = f" ({min(values):.{digits}f} to {max(values):.{digits}f})" if len(values) > 1 else ""
+    return f"{sum(values) / len(values):.{digits}f}{spread}"
 
 
 def _walking(record: Record) -> dict[str, torch.Tensor]:

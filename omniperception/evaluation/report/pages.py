@@ -1,22 +1,10 @@
-"""Results tables in Markdown pages, rendered from files of results between two comments.
-
-<!-- table: before -->                                          all figures, of docs/lab/data/before.json(.gz)
-<!-- table: before view=policies condition=robot split=test --> untouched: a row for each world
-<!-- table: before view=worlds policy=run -->                   the same with a column for each condition
-<!-- table: before view=conditions policy=run,blind -->         untouched and falls: a row for each policy
-<!-- table: avoider,robots view=trained condition=robot -->     the same: a row for each run, a column for each policy
-<!-- table: avoider,ppo view=trainings condition=robot -->      the same: a row for each world, a column for a training
-<!-- table: gait view=walking -->                              figures of a gait: a row for each ground
-<!-- table: gait view=levels -->                               the same, all kinds of ground together
-<!-- table: gait,robots view=runs -->                          the same, a row for each run
-<!-- table: end_to_end view=study -->                          results of a study: a row for each training and policy
-<!-- end -->
-"""
+"""Results tables in Markdown pages, rendered from files of results between two comments (see the command tables)."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -24,15 +12,23 @@ import torch
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError, suggest
 from omniperception.evaluation.report.gaits import level_table, run_table, walking_table
-from omniperception.evaluation.report.records import Record, read, training_of
+from omniperception.evaluation.report.records import Record, read
 from omniperception.evaluation.report.studies import study_table
-from omniperception.evaluation.report.tables import check_apart, grouped, headline, rate_cell, table, without_constants
+from omniperception.evaluation.report.tables import (
+    check_apart,
+    grouped,
+    headline,
+    rate_cell,
+    table,
+    without_constants,
+)
 from omnirobot.common.shell import command_line
 
 _BLOCK = re.compile(r"^<!-- table: (?P<what>[^\n]*?) -->\n(?P<body>.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
 _BEGIN = re.compile(r"^<!-- table:", re.MULTILINE)
 """Comments count at the beginning of a line; within one they are talked about."""
 _FILTERS = ("policy", "world", "terrain", "condition", "split", "run")
+_UNTOUCHED = "reached, untouched and without a fall"
 
 
 def rendered(text: str, data: Path) -> str:
@@ -64,31 +60,20 @@ def _filled(what: str, data: Path) -> str:
                 f"<!-- table: {what} -->: {key}={unknown[0]} shows nothing; {suggest(unknown[0], tuple(there))}"
             )
         records = [record for record in records if getattr(record, key) in wanted]
-    if not records:
-        raise ConfigError(f"<!-- table: {what} --> shows nothing: no result in {name} is like that")
     return f"<!-- table: {what} -->\n\n{VIEWS[view](records).strip()}\n\n{source(records)}\n\n<!-- end -->"
 
 
 def data_file(name: str, data: Path) -> Path:
     """The file of a name: compressed, or not."""
-    found = [path for suffix in (".json.gz", ".json") if (path := data / f"{name}{suffix}").is_file()]
-    if not found:
-        line = command_line("evaluate", f"out={data / name}.json.gz")
-        raise ConfigError(f"{data} has no {name}.json.gz and no {name}.json; what writes it: {line}")
-    return found[0]
+    for suffix in (".json.gz", ".json"):
+        if (path := data / f"{name}{suffix}").is_file():
+            return path
+    line = command_line("evaluate", f"out={data / name}.json.gz")
+    raise ConfigError(f"{data} has no {name}.json.gz and no {name}.json; what writes it: {line}")
 
 
-def by_policy(records: Sequence[Record]) -> str:
-    """How often each policy arrived untouched: a row for each world."""
-    return _by_world(records, "policy", ("world", "terrain", "condition"))
-
-
-def by_world(records: Sequence[Record]) -> str:
-    """How often it was arrived untouched under each condition: a row for each world."""
-    return _by_world(records, "condition", ("world", "terrain", "policy"))
-
-
-def _by_world(records: Sequence[Record], column: str, keys: Sequence[str]) -> str:
+def by_world(records: Sequence[Record], column: str, keys: Sequence[str]) -> str:
+    """How often it was arrived untouched: a row for each world and other keys, a column for each value of another."""
     columns = [name for (name,) in grouped(records, column)]
     if column == "condition":
         columns.sort()  # ideal, paper, robot
@@ -96,27 +81,7 @@ def _by_world(records: Sequence[Record], column: str, keys: Sequence[str]) -> st
     for key, here in sorted(grouped(records, *keys).items()):
         cells = [_untouched([record for record in here if getattr(record, column) == name]) for name in columns]
         rows.append([*key, *cells])
-    return _titled(records, "reached, untouched and without a fall, %", list(keys), columns, rows)
-
-
-def by_condition(records: Sequence[Record]) -> str:
-    """How often each policy arrived untouched, and how often it fell, in the trials of all worlds.
-
-    Raises:
-        ConfigError: policies or runs were in different worlds, or under one condition in others than under another.
-    """
-    _check_same_worlds(records, "policy", "run", "condition")
-    return _over_worlds(records, "policy", "condition", sorted({record.condition for record in records}))
-
-
-def by_run(records: Sequence[Record]) -> str:
-    """The same of each run: a column for each policy.
-
-    Raises:
-        ConfigError: runs were in different worlds, or under different conditions.
-    """
-    _check_same_worlds(records, "run", "policy")
-    return _over_worlds(records, "run", "policy", [policy for (policy,) in grouped(records, "policy")])
+    return _titled(records, f"{_UNTOUCHED}, %", list(keys), columns, rows)
 
 
 def by_training(records: Sequence[Record]) -> str:
@@ -124,30 +89,32 @@ def by_training(records: Sequence[Record]) -> str:
 
     A run in a folder seed<n> is one of the training that the folder above it names, any other its own.
     """
-    trainings = list(dict.fromkeys(training_of(record.run) for record in records))
-    rows = []
-    for key, here in sorted(grouped(records, "terrain", "condition", "policy").items()):
-        of_each = [[record for record in here if training_of(record.run) == training] for training in trainings]
+    trainings = [name for (name,) in grouped(records, "training")]
+    keys, rows = ["terrain", "condition", "policy"], []
+    for key, here in sorted(grouped(records, *keys).items()):
+        of_each = [[record for record in here if record.training == training] for training in trainings]
         worlds = sorted({record.world for record in here})
         for world in worlds:
             rows.append([world, *key, *(_untouched([r for r in theirs if r.world == world]) for theirs in of_each)])
-        everywhere = [
-            theirs if all({r.world for r in own} == set(worlds) for own in grouped(theirs, "run").values()) else []
-            for theirs in of_each
-        ]
         if len(worlds) > 1:
-            rows.append([f"all {len(worlds)}", *key, *(_untouched(theirs) for theirs in everywhere)])
-    keys = ["world", "terrain", "condition", "policy"]
-    return _titled(records, "reached, untouched and without a fall, %", keys, trainings, rows)
+            runs = [grouped(theirs, "run").values() for theirs in of_each]
+            whole = [all({record.world for record in own} == set(worlds) for own in theirs) for theirs in runs]
+            cells = [_untouched(theirs if there else []) for theirs, there in zip(of_each, whole, strict=True)]
+            rows.append([f"all {len(worlds)}", *key, *cells])
+    return _titled(records, f"{_UNTOUCHED}, %", ["world", *keys], trainings, rows)
 
 
-def _check_same_worlds(records: Sequence[Record], *keys: str) -> None:
-    """Refuses to put all worlds of these groups together where one group was in others."""
-    groups = grouped(records, *keys).items()
-    apart = "condition" in keys
+def over_worlds(records: Sequence[Record], row: str, column: str) -> str:
+    """How often it was arrived untouched, and how often fallen, in the trials of all worlds: of each policy or run.
+
+    Raises:
+        ConfigError: some were in other worlds, or under one condition in others than under another.
+    """
+    groups = grouped(records, *dict.fromkeys((row, *(["run"] if row == "policy" else []), column)))
+    with_condition = column != "condition"
     worlds = {
-        key: {record.place if apart else f"{record.place} ({record.condition})" for record in theirs}
-        for key, theirs in groups
+        key: {f"{record.place} ({record.condition})" if with_condition else record.place for record in theirs}
+        for key, theirs in groups.items()
     }
     (first, most), *others = worlds.items()
     for key, found in others:
@@ -156,33 +123,24 @@ def _check_same_worlds(records: Sequence[Record], *keys: str) -> None:
                 f"{' '.join(key)} and {' '.join(first)} were not in the same worlds (only one of them in"
                 f" {', '.join(sorted(found ^ most))}); filter for what all have: world=... terrain=... condition=..."
             )
-
-
-def _over_worlds(records: Sequence[Record], row: str, column: str, columns: list[str]) -> str:
+    columns = [name for (name,) in grouped(records, column)]
+    if column == "condition":
+        columns.sort()
     rows = []
     for (name,), theirs in grouped(records, row).items():
-        cells = []
-        for there in columns:
-            found = [record for record in theirs if getattr(record, column) == there]
-            by_seed = [[r.episodes.happened() for r in own] for own in grouped(found, "run").values()]
-            rates = (
-                rate_cell([torch.cat([one[figure] for one in own]) for own in by_seed])
-                for figure in ("untouched", "fall")
-            )
-            cells.append(" / ".join(rates) if found else "–")
-        rows.append([name, *cells])
-    worlds = len({record.place for record in records})
-    what = f"reached, untouched and without a fall / falls, %, over {worlds} worlds"
+        found = [[record for record in theirs if getattr(record, column) == there] for there in columns]
+        rows.append([name, *(" / ".join((_untouched(own), _rate(own, "fall"))) if own else "–" for own in found)])
+    what = f"{_UNTOUCHED} / falls, %, over {len({record.place for record in records})} worlds"
     heading = "run directory" if row == "run" else row  # a policy is called run
     return _titled(records, what, [heading], columns, rows, apart=row == "run")
 
 
 VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
     "all": table,
-    "policies": by_policy,
-    "worlds": by_world,
-    "conditions": by_condition,
-    "trained": by_run,
+    "policies": partial(by_world, column="policy", keys=("world", "terrain", "condition")),
+    "worlds": partial(by_world, column="condition", keys=("world", "terrain", "policy")),
+    "conditions": partial(over_worlds, row="policy", column="condition"),
+    "trained": partial(over_worlds, row="run", column="policy"),
     "trainings": by_training,
     "walking": walking_table,
     "levels": level_table,
@@ -194,25 +152,27 @@ VIEWS: dict[str, Callable[[Sequence[Record]], str]] = {
 def source(records: Sequence[Record]) -> str:
     """Where the numbers come from: commands, commits, dates, seeds, machine."""
     facts = [record.facts for record in records]
-    commands = sorted({fact["command"] for fact in facts})
-    commits = sorted({(fact["commit"] or "no checkout")[:12] + _changed(fact["commit"]) for fact in facts})
+    commits = set()
+    for fact in facts:
+        commit, _, changes = (fact["commit"] or "no checkout").partition("+")
+        commits.add(commit[:12] + (" with changes" if changes else ""))
     dates = sorted({fact["date"][:10] for fact in facts})
     machines = sorted({f"{fact['machine']['cpu']}, {fact['machine']['device']}" for fact in facts})
     seeds = sorted({record.seed for record in records})
     shown = ", ".join(map(str, seeds)) if len(seeds) <= 3 else f"{len(seeds)} seeds in the file"
-    lines = [f"    {command}" for command in commands]
-    return "\n".join(
-        [*lines, "", f"{', '.join(dates)}; commit {', '.join(commits)}; seeds: {shown}; {'; '.join(machines)}."]
-    )
+    lines = [f"    {command}" for command in sorted({fact["command"] for fact in facts})]
+    last = f"{', '.join(dates)}; commit {', '.join(sorted(commits))}; seeds: {shown}; {'; '.join(machines)}."
+    return "\n".join([*lines, "", last])
 
 
-def _changed(commit: str | None) -> str:
-    return " with changes" if commit and "+" in commit else ""
+def _rate(records: Sequence[Record], name: str) -> str:
+    """How often something happened in the trials of some records, the runs' trials apart."""
+    by_run = grouped(records, "run").values()
+    return rate_cell([torch.cat([one.episodes.happened()[name] for one in run]) for run in by_run]) if records else "–"
 
 
 def _untouched(records: Sequence[Record]) -> str:
-    by_run = grouped(records, "run").values()
-    return rate_cell([torch.cat([record.episodes.clean for record in run]) for run in by_run]) if records else "–"
+    return _rate(records, "untouched")
 
 
 def _titled(

@@ -82,18 +82,10 @@ def _action(
 
 def robot_states(env: OmniEnv) -> list[RobotState]:
     """Measured state of each robot, with the latency that the environment gives it."""
-    measured = env.state.measured
-    tensors = (
-        measured.joint_pos,
-        measured.joint_vel,
-        measured.base_quat_w,
-        measured.base_ang_vel_b,
-        measured.base_lin_vel_b,
-    )
+    m = env.state.measured
+    tensors = m.joint_pos, m.joint_vel, m.base_quat_w, m.base_ang_vel_b, m.base_lin_vel_b
     other = {name: value.cpu().numpy() for name, value in _other_readings(env).items()}
     states = [RobotState(*values) for values in zip(*(tensor.cpu().numpy() for tensor in tensors), strict=True)]
-    if not other:
-        return states
     return [replace(one, other={name: value[k] for name, value in other.items()}) for k, one in enumerate(states)]
 
 
@@ -101,11 +93,10 @@ def _other_readings(env: OmniEnv) -> dict[str, torch.Tensor]:
     """(num_envs, width) newest values of the actor's terms that are measured by names of their own."""
     readings = {}
     for name in env.config.observations.actor:
-        group, widths = env.config.observations.groups[name], env.observation_widths(name)
-        newest = env.observations[name][:, -sum(widths.values()) :].split(list(widths.values()), 1)
+        group, widths = env.config.observations.groups[name], list(env.observation_widths(name).values())
+        newest = env.observations[name][:, -sum(widths) :].split(widths, 1)
         for term, value in zip(group.terms.values(), newest, strict=True):
-            quantity = own_quantity(term)
-            if quantity is not None:
+            if (quantity := own_quantity(term)) is not None:
                 readings[quantity] = value
     return readings
 
