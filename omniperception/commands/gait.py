@@ -112,10 +112,10 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         draw_response(recordings, picture)
         print(f"wrote {response.save(run_dir)}")
     else:
-        given = {"trials": arguments.trials, "overrides": tuple(overrides), "trust": arguments.trust}
         folders = config.search_path(overrides, config.read(run_dir))
         rows = arguments.rows or robustness.rows_of_the_robot(arguments.preset, folders)
-        evaluation = Evaluation([run_dir], [World("walk")], out=arguments.out, **given)
+        given = Evaluation([run_dir], [World("walk")], overrides=tuple(overrides), trust=arguments.trust)
+        evaluation = replace(given, trials=arguments.trials, out=arguments.out)
         found = robustness.measure(robustness.stretches(evaluation, arguments.preset, rows, arguments.factors))
         print(robustness.table(found))
         robustness.draw(found, picture)

@@ -179,14 +179,15 @@ def train(ablation: Ablation) -> None:
         ConfigError: a training failed.
     """
     together = any(override.startswith("hydra/launcher=") for override in ablation.overrides)
+    variants = ablation.study.variants
     for arm in ablation.study.arms:
-        with _ended_with_this_process() as running:
-            for variant in ablation.study.variants:
-                running.append(subprocess.Popen(_sweep(ablation, arm, variant)))
-                if not together:
-                    _wait(running[-1])
-            for process in running:
-                _wait(process)
+        for group in [variants] if together else [[variant] for variant in variants]:
+            with _ended_with_this_process() as running:
+                running += [subprocess.Popen(_sweep(ablation, arm, variant)) for variant in group]
+                for process in running:
+                    if process.wait():
+                        code = process.returncode
+                        raise ConfigError(f"training ended with exit code {code}; the same command goes on from there")
 
 
 @contextmanager
@@ -248,11 +249,6 @@ def overrides_of(variant: str) -> tuple[str, ...]:
     return VARIANTS.get(variant, (f"perception={variant}",))
 
 
-def _wait(process: subprocess.Popen) -> None:
-    if process.wait():
-        raise ConfigError(f"training ended with exit code {process.returncode}; the same command goes on from there")
-
-
 def _tasks(ablation: Ablation) -> list[Task]:
     """Every run in every world, a condition after the other.
 
@@ -263,9 +259,10 @@ def _tasks(ablation: Ablation) -> list[Task]:
     for run_dir in runs:
         if not run_dir.is_dir():
             raise ConfigError(f"{run_dir} has not been trained; use stage=train or stage=all")
-    same = {"policies": study.policies, "split": study.split, "trials": study.trials, "trust": ablation.trust}
-    evaluations = [Evaluation(runs, worlds, condition=condition, **same) for condition in study.conditions]
-    return [task for evaluation in evaluations for task in evaluation.tasks()]
+    same = Evaluation(
+        runs, worlds, policies=study.policies, split=study.split, trials=study.trials, trust=ablation.trust
+    )
+    return [task for condition in study.conditions for task in replace(same, condition=condition).tasks()]
 
 
 def evaluate_all(ablation: Ablation) -> None:

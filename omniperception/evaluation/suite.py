@@ -373,7 +373,7 @@ def evaluate(evaluation: Evaluation) -> list[Record]:
     """
     if evaluation.plots:
         check_figures()
-    tasks, names = evaluation.tasks(), {}
+    tasks, names = evaluation.tasks(), dict[str, Path]()
     for run_dir in (run_dir.resolve() for run_dir in evaluation.runs):
         if names.setdefault(shown(run_dir), run_dir) != run_dir:
             raise ConfigError(

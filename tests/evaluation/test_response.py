@@ -15,7 +15,7 @@ import torch
 from omniperception.commands import main
 from omniperception.evaluation.gait import response
 from omniperception.evaluation.gait.response import Recording, _periodic, around_cycle, driven, falls_by_jump, reach
-from omniperception.evaluation.gait.response_fit import fit, kept, lagged
+from omniperception.evaluation.gait.response_fit import fit, lagged
 from omniperception.sim.response import FILE, Cycle, GaitResponse, NoResponse
 from omnirobot.common.errors import ConfigError
 
@@ -97,13 +97,6 @@ def test_a_step_comes_late_by_the_delay_and_rises_by_the_lag():
     assert x[8] < x[7] / 3  # after the end it begins at 0
     late = torch.stack(list(lagged(asked, done, DT, whole(0.07), whole(1e-4))))[:, 0, 0]
     torch.testing.assert_close(late[:6], torch.tensor([0, 0, 0, 0.5, 1, 1], dtype=torch.float64), atol=1e-6, rtol=0.0)
-
-
-def test_the_second_around_an_end_does_not_count():
-    done = torch.zeros(12, 2, dtype=torch.bool)
-    done[6, 1] = True
-    assert kept(done, 2)[:, 0].tolist() == [False] * 2 + [True] * 10
-    assert kept(done, 2)[:, 1].tolist() == [False] * 2 + [True] * 2 + [False] * 5 + [True] * 3
 
 
 def recording(**fields):

@@ -20,15 +20,12 @@ from omniperception.scene.build import FOOT_FORCE
     [
         ("latency_s", [0.005, 0.045], 3.0, [0.015, 0.135]),
         ("motor_strength", [0.8, 1.2], 2.0, [0.6, 1.4]),
-        ("motor_strength", [0.8, 1.2], 0.0, [1.0, 1.0]),
         ("ground_friction", [0.4, 1.0], 0.5, [0.6, 0.9]),
         ("ground_friction", [0.4, 1.0], 3.0, [0.05, 1.4]),  # friction cannot be negative
         ("ground_restitution", [0.0, 1.0], 2.0, [0.0, 1.0]),
-        ("velocity_scale", [0.95, 1.05], 3.0, [0.85, 1.15]),
         ("pushes", {"every_s": [5.0, 10.0], "speed": 0.5}, 2.0, {"every_s": [5.0, 10.0], "speed": 1.0}),
         ("velocity_drift", {"sd": 0.05, "time_s": 10.0}, 3.0, {"sd": 0.15, "time_s": 10.0}),
         ("velocity_scale", [0.95, 1.05], 25.0, [0.0, 2.25]),  # nor a factor on what is measured
-        ("frames_lost", 0.05, 2.0, 0.1),
         ("frames_lost", 0.05, 25.0, 0.99),
     ],
 )

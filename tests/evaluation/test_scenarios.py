@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from omniperception import build, config
-from omniperception.config import ConfigError
 from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.evaluation.trials.outcomes import CLEARANCE_CAP
 from omniperception.evaluation.trials.tracks import PERIOD_S
@@ -44,27 +43,11 @@ class TestOverlay:
         assert len({config.compose([f"scenario={name}"]).seed for name in config.presets("scenario")}) == 21
         assert run.obstacles.curriculum is None and before.obstacles.curriculum is not None
 
-    @pytest.mark.parametrize("group", ["obstacles=static", "commands=velocity"])
-    def test_another_scene_is_not_mixed_in(self, run_dir, group):
-        for compose in (config.compose, lambda overrides: config.load(run_dir, overrides)):
-            with pytest.raises(ConfigError, match=f"scenario=static defines the {group.split('=')[0]}"):
-                compose(["scenario=static", group])
-
     @pytest.mark.parametrize("scenario", config.presets("scenario"))
     def test_an_experiment_leaves_no_trace_in_the_scene(self, scenario):
         alone, mixed = (config.compose([*given, f"scenario={scenario}"]) for given in ([], ["experiment=quickstart"]))
         for key in config.FIXED_BY_SCENARIO:
             assert alone[key] == mixed[key], key
-
-
-class TestScenes:
-    def test_goals_differ_between_trials_and_seeds_decide(self, make_env):
-        def goals(seed):
-            env = make_env(*BLIND, "scenario=abs_hard", SHORT, "num_envs=3", f"seed={seed}")
-            return run_episodes(env, stand, 6, keep_tracks=True).tracks.goal
-
-        first = goals(4)
-        assert len(first.unique(dim=0)) == 6 and torch.equal(first, goals(4)) and not torch.equal(first, goals(5))
 
 
 class TestMeasures:

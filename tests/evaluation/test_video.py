@@ -84,17 +84,6 @@ def test_an_arrow_lies_on_the_ground_where_it_points(renderer):
     assert greenness[32] > 50 and abs(greenness[60]) < 20
 
 
-def test_points_do_not_cover_an_arrow(renderer):
-    arrow = Arrow(torch.tensor([-2.0, 0.0]), torch.tensor([1.5, 0.0]), 0.4, (0.0, 1.0, 0.0))
-    points = (
-        torch.tensor([[-1.25, 0.0, 0.0], [-1.25, 1.0, 0.0]]),
-        torch.tensor([True, True]),
-    )  # on it, and beside
-    pictures = [renderer.render(view((0.0, 0.0, -50.0), p, (arrow,))).int() for p in (points, NO_POINTS)]
-    changed = (pictures[0] != pictures[1]).any(2)
-    assert not changed[:, 26:38].any() and changed[27:32, 18:24].any()
-
-
 def test_something_in_the_sun_throws_a_shadow(renderer):
     # the sun is at (-0.42, 0.46, 0.78): the shadow of a ball 2 m up falls around (1.08, -1.18, 0)
     shadow_row, shadow_column = 18 + 31.2 / 5.08, 32 + 31.2 * 1.18 / 5.08

@@ -147,10 +147,9 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     second = replace(first, run="b", episodes=replace(episodes, outcome=fell.flip(0), walking=turned))
     by_run = run_table([first, second])
     apart = [line.split("|") for line in by_run.splitlines() if line.startswith("|")]
+    alone = [line.split("|")[2:] for line in level_table([first]).splitlines() if line.startswith("| walk")]
     assert [cells[1].strip() for cells in apart[2:]] == ["run", "run", "b", "b"] and "runs)" not in by_run
-    assert [cells[2:] for cells in apart[2:4]] == [
-        line.split("|")[2:] for line in level_table([first]).splitlines() if line.startswith("| walk")
-    ]
+    assert [cells[2:] for cells in apart[2:4]] == alone
     lines = [line.split("|") for line in walking_table([first, second]).splitlines() if line.startswith("|")]
     at = [cell.strip() for cell in lines[0]].index("falls, %")
     rows = {cells[2].strip(): cells[at].strip() for cells in lines}

@@ -128,8 +128,8 @@ def over_worlds(records: Sequence[Record], row: str, column: str) -> str:
         columns.sort()
     rows = []
     for (name,), theirs in grouped(records, row).items():
-        found = [[record for record in theirs if getattr(record, column) == there] for there in columns]
-        rows.append([name, *(" / ".join((_untouched(own), _rate(own, "fall"))) if own else "–" for own in found)])
+        cells = [[record for record in theirs if getattr(record, column) == there] for there in columns]
+        rows.append([name, *(" / ".join((_untouched(own), _rate(own, "fall"))) if own else "–" for own in cells)])
     what = f"{_UNTOUCHED} / falls, %, over {len({record.place for record in records})} worlds"
     heading = "run directory" if row == "run" else row  # a policy is called run
     return _titled(records, what, [heading], columns, rows, apart=row == "run")

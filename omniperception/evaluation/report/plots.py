@@ -73,8 +73,10 @@ def _draw(axis, record: Record) -> None:
     axis.set_title(f"{record.place}: untouched {rate_cell([episodes.clean])} % of {len(episodes)}", fontsize=9)
     axis.tick_params(labelsize=7)
     low_x, high_x, low_y, high_y = _bounds(tracks)
-    axis.set(xlim=(low_x, high_x), ylim=(low_y, high_y))
-    axis.set_aspect("equal", adjustable="datalim")
+    wide, high = _PANEL
+    size = max(high_x - low_x, (high_y - low_y) * wide / high)  # of the area that holds all and has the panel's shape
+    x, y = (low_x + high_x - size) / 2, (low_y + high_y - size * high / wide) / 2
+    axis.set(xlim=(x, x + size), ylim=(y, y + size * high / wide), aspect="equal")
 
 
 def _footprint(x: float, y: float, yaw: float, half_x: float, half_y: float, bottom: float, speed: float):

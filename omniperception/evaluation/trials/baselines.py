@@ -103,8 +103,9 @@ def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig
         steering = _avoiding(env, avoidance, _Histogram(env))
     else:
         sectors = TrueSectors(avoidance.num_sectors, env.world.obstacles, env.obstacles, env.num_envs, env.device)
-        where = env.state
-        steering = _avoiding(env, avoidance, lambda: sectors.measure(where.kinematics.base_pos_w, where.kinematics.yaw))
+        steering = _avoiding(
+            env, avoidance, lambda: sectors.measure(env.state.kinematics.base_pos_w, env.state.kinematics.yaw)
+        )
     return _driven(env, policy, steering, limits)
 
 
@@ -121,8 +122,12 @@ def _navigated(env: OmniEnv, policy: Policy) -> Steering:
     navigation = getattr(policy, "navigation", None)
     if navigation is None:
         raise ValueError("this policy has no navigation to give ground truth to; leave policy=ground_truth out")
-    state = env.state
-    return lambda: navigation(state.sectors, state.reference, state.measured.planar_velocity, state.last_asked)
+
+    def wanted() -> torch.Tensor:
+        state = env.state
+        return navigation(state.sectors, state.reference, state.measured.planar_velocity, state.last_asked)
+
+    return wanted
 
 
 def geometry_of(robot: RobotConfig) -> GeometryConfig:

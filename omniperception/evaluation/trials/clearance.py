@@ -148,8 +148,8 @@ def _padded(faces: Sequence[np.ndarray | None], device: torch.device) -> tuple[t
     for row, own in zip(rows, faces, strict=True):
         if own is not None:
             row[: len(own)] = own
-    rows = torch.tensor(rows, dtype=torch.float32, device=device)
-    return rows, torch.tensor(counts, dtype=torch.int32, device=device)
+    padded = torch.tensor(rows, dtype=torch.float32, device=device)
+    return padded, torch.tensor(counts, dtype=torch.int32, device=device)
 
 
 def _out_of(mat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:

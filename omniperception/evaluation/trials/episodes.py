@@ -7,12 +7,9 @@ from collections.abc import Callable
 import torch
 
 from omniperception.env.env import OmniEnv, Policy
-from omniperception.env.mdp.commands import VelocityCommand
 from omniperception.evaluation.trials.outcomes import Episodes
 from omniperception.evaluation.trials.tally import Tally
 from omniperception.evaluation.trials.tracks import TrackRecorder
-from omniperception.evaluation.trials.walking import WalkingTally
-from omniperception.scene.build import FOOT_FORCE
 
 
 def run_episodes(
@@ -43,9 +40,7 @@ def run_episodes(
         raise ValueError("run_episodes needs a freshly built environment; this one has already been stepped")
     tally, clock = Tally(env, num_trials), _StageClock(env)
     tracks = TrackRecorder(env, num_trials) if keep_tracks else None
-    measures_walking = isinstance(env.command, VelocityCommand) and FOOT_FORCE in env.world.sensors
-    walking = WalkingTally(env, num_trials) if measures_walking else None
-    recorders = [recorder for recorder in (tally, tracks, walking) if recorder is not None]
+    recorders = (tally,) if tracks is None else (tally, tracks)
     before = list(env.step_hooks)
     env.step_hooks.extend(recorder.record for recorder in recorders)
     try:
@@ -65,7 +60,7 @@ def run_episodes(
                     on_left(tally.left)
     finally:
         env.step_hooks[:] = before
-    return tally.episodes(clock.us_per_env_step(), tracks and tracks.tracks(), walking and walking.columns())
+    return tally.episodes(clock.us_per_env_step(), None if tracks is None else tracks.tracks())
 
 
 class _StageClock:

@@ -41,15 +41,11 @@ class ExportedPolicies:
         if env.step_count:
             for index in env.done.nonzero().flatten().tolist():
                 self.robots[index].reset()
-        states, commands, clouds = robot_states(env), env.command.value.cpu().numpy(), self._new_clouds()
-        given = zip(self.robots, states, commands, clouds, self._ages(), strict=True)
+        late = None if env.sensing is None else env.sensing.late_steps
+        ages_s = [0.0] * env.num_envs if late is None else (late * env.control_dt).tolist()  # of the newest frames
+        commands = env.command.value.cpu().numpy()
+        given = zip(self.robots, robot_states(env), commands, self._new_clouds(), ages_s, strict=True)
         return torch.from_numpy(np.stack([_action(*each) for each in given])).to(env.device)
-
-    def _ages(self) -> list[float]:
-        """Of the newest frames, s."""
-        sensing = self._env.sensing
-        late = None if sensing is None else sensing.late_steps
-        return [0.0] * self._env.num_envs if late is None else (late * self._env.control_dt).tolist()
 
     def _new_clouds(self) -> list[np.ndarray | None]:
         """Points of the frame that has just come; None without one, or where the episode has just begun."""
@@ -117,20 +113,19 @@ def record(env: OmniEnv, policy: ExportedPolicy, steps: int, whole_frames: bool)
         steps: control steps.
         whole_frames: all points that the device measures, in place of those that training kept; without noise.
     """
-    policies = ExportedPolicies(env, policy)
+    policies, sensing = ExportedPolicies(env, policy), env.sensing
     device = _whole_device(env) if whole_frames else None
-    sensing = env.sensing if policies.robots[0].frames is not None else None
     readings, tick = [], 0
-    for _ in range(steps):
-        state, command, points = robot_states(env)[0], env.command.value[0].cpu().numpy().copy(), None
-        if sensing is not None and sensing.tick != tick:
+    for step in range(steps):
+        points = None
+        if policies.robots[0].frames is not None and sensing is not None and sensing.tick != tick:
             tick, frame = sensing.tick, sensing.frame
             if device is not None:
-                time_s = torch.full((env.num_envs,), env.step_count * env.control_dt, dtype=torch.float64)
+                time_s = torch.full((env.num_envs,), step * env.control_dt, dtype=torch.float64)
                 frame = device.cast(time_s.to(env.device))
             assert frame is not None  # it has ticked
             points = raw_points(frame)[0].copy()
-        readings.append(Reading(state, command, points))
+        readings.append(Reading(robot_states(env)[0], env.command.value[0].cpu().numpy().copy(), points))
         with torch.no_grad():
             env.step(policies(env.get_observations()))
     return readings
