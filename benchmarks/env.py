@@ -32,7 +32,7 @@ from omniperception.build import RunConfig, build_runner, seed_everything
 from omniperception.config import ConfigError
 from omniperception.deploy.export import FOLDER
 from omniperception.env.env import OmniEnv
-from omniperception.evaluation.exported import record
+from omniperception.evaluation.trials.exported import record
 from omniperception.sim import SimConfig
 from omnirobot.common.cli import Command, argument
 from omnirobot.runtime import DeployError, ExportedPolicy

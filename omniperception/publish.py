@@ -11,7 +11,7 @@ from omniperception import config
 from omniperception.common import provenance
 from omniperception.config import ConfigError
 from omniperception.deploy.export import FOLDER as EXPORTED
-from omniperception.evaluation.records import FOLDER as RESULTS
+from omniperception.evaluation.report.records import FOLDER as RESULTS
 from omniperception.learning import latest_checkpoint, list_checkpoints
 from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from omniperception.sim.response import FILE as RESPONSE

@@ -12,7 +12,7 @@ import torch
 
 from omniperception import build, config
 from omniperception.env.mdp.terms import StatefulTerm
-from omniperception.evaluation.records import read
+from omniperception.evaluation.report.records import read
 from omniperception.sim import MujocoSimulator, SimConfig
 
 ROOT = Path(__file__).resolve().parents[1]

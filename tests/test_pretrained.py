@@ -11,8 +11,8 @@ import torch
 from omniperception import build, config, publish
 from omniperception.build import build_runner, load_policy
 from omniperception.common import provenance
-from omniperception.evaluation.baselines import prepared
-from omniperception.evaluation.episodes import run_episodes
+from omniperception.evaluation.trials.baselines import prepared
+from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.learning import latest_checkpoint
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -18,7 +18,7 @@ from omniperception.commands import main
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.config import ConfigError
 from omniperception.env.mirror import mirrored_joints
-from omniperception.evaluation import baselines
+from omniperception.evaluation.trials import baselines
 from omniperception.robots import fetch
 from omniperception.robots.stand import flat_world, stand
 from omniperception.scene.fetched import fetched
@@ -135,7 +135,7 @@ def test_it_learns_the_gait_and_its_export_acts_alike(name, trained):
     pytest.importorskip("onnxruntime", reason="extra deploy")
     pytest.importorskip("onnx", reason="extra export")
     from omniperception.deploy.export import export
-    from omniperception.evaluation.exported import ExportedPolicies
+    from omniperception.evaluation.trials.exported import ExportedPolicies
     from omnirobot.runtime import ExportedPolicy
 
     run_dir = trained(name)

@@ -15,11 +15,11 @@ from benchmarks.harness.timing import paired_timings
 from omniperception import build, config
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.env import OmniEnv
-from omniperception.evaluation.exported import record
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import FOLDER as EVALUATION
-from omniperception.evaluation.records import read
-from omniperception.evaluation.statistics import rate
+from omniperception.evaluation.report.records import FOLDER as EVALUATION
+from omniperception.evaluation.report.records import read
+from omniperception.evaluation.trials.exported import record
+from omniperception.evaluation.trials.outcomes import Episodes
+from omniperception.evaluation.trials.statistics import rate
 from omniperception.learning import latest_checkpoint
 from omniperception.learning.checkpoint import load_checkpoint
 from omnirobot.common.shell import command_line

@@ -21,7 +21,6 @@ from pathlib import Path
 from omniperception import config
 from omniperception.evaluation.ablation import (
     Ablation,
-    Study,
     check_trainings,
     evaluate_all,
     load_study,
@@ -56,15 +55,11 @@ class Arguments:
     trust: tuple[str, ...] = trust()
 
 
-_OF_THE_STUDY = ("experiment", "variants", "seeds", "scenarios", "suite", "conditions", "policies", "split", "trials")
-
-
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Runs the stages of the study."""
     if arguments.out is not None and len(arguments.study) > 1:
         raise config.ConfigError(
-            f"out={arguments.out} is the folder of one study, {len(arguments.study)} are given; leave it out and each"
-            " has outputs/<study>"
+            f"out={arguments.out} is the folder of one study, {len(arguments.study)} are given; leave it out"
         )
     ablations = [_ablation(name, arguments, overrides) for name in arguments.study]
     if arguments.stage in ("train", "all"):
@@ -81,23 +76,19 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
 
 def _ablation(name: str, arguments: Arguments, overrides: list[str]) -> Ablation:
     """A study as the arguments change it, in its folder."""
-    given = {name: value for name in _OF_THE_STUDY if (value := getattr(arguments, name)) is not None}
+    names = ("experiment", "variants", "seeds", "scenarios", "suite", "conditions", "policies", "split", "trials")
+    given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     if ("suite" in given) != ("scenarios" in given):  # one takes the place of the other
         given = {"suite": None, "scenarios": ()} | given
     study = replace(load_study(name, config.search_path(overrides)), **given)
     if arguments.arms is not None:
-        study = _with_arms(study, arguments.arms)
+        check_known("arms", arguments.arms, tuple(study.arms))
+        study = replace(study, arms={name: arm for name, arm in study.arms.items() if name in arguments.arms})
     if arguments.stage == "all" and "exported" in study.policies:
         raise config.ConfigError(
             "policies=exported: no run is exported yet; give stage=train, export each run, then give stage=evaluate"
         )
     return Ablation(study, arguments.out or config.OUTPUTS / name, tuple(overrides), arguments.trust)
-
-
-def _with_arms(study: Study, names: tuple[str, ...]) -> Study:
-    """The study with some of its arms, in its order."""
-    check_known("arms", names, tuple(study.arms))
-    return replace(study, arms={name: arm for name, arm in study.arms.items() if name in names})
 
 
 command = Command(main, Arguments, __doc__, "of the trainings", (CheckpointError,))

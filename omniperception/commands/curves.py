@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import config
-from omniperception.evaluation.curves import curves_of, draw_curves
+from omniperception.evaluation.report.curves import curves_of, draw_curves
 from omnirobot.common.cli import PICTURES, Command, argument
 from omnirobot.common.figures import PlotsUnavailable
 
@@ -31,10 +31,11 @@ class Arguments:
 
 def main(arguments: Arguments) -> None:
     """Reads the runs and writes the picture."""
-    runs = [run for folder in arguments.runs for run in config.find_runs(folder)]
+    runs = []
     for folder in arguments.runs:
-        if not config.find_runs(folder):
+        if not (found := config.find_runs(folder)):
             raise config.ConfigError(f"runs={folder} is no run directory and holds none")
+        runs += found
     curves = curves_of(list(dict.fromkeys(runs)), arguments.tags)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     draw_curves(arguments.out, curves, arguments.smooth)

@@ -35,7 +35,6 @@ from pathlib import Path
 
 from omniperception import config
 from omniperception.config import ConfigError
-from omniperception.evaluation.baselines import DRIVEN
 from omniperception.evaluation.suite import (
     POLICIES,
     SPLITS,
@@ -45,6 +44,7 @@ from omniperception.evaluation.suite import (
     held_out_scenarios,
     suite_worlds,
 )
+from omniperception.evaluation.trials.baselines import DRIVEN
 from omniperception.learning import CheckpointError
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT
@@ -100,25 +100,10 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         refuse_arguments(arguments, ("log",), "only split=test is noted")
     if not set(DRIVEN) & set(arguments.policy):
         refuse_arguments(arguments, ("walker",), f"none of policy={','.join(arguments.policy)} drives a gait")
-    evaluate(
-        Evaluation(
-            runs=runs,
-            worlds=worlds,
-            policies=arguments.policy,
-            split=arguments.split,
-            condition=arguments.condition,
-            trials=arguments.trials,
-            num_envs=arguments.num_envs,
-            jobs=arguments.jobs,
-            walker=config.find_run(arguments.walker, "walker") if arguments.walker else None,
-            plots=arguments.plots,
-            again=arguments.again,
-            out=arguments.out,
-            log=arguments.log,
-            overrides=tuple(overrides),
-            trust=arguments.trust,
-        )
-    )
+    names = ("split", "condition", "trials", "num_envs", "jobs", "plots", "again", "out", "log", "trust")
+    given = {name: getattr(arguments, name) for name in names}
+    walker = config.find_run(arguments.walker, "walker") if arguments.walker else None
+    evaluate(Evaluation(runs, worlds, policies=arguments.policy, walker=walker, overrides=tuple(overrides), **given))
 
 
 def _shown(arguments: Arguments, run_dir: Path, world: World, overrides: list[str]) -> Shown:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omniperception.env.env import OmniEnv, Policy
-from omniperception.evaluation.camera import CAMERAS
-from omniperception.evaluation.video_options import VideoOptions
+from omniperception.evaluation.film.camera import CAMERAS
+from omniperception.evaluation.film.video_options import VideoOptions
 from omnirobot.common.cli import argument
 
 if TYPE_CHECKING:
-    from omniperception.evaluation.video import Recorder
+    from omniperception.evaluation.film.video import Recorder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ def film(arguments: FilmArguments, env: OmniEnv, policy: Policy, path: Path) -> 
     Yields:
         What is to be called after every control step.
     """
-    from omniperception.evaluation.video import Recorder
+    from omniperception.evaluation.film.video import Recorder
 
     recorder = Recorder(env, path, arguments.video_s, arguments.video, policy)
     try:

@@ -23,12 +23,11 @@ import torch
 from omniperception import build, config
 from omniperception.common.tables import markdown
 from omniperception.env.env import OmniEnv, Policy
-from omniperception.evaluation import robustness
-from omniperception.evaluation.footfall import COMMANDS, SETTLES_S, SHOWN_S, Footfall, draw_footfall, watch
-from omniperception.evaluation.kicks import AFTER_S, WATCHED_S, KickResults, draw_kicks, kick
-from omniperception.evaluation.records import FOLDER, merge
-from omniperception.evaluation.response import COMMANDS as CYCLES
-from omniperception.evaluation.response import (
+from omniperception.evaluation.gait import robustness
+from omniperception.evaluation.gait.footfall import COMMANDS, SETTLES_S, SHOWN_S, Footfall, draw_footfall, watch
+from omniperception.evaluation.gait.kicks import AFTER_S, WATCHED_S, KickResults, draw_kicks, kick
+from omniperception.evaluation.gait.response import COMMANDS as CYCLES
+from omniperception.evaluation.gait.response import (
     COPIES,
     STEP_S,
     Recording,
@@ -39,8 +38,9 @@ from omniperception.evaluation.response import (
     gait_frequency,
     record,
 )
-from omniperception.evaluation.response_fit import SETTLES_S as UNSETTLED_S
-from omniperception.evaluation.response_fit import fit, kept
+from omniperception.evaluation.gait.response_fit import SETTLES_S as UNSETTLED_S
+from omniperception.evaluation.gait.response_fit import fit, kept
+from omniperception.evaluation.report.records import FOLDER, merge
 from omniperception.evaluation.suite import Evaluation, World
 from omniperception.learning import CheckpointError
 from omniperception.scene.build import FOOT_FORCE
@@ -97,11 +97,13 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     picture.parent.mkdir(exist_ok=True)
     check_figures()
     if arguments.what == "kicks":
-        results = kicked(arguments, run_dir, overrides)
+        trained = policy_on_free_ground(arguments, run_dir, overrides)
+        results = kick(trained.env, trained.policy, arguments.speeds, arguments.bearings, arguments.repeats)
         print(kicks_table(results, arguments.speeds))
         draw_kicks(results, arguments.speeds, arguments.bearings, picture)
     elif arguments.what == "feet":
-        footfall = watched(arguments, run_dir, overrides)
+        trained = policy_on_free_ground(arguments, run_dir, overrides)
+        footfall = watch(trained.env, trained.policy)
         draw_footfall(footfall, picture)
         print(feet_table(footfall))
     elif arguments.what == "response":
@@ -110,16 +112,10 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         draw_response(recordings, picture)
         print(f"wrote {response.save(run_dir)}")
     else:
-        evaluation = Evaluation(
-            [run_dir],
-            [World("walk")],
-            trials=arguments.trials,
-            overrides=tuple(overrides),
-            out=arguments.out,
-            trust=arguments.trust,
-        )
         folders = config.search_path(overrides, config.read(run_dir))
         rows = arguments.rows or robustness.rows_of_the_robot(arguments.preset, folders)
+        given = Evaluation([run_dir], [World("walk")], overrides=tuple(overrides), trust=arguments.trust)
+        evaluation = replace(given, trials=arguments.trials, out=arguments.out)
         found = robustness.measure(robustness.stretches(evaluation, arguments.preset, rows, arguments.factors))
         print(robustness.table(found))
         robustness.draw(found, picture)
@@ -127,18 +123,6 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
             merge(arguments.out, [record for _, record in found])
             print(f"added to {arguments.out}")
     print(f"wrote {picture}")
-
-
-def kicked(arguments: Arguments, run_dir: Path, overrides: list[str]) -> KickResults:
-    """Kicks the run's policy."""
-    trained = policy_on_free_ground(arguments, run_dir, overrides)
-    return kick(trained.env, trained.policy, arguments.speeds, arguments.bearings, arguments.repeats)
-
-
-def watched(arguments: Arguments, run_dir: Path, overrides: list[str]) -> Footfall:
-    """Watches the feet of the run's policy."""
-    trained = policy_on_free_ground(arguments, run_dir, overrides)
-    return watch(trained.env, trained.policy)
 
 
 def answered(

@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 from omniperception import build, config
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.common.provenance import provenance
-from omniperception.evaluation.episodes import run_episodes
-from omniperception.evaluation.report import summary_table, times_line
+from omniperception.evaluation.report.tables import summary_table, times_line
+from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.learning import CheckpointError
 from omniperception.learning.progress import ProgressLine
 from omniperception.viewer import PageOptions, Shown, ViewerError, serve
@@ -73,14 +73,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     print(f"{trained.checkpoint} in {run.env.num_envs} environments, seed {run.env.seed}")
     print(summary_table(summary))
     print(times_line(summary))
-    report = {
-        "checkpoint": trained.checkpoint.name,
-        "overrides": overrides,
-        "seed": run.env.seed,
-        "num_envs": run.env.num_envs,
-        **summary,
-        **provenance(trained.env.device),
-    }
+    report = {"checkpoint": trained.checkpoint.name, "overrides": overrides, "seed": run.env.seed}
+    report |= {"num_envs": run.env.num_envs, **summary, **provenance(trained.env.device)}
     write_whole(run_dir / f"{stem}.json", json.dumps(report, indent=2) + "\n")
     written = [run_dir / f"{stem}.{kind}" for kind in ("json", *(("mp4", "png") if films else ()))]
     print(f"wrote {', '.join(map(str, written))}")

@@ -3,13 +3,17 @@
     tables                # writes every table again
     tables check=true     # says which pages differ, and writes nothing
 
-A table stands in a page between <!-- table: NAME view=... key=value ... --> and <!-- end -->; NAME is a file in `data`,
-written by evaluate out=, or several with commas. Views: all (every figure), policies (a row for each world, a column
-for each policy), worlds (a row for each world, a column for each condition), conditions (a row for each policy),
-trained (a row for each run, a column for each policy), trainings (a row for each world, a column for each training, its
-seeds together), study (a row for each training and policy), walking (figures of a gait: a row for each ground), levels
-(the same, all kinds of ground together), runs (the same, a row for each run). The keys policy, world, terrain,
-condition, split and run choose what is shown. Percentages and intervals are computed from the outcomes of trials.
+A table stands in a page between two comments, each at the beginning of a line:
+
+    <!-- table: NAME view=VIEW condition=robot policy=run,blind -->
+    <!-- end -->
+
+NAME is a file in `data`, written by evaluate out=, or several with commas. Views: all (every figure), policies (a row
+for each world, a column for each policy), worlds (the same with a column for each condition), conditions (a row for
+each policy), trained (a row for each run, a column for each policy), trainings (a row for each world, a column for each
+training, its seeds together), study (a row for each training and policy), walking (figures of a gait: a row for each
+ground), levels (the same, all kinds of ground together), runs (the same, a row for each run). The keys policy, world,
+terrain, condition, split and run choose what is shown. Percentages and intervals are those of the outcomes of trials.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception.config import ConfigError
-from omniperception.evaluation.tables import rendered
+from omniperception.evaluation.report.pages import rendered
 from omnirobot.common.cli import Command, argument
 from omnirobot.common.files import write_whole
 from omnirobot.common.shell import command_line
@@ -46,10 +50,11 @@ def main(arguments: Arguments) -> None:
             different.append(str(page))
             if not arguments.check:
                 write_whole(page, new)
+    shown = ", ".join(different)
     if arguments.check and different:
         again = command_line("tables", f"pages={','.join(map(str, arguments.pages))}", f"data={arguments.data}")
-        raise ConfigError(f"{', '.join(different)} differ from the files of results; commit what this writes: {again}")
-    print(f"wrote {', '.join(different)}" if different else "all tables are those of the files of results")
+        raise ConfigError(f"{shown} differ from the files of results; commit what this writes: {again}")
+    print(f"wrote {shown}" if different else "all tables are those of the files of results")
 
 
 def _pages(given: tuple[Path, ...]) -> list[Path]:

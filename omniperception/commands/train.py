@@ -216,7 +216,7 @@ def learn(
 
     report(summary(parts_of(runner), run.families))
     if distributed.rank() == 0 and run.logger is not None and run.logger.video_interval is not None:
-        from omniperception.evaluation.training_videos import TrainingVideos
+        from omniperception.evaluation.film.training_videos import TrainingVideos
 
         videos = TrainingVideos(runner, run_dir, run.logger.video_interval, run.logger.video_s)
         runner.step_hooks.append(videos.step)

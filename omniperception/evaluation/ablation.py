@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,8 +14,9 @@ import yaml
 
 from omniperception import build, config
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import Record, read, write
-from omniperception.evaluation.study_report import study_table
+from omniperception.evaluation.report.pages import by_training
+from omniperception.evaluation.report.records import Record, read, write
+from omniperception.evaluation.report.studies import study_table
 from omniperception.evaluation.suite import (
     POLICIES,
     SPLITS,
@@ -25,7 +27,6 @@ from omniperception.evaluation.suite import (
     measure_all,
     suite_worlds,
 )
-from omniperception.evaluation.tables import by_training
 from omnirobot.common.errors import check_known, one_line
 from omnirobot.common.files import write_whole
 from omnirobot.common.signals import interruptible
@@ -109,9 +110,9 @@ def load_study(name: str, folders: Sequence[Path] = ()) -> Study:
         if "arms" in given:
             given["arms"] = {arm: Arm(**settings) for arm, settings in given["arms"].items()}
         return Study(**given)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     except (yaml.YAMLError, TypeError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise ConfigError(f"{path}: {error}") from None
         raise ConfigError(f"{path} is no study: {one_line(error)}") from None
 
 
@@ -155,12 +156,11 @@ class Ablation:
     def run_dir(self, arm: str, variant: str, seed: int) -> Path:
         return self.out / arm / variant / f"seed{seed}"
 
-    def run_dirs(self) -> Iterator[Path]:
+    def run_dirs(self) -> list[Path]:
         """All of them, seeds of a training one after the other."""
-        for arm in self.study.arms:
-            for variant in self.study.variants:
-                for seed in self.study.seeds:
-                    yield self.run_dir(arm, variant, seed)
+        study = self.study
+        trainings = itertools.product(study.arms, study.variants, study.seeds)
+        return [self.run_dir(*training) for training in trainings]
 
     def worlds(self) -> list[World]:
         if self.study.suite is not None:
@@ -179,36 +179,34 @@ def train(ablation: Ablation) -> None:
         ConfigError: a training failed.
     """
     together = any(override.startswith("hydra/launcher=") for override in ablation.overrides)
+    variants = ablation.study.variants
     for arm in ablation.study.arms:
-        with _ended_with_this_process() as running:
-            for variant in ablation.study.variants:
-                running.append(subprocess.Popen(_sweep(ablation, arm, variant)))
-                if not together:
-                    _wait(running[-1])
-            for process in running:
-                _wait(process)
+        for group in [variants] if together else [[variant] for variant in variants]:
+            with _ended_with_this_process() as running:
+                running += [subprocess.Popen(_sweep(ablation, arm, variant)) for variant in group]
+                for process in running:
+                    if process.wait():
+                        code = process.returncode
+                        raise ConfigError(f"training ended with exit code {code}; the same command goes on from there")
 
 
 @contextmanager
 def _ended_with_this_process() -> Iterator[list[subprocess.Popen]]:
     """Trainings that are waited for; when this process is told to end, so are they, and save first."""
     running: list[subprocess.Popen] = []
-
-    def wait() -> None:
-        for process in running:
-            process.wait()
-
     with interruptible():
         try:
             try:
                 yield running
             except Exception:  # one has failed; the others go on to their end
-                wait()
+                for process in running:
+                    process.wait()
                 raise
         except KeyboardInterrupt:
             for process in running:
                 process.terminate()
-            wait()
+            for process in running:
+                process.wait()
             raise
 
 
@@ -251,37 +249,25 @@ def overrides_of(variant: str) -> tuple[str, ...]:
     return VARIANTS.get(variant, (f"perception={variant}",))
 
 
-def _wait(process: subprocess.Popen) -> None:
-    if process.wait():
-        raise ConfigError(f"training ended with exit code {process.returncode}; the same command goes on from there")
-
-
-def _evaluations(ablation: Ablation) -> Iterator[Evaluation]:
-    """Of all runs, a condition after the other.
+def _tasks(ablation: Ablation) -> list[Task]:
+    """Every run in every world, a condition after the other.
 
     Raises:
         ConfigError: a run has not been trained.
     """
-    study, worlds, runs = ablation.study, ablation.worlds(), list(ablation.run_dirs())
+    study, worlds, runs = ablation.study, ablation.worlds(), ablation.run_dirs()
     for run_dir in runs:
         if not run_dir.is_dir():
             raise ConfigError(f"{run_dir} has not been trained; use stage=train or stage=all")
-    for condition in study.conditions:
-        yield Evaluation(
-            runs=runs,
-            worlds=worlds,
-            policies=study.policies,
-            split=study.split,
-            condition=condition,
-            trials=study.trials,
-            trust=ablation.trust,
-        )
+    same = Evaluation(
+        runs, worlds, policies=study.policies, split=study.split, trials=study.trials, trust=ablation.trust
+    )
+    return [task for condition in study.conditions for task in replace(same, condition=condition).tasks()]
 
 
 def evaluate_all(ablation: Ablation) -> None:
     """Evaluates every run in every scenario, but for what the same code has evaluated at the same checkpoint before."""
-    for evaluation in _evaluations(ablation):
-        measure_all(evaluation.tasks())
+    measure_all(_tasks(ablation))
 
 
 def write_tables(ablation: Ablation) -> str:
@@ -292,8 +278,7 @@ def write_tables(ablation: Ablation) -> str:
     Raises:
         ConfigError: a run has not been evaluated in a scenario with its newest checkpoint.
     """
-    tasks = [task for evaluation in _evaluations(ablation) for task in evaluation.tasks()]
-    records = [replace(_found(task), run=str(task.run_dir.relative_to(ablation.out))) for task in tasks]
+    records = [replace(_found(task), run=str(task.run_dir.relative_to(ablation.out))) for task in _tasks(ablation)]
     text = study_table(records)
     if ablation.study.suite is not None:
         text = f"{by_training(records)}\n\n{text}"

@@ -24,14 +24,14 @@ from omniperception.common.provenance import CHANGES, ROOT, provenance
 from omniperception.config import ConfigError
 from omniperception.deploy.export import FOLDER as EXPORTED
 from omniperception.env.config import EnvConfig
-from omniperception.evaluation.baselines import BASELINES, DRIVEN, Limits, baseline, commanded_ranges, prepared
-from omniperception.evaluation.episodes import run_episodes
-from omniperception.evaluation.exported import ExportedPolicies
-from omniperception.evaluation.plots import draw_worlds
-from omniperception.evaluation.records import FOLDER, Record, merge, read, write
-from omniperception.evaluation.report import progress_line, table
-from omniperception.evaluation.tracks import Tracks
-from omniperception.evaluation.walking_report import walking_table
+from omniperception.evaluation.report.gaits import walking_table
+from omniperception.evaluation.report.plots import draw_worlds
+from omniperception.evaluation.report.records import FOLDER, Record, merge, read, write
+from omniperception.evaluation.report.tables import progress_line, table
+from omniperception.evaluation.trials.baselines import BASELINES, DRIVEN, baseline, commanded_ranges, prepared
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.exported import ExportedPolicies
+from omniperception.evaluation.trials.tracks import Tracks
 from omniperception.learning import CheckpointError, latest_checkpoint
 from omnirobot.common.errors import check_known, naming, one_line
 from omnirobot.common.figures import check_figures
@@ -136,12 +136,10 @@ def suite_worlds(name: str, folders: Sequence[Path] = ()) -> list[World]:
     """The worlds of a suite, a file of conf/suite with the terrains of each scenario."""
     path = config.listed(config.SUITES, name, folders)
     try:
-        worlds = dict(yaml.safe_load(path.read_text()) or {}).get("worlds")
-    except (yaml.YAMLError, TypeError, ValueError) as error:
-        raise ConfigError(f"{path} is no suite: {one_line(error)}") from None
-    if not isinstance(worlds, dict) or not all(isinstance(terrains, list) for terrains in worlds.values()):
-        raise ConfigError(f"{path} must have 'worlds: {{scenario: [terrain, ...]}}'")
-    found = [World(scenario, terrain) for scenario, terrains in worlds.items() for terrain in terrains]
+        worlds = yaml.safe_load(path.read_text())["worlds"]
+        found = [World(scenario, terrain) for scenario, terrains in worlds.items() for terrain in terrains]
+    except (yaml.YAMLError, TypeError, KeyError, AttributeError) as error:
+        raise ConfigError(f"{path} must have 'worlds: {{scenario: [terrain, ...]}}': {one_line(error)}") from None
     if not found:
         raise ConfigError(f"{path} names no world; it must have 'worlds: {{scenario: [terrain, ...]}}'")
     return found
@@ -173,7 +171,7 @@ class Task:
     @cached_property
     def weights(self) -> str:
         """SHA-256 of the run's newest checkpoint."""
-        return weights_hash(self.run_dir)
+        return checksum(latest_checkpoint(self.run_dir))
 
     @cached_property
     def composed(self):
@@ -217,7 +215,7 @@ class Task:
             "weights": self.weights,
             "seed": self.composed.seed,
             "walker": shown(self.walker),
-            "walker_weights": self.weights if self.walker == self.run_dir else weights_hash(self.walker),
+            "walker_weights": self.weights if self.walker == self.run_dir else checksum(latest_checkpoint(self.walker)),
             "trials": self.evaluation.trials,
             "num_envs": self.evaluation.num_envs,
             "overrides": list(self.evaluation.overrides),
@@ -226,13 +224,15 @@ class Task:
 
     def _fingerprint(self) -> str:
         """SHA-256 of all that is configured, of the files that it names, and of trusted modules: they may change."""
-        configs = (self.composed, config.load(self.run_dir, self._own_overrides()))
-        parts = [OmegaConf.to_yaml(one, resolve=True) for one in configs]
-        named = {path for one in configs for path in _files(OmegaConf.to_container(one, resolve=True))}
-        parts += [checksum(path) for path in sorted(named | set(_sources(self.evaluation.trust)))]
-        if self.policy == "exported" and (described := self.run_dir / EXPORTED / DESCRIPTION).is_file():
-            parts.append(described.read_text())
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+        configs = self.composed, config.load(self.run_dir, self._own_overrides())
+        texts = [OmegaConf.to_yaml(one, resolve=True) for one in configs]
+        words = {event.value for text in texts for event in yaml.parse(text) if isinstance(event, yaml.ScalarEvent)}
+        words |= {word.rpartition("#")[0] for word in words}  # of a mesh in a file the part before its name
+        files = {os.path.expanduser(word) for word in words} | set(_sources(self.evaluation.trust))
+        if self.policy == "exported":
+            files.add(str(self.run_dir / EXPORTED / DESCRIPTION))
+        texts += [checksum(Path(file)) for file in sorted(files) if os.path.isfile(file)]
+        return hashlib.sha256("\n".join(texts).encode()).hexdigest()
 
     @property
     def path(self) -> Path:
@@ -250,28 +250,23 @@ class Task:
         evaluation = self.evaluation
         others = [*evaluation.overrides, *([] if self.walker == self.run_dir else [f"walker={shown(self.walker)}"])]
         changes = [hashlib.sha256(" ".join(others).encode()).hexdigest()[:8]] if others else []
-        return (
-            self.run_dir
-            / FOLDER
-            / "-".join([evaluation.split, evaluation.condition or "own", *names[:-1], *changes, names[-1]])
-        )
+        stem = [evaluation.split, evaluation.condition or "own", *names[:-1], *changes, names[-1]]
+        return self.run_dir / FOLDER / "-".join(stem)
 
     def done(self, facts: dict) -> Record | None:
         """The record of an earlier measurement by the same code with the same settings; None without one.
 
-        None is by the same code where files were changed since the commit: nothing says how.
+        Code that was changed since its commit is never the same: nothing says how it was changed.
         """
-        evaluation, path = self.evaluation, self.path
-        if (facts["commit"] or "").endswith(CHANGES):
-            return None
-        if evaluation.again or not path.is_file() or (evaluation.plots and not path.with_suffix(".npz").is_file()):
+        kept = [self.path, *([self.path.with_suffix(".npz")] if self.evaluation.plots else [])]
+        changed = (facts["commit"] or "").endswith(CHANGES)
+        if changed or self.evaluation.again or not all(path.is_file() for path in kept):
             return None
         try:
-            (record,) = read(path)
-        except ConfigError:  # half a file, or one of another format: measured again
+            (record,) = read(self.path)
+        except ConfigError:  # half a file, or one of another format
             return None
-        now = self.settings() | {"commit": facts["commit"], "versions": facts["versions"]}
-        before = record.plain()
+        now, before = self.settings() | {name: facts[name] for name in ("commit", "versions")}, record.plain()
         return record if all(before.get(name) == value for name, value in now.items()) else None
 
     def measure(self, facts: dict) -> Record:
@@ -314,15 +309,25 @@ class Task:
         try:
             prepared_env = prepared(self.policy, run.env, self._own.lidar)
             trained = load_policy(replace(run, env=prepared_env), self.walker)
-            env, policy, checkpoint = trained.env, trained.policy, trained.checkpoint
             if self.policy in BASELINES:
-                policy = baseline(self.policy, env, policy, self._own.rewards.avoidance, self._limits())
+                avoidance = self._own.rewards.avoidance
+                unlimited = self.walker == self.run_dir and avoidance.risk is not None
+                limits = None if unlimited else commanded_ranges(self.walker)
+                policy = baseline(self.policy, trained.env, trained.policy, avoidance, limits)
+                return replace(trained, policy=policy)
             if self.policy == "exported":
-                exported = _exported(self.run_dir, self.weights)
-                checkpoint, policy = self.run_dir / EXPORTED, ExportedPolicies(env, exported)
+                exported = ExportedPolicy.load(self.run_dir / EXPORTED)
+                made_of = exported.description.provenance
+                if made_of.get("weights") != self.weights:
+                    raise ValueError(
+                        f"it was exported from another checkpoint ({made_of.get('checkpoint')}) than the run's newest,"
+                        f" {latest_checkpoint(self.run_dir).name}; export again"
+                    )
+                policy = ExportedPolicies(trained.env, exported)
+                return replace(trained, policy=policy, checkpoint=self.run_dir / EXPORTED)
         except ValueError as error:
             raise ConfigError(f"policy={self.policy}: {error}") from None
-        return TrainedPolicy(env, policy, checkpoint)
+        return trained
 
     @cached_property
     def _own(self) -> EnvConfig:
@@ -334,51 +339,15 @@ class Task:
         parsed = config.parse(self.evaluation.overrides)
         return [str(override.input_line) for override in parsed if config.group_of(override) not in _SCENE]
 
-    def _limits(self) -> Limits | None:
-        own = self.walker == self.run_dir and self._own.rewards.avoidance.risk is not None
-        return None if own else commanded_ranges(self.walker)
 
-
-def _exported(run_dir: Path, weights: str) -> ExportedPolicy:
-    """A run's exported policy; refused if it was exported from other weights (SHA-256) than the record would name."""
-    policy = ExportedPolicy.load(run_dir / EXPORTED)
-    if policy.description.provenance.get("weights") != weights:
-        of = policy.description.provenance.get("checkpoint")
-        raise ValueError(
-            f"it was exported from another checkpoint ({of}) than the run's newest, {latest_checkpoint(run_dir).name};"
-            " export again"
-        )
-    return policy
-
-
-def _files(value: object) -> Iterator[Path]:
-    """Files that plain data names."""
-    if isinstance(value, Mapping):
-        value = list(value.values())
-    if isinstance(value, list):
-        for item in value:
-            yield from _files(item)
-    elif isinstance(value, str):  # of a mesh in a file the part before its name
-        named = [Path(os.path.expanduser(path)) for path in dict.fromkeys((value, value.rpartition("#")[0]))]
-        yield from (path for path in named if os.path.isfile(path))
-
-
-def _sources(modules: Sequence[str]) -> Iterator[Path]:
+def _sources(modules: Sequence[str]) -> Iterator[str]:
     """Files of Python modules, with what is below them."""
     for name in modules:
-        try:
-            spec = importlib.util.find_spec(name)
-        except (ImportError, ValueError):  # refused where the configuration is assembled
-            continue
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.origin is not None:
+            yield spec.origin
         for folder in (spec and spec.submodule_search_locations) or ():
-            yield from Path(folder).rglob("*.py")
-        if spec is not None and spec.origin is not None and Path(spec.origin).is_file():
-            yield Path(spec.origin)
-
-
-def weights_hash(run_dir: Path) -> str:
-    """SHA-256 of a run's newest checkpoint."""
-    return checksum(latest_checkpoint(run_dir))
+            yield from map(str, Path(folder).rglob("*.py"))
 
 
 def reported_seed(weights: str, world: str) -> int:
@@ -404,28 +373,42 @@ def evaluate(evaluation: Evaluation) -> list[Record]:
     """
     if evaluation.plots:
         check_figures()
-    tasks = evaluation.tasks()
-    _check_names(tasks)
-    ordered = measure_all(tasks)
-    print(f"\n{(walking_table if all(record.episodes.walking for record in ordered) else table)(ordered)}")
+    tasks, names = evaluation.tasks(), dict[str, Path]()
+    for run_dir in (run_dir.resolve() for run_dir in evaluation.runs):
+        if names.setdefault(shown(run_dir), run_dir) != run_dir:
+            raise ConfigError(
+                f"run={run_dir} and {names[shown(run_dir)]} would both be called {shown(run_dir)}; evaluate them from a"
+                " folder above both"
+            )
+    if evaluation.out is not None and evaluation.out.exists():
+        read(evaluation.out)  # refused before anything is measured
+    records = measure_all(tasks)
+    print(f"\n{(walking_table if all(record.episodes.walking for record in records) else table)(records)}")
     if evaluation.plots:
-        _draw(tasks, ordered)
+        _draw(tasks, records)
     if evaluation.out is not None:
-        merge(evaluation.out, ordered)
+        merge(evaluation.out, records)
         print(f"added to {evaluation.out}")
-    return ordered
+    return records
 
 
 def measure_all(tasks: Sequence[Task]) -> list[Record]:
     """A record for each task: measured now, or before and kept. Prints progress and notes what is on the test split."""
     for run_dir in {task.run_dir for task in tasks}:
+        latest_checkpoint(run_dir)  # a run without one is refused before anything is measured
         (run_dir / FOLDER).mkdir(exist_ok=True)
-    facts = provenance(tasks[0].assembled().env.sim.torch_device)
-    _check_tasks(tasks)
+    paths = [task.path.resolve() for task in tasks]
+    for k, task in enumerate(tasks):
+        if paths.index(paths[k]) < k:
+            raise ConfigError(f"run={task.run_dir} policy={task.policy} world={task.world.name} is given twice")
+    device = tasks[0].assembled().env.sim.torch_device
+    facts = provenance(device)
     records = {k: record for k, task in enumerate(tasks) if (record := task.done(facts)) is not None}
     if records:
         print(f"{len(records)} of {len(tasks)} measured before and kept; again=true measures them again", flush=True)
-    for k, record in _measured({k: task for k, task in enumerate(tasks) if k not in records}, facts):
+    left = {k: task for k, task in enumerate(tasks) if k not in records}
+    jobs = tasks[0].evaluation.jobs or (default_num_threads() if device.type == "cpu" else 1)
+    for k, record in _measured(left, facts, min(jobs, len(left))):
         records[k] = record
         print(f"[{len(records)}/{len(tasks)}] {progress_line(record)}", flush=True)
         if tasks[k].evaluation.split == "test":
@@ -433,48 +416,13 @@ def measure_all(tasks: Sequence[Task]) -> list[Record]:
     return [records[k] for k in range(len(tasks))]
 
 
-def _check_tasks(tasks: Sequence[Task]) -> None:
-    """Refuses before anything is measured what would fail after hours."""
-    seen = set()
-    for task in tasks:
-        key = task.path.resolve()
-        if key in seen:
-            raise ConfigError(f"run={task.run_dir} policy={task.policy} world={task.world.name} is given twice")
-        seen.add(key)
-    weights = {run_dir: weights_hash(run_dir) for run_dir in dict.fromkeys(task.run_dir for task in tasks)}
-    for run_dir in dict.fromkeys(task.run_dir for task in tasks if task.policy == "exported"):
-        try:
-            _exported(run_dir, weights[run_dir])
-        except ValueError as error:
-            raise ConfigError(f"policy=exported: {error}") from None
-    for walker in dict.fromkeys(task.walker for task in tasks if task.policy == "blind"):
-        if build.load_run(walker, trust=tasks[0].evaluation.trust).perception is None:
-            raise ConfigError(f"policy=blind: {walker} does not look at the LiDAR, it is blind already; leave it out")
-    out = tasks[0].evaluation.out
-    if out is not None and out.exists():
-        read(out)
-
-
-def _check_names(tasks: Sequence[Task]) -> None:
-    """Refuses runs that one table or file would call the same."""
-    names: dict[str, Path] = {}
-    for run_dir in (task.run_dir.resolve() for task in tasks):
-        if names.setdefault(shown(run_dir), run_dir) != run_dir:
-            raise ConfigError(
-                f"run={run_dir} and {names[shown(run_dir)]} would both be called {shown(run_dir)}; evaluate them from a"
-                " folder above both"
-            )
-
-
-def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Record]]:
+def _measured(tasks: Mapping[int, Task], facts: dict, jobs: int) -> Iterator[tuple[int, Record]]:
     """Numbers of the tasks with their records, in the order in which they end; an error once those begun have ended."""
-    workers = _workers(list(tasks.values()))
-    if workers == 1:
+    if jobs <= 1:
         for k, task in tasks.items():
             yield k, _in_worker(task, facts)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         futures = {pool.submit(_in_worker, task, facts): k for k, task in tasks.items()}
         failed: BaseException | None = None
         try:
@@ -491,14 +439,6 @@ def _measured(tasks: Mapping[int, Task], facts: dict) -> Iterator[tuple[int, Rec
             pool.shutdown(cancel_futures=True)
         if failed is not None:
             raise failed
-
-
-def _workers(tasks: Sequence[Task]) -> int:
-    """Processes; 1 where one of them drives a GPU."""
-    if not tasks:
-        return 1
-    on_gpu = tasks[0].assembled().env.sim.torch_device.type != "cpu"
-    return min(tasks[0].evaluation.jobs or (1 if on_gpu else default_num_threads()), len(tasks))
 
 
 def _in_worker(task: Task, facts: dict) -> Record:
@@ -546,9 +486,8 @@ def _draw(tasks: Sequence[Task], records: Sequence[Record]) -> None:
     """A picture of each policy of each run: all worlds from above, each on the first of its terrains."""
     panels: dict[Path, dict[str, Record]] = {}
     for task, record in zip(tasks, records, strict=True):
-        if record.world not in panels.setdefault(task.picture, {}):
-            tracks = Tracks.load(task.path.with_suffix(".npz"))
-            panels[task.picture][record.world] = replace(record, episodes=replace(record.episodes, tracks=tracks))
+        episodes = replace(record.episodes, tracks=Tracks.load(task.path.with_suffix(".npz")))
+        panels.setdefault(task.picture, {}).setdefault(record.world, replace(record, episodes=episodes))
     for path, worlds in panels.items():
         draw_worlds(path, list(worlds.values()))
         print(f"wrote {path}")

@@ -13,7 +13,7 @@ from PIL import Image
 
 from omnilidar import Lidar, RayScene
 from omniperception.env.sensing import SensorConfig
-from omniperception.evaluation.render import Renderer, View
+from omniperception.evaluation.film.render import Renderer, View
 from omniperception.scene import World
 from omniperception.scene.rays import HitClass, RayShapes, ray_shapes
 from omnirobot.common.errors import naming

@@ -15,8 +15,8 @@ from omniperception.config import ConfigError
 from omniperception.env.config import FROM_LIDAR, EnvConfig
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.state import AVOIDANCE, MEASURED_CLOUD
-from omniperception.evaluation.baselines import BASELINES, Limits, baseline, commanded_ranges
-from omniperception.evaluation.perceived import Perceived, perceived
+from omniperception.evaluation.film.perceived import Perceived, perceived
+from omniperception.evaluation.trials.baselines import BASELINES, Limits, baseline, commanded_ranges
 from omniperception.learning import Runner, latest_checkpoint
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
 from omniperception.scene.rays import RayShapes, ray_shapes

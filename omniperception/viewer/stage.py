@@ -13,7 +13,7 @@ import torch
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.env.heights import height_grid
 from omniperception.env.sensing import split_elevation
-from omniperception.evaluation.perceived import Perceived
+from omniperception.evaluation.film.perceived import Perceived
 from omniperception.scene.rays import HitClass
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, HEIGHTS, OBSTACLE, PROXIMAL, SECTORS, TERRAIN, scale
 from omniperception.viewer.meshes import grid_surface, robot_looks, triangles

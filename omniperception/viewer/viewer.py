@@ -15,7 +15,7 @@ import torch
 
 from omniperception import config
 from omniperception.config import ConfigError
-from omniperception.evaluation.perceived import true
+from omniperception.evaluation.film.perceived import true
 from omniperception.learning import CheckpointError, latest_checkpoint
 from omniperception.viewer.drive import Stick, Velocity
 from omniperception.viewer.options import SWITCHED, PageOptions, Shown

@@ -17,8 +17,8 @@ from omnilidar import LidarConfig
 from omniperception.commands.export import command as export
 from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record, write
+from omniperception.evaluation.report.records import Record, write
+from omniperception.evaluation.trials.outcomes import Episodes
 from omniperception.perception import ProximitySampler
 
 ROOT = Path(__file__).resolve().parents[2]

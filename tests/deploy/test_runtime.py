@@ -22,7 +22,7 @@ from omniperception.config import ConfigError
 from omniperception.deploy import export as export_module
 from omniperception.deploy.export import describe, export
 from omniperception.env.env import OmniEnv
-from omniperception.evaluation.episodes import run_episodes
+from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.learning import CheckpointError
 from omniperception.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 
@@ -31,8 +31,8 @@ pytest.importorskip("onnx", reason="extra export")
 
 from omniperception.deploy.deploy_yaml import deploy_yaml
 from omniperception.evaluation.ablation import VARIANTS, overrides_of
-from omniperception.evaluation.exported import ExportedPolicies, raw_points, record, robot_states
 from omniperception.evaluation.suite import Evaluation, World, evaluate
+from omniperception.evaluation.trials.exported import ExportedPolicies, raw_points, record, robot_states
 from omnirobot.runtime import DeployError, Description, ExportedPolicy, RobotState
 from omnirobot.runtime.description import Term
 

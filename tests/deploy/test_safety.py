@@ -281,7 +281,7 @@ def test_the_published_policy_stands_half_a_second_after_it_slows_down(tmp_path)
     from omniperception import build, config
     from omniperception.deploy.export import export
     from omniperception.env.env import OmniEnv
-    from omniperception.evaluation.exported import raw_points, robot_states
+    from omniperception.evaluation.trials.exported import raw_points, robot_states
 
     run_dir = Path(__file__).resolve().parents[2] / "pretrained" / "avoider"
     export(run_dir, tmp_path, ("onnx",))

@@ -10,7 +10,7 @@ import torch
 from omniperception import build, config
 from omniperception.avoidance.velocity import AvoidanceConfig
 from omniperception.build import TrainedPolicy, load_policy
-from omniperception.evaluation.baselines import StopConfig, baseline, blind, free_share, oracle, prepared
+from omniperception.evaluation.trials.baselines import StopConfig, baseline, blind, free_share, prepared
 
 ROOT = Path(__file__).resolve().parents[2]
 AVOIDER = ROOT / "pretrained/avoider"
@@ -48,30 +48,19 @@ class TestBlind:
             before["frame_count"] = torch.zeros_like(before["frame_count"])
             assert torch.allclose(policy(felt), seeing.policy(before), atol=1e-6)
 
-    def test_nobody_measures_whether_something_is_near(self):
-        pd_risknet = config.find_run("pretrained/pd_risknet_taught")
-        seeing, unseeing = (trained(name, "scenario=corridor", run_dir=pd_risknet) for name in ("run", "blind"))
-        for each in (seeing, unseeing):
-            each.env.step(torch.zeros(4, 12))
-        assert seeing.env.no_obstacle_near is not None and unseeing.env.no_obstacle_near is None
-
-    def test_a_task_that_shows_frames_is_refused(self):
-        avoider = trained("run", "scenario=corridor")
-        with pytest.raises(ValueError, match="EnvConfig.network_sees_frames=False"):
-            blind(avoider.env, avoider.policy)
-        with pytest.raises(ValueError, match="EnvConfig.network_sees_frames=False"):
-            oracle(avoider.env, avoider.policy, CONTROLLER, None)
-
     def test_a_policy_without_a_lidar_is_blind_already(self, make_env):
         env = make_env(*BLIND, "scenario=static", "num_envs=2")
         with pytest.raises(ValueError, match="leave policy=blind out"):
             blind(env, None)
+        shown = trained("run", "scenario=corridor")  # which sees frames
+        with pytest.raises(ValueError, match="EnvConfig.network_sees_frames=False"):
+            baseline("oracle", shown.env, shown.policy, CONTROLLER, None)
 
 
 class TestOracle:
     def commanded(self, env, limits):
         heard = []
-        policy = oracle(env, lambda obs: heard.append(obs["command"].clone()), CONTROLLER, limits)
+        policy = baseline("oracle", env, lambda obs: heard.append(obs["command"].clone()), CONTROLLER, limits)
         policy(env.get_observations())
         return heard[0]
 
@@ -105,19 +94,13 @@ def test_the_driven_policy_perceives_nothing_itself(name):
         assert torch.equal(driven(seen), driven(other))
 
 
-@pytest.mark.parametrize("name", ["oracle", "histogram", "stop"])
-def test_a_driven_policy_needs_a_command(make_env, name):
-    env = make_env("experiment=quickstart", "scenario=static", "num_envs=2", "perception=none")
-    env.observations = env.observations.exclude("command")
-    with pytest.raises(ValueError, match="group 'command'"):
-        baseline(name, env, None, CONTROLLER, None)
-
-
-@pytest.mark.parametrize("name", ["histogram", "stop"])
-def test_geometry_needs_a_lidar(make_env, name):
+def test_a_driven_policy_needs_a_command_and_geometry_a_lidar(make_env):
     env = make_env(*BLIND, "scenario=static", "num_envs=2")
     with pytest.raises(ValueError, match="use lidar=mid360"):
-        baseline(name, env, None, CONTROLLER, None)
+        baseline("stop", env, None, CONTROLLER, None)
+    env.observations = env.observations.exclude("command")
+    with pytest.raises(ValueError, match="group 'command'"):
+        baseline("oracle", env, None, CONTROLLER, None)
 
 
 class TestFromClouds:
@@ -166,16 +149,12 @@ class TestFreeShare:
         place = torch.tensor([[place]])
         return free_share(place, place.norm(dim=-1), torch.tensor([command]), self.config).item()
 
-    def test_falls_with_the_distance_ahead(self):
+    def test_falls_with_the_distance_ahead_and_nowhere_else(self):
         assert self.share([2.0, 0.0], [1.0, 0.0]) == 1.0
         assert math.isclose(self.share([1.0, 0.2], [0.5, 0.0]), 0.5, abs_tol=1e-6)
         assert self.share([0.4, 0.0], [1.0, 0.0]) == 0.0
-
-    def test_beside_and_behind_do_not_count(self):
         assert self.share([0.6, 0.31], [1.0, 0.0]) == 1.0
         assert self.share([-0.6, 0.0], [1.0, 0.0]) == 1.0
         assert self.share([0.0, 0.5], [0.0, 1.0]) == 0.0  # ahead is where the command leads
-
-    def test_nothing_near_leaves_the_command(self):
         empty = free_share(torch.zeros(1, 4, 2), torch.full((1, 4), math.inf), torch.tensor([[1.0, 0.0]]), self.config)
         assert empty.item() == 1.0

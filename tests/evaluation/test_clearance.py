@@ -7,56 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from omniperception.evaluation.clearance import Clearance, Geoms, clearances
-from omniperception.evaluation.clearance_kernels import BOX, TOLERANCE
+from omniperception.evaluation.trials.clearance import Clearance, Geoms, clearances
+from omniperception.evaluation.trials.clearance_kernels import BOX, TOLERANCE
 
 BLIND = ("experiment=walk", "rewards=walk")
-
-
-def distance(a, b, pos, mat=None):
-    """Between two shapes (kind, size) with B at `pos` in the frame of A, and between B and A."""
-    geoms = []
-    for kind, size in (a, b):
-        spec = mujoco.MjSpec()
-        spec.worldbody.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), size=size)
-        geoms.append(Geoms(spec.compile(), [0], 1, torch.device("cpu")))
-    frame_b = torch.eye(3) if mat is None else torch.tensor(mat)
-    at_a, at_b = (torch.zeros(1, 1, 3), torch.eye(3)[None, None]), (torch.tensor([[pos]]), frame_b[None, None])
-    below = torch.tensor([10.0])
-    a, b = (geoms[0], *at_a), (geoms[1], *at_b)
-    there, back = clearances(*a, *b, below), clearances(*b, *a, below)
-    assert there.item() == pytest.approx(back.item(), abs=TOLERANCE) and below.item() == 10.0
-    return there.item()
-
-
-QUARTER_ABOUT_X = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-BALL = "SPHERE", (0.1, 0.0, 0.0)
-ROD = "CAPSULE", (0.1, 0.5, 0.0)
-PILLAR = "CYLINDER", (0.3, 1.0, 0.0)
-CRATE = "BOX", (0.2, 0.3, 0.4)
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "pos", "mat", "expected"),
-    [
-        (BALL, BALL, (0.3, 0.4, 0.0), None, 0.5 - 0.2),
-        (BALL, PILLAR, (1.0, 0.0, 0.9), None, 1.0 - 0.4),
-        (BALL, PILLAR, (0.3 + 0.3, 0.0, 1.0 + 0.4), None, 0.5 - 0.1),  # the rim is 0.3 aside and 0.4 above
-        (BALL, CRATE, (0.2 + 0.3, 0.3 + 0.4, 0.0), None, 0.5 - 0.1),  # an edge
-        (BALL, CRATE, (0.0, 0.0, 1.0), None, 0.6 - 0.1),  # a face
-        (ROD, ROD, (0.5, 0.0, 0.9), None, 0.5 - 0.2),  # side by side
-        (ROD, ROD, (0.4, 0.0, 1.0 + 0.3), None, 0.5 - 0.2),  # end to end, aside
-        (ROD, ROD, (0.7, 0.0, 0.0), QUARTER_ABOUT_X, 0.7 - 0.2),  # crossed
-        (ROD, CRATE, (0.9, 0.0, 0.0), None, 0.7 - 0.1),
-        (PILLAR, CRATE, (0.0, 1.0, 1.0), None, 0.4),
-        (CRATE, CRATE, (1.0, 0.0, 0.0), None, 0.6),
-        (CRATE, CRATE, (0.4 + 0.3, 0.6 + 0.4, 0.8 + 1.2), None, 1.3),  # corner to corner
-        (CRATE, PILLAR, (0.3, 0.1, 0.0), None, 0.0),  # they overlap
-        (ROD, BALL, (0.05, 0.0, 0.2), None, 0.0),
-    ],
-)
-def test_by_hand(a, b, pos, mat, expected):
-    assert distance(a, b, pos, mat) == pytest.approx(expected, abs=TOLERANCE)
 
 
 @pytest.mark.parametrize("scenario", ["static", "aerial", "rod"])
@@ -125,18 +79,18 @@ def random_hulls(count, generator):
     return spec
 
 
-def test_convex_hulls_as_mujoco_measures_them():
-    """Rocks against rocks and every other kind, near each other in random poses; penetration is 0."""
+def test_shapes_as_mujoco_measures_them():
+    """Every kind against every kind, near each other in random poses; penetration is 0."""
     rng = np.random.default_rng(0)
-    spec = random_hulls(8, rng)
-    kinds = ("box", "sphere", "cylinder", "capsule")
+    spec = random_hulls(6, rng)
+    kinds = 2 * ("box", "sphere", "cylinder", "capsule")
     for kind in kinds:
         body = spec.worldbody.add_body(mocap=True)
         body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), size=rng.uniform(0.05, 0.2, 3))
     model = spec.compile()
     data = mujoco.MjData(model)
     geoms = [Geoms(model, [k], 1, torch.device("cpu")) for k in range(model.ngeom)]
-    couples = [(a, b) for a in range(model.ngeom) for b in range(model.ngeom) if a != b and min(a, b) < 8]
+    couples = [(a, b) for a in range(model.ngeom) for b in range(model.ngeom) if a != b]
     expected, got = [], []
     for _ in range(10):
         data.mocap_pos[:] = rng.uniform(-0.6, 0.6, (model.nmocap, 3))

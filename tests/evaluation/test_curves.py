@@ -7,7 +7,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from omniperception import config
 from omniperception.commands import main
-from omniperception.evaluation.curves import Curve, by_recipe, curves_of
+from omniperception.evaluation.report.curves import Curve, by_recipe, curves_of
 
 TAG = "Metrics/velocity_error"
 
@@ -38,13 +38,6 @@ def test_runs_that_differ_by_their_seed_are_one_curve(tmp_path):
     same, alone = curves_of([one, two, other], [TAG])[TAG]
     assert same.steps.tolist() == [0, 1] and same.values.tolist() == [[4.0, 2.0], [6.0, 4.0]]
     assert alone.values.tolist() == [[9.0]]
-
-
-def test_a_run_whose_overrides_all_others_have_is_named_by_its_directory(tmp_path):
-    runs = [make_run(tmp_path / name, 1, [1.0], num_envs=n) for name, n in (("few", 4), ("more", 8))]
-    config.save_recipe(["experiment=walk"], runs[0])
-    config.save_recipe(["experiment=walk", "num_envs=8"], runs[1])
-    assert list(by_recipe(runs)) == [str(runs[0]), "num_envs=8"]
 
 
 def test_a_running_mean_has_fewer_values_at_the_beginning():

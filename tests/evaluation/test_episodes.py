@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from omniperception.evaluation import run_episodes
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.report import summary_table, times_line
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.outcomes import Episodes
 
 SHORT = "terminations.episode_length_s=0.4"  # 20 control steps
 BLIND = ("lidar=none", "obstacles=none", "rewards=walk", "observations=walk")
@@ -60,13 +59,6 @@ def test_a_touch_that_physics_diverges_from_counts(make_env):
     assert episodes.contacts.tolist() == [1, 0] and episodes.collided.tolist() == [True, False]
 
 
-def test_time_with_nothing_near_excludes_the_moments_with_an_obstacle(make_env):
-    env = make_env("obstacles=moving", SHORT, "num_envs=4")
-    free = []
-    episodes = run_episodes(env, stand, 4, on_step=lambda: free.append(env.no_obstacle_near.clone()))
-    assert torch.allclose(episodes.free_s, torch.stack(free).sum(0).double() * env.control_dt)
-
-
 def test_goals_are_successes_of_goal_commands(make_env):
     goal = ("commands=corridor", "commands.spawn.x=[-0.5,-0.5]", "commands.goal_x=[-0.6,-0.6]")
     env = make_env(*BLIND, *goal, "num_envs=2")
@@ -86,14 +78,6 @@ def test_the_free_time_is_that_of_the_straight_way(make_env):
         at = tuple(f"commands.goal_{axis}=[{x},{x}]" for axis, x in zip("xy", goal, strict=True))
         episodes = run_episodes(make_env(*BLIND, *commands, *spawn, *at, SHORT, "num_envs=2"), stand, 3)
         assert episodes.free_time_s.tolist() == pytest.approx([expected] * 3, abs=1e-5)
-
-
-def test_stage_times_survive_the_reports_of_the_log(make_env):
-    env = make_env(*BLIND, SHORT, "num_envs=4", "ppo.num_steps_per_env=7")
-    summary = run_episodes(env, stand, 4).summary()
-    times = summary["us_per_env_step"]
-    assert {"policy", "physics", "rewards", "observations"} <= set(times) and min(times.values()) > 0
-    assert "success" in summary_table(summary) and "policy" in times_line(summary)
 
 
 def test_the_world_of_each_trial_is_filed(make_env):

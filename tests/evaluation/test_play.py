@@ -1,7 +1,6 @@
 """The play command."""
 
 import json
-import sys
 
 import imageio_ffmpeg
 import pytest
@@ -10,7 +9,6 @@ import torch
 from omniperception import build, config
 from omniperception.build import build_runner
 from omniperception.commands import main
-from omniperception.commands.filming import file_stem
 
 SMALL = ("experiment=walk", "num_envs=4", "ppo.num_steps_per_env=4", "ppo.num_mini_batches=1")
 
@@ -39,32 +37,6 @@ def test_a_run_is_replayed(run_dir, capsys, monkeypatch):
     assert report["rates"]["success"]["count"] + report["rates"]["fall"]["count"] == 6
     assert imageio_ffmpeg.count_frames_and_secs(str(run_dir / "replay.mp4"))[0] == 5
     assert (run_dir / "replay.png").is_file()
-
-
-@pytest.mark.slow
-def test_a_scenario_has_files_of_its_own(run_dir, capsys):
-    small = ("trials=2", "video_s=0.08", "video_size=64,36", "terminations.episode_length_s=0.2")
-    before = {path: path.read_bytes() for path in run_dir.glob("replay.*")}
-    main(["play", f"run={run_dir}", *small, "scenario=walk", "camera=top", "video_envs=0,1"])
-    written = [run_dir / f"replay-walk.{kind}" for kind in ("json", "mp4", "png")]
-    assert f"wrote {', '.join(map(str, written))}" in capsys.readouterr().out
-    assert all(path.stat().st_size for path in written)
-    assert {path: path.read_bytes() for path in run_dir.glob("replay.*")} == before
-
-
-def test_files_are_named_for_the_scenario():
-    assert file_stem("replay", ["num_envs=2", "scenario=corridor", "seed=3"]) == "replay-corridor"
-    assert file_stem("replay", ["obstacles=static"]) == "replay"
-
-
-def test_a_missing_library_is_one_line(run_dir, capsys, monkeypatch):
-    for name in [name for name in sys.modules if name.startswith("omniperception.evaluation.") and "video" in name]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delitem(sys.modules, "omniperception.evaluation.overlay", raising=False)
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(SystemExit, match="2"):
-        main(["play", f"run={run_dir}", "trials=2"])
-    assert capsys.readouterr().err == "error: play needs PIL: pip install 'omniperception[train]'\n"
 
 
 def test_replaying_does_not_change_the_policy(run_dir):

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from omniperception.commands import main
-from omniperception.evaluation import response
-from omniperception.evaluation.response import Recording, _periodic, around_cycle, driven, falls_by_jump, reach
-from omniperception.evaluation.response_fit import fit, kept, lagged
+from omniperception.evaluation.gait import response
+from omniperception.evaluation.gait.response import Recording, _periodic, around_cycle, driven, falls_by_jump, reach
+from omniperception.evaluation.gait.response_fit import fit, lagged
 from omniperception.sim.response import FILE, Cycle, GaitResponse, NoResponse
 from omnirobot.common.errors import ConfigError
 
@@ -73,11 +73,6 @@ def test_a_known_answer_is_found_again(gain, lag, delay, noise, noise_s):
         assert axis.noise_s == pytest.approx(noise_s, rel=0.3)
 
 
-def test_robots_that_are_alike_do_not_differ_by_the_scatter_of_the_estimates():
-    axes, _ = fit(*simulated(0.9, 0.1, 0.04, 0.2, 0.3), DT, 2.5)
-    assert all(axis.gain[1] < 0.04 and axis.offset[1] < 0.04 for axis in axes.values())
-
-
 def test_what_swings_with_the_steps_counts_as_error_that_leads_nowhere():
     """A sine of 5 Hz and 0.2 m/s beside an error of 0.1 m/s for 0.3 s: the mean over 0.4 s is the latter's alone."""
     asked, reached, done = simulated(1.0, 0.1, 0.0, 0.1, 0.3)
@@ -102,19 +97,6 @@ def test_a_step_comes_late_by_the_delay_and_rises_by_the_lag():
     assert x[8] < x[7] / 3  # after the end it begins at 0
     late = torch.stack(list(lagged(asked, done, DT, whole(0.07), whole(1e-4))))[:, 0, 0]
     torch.testing.assert_close(late[:6], torch.tensor([0, 0, 0, 0.5, 1, 1], dtype=torch.float64), atol=1e-6, rtol=0.0)
-
-
-def test_the_second_around_an_end_does_not_count():
-    done = torch.zeros(12, 2, dtype=torch.bool)
-    done[6, 1] = True
-    assert kept(done, 2)[:, 0].tolist() == [False] * 2 + [True] * 10
-    assert kept(done, 2)[:, 1].tolist() == [False] * 2 + [True] * 2 + [False] * 5 + [True] * 3
-
-
-def test_robots_that_always_fall_are_refused():
-    asked = torch.zeros(400, 4, 3)
-    with pytest.raises(ValueError, match="fewer than two robots"):
-        fit(asked, asked, torch.ones(400, 4, dtype=torch.bool), DT, 2.5)
 
 
 def recording(**fields):

@@ -9,8 +9,8 @@ import yaml
 from omniperception import config
 from omniperception.commands.gait import kicks_table
 from omniperception.config import ConfigError
-from omniperception.evaluation.kicks import AFTER_S, KickResults, Kicks
-from omniperception.evaluation.robustness import measure, rows_of_the_robot, stretched, stretches
+from omniperception.evaluation.gait.kicks import AFTER_S, KickResults, Kicks
+from omniperception.evaluation.gait.robustness import measure, rows_of_the_robot, stretched, stretches
 from omniperception.evaluation.suite import Evaluation, World
 from omniperception.scene.build import FOOT_FORCE
 
@@ -20,15 +20,12 @@ from omniperception.scene.build import FOOT_FORCE
     [
         ("latency_s", [0.005, 0.045], 3.0, [0.015, 0.135]),
         ("motor_strength", [0.8, 1.2], 2.0, [0.6, 1.4]),
-        ("motor_strength", [0.8, 1.2], 0.0, [1.0, 1.0]),
         ("ground_friction", [0.4, 1.0], 0.5, [0.6, 0.9]),
         ("ground_friction", [0.4, 1.0], 3.0, [0.05, 1.4]),  # friction cannot be negative
         ("ground_restitution", [0.0, 1.0], 2.0, [0.0, 1.0]),
-        ("velocity_scale", [0.95, 1.05], 3.0, [0.85, 1.15]),
         ("pushes", {"every_s": [5.0, 10.0], "speed": 0.5}, 2.0, {"every_s": [5.0, 10.0], "speed": 1.0}),
         ("velocity_drift", {"sd": 0.05, "time_s": 10.0}, 3.0, {"sd": 0.15, "time_s": 10.0}),
         ("velocity_scale", [0.95, 1.05], 25.0, [0.0, 2.25]),  # nor a factor on what is measured
-        ("frames_lost", 0.05, 2.0, 0.1),
         ("frames_lost", 0.05, 25.0, 0.99),
     ],
 )
@@ -41,11 +38,6 @@ def test_a_range_is_stretched_about_what_is_normal(row, value, factor, expected)
     else:
         assert found == pytest.approx(expected)
     config.compose([stretched(row, value, factor)])  # Hydra takes it
-
-
-def test_what_has_no_range_is_refused():
-    with pytest.raises(ConfigError, match=r"randomization\.lidar_device=True has no range"):
-        stretched("lidar_device", True, 2.0)
 
 
 def test_a_range_that_ends_where_it_did_is_not_measured_again():
@@ -67,18 +59,14 @@ def test_what_cannot_be_stretched_so_far_is_refused_before_anything_is_measured(
         measure(stretches(evaluation, "robot", ("ground_friction", "added_mass"), (1.0, 20.0)))
 
 
-def test_rows_of_the_robot_are_the_papers_and_the_robots_without_the_lidars():
-    rows = rows_of_the_robot("robot")
-    assert {"latency_s", "joint_offset", "motor_strength", "pushes", "gyro_bias"} <= set(rows)
-    assert not [row for row in rows if "lidar" in row or "frames" in row]
-    assert "pushes" not in rows_of_the_robot("paper") and not rows_of_the_robot("none")
-
-
 def test_ranges_may_be_those_of_a_preset_of_ones_own(tmp_path):
     (tmp_path / "randomization").mkdir()
     text = "defaults: [none, _self_]\nadded_mass: [-2.0, 2.0]\n"
     (tmp_path / "randomization" / "mine.yaml").write_text(text)
     assert rows_of_the_robot("mine", [tmp_path]) == ("added_mass",)
+    rows = rows_of_the_robot("robot")
+    assert {"latency_s", "joint_offset", "motor_strength", "pushes", "gyro_bias"} <= set(rows)
+    assert not [row for row in rows if "lidar" in row or "frames" in row] and not rows_of_the_robot("none")
     overrides = tuple(config.as_override([tmp_path]))
     evaluation = Evaluation([Path("pretrained/gait")], [World("walk")], overrides=overrides)
     (_, stretch) = stretches(evaluation, "mine", ["added_mass"], [0.5])

@@ -4,10 +4,9 @@ import pytest
 import torch
 
 from omniperception import build, config
-from omniperception.config import ConfigError
-from omniperception.evaluation import run_episodes
-from omniperception.evaluation.outcomes import CLEARANCE_CAP
-from omniperception.evaluation.tracks import PERIOD_S
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.outcomes import CLEARANCE_CAP
+from omniperception.evaluation.trials.tracks import PERIOD_S
 
 BLIND = ("experiment=walk", "rewards=walk")
 SHORT = "terminations.episode_length_s=0.4"
@@ -41,46 +40,14 @@ class TestOverlay:
         run = build.assemble(loaded).env
         assert run.seed == 1007 and run.terminations.episode_length_s == 9.0 and run.obstacles.num_obstacles == 8
         assert run.rewards.avoidance.alpha == 1.7 and run.lidar.max_range == 5.0
+        assert len({config.compose([f"scenario={name}"]).seed for name in config.presets("scenario")}) == 21
         assert run.obstacles.curriculum is None and before.obstacles.curriculum is not None
-
-    def test_overrides_go_on_top(self, run_dir):
-        overrides = ["scenario=corridor", "commands.speed=0.7", "terminations=collision", "seed=9", "num_envs=3"]
-        run = build.assemble(config.load(run_dir, overrides)).env
-        assert run.commands.speed == 0.7 and run.commands.goal_x == (11.5, 11.5)
-        assert run.terminations.on_collision and run.terminations.episode_length_s == 30.0
-        assert run.seed == 9 and run.num_envs == 3
-
-    @pytest.mark.parametrize("group", ["obstacles=static", "commands=velocity"])
-    def test_another_scene_is_not_mixed_in(self, run_dir, group):
-        for compose in (config.compose, lambda overrides: config.load(run_dir, overrides)):
-            with pytest.raises(ConfigError, match=f"scenario=static defines the {group.split('=')[0]}"):
-                compose(["scenario=static", group])
 
     @pytest.mark.parametrize("scenario", config.presets("scenario"))
     def test_an_experiment_leaves_no_trace_in_the_scene(self, scenario):
         alone, mixed = (config.compose([*given, f"scenario={scenario}"]) for given in ([], ["experiment=quickstart"]))
         for key in config.FIXED_BY_SCENARIO:
             assert alone[key] == mixed[key], key
-
-    def test_every_scenario_has_a_seed_of_its_own(self):
-        seeds = [config.compose([f"scenario={name}"]).seed for name in config.presets("scenario")]
-        assert len(set(seeds)) == len(seeds) == 21
-
-
-class TestScenes:
-    def test_goals_differ_between_trials_and_seeds_decide(self, make_env):
-        def goals(seed):
-            env = make_env(*BLIND, "scenario=abs_hard", SHORT, "num_envs=3", f"seed={seed}")
-            return run_episodes(env, stand, 6, keep_tracks=True).tracks.goal
-
-        first = goals(4)
-        assert len(first.unique(dim=0)) == 6 and torch.equal(first, goals(4)) and not torch.equal(first, goals(5))
-
-    def test_free_paths_need_a_goal(self):
-        run = config.compose(["experiment=walk", "scenario=abs_hard"])
-        run.commands = config.compose(["experiment=walk"]).commands
-        with pytest.raises(ConfigError, match="commands=goal"):
-            build.assemble(run)
 
 
 class TestMeasures:

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from omniperception.common.random import EnvRandom, TrialRandom
-from omniperception.evaluation import run_episodes
-from omniperception.evaluation.outcomes import CLEARANCE_CAP
-from omniperception.evaluation.tracks import footprints
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.outcomes import CLEARANCE_CAP
+from omniperception.evaluation.trials.tracks import footprints
 
 WALK = ("experiment=walk", "rewards=walk")
 SHORT = "terminations.episode_length_s=0.4"  # 20 control steps

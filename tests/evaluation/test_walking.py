@@ -9,11 +9,11 @@ import torch
 
 from omniperception.env.mdp.commands import SETTLE_S
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.episodes import run_episodes
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.walking import AT_STOP, COLUMNS
-from omniperception.evaluation.walking_report import Part, grounds, level_table, run_table, walking_table
+from omniperception.evaluation.report.gaits import Part, grounds, level_table, run_table, walking_table
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.outcomes import Episodes
+from omniperception.evaluation.trials.walking import AT_STOP, COLUMNS
 
 BLIND = ("lidar=none", "perception=none", "rewards=walk", "observations=walk", "num_envs=3")
 
@@ -147,10 +147,9 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     second = replace(first, run="b", episodes=replace(episodes, outcome=fell.flip(0), walking=turned))
     by_run = run_table([first, second])
     apart = [line.split("|") for line in by_run.splitlines() if line.startswith("|")]
+    alone = [line.split("|")[2:] for line in level_table([first]).splitlines() if line.startswith("| walk")]
     assert [cells[1].strip() for cells in apart[2:]] == ["run", "run", "b", "b"] and "runs)" not in by_run
-    assert [cells[2:] for cells in apart[2:4]] == [
-        line.split("|")[2:] for line in level_table([first]).splitlines() if line.startswith("| walk")
-    ]
+    assert [cells[2:] for cells in apart[2:4]] == alone
     lines = [line.split("|") for line in walking_table([first, second]).splitlines() if line.startswith("|")]
     at = [cell.strip() for cell in lines[0]].index("falls, %")
     rows = {cells[2].strip(): cells[at].strip() for cells in lines}
@@ -160,8 +159,3 @@ def test_trials_on_tiles_are_told_apart(walking_env):
     for stood, cell in (((none, still), "0.500"), ((none, none), "–")):
         told = [replace(a, episodes=replace(episodes, walking=b)) for a, b in zip((first, second), stood, strict=True)]
         assert walking_table(told).splitlines()[-1].split("|")[-2].strip() == cell
-
-
-def test_commands_to_a_goal_have_no_figures_of_a_gait(make_env):
-    env = make_env("scenario=static", "terminations.episode_length_s=0.1", *BLIND)
-    assert run_episodes(env, lambda obs: torch.zeros(3, 12), 3).walking is None

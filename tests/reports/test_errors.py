@@ -17,7 +17,7 @@ from omniperception import config
 from omniperception.commands import COMMANDS, main
 from omniperception.common import provenance
 from omniperception.deploy.export import BlindNetwork, write_onnx, write_torchscript
-from omniperception.evaluation.video import Recorder
+from omniperception.evaluation.film.video import Recorder
 from omniperception.learning import CheckpointError, load_checkpoint
 from omniperception.scene.robot_file import compile_robot, read_robot
 from omnirobot.common.figures import new_figure, save_figure

@@ -23,7 +23,7 @@ from omniperception import config
 from omniperception.commands import COMMANDS, main
 from omniperception.commands import evaluate as evaluate_command
 from omniperception.commands import robot_fetch as robot_fetch_command
-from omniperception.evaluation import walking_report
+from omniperception.evaluation.report import gaits
 from omniperception.robots import fetch
 from omnirobot.common.errors import ConfigError
 from omnirobot.common.figures import check_figures
@@ -52,8 +52,8 @@ CALLS = {
     "omniperception/commands/train.py": 1,
     "omniperception/config.py": 1,
     "packages/robot/omnirobot/runtime/description.py": 1,
-    "omniperception/evaluation/tables.py": 1,
-    "omniperception/evaluation/walking_report.py": 1,
+    "omniperception/evaluation/report/pages.py": 1,
+    "omniperception/evaluation/report/gaits.py": 1,
     "omniperception/learning/checkpoint.py": 1,
     "omniperception/deploy/trials.py": 1,
     "omniperception/robots/fetch.py": 1,
@@ -360,7 +360,7 @@ def test_results_that_a_table_lacks_are_measured_by_what_is_shown(place, a_run, 
 def test_figures_of_a_gait_are_measured_by_what_is_shown(a_run, asked):
     missing = SimpleNamespace(world="walk", run=str(a_run), episodes=SimpleNamespace(walking=None))
     with pytest.raises(ConfigError, match="no figures of a gait") as refusal:
-        walking_report._walking(missing)
+        gaits._walking(missing)
     (words,) = commands_in(str(refusal.value))
     assert words == ["evaluate", f"run={a_run}", "suite=walking"]
     assert asked(words).runs == [a_run] and len(asked(words).worlds) > 1

@@ -14,8 +14,8 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 
 from omniperception import config
 from omniperception.commands import curves, evaluate, main, robot_new
-from omniperception.evaluation.curves import Curve, draw_curves
-from omniperception.evaluation.video import Recorder
+from omniperception.evaluation.film.video import Recorder
+from omniperception.evaluation.report.curves import Curve, draw_curves
 from omniperception.scene.meshes import check_mesh, mesh_points
 from omnirobot.common.cli import Command
 from omnirobot.common.shell import command_line

@@ -7,8 +7,8 @@ import torch
 
 from benchmarks.harness.reference import mujoco_ranges
 from omnilidar import ShapeKind
-from omniperception.evaluation.clearance import Clearance
-from omniperception.evaluation.clearance_kernels import TOLERANCE
+from omniperception.evaluation.trials.clearance import Clearance
+from omniperception.evaluation.trials.clearance_kernels import TOLERANCE
 from omniperception.scene.rays import ray_shapes
 
 NUM_ENVS, NUM_RAYS = 3, 1500

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from omniperception.config import ConfigError
-from omniperception.evaluation.perceived import true
+from omniperception.evaluation.film.perceived import true
 from omniperception.learning import CheckpointError
 from omniperception.scene.rays import HitClass
 from omniperception.viewer import Shown

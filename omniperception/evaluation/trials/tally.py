@@ -8,11 +8,13 @@ import torch
 
 from omniperception.common.random import TrialRandom
 from omniperception.env.env import OmniEnv
-from omniperception.env.mdp.commands import GoalCommand, GoalCommandConfig
+from omniperception.env.mdp.commands import GoalCommand, GoalCommandConfig, VelocityCommand
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.clearance import Clearance
-from omniperception.evaluation.outcomes import CLEARANCE_CAP, GRAVITY, Episodes
-from omniperception.evaluation.tracks import Tracks
+from omniperception.evaluation.trials.clearance import Clearance
+from omniperception.evaluation.trials.outcomes import CLEARANCE_CAP, GRAVITY, Episodes
+from omniperception.evaluation.trials.tracks import Tracks
+from omniperception.evaluation.trials.walking import Walking
+from omniperception.scene.build import FOOT_FORCE
 
 CLEARANCE_EVERY = 2
 """Control steps between two measurements of the clearance."""
@@ -49,9 +51,12 @@ class Tally:
         self._env, self._trial, self._count, self.left = env, trial_numbers(env), num_trials, num_trials
         device, double = env.device, torch.float64
         n, filed = (env.num_envs,), (num_trials,)
-        self._sums = torch.zeros(*n, len(_SUMS), dtype=double, device=device)
-        self._is_contact = torch.tensor([name == "contacts" for name in _SUMS], device=device)
-        self._filed = torch.zeros(*filed, len(_SUMS), dtype=double, device=device)
+        measures_walking = isinstance(env.command, VelocityCommand) and FOOT_FORCE in env.world.sensors
+        self._walking = Walking(env, num_trials) if measures_walking else None
+        self._names = _SUMS + (Walking.SUMS if measures_walking else ())
+        self._sums = torch.zeros(*n, len(self._names), dtype=double, device=device)
+        self._is_contact = torch.tensor([name == "contacts" for name in self._names], device=device)
+        self._filed = torch.zeros(*filed, len(self._names), dtype=double, device=device)
         self._outcome = torch.zeros(filed, dtype=torch.int64, device=device)
         self._first_contact = torch.full(n, math.inf, dtype=double, device=device)
         self._filed_contact = torch.zeros(filed, dtype=double, device=device)
@@ -69,6 +74,8 @@ class Tally:
         """Takes in the scenes of environments (n,) in which trials are about to begin."""
         commands, goal = self._env.config.commands, self._env.command.goal_w
         fresh = fresh[self._trial[fresh] < self._count]
+        if self._walking is not None:
+            self._walking.begin(fresh, self._trial[fresh])
         if self._world is not None and self._env.obstacles is not None:
             self._world[self._trial[fresh]] = self._env.obstacles.world[fresh, 0]
         if isinstance(commands, GoalCommandConfig) and goal is not None:
@@ -108,8 +115,10 @@ class Tally:
             "energy": (env.state.joint_torque * kinematics.joint_vel).abs().sum(1) * dt,
             "path": kinematics.base_lin_vel_yaw.norm(dim=1) * dt,
         }
+        if self._walking is not None:
+            step |= self._walking.step()
         counted = env.healthy[:, None] | self._is_contact  # what physics diverges from is touched all the same
-        self._sums += torch.where(counted, torch.stack([step[name].double() for name in _SUMS], 1), 0.0)
+        self._sums += torch.where(counted, torch.stack([step[name].double() for name in self._names], 1), 0.0)
         time = self._sums[:, 0] * dt
         self._first_contact = torch.where(began, torch.minimum(self._first_contact, time), self._first_contact)
         if self._clearance is not None:
@@ -122,25 +131,22 @@ class Tally:
     def _file_ended(self) -> None:
         env = self._env
         filed = (env.done & (self._trial < self._count)).nonzero().flatten()
-        if len(filed):
-            trial = self._trial[filed]
-            self._filed[trial] = self._sums[filed]
-            self._filed_contact[trial] = self._first_contact[filed]
-            untouched = self._first_contact[filed].isinf()
-            self._filed_least[trial] = torch.where(untouched, self._least[filed], 0.0)
-            outcomes = torch.stack([env.outcomes[name] for name in OUTCOMES], 1)
-            self._outcome[trial] = outcomes[filed].int().argmax(1)
-            self.left -= len(filed)
+        trial = self._trial[filed]
+        self._filed[trial] = self._sums[filed]
+        self._filed_contact[trial] = self._first_contact[filed]
+        self._filed_least[trial] = torch.where(self._first_contact[filed].isinf(), self._least[filed], 0.0)
+        self._outcome[trial] = torch.stack([env.outcomes[name] for name in OUTCOMES], 1)[filed].int().argmax(1)
+        self.left -= len(filed)
+        if self._walking is not None:
+            self._walking.end(filed, trial, env.done)
         self._sums *= ~env.done[:, None]
         self._first_contact.masked_fill_(env.done, math.inf)
         self._least = self._least.masked_fill(env.done, CLEARANCE_CAP)
 
-    def episodes(
-        self, us_per_env_step: dict[str, float], tracks: Tracks | None, walking: dict[str, torch.Tensor] | None = None
-    ) -> Episodes:
+    def episodes(self, us_per_env_step: dict[str, float], tracks: Tracks | None) -> Episodes:
         """All trials, in their order."""
         env, dt = self._env, self._env.control_dt
-        sums = dict(zip(_SUMS, self._filed.cpu().unbind(1), strict=True))
+        sums = dict(zip(self._names, self._filed.cpu().unbind(1), strict=True))
         steps, free, has_goal = sums["steps"], sums["free"], env.command.goal_w is not None
         return Episodes(
             length_s=steps * dt,
@@ -161,5 +167,5 @@ class Tally:
             world=None if self._world is None else self._world.cpu(),
             us_per_env_step=us_per_env_step,
             tracks=tracks,
-            walking=walking,
+            walking=None if self._walking is None else self._walking.columns(sums),
         )

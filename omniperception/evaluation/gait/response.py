@@ -261,14 +261,12 @@ def draw_response(recordings: Mapping[str, tuple[Recording, torch.Tensor]], path
         robot = int(recording.done.sum(0).argmin())
         steps = min(round(shown_s / recording.dt), len(recording.asked))
         time = (torch.arange(1, steps + 1) * recording.dt).tolist()
+        lines = ("asked", recording.asked, "#999999", "-"), ("reached", recording.velocity, "#35618f", "-")
         for row, axis in enumerate(AXES):
             panel = panels[row, column]
-            for label, values, style in (
-                ("asked", recording.asked, {"color": "#999999", "linewidth": 1.0}),
-                ("reached", recording.velocity, {"color": "#35618f", "linewidth": 1.0}),
-                ("fitted", predicted, {"color": "#c8553d", "linewidth": 1.0, "linestyle": "--"}),
-            ):
-                panel.plot(time, values[:steps, robot, row].tolist(), label=label, **style)
+            for label, values, colour, style in (*lines, ("fitted", predicted, "#c8553d", "--")):
+                shown = values[:steps, robot, row].tolist()
+                panel.plot(time, shown, label=label, color=colour, linestyle=style, linewidth=1.0)
             panel.set_ylabel("yaw rate, rad/s" if axis == "yaw" else f"v_{axis}, m/s", fontsize=8)
             panel.tick_params(labelsize=7)
         panels[0, column].set_title(f"{name}, one of {recording.asked.shape[1]} robots", fontsize=8)

@@ -16,11 +16,11 @@ from torch import nn
 from omniperception.common.rotations import rotate, rotate_yaw
 from omniperception.env.env import OmniEnv
 from omniperception.env.sensing import split_elevation
-from omniperception.evaluation.camera import FollowCamera
-from omniperception.evaluation.overlay import PERCEIVED, TRUE, legend, sector_plot
-from omniperception.evaluation.perceived import perceived, true_sectors
-from omniperception.evaluation.render import COMMAND, DISTAL, PROXIMAL, VELOCITY, Arrow, Renderer, View, shown
-from omniperception.evaluation.video_options import VideoOptions
+from omniperception.evaluation.film.camera import FollowCamera
+from omniperception.evaluation.film.overlay import PERCEIVED, TRUE, legend, sector_plot
+from omniperception.evaluation.film.perceived import perceived, true_sectors
+from omniperception.evaluation.film.render import COMMAND, DISTAL, PROXIMAL, VELOCITY, Arrow, Renderer, View, shown
+from omniperception.evaluation.film.video_options import VideoOptions
 from omniperception.scene.rays import HitClass, ray_shapes
 from omnirobot.common.errors import naming
 
@@ -37,12 +37,7 @@ LEAST_INSET = 40
 
 @dataclass(frozen=True)
 class Moment:
-    """What a panel shows.
-
-    Attributes:
-        view: the scene.
-        perceived, true: (S, 3) obstacles by sector, `Perceived.sectors`; None where the policy perceives none.
-    """
+    """What a panel shows: the scene, and obstacles by sector as perceived and true, where the policy perceives any."""
 
     view: View
     perceived: np.ndarray | None = None
@@ -205,18 +200,16 @@ class Recorder:
     def _points(self, env_id: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Points (P, 3) (m, environment frame) of the episode's newest frame, and which are proximal."""
         sensing, device = self._env.sensing, self._env.device
+        nothing = torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
         if sensing is None or sensing.sliced or sensing.frame is None or sensing.tick < self._blind_until[env_id]:
-            return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
+            return nothing
         frame, config = sensing.frame, sensing.config
         if frame.ranges is None or frame.directions_s is None or frame.elevation is None:  # no network looks at points
-            return torch.zeros(0, 3, device=device), torch.zeros(0, dtype=torch.bool, device=device)
+            return nothing
         hit = frame.ranges[env_id].isfinite()
         points_s = frame.directions_s[env_id, hit] * frame.ranges[env_id, hit, None]
         points_c = rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
-        at, turned = (
-            sensing.scene.body_pos[env_id, sensing.carrier],
-            sensing.scene.body_quat[env_id, sensing.carrier],
-        )
+        at, turned = (pose[env_id, sensing.carrier] for pose in (sensing.scene.body_pos, sensing.scene.body_quat))
         return rotate(turned, points_c) + at, frame.elevation[env_id, hit] > split_elevation(sensing.sampler, config)
 
     def _interest(self, env_id: int) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from omniperception import config
-from omniperception.evaluation.records import training_of
+from omniperception.evaluation.report.records import training_of
 from omnirobot.common.errors import ConfigError
 from omnirobot.common.figures import new_figure, plain, save_figure
 
@@ -75,13 +75,6 @@ def _words(run: Path) -> list[str]:
     return [word for word in config.read_recipe(run) if not word.startswith(beside)]
 
 
-def read_scalars(run: Path, tags: Sequence[str]) -> dict[str, dict[int, float]]:
-    """Values by iteration of each tag that the TensorBoard files of a run have."""
-    events = _events(run)
-    known = set(events.Tags()["scalars"])
-    return {tag: {event.step: event.value for event in events.Scalars(tag)} for tag in tags if tag in known}
-
-
 def _events(run: Path) -> Any:
     """What the TensorBoard files of a run hold."""
     from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
@@ -97,17 +90,18 @@ def curves_of(runs: Sequence[Path], tags: Sequence[str]) -> dict[str, list[Curve
     Raises:
         ConfigError: no run has a tag, or runs of one curve have no iteration in common.
     """
-    scalars = {run: read_scalars(run, tags) for run in runs}
+    events = {run: _events(run) for run in runs}
+    known = {run: events[run].Tags()["scalars"] for run in runs}
     found: dict[str, list[Curve]] = {tag: [] for tag in tags}
     for label, group in by_recipe(runs).items():
         for tag in tags:
-            having = [scalars[run][tag] for run in group if tag in scalars[run]]
+            having = [{e.step: e.value for e in events[run].Scalars(tag)} for run in group if tag in known[run]]
             if having:
                 found[tag].append(_curve(label, having))
     for tag, curves in found.items():
         if not curves:
-            there = sorted(set().union(*(_events(run).Tags()["scalars"] for run in runs)))
-            raise ConfigError(f"tags={tag}: no run has it, out of {len(runs)}; known: {', '.join(there) or 'none'}")
+            there = ", ".join(sorted(set().union(*known.values()))) or "none"
+            raise ConfigError(f"tags={tag}: no run has it, out of {len(runs)}; known: {there}")
     return found
 
 

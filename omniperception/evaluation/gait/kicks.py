@@ -10,9 +10,9 @@ import torch
 
 from omniperception.common.rotations import rotate_yaw
 from omniperception.env.env import OmniEnv, Policy
-from omniperception.evaluation.episodes import run_episodes
-from omniperception.evaluation.statistics import rate
-from omniperception.evaluation.tally import trial_numbers
+from omniperception.evaluation.trials.episodes import run_episodes
+from omniperception.evaluation.trials.statistics import rate
+from omniperception.evaluation.trials.tally import trial_numbers
 from omnirobot.common.figures import new_figure, save_figure
 
 if TYPE_CHECKING:
@@ -72,16 +72,8 @@ class KickResults:
     def shares(self, speeds: Sequence[float], num_bearings: int) -> torch.Tensor:
         """(len(speeds), num_bearings) share survived by size and direction."""
         of = torch.arange(len(self.speed)) % num_bearings
-        return torch.tensor(
-            [
-                [
-                    float(self.survived[there].double().mean())
-                    for b in range(num_bearings)
-                    for there in [self.kicked & (self.speed == speed) & (of == b)]
-                ]
-                for speed in speeds
-            ]
-        )
+        there = [[self.kicked & (self.speed == v) & (of == b) for b in range(num_bearings)] for v in speeds]
+        return torch.tensor([[float(self.survived[one].double().mean()) for one in row] for row in there])
 
 
 def kick(env: OmniEnv, policy: Policy, speeds: Sequence[float], num_bearings: int, repeats: int) -> KickResults:

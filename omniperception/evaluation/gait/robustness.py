@@ -14,11 +14,12 @@ from omegaconf import OmegaConf
 from omniperception import config
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import rate_cell
-from omniperception.evaluation.statistics import rate
+from omniperception.evaluation.report.gaits import Part
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.report.tables import rate_cell
 from omniperception.evaluation.suite import Evaluation, Task, measure_all
-from omniperception.evaluation.walking_report import Part
+from omniperception.evaluation.trials.statistics import rate
+from omnirobot.common.errors import check_known
 from omnirobot.common.figures import new_figure, save_figure
 
 NEUTRAL = {"ground_friction": 0.8, "motor_strength": 1.0, "velocity_scale": 1.0}
@@ -85,17 +86,12 @@ def stretches(evaluation: Evaluation, preset: str, rows: Sequence[str], factors:
         factors: of the ranges.
     """
     values = _rows(preset, config.search_path(evaluation.overrides, config.read(evaluation.runs[0])))
-    unknown = [row for row in rows if row not in values]
-    if unknown:
-        raise ConfigError(f"rows={','.join(unknown)} are unknown; {config.suggest(unknown[0], tuple(values))}")
+    check_known("rows", rows, tuple(values))
     if min(factors, default=0.0) < 0:
         raise ConfigError(f"factors={','.join(f'{factor:g}' for factor in factors)} must not be negative")
     parts = [("", 0.0)] + [(row, factor) for row in rows for factor in sorted(set(factors)) if factor > 0]
     if len(parts) == 1:
-        raise ConfigError(
-            f"nothing is left to measure: preset={preset} has no rows of the robot, or no factor is above 0; give"
-            " rows=, factors= or another preset, such as robot"
-        )
+        raise ConfigError(f"nothing to measure: preset={preset} has no rows of the robot, or no factor is above 0")
     found: list[Stretch] = []
     seen: set[tuple[str, ...]] = set()
     for row, factor in parts:
@@ -117,10 +113,9 @@ def rows_of_the_robot(preset: str, folders: Sequence[Path] = ()) -> tuple[str, .
         preset: of `randomization`.
         folders: the user's, of presets.
     """
-    values = _rows(preset, folders)
     others = ("payload_position", "frames_lost", "frames_late_s")
-    chosen = [row for row in values if not row.startswith("lidar_") and row not in others and values[row] is not None]
-    return tuple(chosen)
+    rows = _rows(preset, folders).items()
+    return tuple(row for row, value in rows if value is not None and row not in others and row[:6] != "lidar_")
 
 
 def measure(measurements: Sequence[Stretch]) -> list[tuple[Stretch, Record]]:
@@ -138,15 +133,11 @@ def table(measured: Sequence[tuple[Stretch, Record]]) -> str:
     """Falls and error by row and factor."""
     factors = sorted({stretch.factor for stretch, _ in measured if stretch.row})
     by_place = {(stretch.row, stretch.factor): record for stretch, record in measured}
-    rows = []
-    for row in dict.fromkeys(stretch.row for stretch, _ in measured if stretch.row):
-        rows.append([row, *(_cell(by_place.get((row, factor))) for factor in factors)])
+    names = dict.fromkeys(stretch.row for stretch, _ in measured if stretch.row)
+    rows = [[row, *(_cell(by_place.get((row, factor))) for factor in factors)] for row in names]
     nothing = _cell(by_place.get(("", 0.0)))
-    return (
-        f"falls, % / velocity error, m/s (–: no wider than before); nothing randomized: {nothing}\n\n"
-        + markdown(["row", *(f"x {factor:g}" for factor in factors)], rows)
-        + "\n"
-    )
+    head = f"falls, % / velocity error, m/s (–: no wider than before); nothing randomized: {nothing}"
+    return f"{head}\n\n{markdown(['row', *(f'x {factor:g}' for factor in factors)], rows)}\n"
 
 
 def draw(measured: Sequence[tuple[Stretch, Record]], path: Path) -> None:

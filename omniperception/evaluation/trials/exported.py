@@ -41,15 +41,11 @@ class ExportedPolicies:
         if env.step_count:
             for index in env.done.nonzero().flatten().tolist():
                 self.robots[index].reset()
-        states, commands, clouds = robot_states(env), env.command.value.cpu().numpy(), self._new_clouds()
-        given = zip(self.robots, states, commands, clouds, self._ages(), strict=True)
+        late = None if env.sensing is None else env.sensing.late_steps
+        ages_s = [0.0] * env.num_envs if late is None else (late * env.control_dt).tolist()  # of the newest frames
+        commands = env.command.value.cpu().numpy()
+        given = zip(self.robots, robot_states(env), commands, self._new_clouds(), ages_s, strict=True)
         return torch.from_numpy(np.stack([_action(*each) for each in given])).to(env.device)
-
-    def _ages(self) -> list[float]:
-        """Of the newest frames, s."""
-        sensing = self._env.sensing
-        late = None if sensing is None else sensing.late_steps
-        return [0.0] * self._env.num_envs if late is None else (late * self._env.control_dt).tolist()
 
     def _new_clouds(self) -> list[np.ndarray | None]:
         """Points of the frame that has just come; None without one, or where the episode has just begun."""
@@ -82,18 +78,10 @@ def _action(
 
 def robot_states(env: OmniEnv) -> list[RobotState]:
     """Measured state of each robot, with the latency that the environment gives it."""
-    measured = env.state.measured
-    tensors = (
-        measured.joint_pos,
-        measured.joint_vel,
-        measured.base_quat_w,
-        measured.base_ang_vel_b,
-        measured.base_lin_vel_b,
-    )
+    m = env.state.measured
+    tensors = m.joint_pos, m.joint_vel, m.base_quat_w, m.base_ang_vel_b, m.base_lin_vel_b
     other = {name: value.cpu().numpy() for name, value in _other_readings(env).items()}
     states = [RobotState(*values) for values in zip(*(tensor.cpu().numpy() for tensor in tensors), strict=True)]
-    if not other:
-        return states
     return [replace(one, other={name: value[k] for name, value in other.items()}) for k, one in enumerate(states)]
 
 
@@ -101,11 +89,10 @@ def _other_readings(env: OmniEnv) -> dict[str, torch.Tensor]:
     """(num_envs, width) newest values of the actor's terms that are measured by names of their own."""
     readings = {}
     for name in env.config.observations.actor:
-        group, widths = env.config.observations.groups[name], env.observation_widths(name)
-        newest = env.observations[name][:, -sum(widths.values()) :].split(list(widths.values()), 1)
+        group, widths = env.config.observations.groups[name], list(env.observation_widths(name).values())
+        newest = env.observations[name][:, -sum(widths) :].split(widths, 1)
         for term, value in zip(group.terms.values(), newest, strict=True):
-            quantity = own_quantity(term)
-            if quantity is not None:
+            if (quantity := own_quantity(term)) is not None:
                 readings[quantity] = value
     return readings
 
@@ -126,20 +113,19 @@ def record(env: OmniEnv, policy: ExportedPolicy, steps: int, whole_frames: bool)
         steps: control steps.
         whole_frames: all points that the device measures, in place of those that training kept; without noise.
     """
-    policies = ExportedPolicies(env, policy)
+    policies, sensing = ExportedPolicies(env, policy), env.sensing
     device = _whole_device(env) if whole_frames else None
-    sensing = env.sensing if policies.robots[0].frames is not None else None
     readings, tick = [], 0
-    for _ in range(steps):
-        state, command, points = robot_states(env)[0], env.command.value[0].cpu().numpy().copy(), None
-        if sensing is not None and sensing.tick != tick:
+    for step in range(steps):
+        points = None
+        if policies.robots[0].frames is not None and sensing is not None and sensing.tick != tick:
             tick, frame = sensing.tick, sensing.frame
             if device is not None:
-                time_s = torch.full((env.num_envs,), env.step_count * env.control_dt, dtype=torch.float64)
+                time_s = torch.full((env.num_envs,), step * env.control_dt, dtype=torch.float64)
                 frame = device.cast(time_s.to(env.device))
             assert frame is not None  # it has ticked
             points = raw_points(frame)[0].copy()
-        readings.append(Reading(state, command, points))
+        readings.append(Reading(robot_states(env)[0], env.command.value[0].cpu().numpy().copy(), points))
         with torch.no_grad():
             env.step(policies(env.get_observations()))
     return readings

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from omniperception.config import ConfigError
-from omniperception.evaluation.outcomes import Episodes
+from omniperception.evaluation.trials.outcomes import Episodes
 from omnirobot.common.files import lock, write_whole
 
 FORMAT = 1
 FOLDER = "evaluation"
 """Folder of a run directory for the results."""
 _KEY = ("run", "policy", "condition", "world", "terrain", "split")
+_NAMED = (*_KEY, "condition_version", "weights", "seed")
 
 
 @dataclass(frozen=True)
@@ -63,15 +64,19 @@ class Record:
         return (*(() if walker == self.run else (f"walker={walker}",)), *self.facts.get("overrides", ()))
 
     @property
+    def training(self) -> str:
+        """The training that the run belongs to."""
+        return training_of(self.run)
+
+    @property
     def place(self) -> str:
         """World and terrain, in words."""
         return self.world if self.terrain in ("own", "flat") else f"{self.world}, {self.terrain}"
 
     def plain(self) -> dict:
         """As it is written; `of` reads it."""
-        names = (*_KEY, "condition_version", "weights", "seed")
         return {
-            **{name: getattr(self, name) for name in names},
+            **{name: getattr(self, name) for name in _NAMED},
             **self.facts,
             "us_per_env_step": {stage: round(us, 1) for stage, us in self.episodes.us_per_env_step.items()},
             "outcomes": self.episodes.columns(),
@@ -81,7 +86,7 @@ class Record:
     def of(cls, plain: dict) -> Record:
         """A record that `plain` wrote."""
         rest = dict(plain)
-        named = {name: rest.pop(name) for name in (*_KEY, "condition_version", "weights", "seed")}
+        named = {name: rest.pop(name) for name in _NAMED}
         episodes = Episodes.from_columns(rest.pop("outcomes"), rest.pop("us_per_env_step"))
         return cls(**named, facts=rest, episodes=episodes)
 
@@ -112,9 +117,9 @@ def read(path: Path) -> list[Record]:
         if content["format"] != FORMAT:
             raise ConfigError(f"{path} has format {content['format']}, this version reads {FORMAT}; evaluate again")
         return [Record.of(plain) for plain in content["records"]]
+    except ConfigError:
+        raise
     except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError) as error:
-        if isinstance(error, ConfigError):
-            raise
         raise ConfigError(f"{path} holds no results of evaluate ({error!r}); delete it, or give another") from None
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import rate_cell
-from omniperception.evaluation.tracks import Tracks
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.report.tables import rate_cell
+from omniperception.evaluation.trials.tracks import Tracks
 from omnirobot.common.figures import new_figure, plain, save_figure
 
 UNTOUCHED, TOUCHED, FAILED = "#1b7f4d", "#d62728", "#3b6fb6"
@@ -20,10 +20,8 @@ SHOWN = 25
 OVERHEAD = 0.45
 """Obstacles whose lower edge is higher (m) are drawn as outlines: the robot passes below."""
 _MARGIN = 0.6
-_PANEL = 4.6
-"""Width of a panel (inches)."""
-_SHAPES = 0.36, 0.75
-"""Least and greatest height of a panel over its width."""
+_PANEL = 4.6, 2.6
+"""Width and height of a panel (inches)."""
 
 
 def draw_worlds(path: Path, records: Sequence[Record]) -> None:
@@ -34,17 +32,13 @@ def draw_worlds(path: Path, records: Sequence[Record]) -> None:
         records: with tracks.
     """
     columns = min(len(records), 2 if len(records) <= 10 else 4)
-    rows = [records[k : k + columns] for k in range(0, len(records), columns)]
-    areas = [_same_shape([_bounds(_tracks(record)) for record in row]) for row in rows]
-    heights = [(row[0][3] - row[0][2]) / (row[0][1] - row[0][0]) for row in areas]
-    figure = new_figure(columns * _PANEL, sum(_PANEL * height + 0.35 for height in heights) + 0.9)
-    axes = figure.subplots(len(rows), columns, squeeze=False, gridspec_kw={"height_ratios": heights})
-    for row_axes, row, row_areas in zip(axes, rows, areas, strict=True):
-        for axis in row_axes[len(row) :]:
-            axis.set_axis_off()
-        for axis, record, area in zip(row_axes, row, row_areas, strict=False):
-            _draw(axis, record)
-            axis.set(xlim=area[:2], ylim=area[2:])
+    rows = -(-len(records) // columns)
+    figure = new_figure(columns * _PANEL[0], rows * _PANEL[1] + 0.9)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis in axes.ravel()[len(records) :]:
+        axis.set_axis_off()
+    for axis, record in zip(axes.ravel(), records, strict=False):
+        _draw(axis, record)
     for axis in axes[-1]:
         axis.set_xlabel("x (m)", fontsize=8)
     for axis in axes[:, 0]:
@@ -57,22 +51,11 @@ def draw_worlds(path: Path, records: Sequence[Record]) -> None:
     save_figure(figure, path)
 
 
-def _same_shape(areas: Sequence[tuple[float, ...]]) -> list[tuple[float, float, float, float]]:
-    """Areas (low x, high x, low y, high y) grown to one ratio of height to width, within _SHAPES."""
-    ratio = max((high_y - low_y) / (high_x - low_x) for low_x, high_x, low_y, high_y in areas)
-    ratio = min(max(ratio, _SHAPES[0]), _SHAPES[1])
-    grown = []
-    for low_x, high_x, low_y, high_y in areas:
-        wide, high = high_x - low_x, high_y - low_y
-        more_x, more_y = max(high / ratio - wide, 0.0) / 2, max(wide * ratio - high, 0.0) / 2
-        grown.append((low_x - more_x, high_x + more_x, low_y - more_y, high_y + more_y))
-    return grown
-
-
 def _draw(axis, record: Record) -> None:
     from matplotlib.collections import LineCollection
 
-    episodes, tracks = record.episodes, _tracks(record)
+    episodes, tracks = record.episodes, record.episodes.tracks
+    assert tracks is not None  # recorded for pictures
     for part in tracks.parts[0].tolist():
         if not math.isnan(part[0]):
             axis.add_patch(_footprint(*part))
@@ -89,7 +72,11 @@ def _draw(axis, record: Record) -> None:
         axis.plot(*tracks.goal[0].tolist(), "*", color="black", markersize=9)
     axis.set_title(f"{record.place}: untouched {rate_cell([episodes.clean])} % of {len(episodes)}", fontsize=9)
     axis.tick_params(labelsize=7)
-    axis.set_aspect("equal")
+    low_x, high_x, low_y, high_y = _bounds(tracks)
+    wide, high = _PANEL
+    size = max(high_x - low_x, (high_y - low_y) * wide / high)  # of the area that holds all and has the panel's shape
+    x, y = (low_x + high_x - size) / 2, (low_y + high_y - size * high / wide) / 2
+    axis.set(xlim=(x, x + size), ylim=(y, y + size * high / wide), aspect="equal")
 
 
 def _footprint(x: float, y: float, yaw: float, half_x: float, half_y: float, bottom: float, speed: float):
@@ -117,11 +104,6 @@ def _legend() -> list:
     lines = [Line2D([], [], color=colour, label=label) for colour, label in ways]
     marks = (("x", "first touch"), ("*", "goal"))
     return [*lines, *(Line2D([], [], color="black", marker=mark, linestyle="", label=label) for mark, label in marks)]
-
-
-def _tracks(record: Record) -> Tracks:
-    assert record.episodes.tracks is not None  # recorded for pictures
-    return record.episodes.tracks
 
 
 def _bounds(tracks: Tracks) -> tuple[float, float, float, float]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from omniperception.env.mixed import families_of
-from omniperception.evaluation.video import Recorder
-from omniperception.evaluation.video_options import VideoOptions
+from omniperception.evaluation.film.video import Recorder
+from omniperception.evaluation.film.video_options import VideoOptions
 from omniperception.learning import Runner
 
 FOLDER = "videos"

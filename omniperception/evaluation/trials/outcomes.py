@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from omniperception.env.metrics import OUTCOMES
-from omniperception.evaluation.statistics import quantiles, rate
-from omniperception.evaluation.tracks import Tracks
+from omniperception.evaluation.trials.statistics import quantiles, rate
+from omniperception.evaluation.trials.tracks import Tracks
 
 CLEARANCE_CAP = 1.0
 """Clearances (m) beyond this are reported as this."""
@@ -150,21 +150,23 @@ class Episodes:
     def columns(self) -> dict:
         """All but the tracks as plain data: columns of `_DIGITS` digits, null for what is infinite or not a number."""
         plain: dict[str, Any] = {"has_goal": self.has_goal, "weight": round(self.weight, 3)}
-        for name in _COLUMNS:
-            values = getattr(self, name)
-            if values is not None:
-                plain[name] = values.tolist() if name in _WHOLE else [_rounded(value) for value in values.tolist()]
+        values = {name: getattr(self, name) for name in _COLUMNS}
+        plain |= {name: _plain(name, value) for name, value in values.items() if value is not None}
         if self.walking is not None:
-            plain["walking"] = {n: [_rounded(value) for value in v.tolist()] for n, v in self.walking.items()}
+            plain["walking"] = {name: _plain(name, value) for name, value in self.walking.items()}
         return plain
 
     @classmethod
     def from_columns(cls, plain: Mapping[str, Any], us_per_env_step: Mapping[str, float] | None = None) -> Episodes:
         """What `columns` was made of, to `_DIGITS` digits."""
         named: dict[str, Any] = {name: _tensor(name, plain[name]) if name in plain else None for name in _COLUMNS}
-        times = dict(us_per_env_step or {})
         walking = {n: _tensor(n, v) for n, v in plain["walking"].items()} if "walking" in plain else None
-        return cls(**named, has_goal=plain["has_goal"], weight=plain["weight"], us_per_env_step=times, walking=walking)
+        given = {"has_goal": plain["has_goal"], "weight": plain["weight"], "walking": walking}
+        return cls(**named, **given, us_per_env_step=dict(us_per_env_step or {}))
+
+
+def _plain(name: str, values: torch.Tensor) -> list:
+    return values.tolist() if name in _WHOLE else [_rounded(value) for value in values.tolist()]
 
 
 def _rounded(value: float) -> float | None:

@@ -8,9 +8,9 @@ import torch
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.statistics import paired_difference, pooled, quantiles
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.trials.outcomes import Episodes
+from omniperception.evaluation.trials.statistics import paired_difference, pooled, quantiles
 
 REFERENCE = "histogram"
 """Policy that the others' differences are taken to: the best known without learning."""
@@ -69,29 +69,25 @@ def table(records: Sequence[Record]) -> str:
         ConfigError: see `check_apart`.
     """
     check_apart(records)
-    conditions, several = {record.condition for record in records}, len({record.terrain for record in records}) > 1
+    keys = ["world", *(key for key in ("terrain", "condition") if len({getattr(r, key) for r in records}) > 1)]
     rows = []
-    for (world, terrain, condition), here in grouped(records, "world", "terrain", "condition").items():
+
+    def add(where: list[str], policy: str, cells: Iterable[str], ours: list[Record], theirs: list[Record]) -> None:
+        rows.append([*where, policy, *cells])
+        if theirs and policy != REFERENCE:
+            rows.append([*where, f"{policy}: difference to {REFERENCE}", difference(ours, theirs)])
+
+    for _, here in grouped(records, "world", "terrain", "condition").items():
         by_policy = {policy: of_one for (policy,), of_one in grouped(here, "policy").items()}
-        where = [world, *([terrain] if several else []), *([condition] if len(conditions) > 1 else [])]
         for policy, seeds in by_policy.items():
-            rows.append([*where, policy, *figures([record.episodes for record in seeds]).values()])
-            if REFERENCE in by_policy and policy != REFERENCE:
-                rows.append([*where, f"{policy}: difference to {REFERENCE}", difference(seeds, by_policy[REFERENCE])])
-    places = len({(record.world, record.terrain) for record in records})
-    if places > 1:
-        for (condition, policy), theirs in grouped(records, "condition", "policy").items():
-            where = [
-                f"mean of {len({(r.world, r.terrain) for r in theirs})}",
-                *([""] if several else []),
-                *([condition] if len(conditions) > 1 else []),
-            ]
-            rows.append([*where, policy, *mean_figures(theirs)])
+            cells = figures([record.episodes for record in seeds]).values()
+            add([getattr(here[0], key) for key in keys], policy, cells, seeds, by_policy.get(REFERENCE, []))
+    if len({(record.world, record.terrain) for record in records}) > 1:
+        for (condition, policy), ours in grouped(records, "condition", "policy").items():
+            named = {"world": f"mean of {len({(r.world, r.terrain) for r in ours})}", "condition": condition}
             reference = [one for one in records if (one.condition, one.policy) == (condition, REFERENCE)]
-            if reference and policy != REFERENCE:
-                rows.append([*where, f"{policy}: difference to {REFERENCE}", difference(theirs, reference)])
-    heads = ["world", *(["terrain"] if several else []), *(["condition"] if len(conditions) > 1 else [])]
-    columns = [*heads, "policy", *COLUMNS.values()]
+            add([named.get(key, "") for key in keys], policy, mean_figures(ours), ours, reference)
+    columns = [*keys, "policy", *COLUMNS.values()]
     return f"{headline(records)}\n\n{markdown(columns, [row + [''] * (len(columns) - len(row)) for row in rows])}\n"
 
 
@@ -154,15 +150,8 @@ def difference(ours: Sequence[Record], theirs: Sequence[Record]) -> str:
 
 def _trials(record: Record) -> tuple:
     """What trials follow from, whoever acts in them."""
-    task = (
-        record.run,
-        record.world,
-        record.terrain,
-        record.condition,
-        record.split,
-        *record.facts.get("overrides", ()),
-    )
-    return (*task, record.seed, len(record.episodes))
+    names = ("run", "world", "terrain", "condition", "split", "seed")
+    return (*(getattr(record, name) for name in names), *record.facts.get("overrides", ()), len(record.episodes))
 
 
 def rate_cell(by_seed: Sequence[torch.Tensor]) -> str:
@@ -181,11 +170,14 @@ def progress_line(record: Record) -> str:
 
 def summary_table(summary: Mapping) -> str:
     """The figures of `Episodes.summary` below each other."""
-    rows: list[tuple] = [(name.replace("_", " "), _percent(rate)) for name, rate in summary["rates"].items()]
-    for key, label in _QUANTILES.items():
-        if summary[key] is not None:
-            rows.append((label, f"{summary[key]['median']:.2f} [{summary[key]['p05']:.2f}, {summary[key]['p95']:.2f}]"))
-    rows += [(label, f"{summary[key]:.3f}") for key, label in _MEANS.items() if summary[key] is not None]
+    rows = [
+        (name.replace("_", " "), f"{100 * rate['rate']:.1f} % [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]")
+        for name, rate in summary["rates"].items()
+    ]
+    for key, label in _FIGURES.items():
+        if (value := summary[key]) is not None:
+            text = "{median:.2f} [{p05:.2f}, {p95:.2f}]".format(**value) if isinstance(value, dict) else f"{value:.3f}"
+            rows.append((label, text))
     return f"{summary['trials']} trials, success: {summary['success_means']}\n\n{markdown(['', 'run'], rows)}\n"
 
 
@@ -195,13 +187,11 @@ def times_line(summary: Mapping) -> str:
     return "  time per environment step: " + ", ".join(f"{name} {spent:.1f}" for name, spent in times) + " us"
 
 
-_QUANTILES = {
+_FIGURES = {
     "time_over_free_time": "time over the free time",
     "clearance_m": "least clearance (m)",
     "touched_impulse_n_s": "impulse of a touched trial (N s)",
     "energy_j": "energy (J)",
-}
-_MEANS = {
     "touches_per_100_m": "touches per 100 m",
     "cost_of_transport": "cost of transport",
     "velocity_error_m_s": "velocity error (m/s)",
@@ -209,10 +199,6 @@ _MEANS = {
     "yaw_rate_error_rad_s": "yaw rate error (rad/s)",
     "mean_length_s": "length of a trial (s)",
 }
-
-
-def _percent(rate: Mapping) -> str:
-    return f"{100 * rate['rate']:.1f} % [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -7,12 +7,9 @@ from collections.abc import Callable
 import torch
 
 from omniperception.env.env import OmniEnv, Policy
-from omniperception.env.mdp.commands import VelocityCommand
-from omniperception.evaluation.outcomes import Episodes
-from omniperception.evaluation.tally import Tally
-from omniperception.evaluation.tracks import TrackRecorder
-from omniperception.evaluation.walking import WalkingTally
-from omniperception.scene.build import FOOT_FORCE
+from omniperception.evaluation.trials.outcomes import Episodes
+from omniperception.evaluation.trials.tally import Tally
+from omniperception.evaluation.trials.tracks import TrackRecorder
 
 
 def run_episodes(
@@ -39,17 +36,13 @@ def run_episodes(
         keep_tracks: whether to keep the robots' ways.
         on_left: called after every control step with the number of trials that have not ended.
     """
-    if num_trials < 1:
-        raise ValueError(f"trials={num_trials} must be at least 1")
     if bool(env.episode_length_buf.any()) or env.step_count:
         raise ValueError("run_episodes needs a freshly built environment; this one has already been stepped")
     tally, clock = Tally(env, num_trials), _StageClock(env)
     tracks = TrackRecorder(env, num_trials) if keep_tracks else None
-    measures_walking = isinstance(env.command, VelocityCommand) and FOOT_FORCE in env.world.sensors
-    walking = WalkingTally(env, num_trials) if measures_walking else None
-    recorders = [recorder for recorder in (tally, tracks, walking) if recorder is not None]
-    hooks = [recorder.record for recorder in recorders]
-    env.step_hooks.extend(hooks)
+    recorders = (tally,) if tracks is None else (tally, tracks)
+    before = list(env.step_hooks)
+    env.step_hooks.extend(recorder.record for recorder in recorders)
     try:
         with torch.no_grad():
             observations = env.get_observations()
@@ -66,13 +59,8 @@ def run_episodes(
                 if on_left is not None:
                     on_left(tally.left)
     finally:
-        for hook in hooks:
-            env.step_hooks.remove(hook)
-    return tally.episodes(
-        clock.us_per_env_step(),
-        tracks.tracks() if tracks is not None else None,
-        walking.columns() if walking is not None else None,
-    )
+        env.step_hooks[:] = before
+    return tally.episodes(clock.us_per_env_step(), None if tracks is None else tracks.tracks())
 
 
 class _StageClock:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from omniperception.evaluation.camera import CAMERAS
+from omniperception.evaluation.film.camera import CAMERAS
 from omnirobot.common.errors import ConfigError
 
 
@@ -26,15 +26,12 @@ class VideoOptions:
         if len(self.size) != 2 or any(n < 2 or n % 2 for n in self.size):
             given = ",".join(map(str, self.size))
             raise ConfigError(f"video_size={given} must be width,height, two even numbers such as 1280,720")
+        given, (width, height) = ",".join(map(str, self.env_ids)), self.panel
         if not self.env_ids or min(self.env_ids) < 0 or len(set(self.env_ids)) < len(self.env_ids):
+            raise ConfigError(f"video_envs={given} must be different numbers from 0 on, such as 0,1,2,3")
+        if min(width, height) < LEAST_PANEL:
             raise ConfigError(
-                f"video_envs={_listed(self.env_ids)} must be different numbers from 0 on, such as 0,1,2,3"
-            )
-        if min(self.panel) < LEAST_PANEL:
-            width, height = self.panel
-            raise ConfigError(
-                f"video_envs={_listed(self.env_ids)} leaves {width} x {height} pixels for each; give fewer, or a larger"
-                " video_size"
+                f"video_envs={given} leaves {width} x {height} pixels for each; give fewer, or a larger video_size"
             )
         if self.camera not in CAMERAS:
             raise ConfigError(f"camera={self.camera} must be one of {', '.join(CAMERAS)}")
@@ -53,16 +50,12 @@ class VideoOptions:
 
     def check_fits(self, num_envs: int) -> None:
         """Refuses environments that do not exist."""
-        if max(self.env_ids) >= num_envs:
+        if (last := max(self.env_ids)) >= num_envs:
+            given = ",".join(map(str, self.env_ids))
             raise ConfigError(
-                f"video_envs={_listed(self.env_ids)}: there are {num_envs} environments, from 0 on;"
-                f" num_envs={max(self.env_ids) + 1} would do"
+                f"video_envs={given}: there are {num_envs} environments, from 0 on; num_envs={last + 1} would do"
             )
 
 
 LEAST_PANEL = 16
 """Pixels, of the picture of one environment."""
-
-
-def _listed(numbers: tuple[int, ...]) -> str:
-    return ",".join(map(str, numbers))

@@ -94,12 +94,19 @@ def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig
     """
     if name == "blind":
         return blind(env, policy)
+    steering: Steering
     if name == "stop":
-        return stop(env, policy, limits)
-    if name == "ground_truth":
-        return ground_truth(env, policy, limits)
-    made = {"histogram": histogram, "oracle": oracle}[name]
-    return made(env, policy, avoidance, limits)
+        steering = _Stop(env, StopConfig.of(env.robot))
+    elif name == "ground_truth":
+        steering = _navigated(env, policy)
+    elif name == "histogram":
+        steering = _avoiding(env, avoidance, _Histogram(env))
+    else:
+        sectors = TrueSectors(avoidance.num_sectors, env.world.obstacles, env.obstacles, env.num_envs, env.device)
+        steering = _avoiding(
+            env, avoidance, lambda: sectors.measure(env.state.kinematics.base_pos_w, env.state.kinematics.yaw)
+        )
+    return _driven(env, policy, steering, limits)
 
 
 def blind(env: OmniEnv, policy: Policy) -> Policy:
@@ -110,19 +117,8 @@ def blind(env: OmniEnv, policy: Policy) -> Policy:
     return policy
 
 
-def oracle(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
-    """The policy, driven by V_cmd + V_avoid with V_avoid from the true obstacles, seen or not."""
-    sectors = TrueSectors(avoidance.num_sectors, env.world.obstacles, env.obstacles, env.num_envs, env.device)
-
-    def motion() -> torch.Tensor:
-        kinematics = env.state.kinematics
-        return sectors.measure(kinematics.base_pos_w, kinematics.yaw)
-
-    return _driven(env, policy, _avoiding(env, avoidance, motion), limits)
-
-
-def ground_truth(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
-    """The policy, driven by what its own navigation asks for of the true obstacles, seen or not."""
+def _navigated(env: OmniEnv, policy: Policy) -> Steering:
+    """What a policy's own navigation asks for of the true obstacles, seen or not."""
     navigation = getattr(policy, "navigation", None)
     if navigation is None:
         raise ValueError("this policy has no navigation to give ground truth to; leave policy=ground_truth out")
@@ -131,17 +127,7 @@ def ground_truth(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
         state = env.state
         return navigation(state.sectors, state.reference, state.measured.planar_velocity, state.last_asked)
 
-    return _driven(env, policy, wanted, limits)
-
-
-def histogram(env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig, limits: Limits | None) -> Policy:
-    """The policy, driven by V_cmd + V_avoid with V_avoid from the raw noisy clouds by geometry alone."""
-    return _driven(env, policy, _avoiding(env, avoidance, _Histogram(env)), limits)
-
-
-def stop(env: OmniEnv, policy: Policy, limits: Limits | None) -> Policy:
-    """The policy, driven by V_cmd, which falls to zero while something is near in its direction."""
-    return _driven(env, policy, _Stop(env, StopConfig.of(env.robot)), limits)
+    return wanted
 
 
 def geometry_of(robot: RobotConfig) -> GeometryConfig:
@@ -169,16 +155,12 @@ class StopConfig:
         _, front, side = robot.outline
         return cls(front + 0.34, front + 1.04, side + 0.03)
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.stand < self.slow:
-            raise ValueError(f"stand={self.stand} and slow={self.slow} must be 0 < stand < slow (m)")
-
 
 class _Clouds:
     """Newest clouds of an environment's LiDAR, each handed on once.
 
     Attributes:
-        attitude: of the bases as measured when the newest frame came.
+        period_s: from frame to frame.
     """
 
     def __init__(self, env: OmniEnv) -> None:
@@ -190,33 +172,23 @@ class _Clouds:
             )
         self._env, self._sensing, self._tick = env, env.sensing, -1
         self._standing = Standing(geometry_of(env.robot))
-
-    @property
-    def is_new(self) -> bool:
-        """Tell whether a frame has come since the last `nearest`."""
-        return self._sensing.tick != self._tick
-
-    @property
-    def period_s(self) -> float:
-        """Time (s) from frame to frame."""
-        return self._sensing.period_steps * self._env.control_dt
+        self.period_s = env.sensing.period_steps * env.control_dt
 
     @property
     def begun(self) -> torch.Tensor:
         """(num_envs,) bool: whose episode has just begun; their newest cloud shows the one before."""
         return (self._env.episode_length_buf == 0) & (self._env.step_count > 0)
 
-    @property
-    def fresh(self) -> torch.Tensor:
-        """(num_envs,) bool: whose newest cloud came with the newest tick and shows this episode."""
-        return self._sensing.fresh & ~self.begun
-
-    def nearest(self) -> Nearest:
-        """Nearest obstacle by sector in the newest clouds."""
+    def new(self) -> tuple[Nearest, torch.Tensor] | None:
+        """Nearest obstacle by sector in the clouds that have come since the last call, and (num_envs,) bool which of
+        them came with the newest tick and show this episode; None where none has."""
+        if self._sensing.tick == self._tick:
+            return None
         self._tick, frame, sensor = self._sensing.tick, self._sensing.frame, self._sensing.config
         assert frame is not None and frame.ranges is not None and frame.directions_s is not None  # it has been cast
         attitude = Attitude(self._env.state.measured.base_quat_w, sensor.mount_pos, sensor.quat)
-        return nearest_obstacles(frame.ranges, frame.directions_s, attitude, self._standing)
+        nearest = nearest_obstacles(frame.ranges, frame.directions_s, attitude, self._standing)
+        return nearest, self._sensing.fresh & ~self.begun
 
 
 class _Histogram:
@@ -241,9 +213,9 @@ class _Histogram:
         self._odometry.start(begun.nonzero().flatten(), measured)
         self._tracks.reset(begun)
         self._tracks.advance(self._odometry.since_last_frame(), self._env.control_dt)
-        if clouds.is_new:
-            nearest = clouds.nearest()
-            self._tracks.update(nearest.distance, nearest.place, clouds.fresh)
+        if (new := clouds.new()) is not None:
+            nearest, fresh = new
+            self._tracks.update(nearest.distance, nearest.place, fresh)
 
 
 class _Stop:
@@ -257,8 +229,8 @@ class _Stop:
     def __call__(self) -> torch.Tensor:
         """(num_envs, 2) m/s."""
         clouds, config = self._clouds, self._config
-        if clouds.is_new:
-            fresh, nearest = clouds.fresh, clouds.nearest()
+        if (new := clouds.new()) is not None:
+            nearest, fresh = new
             self._place = torch.where(fresh[:, None, None], nearest.place, self._place)
             self._distance = torch.where(fresh[:, None], nearest.distance, self._distance)
         self._distance = torch.where(clouds.begun[:, None], torch.inf, self._distance)

@@ -71,15 +71,8 @@ def fit(
             a, b = (getattr(one, key)[long_enough, k] for one in halves)
             shared = ((a - a.mean()) * (b - b.mean())).mean().clamp(min=0.0).sqrt()
             pairs[key] = float(mean), float(shared)
-        axes[name] = AxisResponse(
-            gain=pairs["gain"],
-            lag_s=pairs["lag"],
-            delay_s=pairs["delay"],
-            acceleration=acceleration[k],
-            offset=pairs["offset"],
-            noise=noise[k][0],
-            noise_s=noise[k][1],
-        )
+        pairs |= {"lag_s": pairs.pop("lag"), "delay_s": pairs.pop("delay")}
+        axes[name] = AxisResponse(**pairs, acceleration=acceleration[k], noise=noise[k][0], noise_s=noise[k][1])
     return axes, predicted
 
 

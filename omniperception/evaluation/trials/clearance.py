@@ -12,8 +12,8 @@ import warp as wp
 from omnilidar.launch import launch_over_envs, view
 from omnilidar.mujoco import convex_hull
 from omniperception.env.env import OmniEnv
-from omniperception.evaluation import clearance_kernels as kernels
-from omniperception.evaluation.clearance_kernels import BOX, CAPSULE, CYLINDER, HULL
+from omniperception.evaluation.trials import clearance_kernels as kernels
+from omniperception.evaluation.trials.clearance_kernels import BOX, CAPSULE, CYLINDER, HULL
 
 _KINDS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: CAPSULE,
@@ -74,20 +74,11 @@ def clearances(
         held.append((geoms, geoms.centres(pos, mat).contiguous(), mat, geoms.size.contiguous()))
     (robot, at_r, mat_r, size_r), (obstacles, at_o, mat_o, size_o) = held
     inputs = [
-        view(robot.kind, wp.int32),
-        view(size_r, wp.vec3),
-        view(robot.radius, wp.float32),
-        view(robot.faces, wp.vec3),
-        view(robot.num_faces, wp.int32),
-        view(at_r, wp.vec3),
-        view(mat_r, wp.mat33),
-        view(obstacles.kind, wp.int32),
-        view(size_o, wp.vec3),
-        view(obstacles.faces, wp.vec3),
-        view(obstacles.num_faces, wp.int32),
-        view(at_o, wp.vec3),
-        view(mat_o, wp.mat33),
-        view(least, wp.float32),
+        *(view(robot.kind, wp.int32), view(size_r, wp.vec3), view(robot.radius, wp.float32)),
+        *(view(robot.faces, wp.vec3), view(robot.num_faces, wp.int32), view(at_r, wp.vec3), view(mat_r, wp.mat33)),
+        *(view(obstacles.kind, wp.int32), view(size_o, wp.vec3)),
+        *(view(obstacles.faces, wp.vec3), view(obstacles.num_faces, wp.int32), view(at_o, wp.vec3)),
+        *(view(mat_o, wp.mat33), view(least, wp.float32)),
     ]
     launch_over_envs(kernels.clearances, len(least), inputs, least.device)
     return least
@@ -105,29 +96,27 @@ class Geoms:
     """
 
     def __init__(self, model: mujoco.MjModel, ids: Sequence[int], num_envs: int, device: torch.device) -> None:
-        kinds, sizes, centres, faces, sized = [], [], [], [], []
+        rows, sized = [], []
         for i in ids:
             geom_type = mujoco.mjtGeom(int(model.geom_type[i]))
-            kind, size, centre, own = _KINDS.get(geom_type, BOX), model.geom_size[i].copy(), np.zeros(3), None
+            kind, size, centre, faces = _KINDS.get(geom_type, BOX), model.geom_size[i].copy(), np.zeros(3), None
             if geom_type == mujoco.mjtGeom.mjGEOM_SPHERE:
                 size[1:] = 0.0
             elif geom_type == mujoco.mjtGeom.mjGEOM_MESH and model.mesh_graphadr[model.geom_dataid[i]] >= 0:
                 kind = HULL
-                centre, size, own = _hull(model, int(model.geom_dataid[i]))
+                centre, size, faces = _hull(model, int(model.geom_dataid[i]))
             elif geom_type not in _KINDS:
                 centre, size = model.geom_aabb[i, :3], model.geom_aabb[i, 3:]
-            kinds.append(kind)
-            sizes.append(size)
-            centres.append(centre)
-            faces.append(own)
+            rows.append((kind, size, centre, faces))
             sized.append(geom_type in _KINDS)
+        kinds, sizes, centres, all_faces = zip(*rows, strict=True)
         self.ids, self.num = tuple(int(i) for i in ids), len(ids)
         self.kind = torch.tensor(kinds, dtype=torch.int32, device=device)
         size = torch.tensor(np.array(sizes), dtype=torch.float32, device=device)
         self.size = size.expand(num_envs, -1, -1)
         self._centre = torch.tensor(np.array(centres), dtype=torch.float32, device=device)
         self._is_sized = torch.tensor(sized, device=device)[:, None]
-        self.faces, self.num_faces = _padded(faces, device)
+        self.faces, self.num_faces = _padded(all_faces, device)
         by_kind = torch.stack((size[:, 0] + size[:, 1], torch.hypot(size[:, 0], size[:, 1]), *2 * [size.norm(dim=1)]))
         self.radius = by_kind.gather(0, self.kind[None].long())[0]
 
@@ -152,17 +141,15 @@ def _hull(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, np.
     return centre, np.abs(vertices - centre).max(0), faces
 
 
-def _padded(faces: list[np.ndarray | None], device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+def _padded(faces: Sequence[np.ndarray | None], device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
     """(G, F, 4, 3) faces of all geoms, zeros where one has fewer, and (G,) how many each has."""
     counts = [0 if own is None else len(own) for own in faces]
     rows = np.zeros((len(faces), max(1, *counts), 4, 3))
     for row, own in zip(rows, faces, strict=True):
         if own is not None:
             row[: len(own)] = own
-    return (
-        torch.tensor(rows, dtype=torch.float32, device=device),
-        torch.tensor(counts, dtype=torch.int32, device=device),
-    )
+    padded = torch.tensor(rows, dtype=torch.float32, device=device)
+    return padded, torch.tensor(counts, dtype=torch.int32, device=device)
 
 
 def _out_of(mat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:

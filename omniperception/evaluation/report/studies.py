@@ -7,8 +7,8 @@ from pathlib import Path
 
 from omniperception.common.tables import markdown
 from omniperception.config import ConfigError
-from omniperception.evaluation.records import Record
-from omniperception.evaluation.report import check_apart, grouped, headline, rate_cell
+from omniperception.evaluation.report.records import Record
+from omniperception.evaluation.report.tables import check_apart, grouped, headline, rate_cell
 
 RATES = {
     "untouched": "reached, untouched",
@@ -41,15 +41,14 @@ def study_table(records: Sequence[Record]) -> str:
     check_apart(records)
     tables = []
     for (world, terrain, condition), here in grouped(records, "world", "terrain", "condition").items():
-        by_row: dict[tuple[str, str, str], list[Record]] = {}
+        by_row: dict[tuple[str, ...], list[Record]] = {}
         for record in here:
             if len(parts := Path(record.run).parts[-3:-1]) < 2:
                 raise ConfigError(f"{record.run} is no run of a study, whose runs lie in <arm>/<variant>/seed<n>")
-            arm, variant = parts
-            by_row.setdefault((arm, variant, record.policy), []).append(record)
+            by_row.setdefault((*parts, record.policy), []).append(record)
         rows = [[*row, *_cells(seeds)] for row, seeds in by_row.items()]
         columns = ["arm", "variant", "policy", *(f"{label}, %" for label in RATES.values())]
-        if world == "corridor" and any(variant in PAPER for _, variant, _ in by_row):
+        if world == "corridor" and any(row[1] in PAPER for row in rows):
             columns.append(_PAPER_HEADING)
             rows = [[*row, PAPER.get(row[1], "")] for row in rows]
         place = world if terrain == "own" else f"{world}, {terrain}"

@@ -1,0 +1,1 @@
+"""Pictures and videos of environments, without a graphics library."""
