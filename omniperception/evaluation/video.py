@@ -217,7 +217,7 @@ class Recorder:
             sensing.scene.body_pos[env_id, sensing.carrier],
             sensing.scene.body_quat[env_id, sensing.carrier],
         )
-        return rotate(turned, points_c) + at, frame.elevation[env_id, hit] > split_elevation(sensing.sampler, config)
+        return rotate(turned, points_c) + at, frame.elevation[env_id, hit] > split_elevation(sensing.history, config)
 
     def _interest(self, env_id: int) -> float:
         """Score of a picture: the robot walks ahead, and its LiDAR sees obstacles."""
