@@ -78,7 +78,7 @@ def record(run: RunConfig, walker: Path, frames: int) -> Recording:
     risky = build.assemble(config.compose(["rewards=velocity_risk"])).env.rewards.avoidance.risk
     rewards = replace(run.env.rewards, avoidance=replace(rules[0], risk=risky))
     env = OmniEnv(replace(run.env, rewards=rewards, targets=(AVOIDANCE_TARGET,), skip_curricula=True))
-    assert env.sensing is not None and env.sensing.frames is not None and env.avoidance is not None
+    assert env.sensing is not None and env.sensing.history is not None and env.avoidance is not None
     teacher = build.load_teacher(walker, env)
     told = (torch.arange(env.num_envs) % 2 == 0).float()[:, None]
     kept: list[list[torch.Tensor]] = []
@@ -90,7 +90,7 @@ def record(run: RunConfig, walker: Path, frames: int) -> Recording:
             avoidance, kinematics = env.avoidance, env.state.kinematics
             assert avoidance.motion is not None and avoidance.sector_distance is not None
             motion = encode(avoidance.motion)
-            row = [env.sensing.frames[:, -1], env.sensing.frame_count[:, 0], observations["command"]]
+            row = [env.sensing.history.frames[:, -1], env.sensing.history.count[:, 0], observations["command"]]
             row += [kinematics.base_lin_vel_b.float(), motion[..., 0], motion[..., 1:].flatten(1)]
             row += [avoidance_velocity(avoidance.sector_distance, rule) for rule in rules]
             kept.append([value.clone() for value in (*row, avoidance.velocity)])

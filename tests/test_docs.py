@@ -146,6 +146,7 @@ def forget(package):
         ("rewards=mine",),
         ("lidar=os0_32", "lidar.mount=back"),
         ("lidar=mine", "condition=robot"),
+        ("lidar=watched", "observations=watched"),
         ("terrain=mine",),
         ("obstacles=mine",),
         ("scenario=mine",),

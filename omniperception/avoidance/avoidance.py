@@ -15,10 +15,11 @@ from omniperception.avoidance.velocity import (
     AvoidanceConfig,
     avoidance_velocity,
 )
+from omniperception.common.stateful import Stateful
 from omniperception.scene import ObstacleField, ObstaclesConfig
 
 
-class Avoidance:
+class Avoidance(Stateful):
     """V_avoid of all environments: `add_frame` at each LiDAR frame, `choose` at each step, `reset` at each reset.
 
     It exists only where a term or a supervised network reads it, and holds only what they read.
@@ -32,6 +33,8 @@ class Avoidance:
             that the LiDAR has seen, at the newest frame; None where V_avoid is the paper's.
         risk: (num_envs, K) of each candidate velocity, from `motion`; None when no V_avoid follows from it.
     """
+
+    saved, buffers = ("velocity", "motion", "risk"), ("sector_distance",)
 
     def __init__(
         self,
@@ -122,13 +125,3 @@ class Avoidance:
             self.motion = self.motion.index_copy(0, env_ids, nothing)
         if self.risk is not None:
             self.risk = self.risk.index_fill(0, env_ids, 0.0)
-
-    def state_dict(self) -> dict:
-        """State that `load_state_dict` needs for an exact resume."""
-        kept = {"velocity": self.velocity, "motion": self.motion, "risk": self.risk}
-        return {**kept, "sector_distance": None if self.sector_distance is None else self.sector_distance.clone()}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.velocity, self.motion, self.risk = state["velocity"], state["motion"], state["risk"]
-        if self.sector_distance is not None:
-            self.sector_distance.copy_(state["sector_distance"])

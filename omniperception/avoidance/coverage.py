@@ -9,10 +9,11 @@ import torch
 from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.common.rotations import multiply, rotate, yaw_of, yaw_quat
 from omniperception.common.sectors import sector_of
+from omniperception.common.stateful import Stateful
 from omnirobot.common.coverage import BIN_DEG, FRAMES, NUM_BINS, NUM_SECTORS, OPEN_DEG, SHARE, SHUT_DEG
 
 
-class Coverage:
+class Coverage(Stateful):
     """Which sectors the newest frames cover, in each environment.
 
     A sector is covered where the answers of the newest FRAMES frames lie in enough bins of elevation: many points in a
@@ -21,6 +22,8 @@ class Coverage:
     Attributes:
         covered: (num_envs, NUM_SECTORS) bool; everywhere before an episode's first frame.
     """
+
+    saved = ("_answered", "covered")
 
     def __init__(self, num_envs: int, least: torch.Tensor) -> None:
         """Args: num_envs; least: (NUM_SECTORS,) bins of a covered sector, see :func:`least_bins`."""
@@ -50,13 +53,6 @@ class Coverage:
         """Episodes begin in environments (n,)."""
         self._answered.index_fill_(1, env_ids, True)
         self.covered.index_fill_(0, env_ids, True)
-
-    def state_dict(self) -> dict:
-        return {"answered": self._answered.clone(), "covered": self.covered.clone()}
-
-    def load_state_dict(self, state: dict) -> None:
-        self._answered.copy_(state["answered"])
-        self.covered.copy_(state["covered"])
 
 
 def answered_bins(directions_l: torch.Tensor, answered: torch.Tensor) -> torch.Tensor:

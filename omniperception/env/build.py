@@ -15,12 +15,14 @@ from omniperception.sim import Simulator
 
 if TYPE_CHECKING:
     from omniperception.avoidance.avoidance import Avoidance
+    from omniperception.env.consumers import FrameConsumer
     from omniperception.env.frame_delivery import FrameDelivery
     from omniperception.env.height_lookup import HeightLookup
     from omniperception.env.mdp.curriculum import Curriculum
     from omniperception.env.mdp.pushes import Pushes
     from omniperception.env.measurement import MeasurementErrors
-    from omniperception.env.sensing import LidarSensing
+    from omniperception.env.partial_frames import PartialFrames
+    from omniperception.env.sensing import LidarSensing, SensorConfig
     from omniperception.env.terrain_levels import TerrainLevels
     from omniperception.perception import Sampler
     from omniperception.scene.ground import Ground
@@ -163,25 +165,52 @@ def build_sensing(
     """The LiDAR, where something reads it."""
     if config.lidar is None or not config.uses_lidar:
         return None
+    from omniperception.env.odometry import Odometry, TimedOdometry
     from omniperception.env.sensing import LidarSensing
 
-    needed = config.requirements()
+    delivery = build_delivery(config, random)
+    late, partial = (0, None) if delivery is None else (delivery.max_late_steps, delivery.partial)
+    odometry: Odometry | TimedOdometry | None = None
+    if config.frame_times:
+        odometry = TimedOdometry(config.num_envs, config.sim.control_dt, late, sim.device)
+    elif config.base_motion:
+        odometry = Odometry(config.num_envs, config.sim.control_dt, sim.device)
     return LidarSensing(
         config.lidar,
         sim,
         config.sim.control_dt,
-        config.lidar_noise,
-        config.seed,
-        config.sim.num_threads or None,
-        build_sampler(config),
-        config.frame_history,
-        config.base_motion,
-        config.frame_times,
-        sector_distance=avoidance.sector_distance if avoidance is not None else None,
-        obstacles=avoidance.obstacle_names if avoidance is not None else (),
-        distal=DISTAL_RANGE in needed,
-        whole=CLOUD in needed,
-        measured=MEASURED_CLOUD in needed,
-        shown=config.network_sees_frames,
-        delivery=build_delivery(config, random),
+        build_consumers(config, config.lidar, avoidance, partial),
+        noise=config.lidar_noise,
+        seed=config.seed,
+        num_threads=config.sim.num_threads or None,
+        delivery=delivery,
+        odometry=odometry,
     )
+
+
+def build_consumers(
+    config: EnvConfig, sensor: SensorConfig, avoidance: Avoidance | None, partial: PartialFrames | None
+) -> dict[str, FrameConsumer]:
+    """What takes something of each frame, in this order: the task's own by their classes, others by their names."""
+    from omniperception.env import consumers
+    from omniperception.env.sensing import least_bins_of
+
+    found: list[FrameConsumer] = []
+    needed, sampler = config.requirements(), build_sampler(config)
+    reads_points = MEASURED_CLOUD in needed or (sampler is not None and config.network_sees_frames)
+    if partial is not None and reads_points:
+        least = least_bins_of(sensor, sensor.scan_pattern(), config.robot)
+        found.append(consumers.CoveredSectors(partial, least))
+    if avoidance is not None and avoidance.obstacle_names:
+        found.append(consumers.Sightings(avoidance.obstacle_names))
+    if DISTAL_RANGE in needed:
+        found.append(consumers.DistalRange())
+    if sampler is not None:
+        found.append(consumers.FrameHistory(sampler, config.frame_history, config.network_sees_frames))
+    if avoidance is not None and avoidance.sector_distance is not None:
+        found.append(consumers.SectorRanges(avoidance.sector_distance))
+    read = {CLOUD: ("true_ranges", "directions_s", "elevation"), MEASURED_CLOUD: ("ranges", "directions_s")}
+    if needed & read.keys():
+        found.append(consumers.Clouds({name for key in needed & read.keys() for name in read[key]}))
+    own = {name: build() for name, build in sensor.consumers.items()}
+    return {type(consumer).__name__: consumer for consumer in found} | own

@@ -259,4 +259,5 @@ class EnvConfig:
     @property
     def uses_lidar(self) -> bool:
         """Tell whether anything reads the LiDAR; otherwise it is not built."""
-        return self.lidar is not None and (self.sampler is not None or bool(self.requirements() & FROM_LIDAR))
+        reads = self.sampler is not None or not FROM_LIDAR.isdisjoint(self.requirements())
+        return self.lidar is not None and (reads or bool(self.lidar.consumers))

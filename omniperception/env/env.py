@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
+from itertools import count
 
 import torch
 from rsl_rl.env import VecEnv
-from tensordict import TensorDict
+from tensordict import NonTensorData, TensorDict
 
 from omnilidar.launch import use_threads
 from omniperception.avoidance.velocity import COMMAND, LAST_ASKED
 from omniperception.common.random import EnvRandom, TrialRandom
 from omniperception.common.rotations import rotate_yaw, yaw_quat
+from omniperception.common.stateful import Stateful
 from omniperception.common.timing import StageTimer
 from omniperception.env.build import (
     build_avoidance,
@@ -40,6 +42,15 @@ MAX_ACTION = 100.0
 
 Policy = Callable[[TensorDict], torch.Tensor]
 """From observations to actions (num_envs, num_actions), without exploration noise."""
+
+
+_numbers = count(0, 1 << 32)
+
+
+@lru_cache(8)
+def frame_number(number: int, num_envs: int, device: torch.device) -> NonTensorData:
+    """Number of the newest LiDAR frame, the same for all environments, as an observation that stays on the host."""
+    return NonTensorData(number, batch_size=[num_envs], device=device)
 
 
 class TaskEnv(VecEnv):
@@ -72,7 +83,7 @@ class TaskEnv(VecEnv):
         return self.observations
 
 
-class OmniEnv(TaskEnv):
+class OmniEnv(TaskEnv, Stateful):
     """`num_envs` robots among obstacles behind rsl_rl's VecEnv contract.
 
     One control step: pushes -> `decimation` physics steps, before each of which the obstacles move -> at the LiDAR's
@@ -94,6 +105,12 @@ class OmniEnv(TaskEnv):
         velocity_error, yaw_rate_error: (num_envs,) m/s and rad/s against the command in the last step; 0 where the
             physics failed.
     """
+
+    saved = (
+        *("sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing", "pushes"),
+        *("state", "metrics", "difficulty", "rewards", "_groups", "random", "step_count", "_frame_heights"),
+    )
+    buffers = ("_episode_length",)
 
     def __init__(self, config: EnvConfig, episode_length: torch.Tensor | None = None) -> None:
         """
@@ -127,22 +144,17 @@ class OmniEnv(TaskEnv):
         self.sensing = build_sensing(config, self.sim, self.random, self.avoidance)
         self.pushes = build_pushes(config, self.sim, self.random, self.difficulty)
         self.state = EnvState(
+            config,
             self.sim,
-            self.control_dt,
-            self.command,
-            self.randomizer,
-            self.obstacles,
-            lookup,
-            self.avoidance,
-            self.sensing,
-            build_errors(config, self.random, self.difficulty),
-            self._episode_length,
-            config.observations.command_acceleration,
-            self.difficulty,
-            config.stepping,
-            config.requirements(),
-            config.sim.has_legs,
-            config.num_asked,
+            episode_steps=self._episode_length,
+            command=self.command,
+            randomizer=self.randomizer,
+            difficulty=self.difficulty,
+            errors=build_errors(config, self.random, self.difficulty),
+            height_lookup=lookup,
+            obstacles=self.obstacles,
+            sensing=self.sensing,
+            avoidance=self.avoidance,
         )
         if not config.sim.has_legs:
             self.state.ask_by(lambda: self.state.asked[:, :2].clone())
@@ -151,6 +163,7 @@ class OmniEnv(TaskEnv):
         self.metrics = EpisodeMetrics(self.num_envs, self.device, tuple(config.rewards.terms))
         self._spawn = self._spawn_bounds()
         self._sized = self._resizable_geoms()
+        self._number = next(_numbers)  # frames of two environments, or of two states of one, never have the same
         self._frame_heights: torch.Tensor | None = None  # at the newest frame, where only supervision reads heights
         self.rewards = RewardManager(config.rewards.terms, self.state)
         self._groups = {n: ObservationManager(n, g, self.state) for n, g in config.observations.groups.items()}
@@ -393,8 +406,9 @@ class OmniEnv(TaskEnv):
             self.avoidance.reset(env_ids)
         if self._frame_heights is not None:
             self._frame_heights = self._frame_heights.index_fill(0, env_ids, 0.0)
-        for manager in self._managers().values():
-            manager.reset(env_ids)
+        self.rewards.reset(env_ids)
+        for group in self._groups.values():
+            group.reset(env_ids)
 
     def _first_command(self, obstacles: ObstacleField, env_ids: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
         """(n, 2) m/s, environment frame: what is commanded in the worlds that have been drawn for environments (n,)."""
@@ -421,17 +435,17 @@ class OmniEnv(TaskEnv):
 
     def _collect(self, groups: dict[str, torch.Tensor]) -> TensorDict:
         """Adds LiDAR frames and the targets of supervision to the observation groups."""
-        if self.sensing is not None and self.sensing.frames is not None:
-            groups["frames"] = self.sensing.frames
-            groups["frame_count"] = self.sensing.frame_count.clone()
-            groups["frame_tick"] = self.sensing.frame_tick
+        numbered: dict[str, torch.Tensor | NonTensorData] = {}
+        if self.sensing is not None and (history := self.sensing.history) is not None:
+            groups |= {"frames": history.frames, "frame_count": history.count.clone()}
+            numbered["frame_tick"] = frame_number(self._number + self.sensing.tick, self.num_envs, self.device)
         if HEIGHT_TARGET in self.config.targets:
             groups[HEIGHT_TARGET] = self.state.heights if self._frame_heights is None else self._frame_heights
         if self.avoidance is not None:
             groups |= self.avoidance.targets(self.config.targets)
         if self.config.rewards.avoidance.max_acceleration is not None:
             groups[LAST_ASKED] = self.state.last_asked
-        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+        return TensorDict(numbered | groups, batch_size=[self.num_envs], device=self.device)
 
     def _report(self) -> dict[str, float]:
         """Metrics at the end of a log interval."""
@@ -505,53 +519,31 @@ class OmniEnv(TaskEnv):
 
     def state_dict(self) -> dict:
         """State that an exact resume needs."""
-        return {
-            **{name: part.state_dict() for name, part in self._with_state().items()},
-            "random": self.random.state_dict(),
-            "step_count": self.step_count,
-            "episode_length": self.episode_length_buf.clone(),
-            "frame_heights": self._frame_heights,
-            "observations": {name: self.observations[name] for name in self._groups},
-        }
+        return super().state_dict() | {"observations": {name: self.observations[name] for name in self._groups}}
 
     def load_state_dict(self, state: dict) -> None:
         """Resumes from the `state_dict` of an environment with the same configuration."""
-        for name, part in self._with_state().items():
-            part.load_state_dict(state[name])
+        super().load_state_dict(state)
         if self.obstacles is not None:
-            self._resize(self.obstacles, torch.arange(self.num_envs, device=self.device))
-        self.random.load_state_dict(state["random"])
-        self.step_count, self._has_stepped = state["step_count"], True
-        self.episode_length_buf.copy_(state["episode_length"])
-        self._frame_heights = state["frame_heights"]
+            self._resize(self.obstacles, self._all_envs)
+        self._has_stepped, self._number = True, next(_numbers)
         self.observations = self._collect(dict(state["observations"]))
 
     def begin_at_levels_of(self, state: dict) -> None:
         """Begins new episodes at the levels that the curricula have in the `state_dict` of another task, of those that
         there are here; of several families', in that of the first."""
         state = next(iter(state.get("families", {"": state}).values()))
-        command = state.get("command", {}) if isinstance(self.command, VelocityCommand) else {}
-        saved = {"randomization": state["difficulty"], "obstacle": state.get("obstacles", {}), "command": command}
+        command = state["command"].get("curriculum", {}) if isinstance(self.command, VelocityCommand) else {}
+        saved = {"randomization": state["difficulty"], "obstacle": state["obstacles"] or {}, "command": command}
         for name, part in self._curricula().items():
             if part.rises and "level" in saved[name]:
                 part.level = saved[name]["level"]
-        levels = state.get("ground", {}).get("level")
+        levels = (state["ground"] or {}).get("level")
         if self.ground is not None and self.terrain_levels is not None and levels is not None and len(levels):
             some = torch.arange(self.num_envs) % len(levels)
             self.ground.load_state_dict({"level": levels.cpu()[some].clamp(max=self.ground.config.levels - 1)})
             self._has_stepped = True  # so that `reset` keeps them
         self.reset()
-
-    def _managers(self) -> dict[str, RewardManager | ObservationManager]:
-        """The managers, by name."""
-        return {"rewards": self.rewards, **{f"observations.{name}": group for name, group in self._groups.items()}}
-
-    def _with_state(self) -> dict:
-        """Components with a state to be saved, by name."""
-        names = ["sim", "command", "randomizer", "ground", "terrain_levels", "obstacles", "avoidance", "sensing"]
-        names += ["pushes", "state", "metrics", "difficulty"]
-        parts = {name: getattr(self, name) for name in names} | self._managers()
-        return {name: part for name, part in parts.items() if part is not None}
 
     def _resizable_geoms(self) -> tuple[tuple[str, ...], tuple[int, ...], torch.Tensor]:
         """Names, geoms and indices of the parts of obstacles whose sizes differ between environments."""

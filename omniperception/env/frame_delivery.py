@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 
 from omniperception.common.random import Branch
+from omniperception.common.stateful import Stateful
 from omniperception.env.partial_frames import PartialFrames
 
 
-class FrameDelivery:
+class FrameDelivery(Stateful):
     """Draws for every frame of every environment whether it comes, and how late.
 
     Attributes:
@@ -17,6 +18,8 @@ class FrameDelivery:
         max_late_steps: the largest of them.
         partial: takes points away; None: all frames are whole.
     """
+
+    saved, buffers = ("partial",), ("fresh", "late_steps")
 
     def __init__(
         self,
@@ -60,19 +63,11 @@ class FrameDelivery:
         if self.partial is not None:
             self.partial.draw()
 
-    def state_dict(self) -> dict:
-        partial = None if self.partial is None else self.partial.state_dict()
-        return {"fresh": self.fresh.clone(), "late_steps": self.late_steps.clone(), "partial": partial}
 
-    def load_state_dict(self, state: dict) -> None:
-        self.fresh.copy_(state["fresh"])
-        self.late_steps.copy_(state["late_steps"])
-        if self.partial is not None:
-            self.partial.load_state_dict(state["partial"])
-
-
-class PastPoses:
+class PastPoses(Stateful):
     """Poses of bodies at the newest control steps, in a ring."""
+
+    saved = ("_pos", "_quat", "_newest")
 
     def __init__(self, num_steps: int, num_envs: int, num_bodies: int, device: torch.device) -> None:
         """Args: num_steps: control steps kept, the present one included; num_envs; num_bodies; device."""
@@ -96,11 +91,3 @@ class PastPoses:
         """Poses of each environment as many control steps ago, (num_envs,) int64."""
         index = torch.remainder(self._newest - steps_ago, len(self._pos))
         return self._pos[index, self._all_envs], self._quat[index, self._all_envs]
-
-    def state_dict(self) -> dict:
-        return {"pos": self._pos.clone(), "quat": self._quat.clone(), "newest": self._newest}
-
-    def load_state_dict(self, state: dict) -> None:
-        self._pos.copy_(state["pos"])
-        self._quat.copy_(state["quat"])
-        self._newest = state["newest"]

@@ -9,16 +9,19 @@ import torch
 
 from omniperception.common.random import Branch, EnvRandom
 from omniperception.common.rotations import multiply, rotate
+from omniperception.common.stateful import Stateful
 from omniperception.env.kinematics import Kinematics
 from omniperception.env.mdp.curriculum import FULL, Curriculum
 from omniperception.env.mdp.randomization import Drift, RandomizationConfig
 
 
-class MeasurementErrors:
+class MeasurementErrors(Stateful):
     """Draws the errors of each environment's measurements and adds them to a state.
 
     Biases and scale errors hold for an episode, noise for a control step. Where a row is null nothing is drawn.
     """
+
+    saved = ("_bias", "_noise", "_drift")
 
     def __init__(
         self,
@@ -91,24 +94,16 @@ class MeasurementErrors:
             ),
         )
 
-    def state_dict(self) -> dict:
-        drift = None if self._drift is None else self._drift.value.clone()
-        return {"bias": self._bias.values.clone(), "noise": self._noise.values.clone(), "drift": drift}
 
-    def load_state_dict(self, state: dict) -> None:
-        self._bias.values.copy_(state["bias"])
-        self._noise.values.copy_(state["noise"])
-        if self._drift is not None:
-            self._drift.value.copy_(state["drift"])
-
-
-class _Uniforms:
+class _Uniforms(Stateful):
     """Numbers drawn uniformly from the ranges of some rows; angles in rad.
 
     Attributes:
         values: (num_envs, sum of the widths) of the rows that are not null.
         rows: (num_envs, width) each, views of `values` by name.
     """
+
+    buffers = ("values",)
 
     def __init__(
         self, config: RandomizationConfig, widths: Mapping[str, int], num_envs: int, random: EnvRandom
@@ -135,12 +130,14 @@ class _Uniforms:
             self.values.index_copy_(0, env_ids, self._low + self._span * u)
 
 
-class _Wander:
+class _Wander(Stateful):
     """A `Drift` of three axes in every environment, stepped exactly.
 
     Attributes:
         value: (num_envs, 3).
     """
+
+    saved = ("value",)
 
     def __init__(self, config: Drift, num_envs: int, dt: float, random: EnvRandom) -> None:
         self._sd, self._random = config.sd, random

@@ -6,18 +6,21 @@ from collections.abc import Sequence
 
 import torch
 
+from omniperception.common.stateful import Stateful
 from omniperception.sim import Failure
 
 OUTCOMES = ("time_out", "fall", "goal", "collision_end", "diverged")
 """Reasons for which an episode can end."""
 
 
-class EpisodeMetrics:
+class EpisodeMetrics(Stateful):
     """Sums on the device, read out at the end of a log interval: a step itself never synchronises with the host.
 
     Attributes:
         collided: (num_envs,) bool: whether the current episode has had a contact with an obstacle.
     """
+
+    saved = ("_rewards", "_errors", "_outcomes", "_failures", "_clipped", "_healthy_steps", "_steps", "collided")
 
     def __init__(self, num_envs: int, device: torch.device, reward_terms: tuple[str, ...]) -> None:
         self._names = reward_terms
@@ -68,16 +71,6 @@ class EpisodeMetrics:
     def calm_velocity_error(self) -> float:
         """Mean linear velocity error (m/s) in calm moments since the last drain; inf if there were none."""
         return float(self._errors[2] / self._errors[3]) if self._errors[3] > 0 else float("inf")
-
-    def state_dict(self) -> dict:
-        sums = [total.clone() for total in self._sums()]
-        return {"sums": sums, "steps": self._steps, "collided": self.collided.clone()}
-
-    def load_state_dict(self, state: dict) -> None:
-        for total, saved in zip(self._sums(), state["sums"], strict=True):
-            total.copy_(saved)
-        self.collided.copy_(state["collided"])
-        self._steps = state["steps"]
 
     def _sums(self) -> tuple[torch.Tensor, ...]:
         return self._rewards, self._errors, self._outcomes, self._failures, self._clipped, self._healthy_steps

@@ -7,16 +7,14 @@ from dataclasses import replace
 from itertools import pairwise
 
 import torch
-from tensordict import TensorDict
+from tensordict import NonTensorData, TensorDict
 
 from omniperception.env.config import EnvConfig
-from omniperception.env.env import OmniEnv, TaskEnv
+from omniperception.env.env import OmniEnv, TaskEnv, frame_number
 from omniperception.env.mdp.terms import ActorInput, ObservationsConfig
 
 OF_A_FAMILY = ("num_envs", "seed", "obstacles", "commands", "terminations")
 """Fields of EnvConfig in which families may differ."""
-_KEPT = ("frames", "frame_tick")
-"""Observations that are the same tensor until they change, which is what says that they have not."""
 _SHOWN = ("goal_rate", "collision_rate", "fall_rate", "time_out_rate", "contact_share", "velocity_error")
 """Metrics that are logged for each family, too."""
 
@@ -62,7 +60,7 @@ class MixedEnv(TaskEnv):
             self.max_episode_length[part] = self.envs[name].max_episode_length
         self.state = _PolicySources(self)
         self.step_hooks: list[Callable[[], None]] = []
-        self._joined: dict[str, tuple[list[torch.Tensor], torch.Tensor]] = {}
+        self._frames: tuple[tuple[int, ...], torch.Tensor] | None = None
         self.observations = self._join([env.get_observations() for env in self._each()])
 
     # ---- rsl_rl's contract -------------------------------------------------------------------------------------------
@@ -89,18 +87,22 @@ class MixedEnv(TaskEnv):
 
     def _join(self, observations: Sequence[TensorDict]) -> TensorDict:
         """Observations of all families, in their order."""
-        groups: dict[str, torch.Tensor] = {}
+        groups: dict[str, torch.Tensor | NonTensorData] = {}
         for name in map(str, observations[0].keys()):
             own = [part[name] for part in observations]
-            if name in _KEPT:
-                before, joined = self._joined.get(name, ([], own[0]))
-                if len(before) != len(own) or any(a is not b for a, b in zip(before, own, strict=True)):
-                    joined = torch.cat(own)
-                    self._joined[name] = own, joined
-                groups[name] = joined
+            if name == "frame_tick":
+                groups[name] = frame_number(own[0], self.num_envs, self.device)
             else:
-                groups[name] = torch.cat(own)
+                groups[name] = self._joined_frames(own) if name == "frames" else torch.cat(own)
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+
+    def _joined_frames(self, own: Sequence[torch.Tensor]) -> torch.Tensor:
+        """The families' frames, the same tensor until one of them has others."""
+        histories = [env.sensing.history for env in self._each() if env.sensing is not None]
+        versions = tuple(history.version for history in histories if history is not None)
+        if self._frames is None or self._frames[0] != versions:
+            self._frames = versions, torch.cat(list(own))
+        return self._frames[1]
 
     def _merge(self, logs: Sequence[Mapping[str, float]]) -> dict[str, float]:
         """Logs of all families in one: counts of anomalies are added, of the rest means over the environments of the

@@ -5,11 +5,19 @@ from __future__ import annotations
 import torch
 
 from omniperception.common.rotations import rotate_yaw
+from omniperception.common.stateful import Stateful
 from omniperception.env.kinematics import Kinematics
 
 
-class Odometry:
-    """Adds up the measured velocity from one frame to the next; the heading is the IMU's."""
+class Odometry(Stateful):
+    """Adds up the measured velocity from one frame to the next; the heading is the IMU's.
+
+    Attributes:
+        num_rows: rows of a frame that say how the base moved.
+    """
+
+    num_rows = 1
+    saved = ("_travelled_w", "_yaw", "_yaw_before")
 
     def __init__(self, num_envs: int, control_dt: float, device: torch.device) -> None:
         self._dt = control_dt
@@ -29,33 +37,25 @@ class Odometry:
         self._yaw = measured.yaw
         self._travelled_w = self._travelled_w + rotate_yaw(measured.yaw, measured.base_lin_vel_yaw) * self._dt
 
-    def since_last_frame(self, came: torch.Tensor | None = None) -> torch.Tensor:
-        """Motion up to now since the last frame that came, in the levelled base of then.
+    def take(self, came: torch.Tensor, late_steps: torch.Tensor | None = None) -> torch.Tensor:
+        """The row of the newest frame.
 
         Args:
-            came: (num_envs, 1) bool: whose frame comes now; None: all.
+            came: (num_envs,) bool: whose frame comes now.
+            late_steps: not looked at: frames that bear no time count as taken when they come.
 
         Returns:
-            (num_envs, 3) x, y (m) and yaw (rad); 0 where no frame comes, and the sum goes on.
+            (num_envs, 1, 3): motion up to now since the last frame that came, x, y (m) and yaw (rad), in the levelled
+            base of then; 0 where no frame comes, and the sum goes on.
         """
         turned = torch.remainder(self._yaw - self._yaw_before + torch.pi, 2 * torch.pi) - torch.pi
         moved = torch.cat((rotate_yaw(-self._yaw_before, self._travelled_w), turned[:, None]), 1)
-        if came is None:
-            self._yaw_before = self._yaw
-            self._travelled_w = torch.zeros_like(self._travelled_w)
-            return moved
-        self._yaw_before = torch.where(came[:, 0], self._yaw, self._yaw_before)
-        self._travelled_w = torch.where(came, 0.0, self._travelled_w)
-        return torch.where(came, moved, 0.0)
-
-    def state_dict(self) -> dict:
-        return {"travelled": self._travelled_w, "yaw": self._yaw, "yaw_before": self._yaw_before}
-
-    def load_state_dict(self, state: dict) -> None:
-        self._travelled_w, self._yaw, self._yaw_before = state["travelled"], state["yaw"], state["yaw_before"]
+        self._yaw_before = torch.where(came, self._yaw, self._yaw_before)
+        self._travelled_w = torch.where(came[:, None], 0.0, self._travelled_w)
+        return torch.where(came[:, None], moved, 0.0)[:, None]
 
 
-class TimedOdometry:
+class TimedOdometry(Stateful):
     """As `Odometry`, for frames that bear the time at which they were taken.
 
     Attributes:
@@ -63,6 +63,7 @@ class TimedOdometry:
     """
 
     num_rows = 3
+    saved = ("_newest", "_pose", "_quat", "_taken", "_age", "_has_frame")
 
     def __init__(self, num_envs: int, control_dt: float, max_late_steps: int, device: torch.device) -> None:
         """Args: max_late_steps: control steps by which a frame may be older than the moment it comes."""
@@ -93,11 +94,11 @@ class TimedOdometry:
         """(num_envs, 4) measured orientation of the base when a frame was taken, (num_envs,) control steps ago."""
         return self._quat[self._newest] if late_steps is None else self._quat[self._at(late_steps), self._all_envs]
 
-    def take(self, came: torch.Tensor | None, late_steps: torch.Tensor | None) -> torch.Tensor:
+    def take(self, came: torch.Tensor, late_steps: torch.Tensor | None = None) -> torch.Tensor:
         """Rows of the newest frame.
 
         Args:
-            came: (num_envs,) bool: whose frame comes now; None: all.
+            came: (num_envs,) bool: whose frame comes now.
             late_steps: (num_envs,) control steps ago it was taken; None: now.
 
         Returns:
@@ -110,7 +111,6 @@ class TimedOdometry:
         late = torch.zeros_like(self._age) if late_steps is None else late_steps * self._dt
         taken = here if late_steps is None else self._pose[self._at(late_steps), self._all_envs]
         between = self._age - late
-        came = torch.ones_like(self._has_frame) if came is None else came
         follows, self._has_frame = came & self._has_frame, came | self._has_frame
         moved = _seen_from(self._taken, taken) * follows[:, None]
         self._taken, self._age = torch.where(came[:, None], taken, self._taken), torch.where(came, late, self._age)
@@ -119,16 +119,6 @@ class TimedOdometry:
 
     def _at(self, late_steps: torch.Tensor) -> torch.Tensor:
         return torch.remainder(self._newest - late_steps, len(self._pose))
-
-    def state_dict(self) -> dict:
-        kept = {"pose": self._pose, "quat": self._quat, "taken": self._taken, "age": self._age}
-        kept["has_frame"] = self._has_frame
-        return {"newest": self._newest, **{name: value.clone() for name, value in kept.items()}}
-
-    def load_state_dict(self, state: dict) -> None:
-        self._newest = state["newest"]
-        names = ("pose", "quat", "taken", "age", "has_frame")
-        self._pose, self._quat, self._taken, self._age, self._has_frame = (state[name].clone() for name in names)
 
 
 def _seen_from(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:

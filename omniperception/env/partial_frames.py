@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from omniperception.common.random import Branch
+from omniperception.common.stateful import Stateful
 
 KINDS = ("sector", "thin", "slice", "wedge")
 """What is missing of a frame: an azimuth sector, the same in all frames; all but a share of the points, at random; all
@@ -50,8 +51,10 @@ class PartialFramesConfig:
             raise ValueError(f"randomization.partial_frames.keep={self.keep} must be a share between 0 and 1")
 
 
-class PartialFrames:
+class PartialFrames(Stateful):
     """Draws spells for each environment, and takes points away from its frames while one lasts."""
+
+    saved = ("_left", "_lasts", "_kind", "_offset", "_keep")
 
     def __init__(
         self, config: PartialFramesConfig, period_s: float, num_rays: int, num_envs: int, random: Branch
@@ -109,10 +112,3 @@ class PartialFrames:
         """(n,) int64 frames in a time drawn from a range; `u` (n,) uniform in [0, 1)."""
         low, high = seconds
         return ((low + u * (high - low)) / self._period_s).round().long()
-
-    def state_dict(self) -> dict:
-        return {name: getattr(self, f"_{name}").clone() for name in ("left", "lasts", "kind", "offset", "keep")}
-
-    def load_state_dict(self, state: dict) -> None:
-        for name, value in state.items():
-            setattr(self, f"_{name}", value.clone())

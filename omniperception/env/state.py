@@ -12,6 +12,7 @@ import torch
 
 from omniperception.common.lazy import lazy
 from omniperception.common.rotations import rotate, rotate_yaw
+from omniperception.common.stateful import Stateful
 from omniperception.common.vectors import moved_towards
 from omniperception.env.heights import flat_heights
 from omniperception.env.kinematics import Kinematics
@@ -23,6 +24,8 @@ if TYPE_CHECKING:  # parts that not every task has
     from omnilidar import LidarFrame
     from omniperception.avoidance.avoidance import Avoidance
     from omniperception.avoidance.true_sectors import TrueSectors
+    from omniperception.env.config import EnvConfig
+    from omniperception.env.consumers import FrameConsumer
     from omniperception.env.height_lookup import HeightLookup
     from omniperception.env.mdp.commands import Command
     from omniperception.env.mdp.randomization import Randomizer
@@ -89,7 +92,7 @@ class Obstacles(NamedTuple):
     half_sides: torch.Tensor
 
 
-class EnvState:
+class EnvState(Stateful):
     """State of all environments, (num_envs, ...): a quantity is computed when it is first read, and never otherwise.
 
     Quantities are computed at first use and hold until the environment calls `invalidate`, after the physics steps of a
@@ -120,50 +123,43 @@ class EnvState:
             the step that ended; 0 after a reset, and where no policy says so.
     """
 
+    saved = ("actions", "targets", "stand_s", "last_asked", "_reference", "_history", "_errors", "_foot_times")
+
     def __init__(
         self,
+        config: EnvConfig,
         sim: Simulator,
-        control_dt: float,
+        *,
+        episode_steps: torch.Tensor,
         command: Command,
         randomizer: Randomizer,
-        obstacles: ObstacleField | None,
-        height_lookup: HeightLookup | None,
-        avoidance: Avoidance | None,
-        sensing: LidarSensing | None,
-        errors: MeasurementErrors | None,
-        episode_steps: torch.Tensor,
-        command_acceleration: Sequence[float] | None,
         difficulty: Curriculum,
-        stepping: SteppingConfig | None,
-        declared: frozenset[str],
-        has_legs: bool = True,
-        num_asked: int = 2,
+        errors: MeasurementErrors | None,
+        height_lookup: HeightLookup | None,
+        obstacles: ObstacleField | None,
+        sensing: LidarSensing | None,
+        avoidance: Avoidance | None,
     ) -> None:
         """
         Args:
+            config: of the task.
             sim: the physics.
-            control_dt: s.
+            episode_steps: (num_envs,) int64 control steps since the episodes began, the environment's own.
             command: source of the commands.
             randomizer: of the physics; tells how late `measured` is.
-            obstacles: None without any.
-            height_lookup: heights above ground that is not flat; None on a plane at 0.
-            avoidance: source of V_avoid.
-            sensing: the LiDAR.
-            errors: of what is measured.
-            episode_steps: (num_envs,) int64 control steps since the episodes began, the environment's own.
-            command_acceleration: of `reference`; see `ObservationsConfig`.
             difficulty: share of the randomization; the less of it, the faster `reference` follows.
-            stepping: of `pose`; None: it is the default pose.
-            declared: what terms and others have said that they read; see `requires`.
-            num_asked: components of `last_asked`.
-            has_legs: whether actions move joints; otherwise they are velocities that are asked for.
+            errors: of what is measured.
+            height_lookup: heights above ground that is not flat; None on a plane at 0.
+            obstacles: None without any.
+            sensing: the LiDAR.
+            avoidance: source of V_avoid.
         """
-        self._declared = declared
+        self._declared = config.requirements()
         self._errors, self._episode_steps = errors, episode_steps
         self._velocity_source: Callable[[], torch.Tensor | None] | None = None
         self._asked_source: Callable[[], torch.Tensor | None] | None = None
         self._sim, self._command, self._obstacles, self._height_lookup = sim, command, obstacles, height_lookup
-        self.num_envs, self.device, self.control_dt = sim.num_envs, sim.device, control_dt
+        self.num_envs, self.device, self.control_dt = sim.num_envs, sim.device, config.sim.control_dt
         self._avoidance, self._sensing = avoidance, sensing
         robot, model = sim.world.robot, sim.world.model
         ids = [model.joint(name).id for name in robot.joints]
@@ -176,22 +172,22 @@ class EnvState:
         self.default_base_height = robot.base_height
         self._foot_geoms = tuple(model.geom(name).id for foot in robot.feet for name in foot)
         self._foot_of = _membership([len(foot) for foot in robot.feet], self.device)
-        self._has_legs = has_legs
-        width = robot.num_joints if has_legs else 3
-        self.actions: tuple[torch.Tensor, ...] = (torch.zeros(self.num_envs, width, device=self.device),) * 3
+        self._has_legs = config.sim.has_legs
+        self.actions: tuple[torch.Tensor, ...]
+        self.actions = (torch.zeros(self.num_envs, config.num_actions, device=self.device),) * 3
         self.drawn_physics = randomizer.drawn
         self._history = None if randomizer.delay is None else StateHistory(sim, randomizer)
         self._foot_times: AirTimes | None = None
         self._true_sectors: TrueSectors | None = None
         self.before = self.kinematics
         self.stand_s = torch.zeros(self.num_envs, device=self.device)
-        self.last_asked = torch.zeros(self.num_envs, num_asked, device=self.device)
-        self._command_acceleration, self._difficulty = command_acceleration, difficulty
+        self.last_asked = torch.zeros(self.num_envs, config.num_asked, device=self.device)
+        self._command_acceleration, self._difficulty = config.observations.command_acceleration, difficulty
         self._reference = torch.zeros(self.num_envs, 3, device=self.device)
-        self._rest = self.default_joint_pos if has_legs else torch.zeros(3, device=self.device)
+        self._rest = self.default_joint_pos if self._has_legs else torch.zeros(3, device=self.device)
         self.pose = self._rest.expand(self.num_envs, -1)
         self.targets = (self.pose, self.pose)
-        self._stepping = None if stepping is None else Stepping(stepping, robot, self.device)
+        self._stepping = None if config.stepping is None else Stepping(config.stepping, robot, self.device)
 
     # ---- followed by the environment ---------------------------------------------------------------------------------
 
@@ -256,31 +252,9 @@ class EnvState:
         """Tell whether a quantity has been read since the last `invalidate`."""
         return name in self.__dict__
 
-    def state_dict(self) -> dict:
-        """State that lasts from step to step."""
-        return {
-            "actions": list(self.actions),
-            "targets": list(self.targets),
-            "stand_s": self.stand_s,
-            "last_asked": self.last_asked,
-            "reference": self._reference,
-            "history": self._history and self._history.state_dict(),
-            "errors": self._errors and self._errors.state_dict(),
-            "foot_times": self._foot_times and self._foot_times.state_dict(),
-        }
-
     def load_state_dict(self, state: dict) -> None:
         self.invalidate()
-        self.actions = tuple(state["actions"])
-        self.targets = (state["targets"][0], state["targets"][1])
-        self.stand_s, self._reference = state["stand_s"].clone(), state["reference"].clone()
-        self.last_asked = state["last_asked"].clone()
-        if self._history is not None:
-            self._history.load_state_dict(state["history"])
-        if self._errors is not None:
-            self._errors.load_state_dict(state["errors"])
-        if self._foot_times is not None:
-            self._foot_times.load_state_dict(state["foot_times"])
+        super().load_state_dict(state)
 
     # ---- the robot ---------------------------------------------------------------------------------------------------
 
@@ -494,6 +468,12 @@ class EnvState:
         the cap before the first frame. Requires "distal_range"."""
         return self._part(self._sensing, DISTAL_RANGE).mean_distal_range(max_distance)
 
+    def consumer(self, name: str) -> FrameConsumer:
+        """What `lidar.consumers` has by this name."""
+        if self._sensing is None or name not in self._sensing.consumers:
+            raise UndeclaredQuantity(name, f"of LiDAR frames; give lidar.consumers.{name}")
+        return self._sensing.consumers[name]
+
     def _part(self, part: Part | None, name: str) -> Part:
         """The part that has a quantity, if it was declared: otherwise it is not computed."""
         if part is None or name not in self._declared:
@@ -557,8 +537,10 @@ def with_velocity(state: Kinematics, lin_vel_b: torch.Tensor) -> Kinematics:
     )
 
 
-class StateHistory:
+class StateHistory(Stateful):
     """The physics states that a delayed measurement may show."""
+
+    saved = ("_past",)
 
     def __init__(self, sim: Simulator, randomizer: Randomizer) -> None:
         assert randomizer.delay is not None  # measurements are late
@@ -581,15 +563,8 @@ class StateHistory:
         index = qpos.shape[1] - 1 - self._delay
         return Kinematics(qpos[self._all_envs, index], qvel[self._all_envs, index])
 
-    def state_dict(self) -> dict:
-        return {"past": [past.clone() for past in self._past]}
 
-    def load_state_dict(self, state: dict) -> None:
-        for past, saved in zip(self._past, state["past"], strict=True):
-            past.copy_(saved)
-
-
-class AirTimes:
+class AirTimes(Stateful):
     """Time that each foot has been in the air, updated in every control step; all (num_envs, F).
 
     Attributes:
@@ -597,6 +572,8 @@ class AirTimes:
         last_air: s: of the last such phase that has ended in this episode; 0 before.
         touched_down: bool: contact began in this control step.
     """
+
+    saved = ("air", "last_air", "touched_down")
 
     def __init__(self, contact: torch.Tensor) -> None:
         """Starts all times at 0; `contact` (num_envs, F) bool gives the shape."""
@@ -612,9 +589,3 @@ class AirTimes:
     def reset(self, env_ids: torch.Tensor) -> None:
         for name, value in vars(self).items():
             setattr(self, name, value.index_fill(0, env_ids, 0))
-
-    def state_dict(self) -> dict:
-        return dict(vars(self))
-
-    def load_state_dict(self, state: dict) -> None:
-        vars(self).update(state)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 
 from omniperception.common.random import EnvRandom
+from omniperception.common.stateful import Stateful
 from omniperception.env.kinematics import Kinematics
 from omniperception.scene.ground import Ground
 
@@ -17,7 +18,7 @@ _MIN_SPEED = 1e-3
 """Commands slower than this (m/s) have no direction."""
 
 
-class TerrainLevels:
+class TerrainLevels(Stateful):
     """Follows each environment's episode and chooses the tile of its next one; see `TerrainCurriculumConfig`.
 
     Attributes:
@@ -25,6 +26,8 @@ class TerrainLevels:
         commanded: (num_envs,) distance (m) that was commanded.
         reach: (num_envs,) largest horizontal distance (m) from where the episode started.
     """
+
+    saved = ("walked", "commanded", "reach", "_steps", "_start")  # the levels are the ground's
 
     def __init__(
         self, ground: Ground, random: EnvRandom, control_dt: float, max_episode_length: int, any_tile: bool = False
@@ -106,13 +109,3 @@ class TerrainLevels:
             "Metrics/terrain_level": self._ground.mean_level(),
             **{f"Terrain/level_{kind}": level for kind, level in kinds.items()},
         }
-
-    def state_dict(self) -> dict:
-        """State that `load_state_dict` needs for an exact resume; the levels are the ground's."""
-        totals = torch.stack((self.walked, self.commanded, self.reach, self._steps))
-        return {"totals": totals, "start": self._start.clone()}
-
-    def load_state_dict(self, state: dict) -> None:
-        for total, saved in zip((self.walked, self.commanded, self.reach, self._steps), state["totals"], strict=True):
-            total.copy_(saved)
-        self._start.copy_(state["start"])

@@ -25,7 +25,7 @@ class PerceptionActor(EstimatingModel):
     """An MLP on one-dimensional observation groups and the embedding of the LiDAR history.
 
     While it acts, the embedding is computed without gradients, once per LiDAR frame: as long as it is given the same
-    tensor ``frame_tick``. :meth:`reset` forgets it, which is due when weights change. In an update each distinct window
+    number ``frame_tick``. :meth:`reset` forgets it, which is due when weights change. In an update each distinct window
     of a :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the
     network's embedding of an empty history.
 
@@ -117,7 +117,7 @@ class PerceptionActor(EstimatingModel):
         self.max_change = max_change
         self.asked: torch.Tensor | None = None
         self._check_supervision(obs)
-        self._newest: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # tick, embeddings
+        self._newest: tuple[int, torch.Tensor, torch.Tensor] | None = None  # tick, embeddings
         self._losses: dict[str, list[torch.Tensor]] = {target: [] for target in self.supervision}
 
     def get_latent(
@@ -148,7 +148,7 @@ class PerceptionActor(EstimatingModel):
     def embed_newest(self, obs: TensorDict) -> torch.Tensor:
         """(N, D) embeddings of the current histories, extended for the read-out; the empty one without a frame."""
         frames, count, tick = obs["frames"], obs["frame_count"], obs["frame_tick"]
-        if self._newest is None or self._newest[0] is not tick:
+        if self._newest is None or self._newest[0] != tick:
             features = self._extend(self.perception(frames, count)[:, 0])
             self._newest = (tick, features, self.embed_empty(frames))
         features, empty = self._newest[1:]
@@ -157,7 +157,7 @@ class PerceptionActor(EstimatingModel):
     @property
     def tick(self) -> int | None:
         """Number of the newest LiDAR frame acted on; None after a reset."""
-        return None if self._newest is None else int(self._newest[0][0])
+        return None if self._newest is None else self._newest[0]
 
     def embed(self, obs: WindowedObservations) -> torch.Tensor:
         """(B, D) embeddings of the steps of an update, or (B, D + K) those that were acted on; each window is embedded

@@ -232,7 +232,7 @@ class Stage:
             return scale(points[:, 2] / 2.0)
         assert cloud.elevation is not None
         sensing = self._session.env.sensing
-        split = split_elevation(None if sensing is None else sensing.sampler, sensor)
+        split = split_elevation(None if sensing is None else sensing.history, sensor)
         proximal = cloud.elevation[0, hit].numpy(force=True) > split
         return np.where(proximal[:, None], np.array(PROXIMAL), np.array(DISTAL)).astype(np.uint8)
 

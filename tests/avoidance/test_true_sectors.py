@@ -145,7 +145,7 @@ def test_risk_is_of_what_a_ray_has_hit_alone(risky_env):
         env.step(torch.zeros(5, 12))
     assert env.sensing.due(env.step_count)
     avoidance, kinematics = env.avoidance, env.state.kinematics
-    known = env.sensing.unseen < env.config.remembered_frames
+    known = env.sensing.consumers["Sightings"].unseen < env.config.remembered_frames
     assert known.any() and not known.all()  # the mount is blind behind
 
     def measured(known):
@@ -158,7 +158,7 @@ def test_risk_is_of_what_a_ray_has_hit_alone(risky_env):
     for env_id in range(5):
         seen = {names[k] for k in hit[env_id].unique().tolist() if k >= 0}
         for o, name in enumerate(avoidance.true_sectors.names):
-            assert (env.sensing.unseen[env_id, o] == 0) == (name in seen)
+            assert (env.sensing.consumers["Sightings"].unseen[env_id, o] == 0) == (name in seen)
     env.step(torch.zeros(5, 12))
     kinematics = env.state.kinematics
     assert torch.equal(avoidance.motion, held) and not torch.equal(held, measured(known))
@@ -179,13 +179,13 @@ def test_a_reset_forgets_one_environment_alone(risky_env):
     env._reset(torch.tensor([2]))
     assert not avoidance.risk[2].any() and not avoidance.velocity[2].any() and not encode(avoidance.motion)[2].any()
     assert torch.equal(avoidance.risk[[0, 1, 3, 4]], before[[0, 1, 3, 4]])
-    assert (env.sensing.unseen[2] > 1000).all()
+    assert (env.sensing.consumers["Sightings"].unseen[2] > 1000).all()
 
 
 def test_only_what_is_read_exists(make_config):
     """V_avoid of the paper has no risk; perception alone needs no risk and no sectors; walking needs none of it."""
     paper = OmniEnv(make_config("rewards=default", "num_envs=2").env)
-    assert paper.avoidance.motion is None and paper.avoidance.risk is None and paper.sensing.unseen is None
+    assert paper.avoidance.motion is None and paper.avoidance.risk is None and paper.sensing.seen_within(1) is None
     perceived = OmniEnv(make_config("experiment=avoid", "init=unread", "num_envs=2").env).avoidance
     assert perceived.motion is not None and perceived.risk is None and perceived.sector_distance is None
     assert OmniEnv(make_config("experiment=walk", "num_envs=2").env).avoidance is None

@@ -142,14 +142,14 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
             torch.testing.assert_close(got, expected, atol=1e-5, rtol=0.0)
             inputs = [torch.from_numpy(np.stack([robot.observation for robot in policies.robots]))]
             if policies.robots[0].frames is not None:
-                assert [robot.frame_count for robot in policies.robots] == env.sensing.frame_count.flatten().tolist()
+                assert [robot.frame_count for robot in policies.robots] == env.sensing.history.count.flatten().tolist()
                 torch.testing.assert_close(
                     torch.from_numpy(np.stack([robot.frames for robot in policies.robots])),
-                    env.sensing.frames,
+                    env.sensing.history.frames,
                     atol=1e-5,
                     rtol=0.0,
                 )
-                lost += int((~env.sensing.fresh & (env.sensing.frame_count[:, 0] > 1)).sum())
+                lost += int((~env.sensing.fresh & (env.sensing.history.count[:, 0] > 1)).sum())
                 frames += policies.robots[0].frame_count
                 inputs.append(torch.from_numpy(np.stack([robot.frames for robot in policies.robots])))
                 asked = []
@@ -160,7 +160,7 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
                     limited += int(((ours - asked[0]).norm(dim=1) > 2.0 * env.control_dt - 1e-5).sum())
                 blind = actions_of(scripted(*inputs, torch.zeros(2, 1, dtype=torch.int64), *asked))
                 without_frames = max(without_frames, float((blind - expected).abs().max()))
-                inputs += [env.sensing.frame_count, *asked]
+                inputs += [env.sensing.history.count, *asked]
             torch.testing.assert_close(actions_of(scripted(*inputs)), expected, atol=1e-5, rtol=0.0)
             if torch_side.policy.estimate is not None:
                 estimates = torch.from_numpy(np.stack([robot.base_lin_vel for robot in policies.robots]))
@@ -195,7 +195,7 @@ def test_a_policy_sees_with_a_head_that_turns(tmp_path):
             expected = side.policy(env.get_observations())
             torch.testing.assert_close(policies(env.get_observations()), expected, atol=1e-5, rtol=0.0)
             frames = torch.from_numpy(np.stack([robot.frames for robot in policies.robots]))
-            torch.testing.assert_close(frames, env.sensing.frames, atol=1e-5, rtol=0.0)
+            torch.testing.assert_close(frames, env.sensing.history.frames, atol=1e-5, rtol=0.0)
             if step == 3:
                 env.sim.qpos[:, neck] = torch.tensor([0.8, -0.5], dtype=env.sim.qpos.dtype)
             env.step(expected)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from stepping import random_actions, still
+from stepping import random_actions, still, tensors
 
 from omnilidar import Lidar
 from omniperception.common.random import EnvRandom
@@ -90,7 +90,7 @@ class TestLost:
             for action in random_actions(whole, 2 * len(TestLost.FRESH), scale=0.5):
                 observations = env.step(action)[0]
                 if env.sensing.due(env.step_count):
-                    notes.append({**dict(observations.items()), "unseen": env.sensing.unseen.clone()})
+                    notes.append({**tensors(observations), "unseen": env.sensing.consumers["Sightings"].unseen.clone()})
                     assert not env.done.any()
         return seen
 
@@ -115,10 +115,9 @@ class TestLost:
                 assert int(got["frame_count"][env]) == count, (tick, env)
                 torch.testing.assert_close(got["frames"][env], expected, atol=1e-6, rtol=1e-5)
 
-    def test_ticks_stay_common_and_nothing_is_lost_where_all_come(self, pair):
+    def test_nothing_is_lost_where_all_come(self, pair):
         whole, lossy = pair
         for one, other in zip(whole, lossy, strict=True):
-            assert (one["frame_tick"] == other["frame_tick"]).all()
             assert torch.equal(one["frames"][0], other["frames"][0])
 
     def test_what_a_repeated_frame_shows_stays_seen(self, pair):
@@ -147,7 +146,7 @@ def test_training_keeps_each_frame_once_although_some_are_lost(make_env):
     seen, lost = [], 0
     for step, action in enumerate(random_actions(env, 30, scale=0.3)):
         observations = env.get_observations()
-        storage.record_frames(observations, int(observations["frame_tick"][0]))
+        storage.record_frames(observations, observations["frame_tick"])
         storage.step = step + 1  # transitions beside the frames do not matter here
         seen.append((observations["frames"].clone(), observations["frame_count"].flatten().clone()))
         lost += int((~env.sensing.fresh).sum())

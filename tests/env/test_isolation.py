@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from stepping import FULL, OTHERS, SIMS, assert_equal, outcome, random_actions, still
+from stepping import FULL, OTHERS, SIMS, assert_equal, assert_same, outcome, random_actions, still, tensors
 
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import RewardTerm
@@ -43,7 +43,7 @@ def test_a_saved_state_goes_on_bit_for_bit(make_env, tmp_path, task):
         resumed.step(action)
     save_checkpoint(tmp_path / "state.pt", whole.state_dict())
     resumed.load_state_dict(load_checkpoint(tmp_path / "state.pt"))
-    assert_equal(dict(whole.get_observations()), dict(resumed.get_observations()))
+    assert_equal(tensors(whole.get_observations()), tensors(resumed.get_observations()))
     ends, level = 0, whole.ground.level.clone() if whole.ground else None
     for action in actions[13:]:
         expected = outcome(whole, action)[0]
@@ -73,17 +73,6 @@ def test_a_saved_state_is_no_live_memory(make_env, task):
         env.step(action)
     env.reset()
     assert_same(saved, kept)
-
-
-def assert_same(a, b, path=""):
-    if isinstance(a, torch.Tensor):
-        assert torch.equal(a, b), path
-    elif isinstance(a, dict | list | tuple):
-        pairs = a.items() if isinstance(a, dict) else enumerate(a)
-        for key, value in pairs:
-            assert_same(value, b[key], f"{path}/{key}")
-    else:
-        assert a == b, path
 
 
 def test_a_saved_state_has_its_clouds_and_targets(make_env):

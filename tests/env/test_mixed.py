@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from stepping import assert_equal, random_actions
+from stepping import assert_equal, random_actions, tensors
 
 from omniperception import build, config
 from omniperception.env.env import OmniEnv
@@ -33,7 +33,7 @@ def families(*overrides, num_envs=5, task="blind"):
 
 def step(env, action):
     observations, reward, done, extras = env.step(action)
-    seen = {**dict(observations.items()), "reward": reward, "done": done, "time_outs": extras["time_outs"]}
+    seen = {**tensors(observations), "reward": reward, "done": done, "time_outs": extras["time_outs"]}
     return {name: value.clone() for name, value in seen.items()}
 
 
@@ -76,7 +76,7 @@ def test_a_saved_state_goes_on_bit_for_bit(tmp_path, task):
         resumed.step(action)
     save_checkpoint(tmp_path / "state.pt", whole.state_dict())
     resumed.load_state_dict(load_checkpoint(tmp_path / "state.pt"))
-    assert_equal(dict(whole.get_observations()), dict(resumed.get_observations()))
+    assert_equal(tensors(whole.get_observations()), tensors(resumed.get_observations()))
     for action in actions[9:]:
         assert_equal(step(whole, action), step(resumed, action))
     assert torch.equal(whole.episode_length_buf, resumed.episode_length_buf)
@@ -90,8 +90,7 @@ def test_frames_are_the_same_tensors_between_two_ticks():
         observations = env.step(torch.zeros(5, env.num_actions))[0]
         ticks.append(observations["frame_tick"])
         frames.append(observations["frames"])
-        assert ticks[-1].unique().numel() == 1
-    changes = [a is not b for a, b in pairwise(ticks)]
+    changes = [a != b for a, b in pairwise(ticks)]
     assert changes == [True, False, True, False, True, False, True]  # 0.04 s are two control steps
     assert [a is not b for a, b in pairwise(frames)] == changes
 

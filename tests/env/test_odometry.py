@@ -15,6 +15,7 @@ from omnirobot.wire.sensor_clock import FrameAges
 
 DT = 0.02
 CPU = torch.device("cpu")
+BOTH = torch.ones(2, dtype=torch.bool)
 
 
 def measured(yaw, vx, vy):
@@ -27,30 +28,19 @@ def test_a_straight_walk_and_a_turn_by_hand():
     odometry.start(torch.arange(2), measured(1.0, 0.0, 0.0))
     for _ in range(5):
         odometry.advance(measured(1.0, 0.5, 0.1))
-    assert odometry.since_last_frame()[0].tolist() == pytest.approx([0.05, 0.01, 0.0], abs=1e-6)
+    assert odometry.take(BOTH)[0, 0].tolist() == pytest.approx([0.05, 0.01, 0.0], abs=1e-6)
     odometry.advance(
         measured(1.0 + math.pi / 2, 0.5, 0.0)
     )  # has turned left and walks, as seen from before, to the left
-    assert odometry.since_last_frame()[0].tolist() == pytest.approx([0.0, 0.01, math.pi / 2], abs=1e-6)
-    assert odometry.since_last_frame()[0].tolist() == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
+    assert odometry.take(BOTH)[0, 0].tolist() == pytest.approx([0.0, 0.01, math.pi / 2], abs=1e-6)
+    assert odometry.take(BOTH)[0, 0].tolist() == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
 
 
 def test_the_heading_may_wrap():
     odometry = Odometry(2, DT, CPU)
     odometry.start(torch.arange(2), measured(3.1, 0.0, 0.0))
     odometry.advance(measured(-3.1, 0.0, 0.0))
-    assert odometry.since_last_frame()[0, 2].item() == pytest.approx(2 * math.pi - 6.2, abs=1e-5)
-
-
-def test_a_reset_touches_one_robot_alone_and_a_saved_state_goes_on():
-    odometry, other = Odometry(2, DT, CPU), Odometry(2, DT, CPU)
-    odometry.start(torch.arange(2), measured(0.0, 0.0, 0.0))
-    odometry.advance(measured(0.2, 1.0, 0.0))
-    odometry.start(torch.tensor([1]), measured(2.0, 0.0, 0.0))
-    other.load_state_dict(odometry.state_dict())
-    moved = odometry.since_last_frame()
-    assert moved[1].tolist() == [0.0, 0.0, 0.0] and moved[0, 2].item() == pytest.approx(0.2)
-    assert torch.equal(moved, other.since_last_frame())
+    assert odometry.take(BOTH)[0, 0, 2].item() == pytest.approx(2 * math.pi - 6.2, abs=1e-5)
 
 
 def test_the_runtime_measures_the_same():
@@ -71,7 +61,7 @@ def test_the_runtime_measures_the_same():
         task.start(torch.arange(2), state) if step == 0 else task.advance(state)
         deployed.advance(quat, velocity)
         if step % 7 == 3:
-            assert deployed.since_last_frame() == pytest.approx(task.since_last_frame()[0].numpy(), abs=1e-5)
+            assert deployed.since_last_frame() == pytest.approx(task.take(BOTH)[0, 0].numpy(), abs=1e-5)
 
 
 def circle(step: int) -> tuple[float, float, float]:
@@ -136,7 +126,7 @@ def test_frames_that_bear_their_times():
         each.advance(state(26))
         each.start(torch.tensor([1]), state(26))
     late = torch.zeros(2, dtype=torch.int64)
-    assert torch.equal(*(each.take(None, late) for each in (odometry, again)))
+    assert torch.equal(*(each.take(BOTH, late) for each in (odometry, again)))
 
 
 def test_the_runtime_says_the_same_of_their_times():

@@ -107,16 +107,3 @@ class TestBranches:
     def test_seeds_of_trials_are_refused(self):
         with pytest.raises(ValueError, match="seeds of a reset would be ignored in trials"):
             TrialRandom(2, 5).seed(everyone(5), everyone(5))
-
-    def test_a_saved_state_goes_on(self):
-        def make():
-            random = EnvRandom(4, 3)
-            return random, random.branch("a")
-
-        (whole, branch), (resumed, later) = make(), make()
-        whole.start_episode(torch.tensor([1]))
-        branch.start_episode(torch.tensor([1]))
-        branch.uniform(torch.tensor([0, 1]), (3,))
-        resumed.load_state_dict(whole.state_dict())
-        assert torch.equal(branch.uniform(everyone(3), (4,)), later.uniform(everyone(3), (4,)))
-        assert torch.equal(whole.uniform(everyone(3), (4,)), resumed.uniform(everyone(3), (4,)))

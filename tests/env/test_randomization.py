@@ -275,39 +275,33 @@ def test_the_devices_own_noise_reaches_the_lidar(make_config, lidar, sigma, angl
     assert models == (GaussianNoise(sigma), *([AngularJitter(angle)] if angle else []))
 
 
-def test_noise_of_a_sensor_without_a_maker_is_refused(make_config):
-    with pytest.raises(ValueError, match=r"randomization\.lidar_device needs a sensor whose maker states its noise"):
-        make_config("randomization=device", "lidar=custom")
-
-
 def test_measured_noise_reaches_the_lidar(make_config):
     (table,) = make_config("randomization=lidar_measured", "lidar=mid360").env.lidar_noise
     assert table.dropout_at(0.6) == 0.53 and table.dropout_at(3.0) < 0.01 and table.dropout_at(5.0) == 0.0
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
+    ("randomization", "overrides", "message"),
     [
-        (("lidar=avia",), "needs a sensor of which there is a recording .*but lidar.device is avia"),
-        (("lidar=custom",), "but lidar.device is null; use randomization=device"),
-        (("lidar=mid360", "randomization.lidar_device=true"), "both true"),
+        ("device", ("lidar=custom",), r"randomization\.lidar_device needs a sensor whose maker states its noise"),
+        ("lidar_measured", ("lidar=avia",), "needs a sensor of which there is a recording .*but lidar.device is avia"),
+        ("lidar_measured", ("lidar=custom",), "but lidar.device is null; use randomization=device"),
+        ("lidar_measured", ("lidar=mid360", "randomization.lidar_device=true"), "both true"),
+        (
+            "device",
+            ("lidar=mid360", "randomization.lidar_gaussian={sigma: 0.05}"),
+            r"lidar_gaussian are two .* \(GaussianNoise\)",
+        ),
+        (
+            "device",
+            ("lidar=mid360", "randomization.lidar_jitter={sigma_deg: 0.1}"),
+            r"lidar_jitter are two .* \(AngularJitter\)",
+        ),
     ],
 )
-def test_measured_noise_needs_a_recording(make_config, overrides, message):
+def test_noise_without_a_source_or_with_two_is_refused(make_config, randomization, overrides, message):
     with pytest.raises(ValueError, match=message):
-        make_config("randomization=lidar_measured", *overrides)
-
-
-@pytest.mark.parametrize(
-    ("row", "model"),
-    [("lidar_gaussian={sigma: 0.05}", "GaussianNoise"), ("lidar_jitter={sigma_deg: 0.1}", "AngularJitter")],
-)
-def test_two_noises_of_one_kind_are_refused_by_their_rows(make_config, row, model):
-    name = row.split("=")[0]
-    with pytest.raises(
-        ValueError, match=rf"randomization\.lidar_device and {name} are two .* \({model}\); set lidar_dev"
-    ):
-        make_config("randomization=device", "lidar=mid360", f"randomization.{row}")
+        make_config(f"randomization={randomization}", *overrides)
 
 
 def test_the_critic_sees_what_was_drawn(make_env):

@@ -270,7 +270,7 @@ class TestConfiguration:
         env = make_env("perception=none", "observations=walk", zero)
         assert env.sensing is None
         env = make_env("perception=none", "observations=walk")
-        assert env.sensing is not None and env.sensing.frames is None
+        assert env.sensing is not None and env.sensing.history is None
 
     def test_sum_of_terms_times_the_control_step(self, make_env):
         env = make_env("obstacles=none", "rewards.terms.tilt_squared=null", blind=True)

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from stepping import OTHERS, assert_equal, outcome, random_actions, still
+from stepping import OTHERS, assert_equal, assert_same, outcome, random_actions, still
 
 from omnilidar import OUTPUTS, Lidar
 from omniperception.env.build import build_sampler
+from omniperception.env.consumers import FrameConsumer
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.terms import RewardTerm
 from omniperception.env.state import requires
@@ -17,13 +18,14 @@ from omniperception.env.state import requires
 def test_frames_come_at_tick_times_only(make_env):
     env = make_env("obstacles=static")
     observations = env.get_observations()
+    first = observations["frame_tick"]
     assert env.sensing.period_steps == 5
     for step in range(1, 16):
         before = observations["frames"].clone()
         observations = env.step(still(env))[0]
         changed = not torch.equal(before, observations["frames"])
         assert changed == (step % 5 == 0), step
-        assert (observations["frame_tick"] == 1 + step // 5).all()
+        assert observations["frame_tick"] == first + step // 5
         assert (observations["frame_count"] == 1 + step // 5).all()
         if changed:
             assert torch.equal(observations["frames"][:, :-1], before[:, 1:])
@@ -34,8 +36,8 @@ def test_frame_count_stops_at_the_history_and_points_lie_within_the_range(make_e
     env = make_env("obstacles=static", "perception.history=3", "lidar.period_s=0.02")
     counts = [int(env.step(still(env))[0]["frame_count"][0]) for _ in range(5)]
     assert counts == [2, 3, 3, 3, 3]
-    assert env.sensing.frames.shape[:2] == (4, 3)
-    distance = env.sensing.frames.norm(dim=-1)
+    assert env.sensing.history.frames.shape[:2] == (4, 3)
+    distance = env.sensing.history.frames.norm(dim=-1)
     assert distance.max() <= 1.0 + 1e-6 and distance[distance > 0].min() >= 0.1 / 6.0 - 1e-6
 
 
@@ -43,7 +45,7 @@ def test_a_reset_clears_that_environments_frames_only(make_env):
     env = make_env("obstacles=static", "rewards=paper")
     for _ in range(6):
         env.step(still(env))
-    before, tick = env.sensing.frames.clone(), env.get_observations()["frame_tick"]
+    before, tick = env.sensing.history.frames.clone(), env.get_observations()["frame_tick"]
     sectors = env.avoidance.sector_distance.clone()
     env.sim.qpos[1, 2] = 0.05
     observations, _, done, _ = env.step(still(env))
@@ -51,14 +53,14 @@ def test_a_reset_clears_that_environments_frames_only(make_env):
     assert observations["frame_count"].flatten().tolist() == [2, 0, 2, 2]
     assert (observations["frames"][1] == 0).all()
     assert torch.equal(observations["frames"][OTHERS], before[OTHERS])
-    assert observations["frame_tick"] is tick  # by which an actor knows that it has embedded the others' frames
+    assert observations["frame_tick"] == tick  # by which an actor knows that it has embedded the others' frames
     assert torch.equal(env.avoidance.sector_distance[OTHERS], sectors[OTHERS])
     assert (env.avoidance.sector_distance[1] == 6.0).all()
     assert env.sensing.mean_distal_range(6.0)[1] == 6.0  # the last episode's distances are forgotten, too
     for _ in range(3):
         observations = env.step(still(env))[0]
     assert observations["frame_count"].flatten().tolist() == [3, 1, 3, 3]
-    assert tick.flatten().tolist() == [2] * 4 and observations["frame_tick"].flatten().tolist() == [3] * 4
+    assert observations["frame_tick"] == tick + 1
     assert (observations["frames"][1, :-1] == 0).all() and (observations["frames"][1, -1] != 0).any()
     assert env.sensing.mean_distal_range(6.0)[1] < 6.0
 
@@ -105,7 +107,7 @@ def test_noise_reaches_the_points_and_not_the_reward(make_env):
     clean, noisy = make_env("obstacles=static"), make_env("obstacles=static", "randomization=lidar")
     torch.testing.assert_close(clean.avoidance.sector_distance, noisy.avoidance.sector_distance)
     assert torch.equal(clean.sensing.frame.true_ranges, noisy.sensing.frame.true_ranges)
-    assert not torch.equal(clean.sensing.frames, noisy.sensing.frames)
+    assert not torch.equal(clean.sensing.history.frames, noisy.sensing.history.frames)
 
 
 def test_sector_target_is_the_nearness_of_obstacles(make_env):
@@ -145,7 +147,7 @@ def test_no_frames_until_the_curriculum_has_obstacles(make_env):
     env = make_env("experiment=quickstart", "perception.sampler.num_proximal=8")
     for _ in range(6):
         env.step(still(env))
-    assert env.obstacles.level == 0.0 and env.sensing.tick == 0 and not env.sensing.frame_count.any()
+    assert env.obstacles.level == 0.0 and env.sensing.tick == 0 and not env.sensing.history.count.any()
     assert "rays" not in env.timer.seconds
     env.obstacles.level = 0.5
     for _ in range(5):
@@ -264,8 +266,8 @@ class TestSlices:
                 env.episode_length_buf[step % 5] = env.max_episode_length - 1 if step % 4 == 1 else 5
             actions = 0.3 * torch.sin(torch.arange(60.0).reshape(5, 12) + step)
             assert_equal(outcome(whole, actions)[0], outcome(sliced, actions)[0])
-        if whole.sensing.unseen is not None:
-            assert torch.equal(whole.sensing.unseen, sliced.sensing.unseen)
+        for consumer, other in zip(*(each.sensing.consumers.values() for each in (whole, sliced)), strict=True):
+            assert_same(consumer.state_dict(), other.state_dict())
 
     def test_reading_a_whole_cloud_that_does_not_fit_is_refused(self, make_env):
         env = make_env("obstacles=static", "lidar.cloud_mb=0.1", num_envs=5)
@@ -283,3 +285,47 @@ class TestSlices:
         env = OmniEnv(replace(config, rewards=replace(config.rewards, terms=terms)))
         env.step(torch.zeros(5, 12))
         assert len(env.sensing.lidar.env_slices) == 1 and env.rewards.weighted["nearest"].min() > 0
+
+
+class Nearest(FrameConsumer):
+    """A consumer of one's own: the least range of each cloud, and how many frames there have been."""
+
+    outputs = ("true_ranges",)
+    saved = ("least", "frames")
+
+    def attach(self, sensing):
+        super().attach(sensing)
+        self.least, self.frames = torch.zeros(sensing.num_envs), 0
+
+    def take(self, envs, frame):
+        self.least[envs] = frame.true_ranges.amin(1)
+
+    def finish(self):
+        self.frames += 1
+
+    def reset(self, env_ids):
+        self.least[env_ids] = 0.0
+
+
+@pytest.mark.parametrize("cloud_mb", [0.01, 1000.0])
+def test_a_consumer_of_ones_own_stands_beside_the_others(make_env, cloud_mb):
+    """Alone it has the LiDAR built, and rays compute what it reads; it is reset and saved with the rest."""
+    task = make_env("obstacles=static", blind=True, num_envs=5).config
+    sensor = make_env("obstacles=static", "perception=none", num_envs=5).config.lidar
+    sensor = replace(sensor, consumers={"near": Nearest}, cloud_mb=cloud_mb)
+    env, resumed = (OmniEnv(replace(task, lidar=sensor)) for _ in range(2))
+    near = env.state.consumer("near")
+    assert env.sensing.lidar.outputs == {"true_ranges"} and env.sensing.sliced == (cloud_mb < 1)
+    for action in random_actions(env, 6, scale=0.3):
+        env.step(action)
+    assert near.frames == env.sensing.tick == 2 and (near.least > 0.1).all()
+    if not env.sensing.sliced:
+        assert torch.equal(near.least, env.sensing.frame.true_ranges.amin(1))
+    resumed.load_state_dict(env.state_dict())
+    for each in (env, resumed):
+        each.reset(torch.tensor([2]))
+        each.step(torch.zeros(5, 12))
+        assert each.state.consumer("near").least.gt(0).tolist() == [True, True, False, True, True]
+    assert torch.equal(near.least, resumed.state.consumer("near").least)
+    with pytest.raises(ValueError, match="reads far of LiDAR frames; give lidar.consumers.far"):
+        env.state.consumer("far")

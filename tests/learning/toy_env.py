@@ -1,6 +1,7 @@
 """A tiny deterministic environment with LiDAR frames, resets and time-outs, and configurations to train on it."""
 
 import functools
+import itertools
 
 import numpy as np
 import torch
@@ -8,10 +9,12 @@ from rsl_rl.env import VecEnv
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
+from omniperception.env.env import frame_number
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.perception import PdRiskNet, PdSampler
 
 HISTORY, POINTS, PERIOD = 4, 3, 5
+FIRST = itertools.count(0, 1 << 32)
 STATE = ("step_count", "tick", "position", "episode_length_buf", "frames", "frame_count")
 
 
@@ -28,11 +31,11 @@ class ToyEnv(VecEnv):
         self.has_frames, self.period = frames, period
         self.rng = np.random.default_rng(seed)
         self.step_count = 0
-        self.tick = 0
+        self.tick, self.first = 0, next(FIRST)
         self.position = torch.tensor(self.rng.normal(size=(num_envs, 2)), dtype=torch.float32)
         self.episode_length_buf = torch.arange(num_envs) * 3 % episode
         self.frames = torch.zeros(num_envs, history, POINTS, 3)
-        self.frame_count, self.frame_tick = torch.zeros(2, num_envs, 1, dtype=torch.long).unbind(0)
+        self.frame_count = torch.zeros(num_envs, 1, dtype=torch.long)
 
     curriculum_levels = (1.0,)
 
@@ -48,7 +51,7 @@ class ToyEnv(VecEnv):
         if self.has_frames:
             groups["frames"] = self.frames
             groups["frame_count"] = self.frame_count.clone()
-            groups["frame_tick"] = self.frame_tick
+            groups["frame_tick"] = frame_number(self.first + self.tick, self.num_envs, torch.device("cpu"))
         return TensorDict(groups, batch_size=[self.num_envs])
 
     def step(self, actions):
@@ -70,7 +73,6 @@ class ToyEnv(VecEnv):
         noise = torch.randn(self.num_envs, POINTS, 1) * 0.01  # torch's global generator
         self.frames[:, -1] = torch.cat([self.position, torch.ones(self.num_envs, 1)], -1).unsqueeze(1) * 0.1 + noise
         self.frame_count = (self.frame_count + 1).clamp(max=self.frames.shape[1])
-        self.frame_tick = torch.full_like(self.frame_tick, self.tick)
 
     def _reset(self, ids):
         self.position[ids] = torch.tensor(self.rng.normal(size=(len(ids), 2)), dtype=torch.float32)
@@ -86,7 +88,6 @@ class ToyEnv(VecEnv):
         self.rng.bit_generator.state = state["rng"]
         for name in STATE:
             setattr(self, name, state[name])
-        self.frame_tick = torch.full_like(self.frame_tick, self.tick)
 
 
 def config(frames=True, supervised=False, **ppo):

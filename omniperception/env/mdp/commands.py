@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 import torch.nn.functional as F
 
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import rotate_yaw
+from omniperception.common.stateful import Stateful
 from omniperception.env.kinematics import Kinematics
 from omniperception.env.mdp.curriculum import Curriculum, CurriculumConfig
 
@@ -143,7 +143,7 @@ class GoalCommandConfig:
         return GoalCommand(self, num_envs, device, random)
 
 
-class Command(Protocol):
+class Command(Stateful):
     """A source of commands.
 
     Attributes:
@@ -152,21 +152,19 @@ class Command(Protocol):
     """
 
     value: torch.Tensor
-
-    @property
-    def goal_w(self) -> torch.Tensor | None: ...
+    goal_w: torch.Tensor | None = None
 
     def reset(self, env_ids: torch.Tensor, kinematics: Kinematics) -> None:
         """Draws new commands for some environments (n,); `kinematics` of all."""
+        raise NotImplementedError
 
-    def advance(self, dt: float, kinematics: Kinematics) -> None: ...
+    def advance(self, dt: float, kinematics: Kinematics) -> None:
+        """A control step of `dt` (s)."""
+        raise NotImplementedError
 
     def reached(self, kinematics: Kinematics, time_s: torch.Tensor | float) -> torch.Tensor | None:
         """(num_envs,) bool whether the goal is reached, time_s (num_envs,) into the episodes; None without one."""
-
-    def state_dict(self) -> dict: ...
-
-    def load_state_dict(self, state: dict) -> None: ...
+        return None
 
 
 _ROUNDING_S = 1e-3  # of times that are sums or products of control steps
@@ -174,7 +172,7 @@ SETTLE_S = 0.5
 """Time (s) after a new command from which on a robot is held to it."""
 
 
-class VelocityCommand:
+class VelocityCommand(Command):
     """Draws a new velocity at every reset and after every `resample_s`.
 
     Attributes:
@@ -183,10 +181,11 @@ class VelocityCommand:
         age: (num_envs,) s since the last one.
     """
 
+    saved, buffers = ("curriculum",), ("value", "time_left", "age")
+
     def __init__(self, config: VelocityCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
         self.config = config
         self.value = torch.zeros(num_envs, 3, device=device)
-        self.goal_w = None
         self.curriculum = Curriculum(config.curriculum)
         self.time_left, self.age = torch.zeros(2, num_envs, device=device).unbind(0)
         self._random = random
@@ -203,18 +202,6 @@ class VelocityCommand:
         expired = (self.time_left <= 0).nonzero().flatten()
         if len(expired):
             self._draw(expired)
-
-    def reached(self, kinematics: Kinematics, time_s: torch.Tensor | float) -> None:
-        return None
-
-    def state_dict(self) -> dict:
-        tensors = {name: getattr(self, name).clone() for name in ("value", "time_left", "age")}
-        return tensors | self.curriculum.state_dict()
-
-    def load_state_dict(self, state: dict) -> None:
-        for name in ("value", "time_left", "age"):
-            getattr(self, name).copy_(state[name])
-        self.curriculum.load_state_dict(state)
 
     @property
     def settled(self) -> torch.Tensor:
@@ -234,7 +221,7 @@ ROUTE_WINDOW = 1.0
 """How far (m) on along a route the point nearest to the robot is looked for, so that it skips no bend behind a wall."""
 
 
-class GoalCommand:
+class GoalCommand(Command):
     """Points to the goal from wherever the robot is, or to a place ahead on a route there.
 
     Attributes:
@@ -243,6 +230,9 @@ class GoalCommand:
         progress: (num_envs,) m, the way along the routes to the points nearest to the robots; never falls.
         speed: (num_envs, 1) m/s, what is commanded on the way.
     """
+
+    goal_w: torch.Tensor
+    saved, buffers = ("route_w", "along", "progress", "speed"), ("value", "goal_w")
 
     def __init__(self, config: GoalCommandConfig, num_envs: int, device: torch.device, random: EnvRandom) -> None:
         self.config = config
@@ -323,20 +313,6 @@ class GoalCommand:
     def _distance(self, kinematics: Kinematics, point_w: torch.Tensor) -> torch.Tensor:
         """(num_envs,) m, horizontal, from the bases to points (num_envs, 2)."""
         return (point_w - kinematics.base_pos_w[:, :2]).norm(dim=1)
-
-    def state_dict(self) -> dict:
-        names = ("value", "goal_w", *(() if self.route_w is None else ("route_w", "progress")))
-        names += ("speed",) if self._draws_speed else ()
-        return {name: getattr(self, name).clone() for name in names}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.value.copy_(state["value"])
-        self.goal_w.copy_(state["goal_w"])
-        if self._draws_speed:
-            self.speed.copy_(state["speed"])
-        if "route_w" in state:
-            self.route_w, self.progress = state["route_w"].clone(), state["progress"].clone()
-            self.along = _along(self.route_w)
 
 
 def _along(route: torch.Tensor) -> torch.Tensor:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from omniperception.common.stateful import Stateful
+
 
 @dataclass(frozen=True)
 class CurriculumConfig:
@@ -28,12 +30,14 @@ class CurriculumConfig:
                 raise ValueError(f"curriculum.{key}={getattr(self, key)} must be positive")
 
 
-class Curriculum:
+class Curriculum(Stateful):
     """A share that rises while robots walk well, and falls while they do not.
 
     Attributes:
         level: the share, 0 to 1; 1 from the beginning without a curriculum.
     """
+
+    saved = ("level",)
 
     def __init__(self, config: CurriculumConfig | None) -> None:
         self._config = config
@@ -50,12 +54,6 @@ class Curriculum:
         if config is not None:
             change = config.rise * seconds * (1.0 if velocity_error < config.max_velocity_error else -1.0)
             self.level = min(max(self.level + change, config.start), 1.0)
-
-    def state_dict(self) -> dict:
-        return {"level": self.level}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.level = state["level"]
 
 
 FULL = Curriculum(None)

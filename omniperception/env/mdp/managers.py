@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 
+from omniperception.common.stateful import Stateful
 from omniperception.env.mdp.terms import ObservationGroup, RewardTerm, StatefulTerm, build_term
 from omniperception.env.state import EnvState
 
 
-class RewardManager:
+class RewardManager(Stateful):
     """The weighted sum of the reward terms.
 
     Attributes:
         weighted: (num_envs,) of each term in the last step, times its weight and the control step.
     """
 
+    saved = ("_stateful",)
+
     def __init__(self, terms: Mapping[str, RewardTerm], state: EnvState) -> None:
         """Raises ValueError for a term that does not return (num_envs,)."""
         self._weights = {name: term.weight for name, term in terms.items()}
         self._terms = {name: build_term(term.func) for name, term in terms.items()}
+        self._stateful = _stateful(self._terms)
         self.weighted: dict[str, torch.Tensor] = {}
         for name, term in self._terms.items():
             _check_shape(f"rewards.terms.{name}", term(state), (state.num_envs,), f"({state.num_envs},)")
@@ -38,18 +41,11 @@ class RewardManager:
 
     def reset(self, env_ids: torch.Tensor) -> None:
         """Resets the terms with memory for environments (n,) that begin an episode."""
-        for term in _stateful(self._terms).values():
+        for term in self._stateful.values():
             term.reset(env_ids)
 
-    def state_dict(self) -> dict:
-        return {name: term.state_dict() for name, term in _stateful(self._terms).items()}
 
-    def load_state_dict(self, state: dict) -> None:
-        for name, term in _stateful(self._terms).items():
-            term.load_state_dict(state[name])
-
-
-class ObservationManager:
+class ObservationManager(Stateful):
     """One observation group: its terms in order, and their history if it has one.
 
     Attributes:
@@ -57,9 +53,12 @@ class ObservationManager:
         width: numbers of a control step.
     """
 
+    saved = ("_history", "_stateful")
+
     def __init__(self, name: str, group: ObservationGroup, state: EnvState) -> None:
         """Raises ValueError for a term that does not return (num_envs, width)."""
         self._terms = {term_name: build_term(term) for term_name, term in group.terms.items()}
+        self._stateful = _stateful(self._terms)
         self.slices: dict[str, slice] = {}
         self.width = 0
         for term_name, term in self._terms.items():
@@ -88,7 +87,7 @@ class ObservationManager:
 
     def peek(self, state: EnvState) -> torch.Tensor:
         """(num_envs, history * width) what `compute` would return, which leaves everything as it is."""
-        before = copy.deepcopy(self.state_dict())
+        before = self.state_dict()
         values = self.compute(state, torch.zeros(0, dtype=torch.int64, device=state.device))
         self.load_state_dict(before)
         return values
@@ -96,24 +95,15 @@ class ObservationManager:
     def begin(self, state: EnvState, fresh: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
         """`observed` (num_envs, history * width), which `compute` returned last, with episodes that begin in some
         environments `fresh` (n,); history and memory of the others stay as they are."""
-        before = copy.deepcopy(self.state_dict())
+        before = self.state_dict()
         values = self.compute(state, fresh)
         self.load_state_dict(_with_rows(before, self.state_dict(), fresh))
         return observed.index_copy(0, fresh, values[fresh])
 
     def reset(self, env_ids: torch.Tensor) -> None:
         """Resets the terms with memory for environments (n,) that begin an episode."""
-        for term in _stateful(self._terms).values():
+        for term in self._stateful.values():
             term.reset(env_ids)
-
-    def state_dict(self) -> dict:
-        terms = {name: term.state_dict() for name, term in _stateful(self._terms).items()}
-        return {"history": self._history, "terms": terms}
-
-    def load_state_dict(self, state: dict) -> None:
-        self._history = state["history"]
-        for name, term in _stateful(self._terms).items():
-            term.load_state_dict(state["terms"][name])
 
 
 def _check_shape(name: str, value: torch.Tensor, shape: tuple[int, ...], expected: str) -> None:

@@ -7,17 +7,20 @@ import math
 import torch
 
 from omniperception.common.random import Branch
+from omniperception.common.stateful import Stateful
 from omniperception.env.mdp.curriculum import FULL, Curriculum
 from omniperception.env.mdp.randomization import PushesConfig
 from omniperception.sim import Simulator
 
 
-class Pushes:
+class Pushes(Stateful):
     """Pushes each environment's robot at times and in directions of its own.
 
     Attributes:
         countdown: (num_envs,) int64 control steps until the next push; it comes in the step that begins at 0.
     """
+
+    saved = ("countdown",)
 
     def __init__(
         self, config: PushesConfig, sim: Simulator, control_dt: float, random: Branch, curriculum: Curriculum = FULL
@@ -54,9 +57,3 @@ class Pushes:
         """(n,) int64 control steps from one push to the next, at least 1; `u` (n,) uniform in [0, 1)."""
         low, high = self._config.every_s
         return ((low + u * (high - low)) / self._dt).round().long().clamp(min=1)
-
-    def state_dict(self) -> dict:
-        return {"countdown": self.countdown.clone()}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.countdown.copy_(state["countdown"])

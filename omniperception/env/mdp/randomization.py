@@ -11,6 +11,7 @@ import torch
 
 from omnilidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
 from omniperception.common.random import EnvRandom
+from omniperception.common.stateful import Stateful
 from omniperception.env.mdp.curriculum import FULL, Curriculum, CurriculumConfig
 from omniperception.env.partial_frames import PartialFramesConfig
 from omniperception.scene.terrain import ground_solrefs
@@ -223,8 +224,10 @@ class RandomizationConfig:
         return tuple(model for model in models if not isinstance(model, bool | None))
 
 
-class Randomizer:
+class Randomizer(Stateful):
     """Draws each environment's physical parameters at its resets and writes them into the simulator's model."""
+
+    buffers = ("drawn", "delay")
 
     def __init__(
         self, config: RandomizationConfig, sim: Simulator, random: EnvRandom, curriculum: Curriculum = FULL
@@ -291,15 +294,6 @@ class Randomizer:
             self.delay[env_ids] = steps.clamp(max=self.max_delay)  # drawn in float32, which rounds half steps anyhow
         if self._mass:
             self._set_masses(env_ids, drawn)
-
-    def state_dict(self) -> dict:
-        """Parameters that live outside the physics model."""
-        return {"drawn": self.drawn.clone(), "delay": None if self.delay is None else self.delay.clone()}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.drawn.copy_(state["drawn"])
-        if self.delay is not None:
-            self.delay.copy_(state["delay"])
 
     def _write(self, field: str, env_ids: torch.Tensor, values: torch.Tensor, *index: int) -> None:
         """Writes float64 values into a model field of some environments, at an index, in the engine's precision."""

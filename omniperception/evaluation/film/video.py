@@ -210,7 +210,7 @@ class Recorder:
         points_s = frame.directions_s[env_id, hit] * frame.ranges[env_id, hit, None]
         points_c = rotate(points_s.new_tensor(config.quat), points_s) + points_s.new_tensor(config.mount_pos)
         at, turned = (pose[env_id, sensing.carrier] for pose in (sensing.scene.body_pos, sensing.scene.body_quat))
-        return rotate(turned, points_c) + at, frame.elevation[env_id, hit] > split_elevation(sensing.sampler, config)
+        return rotate(turned, points_c) + at, frame.elevation[env_id, hit] > split_elevation(sensing.history, config)
 
     def _interest(self, env_id: int) -> float:
         """Score of a picture: the robot walks ahead, and its LiDAR sees obstacles."""

@@ -111,7 +111,7 @@ def baseline(name: str, env: OmniEnv, policy: Policy, avoidance: AvoidanceConfig
 
 def blind(env: OmniEnv, policy: Policy) -> Policy:
     """The policy as it acts before its first frame: in an environment that never shows it one."""
-    if env.sensing is None or env.sensing.frames is None:
+    if env.sensing is None or env.sensing.history is None:
         raise ValueError("this policy does not look at the LiDAR, it is blind already; leave policy=blind out")
     _check_hidden(env)
     return policy
@@ -212,7 +212,7 @@ class _Histogram:
         self._odometry.advance(measured)
         self._odometry.start(begun.nonzero().flatten(), measured)
         self._tracks.reset(begun)
-        self._tracks.advance(self._odometry.since_last_frame(), self._env.control_dt)
+        self._tracks.advance(self._odometry.take(torch.ones_like(begun))[:, 0], self._env.control_dt)
         if (new := clouds.new()) is not None:
             nearest, fresh = new
             self._tracks.update(nearest.distance, nearest.place, fresh)
@@ -302,7 +302,7 @@ def _driven(env: OmniEnv, policy: Policy, steering: Steering, limits: Limits | N
 
 
 def _check_hidden(env: OmniEnv) -> None:
-    if env.sensing is not None and env.sensing.frames is not None and env.config.network_sees_frames:
+    if env.sensing is not None and env.sensing.history is not None and env.config.network_sees_frames:
         raise ValueError(
             "this task shows the network LiDAR frames; prepare it with EnvConfig.network_sees_frames=False"
         )

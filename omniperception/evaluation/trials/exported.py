@@ -54,11 +54,11 @@ class ExportedPolicies:
             return [None] * env.num_envs
         self._tick = env.sensing.tick
         frame = env.sensing.frame
-        assert frame is not None  # it has ticked
+        assert frame is not None and env.sensing.history is not None  # it has ticked, and the policy looks
         for robot, came in zip(self.robots, env.sensing.fresh.tolist(), strict=True):
             if not came:
                 robot.repeat_frame()
-        new = (env.sensing.fresh & (env.sensing.frame_count[:, 0] > 0)).tolist()
+        new = (env.sensing.fresh & (env.sensing.history.count[:, 0] > 0)).tolist()
         return [cloud if is_new else None for cloud, is_new in zip(raw_points(frame), new, strict=True)]
 
 
