@@ -72,7 +72,7 @@ class Runner:
         """
         distributed.connect(device)
         self.env, self.config, self.device = env, config, device
-        self.alg = PerceptivePpo.build(env, config, device, distributed.multi_gpu())
+        self.alg = PerceptivePpo(env, config, device, distributed.multi_gpu())
         actor = self.alg.actor
         if config.estimator is not None and estimates_velocity(env.config.observations):
             env.state.measure_velocity_by(lambda: actor.estimate)

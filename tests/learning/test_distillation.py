@@ -24,7 +24,7 @@ def algorithm(env, frames, **distillation):
     torch.manual_seed(0)
     wanted = DistillationConfig("somewhere", **{"iterations": 20, "learning_rate": 1e-2, **distillation})
     settings = replace(config(frames, num_learning_epochs=4), distillation=wanted)
-    return PerceptivePpo.build(env, settings, "cpu")
+    return PerceptivePpo(env, settings, "cpu")
 
 
 def test_a_teacher_follows_command_and_avoidance_together():

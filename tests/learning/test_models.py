@@ -78,7 +78,7 @@ def test_features_once_per_tick_until_the_actor_is_reset():
 
 def test_weights_that_learn_or_are_loaded_are_used_at_once():
     env = ToyEnv(6)
-    alg, other = (PerceptivePpo.build(env, config(supervised=True), "cpu") for _ in range(2))
+    alg, other = (PerceptivePpo(env, config(supervised=True), "cpu") for _ in range(2))
     collect(alg, env, 8)
     obs = env.get_observations()
     with torch.inference_mode():

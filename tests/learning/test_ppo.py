@@ -12,7 +12,7 @@ from omniperception.learning.ppo import FIRST_LEARNING_RATE
 
 def algorithm(env, num_steps=8, frames=True, **options):
     torch.manual_seed(0)
-    return PerceptivePpo.build(env, config(frames, num_steps_per_env=num_steps, **options), "cpu")
+    return PerceptivePpo(env, config(frames, num_steps_per_env=num_steps, **options), "cpu")
 
 
 def collected(num_envs=4, frames=True, num_steps=8, **options):
@@ -103,9 +103,9 @@ def test_an_exploding_learning_rate_ends_in_a_clear_stop():
 
 def test_symmetry_and_frames_are_refused():
     with pytest.raises(ValueError, match="one-dimensional observations only"):
-        PerceptivePpo.build(ToyEnv(4), replace(config(), mirror=lambda **_: None), "cpu")
+        PerceptivePpo(ToyEnv(4), replace(config(), mirror=lambda **_: None), "cpu")
     with pytest.raises(ValueError, match="observations.actor is empty"):
-        PerceptivePpo.build(ToyEnv(4), replace(config(), actor_groups=()), "cpu")
+        PerceptivePpo(ToyEnv(4), replace(config(), actor_groups=()), "cpu")
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_the_critic_warms_up_alone():
 )  # None is in the files of older runs
 def test_updates_multiply_in_the_precision_that_is_asked_for(given, dtype):
     env, kinds = ToyEnv(6), set()
-    alg = PerceptivePpo.build(env, config(frames=False, mixed_precision=given), "cpu")
+    alg = PerceptivePpo(env, config(frames=False, mixed_precision=given), "cpu")
     collect(alg, env, 8)
     first = next(module for module in alg.actor.modules() if isinstance(module, torch.nn.Linear))
     first.register_forward_hook(lambda module, inputs, result: kinds.add(result.dtype))

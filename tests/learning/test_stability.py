@@ -22,7 +22,7 @@ def finite_weights(alg):
 
 def test_a_frame_that_is_not_finite_does_not_reach_a_supervised_network():
     env = ToyEnv(6)
-    alg = PerceptivePpo.build(env, config(supervised=True), "cpu")
+    alg = PerceptivePpo(env, config(supervised=True), "cpu")
     collect(alg, env, 8)
     alg.storage.frames[2] = float("nan")
     line = stopped_by(alg)

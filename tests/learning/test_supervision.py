@@ -19,7 +19,7 @@ def algorithm(env, avoidance_weight=0.0, network=None, **ppo):
     if network is not None:
         sampler = functools.partial(FpsSampler, 3, max_range=5.0)
         perception = replace(perception, sampler=sampler, network=functools.partial(network), height_weight=0.0)
-    return PerceptivePpo.build(env, replace(cfg, perception=perception), "cpu")
+    return PerceptivePpo(env, replace(cfg, perception=perception), "cpu")
 
 
 def parameters(module):
@@ -74,7 +74,7 @@ def test_ppo_sees_what_the_policy_acted_on_and_does_not_change_it(avoidance_weig
 
 def test_a_policy_may_be_supervised_from_some_iteration_on():
     env = ToyEnv(6)
-    alone = PerceptivePpo.build(env, config(), "cpu")
+    alone = PerceptivePpo(env, config(), "cpu")
     collect(alone, env, 8)
     alone.update()
     supervised = algorithm(env)
@@ -111,7 +111,7 @@ def test_without_epochs_of_ppo_the_policy_stays_as_it_is():
 def test_the_learning_rate_falls():
     env, cfg = ToyEnv(4), config(max_iterations=4, num_learning_epochs=0)
     perception = replace(cfg.perception, supervised_epochs=1, learning_rate=1e-3, final_learning_rate=2e-4)
-    alg, rates = PerceptivePpo.build(env, replace(cfg, perception=perception), "cpu"), []
+    alg, rates = PerceptivePpo(env, replace(cfg, perception=perception), "cpu"), []
     for _ in range(5):
         collect(alg, env, 8)
         alg.update()
