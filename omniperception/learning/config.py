@@ -18,6 +18,7 @@ from omniperception.learning.log_writers import LoggerConfig
 from omniperception.learning.navigation import NavigationConfig, VelocityInput
 from omniperception.perception import PerceptionNetwork, Sampler
 
+
 @dataclass(frozen=True)
 class PerceptionConfig:
     """Configuration of the actor's perception.

@@ -63,7 +63,7 @@ class PerceptionActor(EstimatingModel):
         navigation: asks for velocities in place of the sum, or None.
         max_change: most (m/s) by which the sum changes from step to step; None: no limit.
         asked: (N, 2) m/s, or (N, 3) with navigation, which turns (rad/s), too: the sum that the newest actions were
-            computed from; None before the first, and without a read-out.
+            computed from; None before the first, and without a limit.
     """
 
     def __init__(self, obs: TensorDict, config: LearningConfig, num_actions: int) -> None:
@@ -136,7 +136,7 @@ class PerceptionActor(EstimatingModel):
             if self.read_out is None:
                 return groups, features
             asked, command = self._ask(groups, features, has_frame), groups[COMMAND]
-            if not is_update:
+            if not is_update and self.max_change is not None:
                 self.asked = asked
             groups = groups.clone(recurse=False)
             groups[COMMAND] = torch.cat((asked, command[:, asked.shape[1] :]), 1)
@@ -254,7 +254,7 @@ class PerceptionActor(EstimatingModel):
         """
         assert self.navigation is not None and self.max_change is not None
         sectors, risks = self._surroundings(features, has_frame)
-        wanted = self.navigation(sectors, command, velocity, last_asked, risks=risks)
+        wanted = self.navigation(sectors, command, velocity, last_asked, risks)
         wanted = torch.where(has_frame[:, None], wanted, command)
         linear = moved_towards(last_asked[:, :2], wanted[:, :2], self.max_change)
         turn = last_asked[:, 2:] + (wanted - last_asked)[:, 2:].clamp(-self._max_turn, self._max_turn)
@@ -335,4 +335,4 @@ class PerceivingNavigator(PerceptionActor):
         assert self.navigation is not None
         groups, features, has_frame = self._embedded(obs)
         sectors, risks = self._surroundings(features, has_frame)
-        return self.navigation.inputs(sectors, groups[COMMAND], groups[MOTION], groups[ASKED], risks=risks)
+        return self.navigation.inputs(sectors, groups[COMMAND], groups[MOTION], groups[ASKED], risks)

@@ -114,11 +114,18 @@ class Navigator(nn.Module):
         self.mlp = CorrectedChoice(config)
         self.register_buffer("candidates", config.risk.candidates(), persistent=False)
 
-    def inputs(self, *given: torch.Tensor, risks: torch.Tensor | None = None) -> torch.Tensor:
-        """`navigation_inputs` (n, D) of sectors, reference, velocity and what is asked for."""
-        return navigation_inputs(*given, self.risk, self.candidates, risks)
+    def inputs(
+        self,
+        sectors: torch.Tensor,
+        reference: torch.Tensor,
+        velocity: torch.Tensor,
+        asked: torch.Tensor,
+        risks: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """`navigation_inputs` (n, D)."""
+        return navigation_inputs(sectors, reference, velocity, asked, self.risk, self.candidates, risks)
 
-    def forward(self, *given: torch.Tensor, risks: torch.Tensor | None = None) -> torch.Tensor:
+    def forward(self, *given: torch.Tensor | None) -> torch.Tensor:
         """(n, 3) what a gait is to be asked for; arguments as `inputs` takes them."""
-        wanted = self.mlp(self.inputs(*given, risks=risks))
+        wanted = self.mlp(self.inputs(*given))  # type: ignore[arg-type]
         return torch.minimum(torch.maximum(wanted, self.least), self.most)

@@ -75,6 +75,7 @@ class FitPerception(Phase):
     """
 
     def __init__(self, alg: PerceptivePpo) -> None:
+        assert alg.config.perception is not None
         self.config = alg.config.perception
         trained = {"perception network": list(alg.actor.perception_parameters())}
         super().__init__(alg, trained, self.config.learning_rate, alg.max_grad_norm)
@@ -151,10 +152,10 @@ class Distil(Phase):
 
     def update(self, storage: PerceptiveStorage) -> dict[str, float]:
         """Mean squared errors of actions and values."""
-        alg, losses = self.alg, []
-        if alg.teacher is None:
+        alg, config, losses = self.alg, self.alg.config.distillation, []
+        if alg.teacher is None or config is None:
             raise RuntimeError("distillation needs a teacher: learn_from")
-        alg.set_learning_rate(alg.config.distillation.learning_rate)
+        alg.set_learning_rate(config.learning_rate)
         for batch in storage.mini_batch_generator(alg.num_mini_batches, alg.num_learning_epochs):
             obs = batch.observations
             wanted = alg.teacher.actions(obs.groups if isinstance(obs, WindowedObservations) else obs)

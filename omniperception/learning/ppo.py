@@ -51,7 +51,8 @@ class PerceptivePpo(PPO):
     Attributes:
         config: what learns, and how.
         num_updates: completed updates.
-        teacher: for `config.distillation`.
+        lessons: updates, the first ones, in which a teacher teaches.
+        teacher: that does.
         learns_policy: whether policy and critic learn; otherwise they stay, and perception learns alone.
         is_new: whether the policy begins with weights of its own, not with another run's.
         fitting: phases with an optimiser of their own, by the name under which a checkpoint has it.
@@ -103,6 +104,7 @@ class PerceptivePpo(PPO):
         )
         self.config, self.num_updates, self.is_new = config, 0, True
         self.learns_policy = ppo.num_learning_epochs > 0
+        self.lessons = config.distillation.iterations if config.distillation is not None else 0
         self.teacher: Teacher | None = None
         groups = [{"params": parameters} for parameters in self.policy_and_critic().values()]
         if ppo.critic_learning_rate is None:
@@ -119,12 +121,11 @@ class PerceptivePpo(PPO):
 
     def phases(self) -> list[Phase]:
         """What the next update does, in this order."""
-        lessons = self.config.distillation.iterations if self.config.distillation is not None else 0
         perception, estimator = (self.fitting.get(name) for name in ("perception", "estimator"))
         own = [phase for name, phase in self.fitting.items() if name not in ("perception", "estimator")]
         if not self.learns_policy:
             policy = []
-        elif self.num_updates < lessons:
+        elif self.num_updates < self.lessons:
             policy = [Distil(self), Normalize(self)]
         elif self.num_updates < self.config.ppo.critic_warmup:
             policy = [WarmCritic(self), Normalize(self)]
@@ -135,7 +136,7 @@ class PerceptivePpo(PPO):
 
     def update(self) -> dict[str, float]:
         """Learns from a full rollout; mean losses, among them those of the supervised targets."""
-        ppo, losses = self.config.ppo, {}
+        ppo, losses = self.config.ppo, dict[str, float]()
         self.guard.start(self.num_updates)
         self.entropy_coef = self.annealed(ppo.entropy_coef, ppo.final_entropy_coef)
         self.desired_kl = self.annealed(ppo.desired_kl, ppo.final_desired_kl)
@@ -178,8 +179,7 @@ class PerceptivePpo(PPO):
 
     def is_first_of_pretrained(self) -> bool:
         """Whether this is PPO's first update of a policy that is another run's, has been taught or has waited."""
-        lessons = self.config.distillation.iterations if self.config.distillation is not None else 0
-        first = max(self.config.ppo.critic_warmup, lessons)
+        first = max(self.config.ppo.critic_warmup, self.lessons)
         return self.num_updates == first and (first > 0 or not self.is_new)
 
     def learn_from(self, teacher: Teacher) -> None:

@@ -226,7 +226,11 @@ class Runner:
     def _walk_as(self, run_dir: Path, seeing: list[Path], theirs: ObservationsConfig) -> list[Path]:
         """Moves as another run does, whose observations are given; returns the runs whose perception goes on."""
         state, actor, own = self._weights(run_dir), self.alg.actor, self.env.config.observations
-        weights, inputs, given = state["actor_state_dict"], self.env.actor_inputs(own), self._inputs(theirs, theirs.actor)
+        weights, inputs, given = (
+            state["actor_state_dict"],
+            self.env.actor_inputs(own),
+            self._inputs(theirs, theirs.actor),
+        )
         if given is None:
             raise CheckpointError(
                 f"init={run_dir} does not fit: that run's policy observes what this task does not have; give both the"

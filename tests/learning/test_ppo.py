@@ -1,4 +1,4 @@
-"""PPO: returns by hand, its update against rsl_rl's, phases in their order, and the stop at numbers that are not finite."""
+"""PPO: returns by hand, its update against rsl_rl's, and the stop at numbers that are not finite."""
 
 import copy
 
