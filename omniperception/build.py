@@ -32,9 +32,9 @@ from omniperception.learning import CheckpointError, Runner, distributed, latest
 from omniperception.learning.checkpoint import difference
 from omniperception.learning.config import LearningConfig, PerceptionConfig, PPOConfig
 from omniperception.learning.distillation import DistillationConfig, Teacher
-from omniperception.learning.estimator import EstimatingModel, EstimatorConfig
+from omniperception.learning.estimator import EstimatorConfig
 from omniperception.learning.log_writers import LoggerConfig
-from omniperception.learning.memory import check_fits
+from omniperception.learning.models import build_actor
 from omniperception.learning.navigation import NavigationConfig, VelocityInput
 from omniperception.scene import Mount, ObstaclesConfig, RobotConfig, SteppingConfig
 from omniperception.scene.held_out import held_out
@@ -378,8 +378,6 @@ def build_runner(run: RunConfig, log_dir: Path | None) -> Runner:
     run = replace(run, env=replace(run.env, seed=run.env.seed + distributed.SEED_STRIDE * distributed.rank()))
     seed_everything(run.env.seed)
     try:
-        if run.perception is not None:
-            check_fits(run.perception, run.ppo, run.env.num_envs, steps_per_frame(run), run.env.sim.torch_device)
         env = MixedEnv(run.family_envs()) if run.families else OmniEnv(run.env)
         return Runner(env, learning_config(run, env), log_dir, str(env.device))
     except (ValueError, ImportError) as error:
@@ -465,15 +463,9 @@ def load_teacher(run_dir: Path, env: OmniEnv | MixedEnv, trust: Sequence[str] = 
         values = env.actor_inputs(replace(run.env.observations, actor=[estimated]))
         observations[estimated] = torch.zeros(env.num_envs, len(values), device=env.device)
     with torch.random.fork_rng(devices=[]):  # learning draws as if nobody had taught
-        actor = EstimatingModel(
-            observations,
-            {"actor": list(groups)},
-            "actor",
-            env.num_actions,
-            EstimatorConfig(estimated) if estimated else None,
-            distribution_cfg={"class_name": "GaussianDistribution", "init_std": run.ppo.init_std},
-            **run.ppo.mlp,
-        ).to(env.device)
+        estimator = EstimatorConfig(estimated) if estimated else None
+        settings = LearningConfig(run.ppo, None, groups, (), estimator=estimator)
+        actor = build_actor(observations, settings, env.num_actions).to(env.device)
     weights = load_checkpoint(latest_checkpoint(run_dir), str(env.device))["actor_state_dict"]
     reason = difference(actor.state_dict(), weights)
     if reason is not None:

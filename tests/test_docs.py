@@ -151,6 +151,7 @@ def forget(package):
         ("obstacles=mine",),
         ("scenario=mine",),
         ("perception=mine",),
+        ("ppo=mine",),
     ],
     ids=lambda overrides: overrides[0],
 )
@@ -160,7 +161,10 @@ def test_what_the_guide_adds_trains(own_project, overrides, monkeypatch):
     added = (f"hydra.searchpath=['file://{own_project / 'conf'}']",)
     small = ("num_envs=4", "obstacles.curriculum=null", "ppo.num_mini_batches=1", "lidar.num_rays=200")
     runner = build_runner(assemble(compose((*added, *overrides, *small))), None)
+    losses, update = {}, runner.alg.update
+    runner.alg.update = lambda: losses.update(update()) or losses
     runner.learn(1)
+    assert ("smooth" in losses) == ("smooth_optimizer_state_dict" in runner.alg.save()) == ("ppo=mine" in overrides)
     forget("own_project")
 
 

@@ -15,7 +15,7 @@ from omniperception.commands import main
 from omniperception.common import provenance
 from omniperception.learning import CheckpointError, Runner, distributed, load_checkpoint
 from omniperception.learning.checkpoint import checkpoint_path
-from omniperception.learning.ppo import PerceptivePpo
+from omniperception.learning.phases import Distil
 from omnirobot.common.files import try_lock
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -143,8 +143,8 @@ def test_a_gait_teaches_a_policy_that_perceives(tmp_path, monkeypatch, capsys):
         )
 
     taught = "distillation={teacher: gait, iterations: 1}"
-    lessons, imitate = [], PerceptivePpo._imitate
-    monkeypatch.setattr(PerceptivePpo, "_imitate", lambda *given: lessons.append(imitate(*given)) or lessons[-1])
+    lessons, imitate = [], Distil.update
+    monkeypatch.setattr(Distil, "update", lambda *given: lessons.append(imitate(*given)) or lessons[-1])
     main(["train", *student, taught, "ppo.num_learning_epochs=1", "ppo.max_iterations=2", "hydra.run.dir=end"])
     (lesson,) = lessons
     assert lesson["imitation"] < 1e-10  # nothing near: but for rounding it did what its teacher did

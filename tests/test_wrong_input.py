@@ -154,7 +154,6 @@ LINES = [
     ("train robot.gait.frequency=50", "robot.gait.frequency=50 is too fast for control steps of 0.02 s; at most 12.5"),
     ("train observations.actor=[smell]", "smell"),
     ("train perception.sampler.num_proximal=0", "perception.sampler.num_proximal=0"),
-    ("train perception.memory_gb=0.001", "0.0 GB"),
     ("train randomization.latency_s=[0.02,0.01]", "latency_s"),
     ("train terminations.episode_length_s=0", "episode_length_s=0"),
     # parts that do not fit together

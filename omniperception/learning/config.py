@@ -41,8 +41,6 @@ class PerceptionConfig:
             state estimator.
         frame_times: whether frames bear the time at which they were taken, as those of most devices do: what is late is
             put where it was, and its age is known. It needs `base_motion`, and a network that reads three rows more.
-        memory_gb: memory (10^9 bytes) that the network may need in training, checked before anything is allocated; None
-            for all of the device's.
     """
 
     sampler: Callable[[], Sampler]
@@ -57,11 +55,8 @@ class PerceptionConfig:
     final_learning_rate: float | None = None
     base_motion: bool = False
     frame_times: bool = False
-    memory_gb: float | None = None
 
     def __post_init__(self) -> None:
-        if self.memory_gb is not None and self.memory_gb <= 0:
-            raise ValueError(f"perception.memory_gb={self.memory_gb} must be positive, or null for the device's memory")
         if self.frame_times and not self.base_motion:
             raise ValueError("perception.frame_times=true needs perception.base_motion=true")
         if self.history < 1:
@@ -139,6 +134,8 @@ class PPOConfig:
         final_entropy_coef: what entropy_coef changes to, linearly, until max_iterations; None: it stays as it is.
         final_desired_kl: what desired_kl changes to, likewise: smaller steps at the end.
         symmetry: whether updates see every sample's left-right mirror image, too (a blind policy only).
+        phases: of one's own, after the others of every update, by name: each makes a :class:`Phase` of the algorithm.
+            Those named perception or estimator take the place of what fits these.
         The others are rsl_rl's PPO arguments.
     """
 
@@ -170,6 +167,7 @@ class PPOConfig:
     critic_warmup: int = 0
     critic_learning_rate: float | None = None
     symmetry: bool = False
+    phases: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in (

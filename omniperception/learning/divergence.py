@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -22,31 +23,30 @@ class DivergenceGuard:
         """Args: algorithm: on a :class:`PerceptiveStorage`."""
         self._algorithm, self._update = algorithm, 0
         self._has_gradient: dict[str, bool] = {}
-        algorithm.optimizer.register_step_pre_hook(lambda *_: self._check_policy())
 
     def start(self, update: int) -> None:
         """Args: update: number of the update that begins, named in messages."""
         self._update = update
         self._has_gradient.clear()
 
-    def check_gradients(self, name: str, parameters: list[torch.nn.Parameter]) -> float:
-        """The largest norm of a parameter's gradient; one that is not finite stops the training."""
+    def check_gradients(self, name: str, parameters: Sequence[torch.nn.Parameter]) -> None:
+        """Stop at a gradient that is not finite, before a step with it."""
         finite, largest = _finite_and_largest([p.grad for p in parameters if p.grad is not None])
         if not finite:
             raise TrainingDiverged(
                 f"update {self._update}: the gradient of the {name} is not finite"
                 f" ({self._diagnosis()}); the weights are those of the last good step"
             )
-        return largest
+        self._has_gradient[name] = self._has_gradient.get(name, False) or largest > 0.0
 
     def check_learning(self, losses: dict[str, float]) -> None:
-        """Stop if no step of the update had a gradient: one whose norm overflows is made 0 where it is clipped.
+        """Stop if no step of policy or critic had a gradient: one whose norm overflows is made 0 where it is clipped.
 
         In the first step nothing is clipped by PPO, so that the actor has one unless all advantages are 0, or it does
         already what a teacher does.
         """
         storage = self._algorithm.storage
-        idle = [name for name, has_gradient in self._has_gradient.items() if not has_gradient]
+        idle = [name for name in ("actor", "critic") if not self._has_gradient.get(name, True)]
         if "actor" in idle and (not bool(storage.advantages.any()) or losses.get("imitation") == 0.0):
             idle.remove("actor")
         if idle:
@@ -65,14 +65,6 @@ class DivergenceGuard:
                 raise TrainingDiverged(
                     f"update {self._update}: {name} parameter '{bad}' is not finite ({self._diagnosis()})"
                 )
-
-    def _check_policy(self) -> None:
-        for name, model in (("actor", self._algorithm.actor), ("critic", self._algorithm.critic)):
-            learning = [p for p in model.parameters() if p.requires_grad]
-            if not learning:  # kept as it is while the other one warms up
-                continue
-            has_gradient = self.check_gradients(name, learning) > 0.0
-            self._has_gradient[name] = self._has_gradient.get(name, False) or has_gradient
 
     def _diagnosis(self) -> str:
         """Name of the stored quantity that is not finite, or advice if all are."""

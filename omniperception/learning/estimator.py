@@ -44,9 +44,12 @@ class EstimatingModel(MLPModel):
 
     Attributes:
         estimator: the network, or None.
-        estimated: the observation group with the truth, or None.
         estimate: (N, K) estimates that the newest actions were computed from; None before the first.
+        blind_dim: inputs of the policy's first layer that come from no perception: observations and estimates.
+        auxiliary_loss: of the newest pass of an update, to be added to what is minimised.
     """
+
+    auxiliary_loss: torch.Tensor | float = 0.0
 
     def __init__(
         self,
@@ -55,6 +58,7 @@ class EstimatingModel(MLPModel):
         obs_set: str,
         output_dim: int,
         estimator: EstimatorConfig | None = None,
+        embedding_dim: int = 0,
         **mlp_options,
     ) -> None:
         """
@@ -64,14 +68,17 @@ class EstimatingModel(MLPModel):
             obs_set: this model's set.
             output_dim: number of actions.
             estimator: None: nothing is estimated.
+            embedding_dim: further inputs of the policy's first layer.
             mlp_options: ``hidden_dims``, ``activation``, ``obs_normalization`` and ``distribution_cfg`` of `MLPModel`.
         """
-        self._num_estimates = 0 if estimator is None else obs[estimator.group].shape[-1]  # read by _get_latent_dim
+        num_estimates = 0 if estimator is None else obs[estimator.group].shape[-1]
+        self._added_dims = num_estimates, embedding_dim  # read by _get_latent_dim while the base class builds the MLP
         super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
+        self.blind_dim = self.obs_dim + num_estimates
         self.estimator: MLP | None = None
-        self.estimated = None if estimator is None else estimator.group
         if estimator is not None:
-            self.estimator = MLP(self.obs_dim, self._num_estimates, list(estimator.hidden_dims), "elu")
+            self.estimator = MLP(self.obs_dim, num_estimates, list(estimator.hidden_dims), "elu")
+            self._truth = estimator.group
         self.estimate: torch.Tensor | None = None
 
     def get_latent(
@@ -92,12 +99,7 @@ class EstimatingModel(MLPModel):
         assert self.estimator is not None  # it is asked for where something is estimated
         with torch.no_grad():
             latent = MLPModel.get_latent(self, obs)
-        return (self.estimator(latent) - obs[self.estimated]).square().mean()
-
-    @property
-    def blind_dim(self) -> int:
-        """Inputs of the policy's first layer that come from no perception: observations and estimates."""
-        return self.obs_dim + self._num_estimates
+        return (self.estimator(latent) - obs[self._truth]).square().mean()
 
     def _get_latent_dim(self) -> int:
-        return self.blind_dim
+        return self.obs_dim + sum(self._added_dims)

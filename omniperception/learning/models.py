@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 from rsl_rl.modules import HiddenState
@@ -12,13 +13,27 @@ from torch import nn
 
 from omniperception.avoidance.sector_motion import decode
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND, LAST_ASKED, MOTION_TARGET
-from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.common.vectors import moved_towards
+from omniperception.learning.config import LearningConfig
 from omniperception.learning.estimator import EstimatingModel
-from omniperception.learning.navigation import ASKED, MOTION, NavigationConfig, Navigator, VelocityInput
+from omniperception.learning.navigation import ASKED, MOTION, NavigationActor, Navigator
 from omniperception.learning.read_out import MotionReadOut, VelocityReadOut
 from omniperception.learning.storage import WindowedObservations
-from omniperception.perception import PerceptionNetwork
+
+
+def build_actor(obs: TensorDict, config: LearningConfig, num_actions: int) -> EstimatingModel:
+    """The actor of a configuration, for observations like the given ones."""
+    if config.perception is not None:
+        return (PerceptionActor if config.moves_joints else PerceivingNavigator)(obs, config, num_actions)
+    given = (obs, {"actor": list(config.actor_groups)}, "actor", num_actions)
+    if config.navigation is not None:
+        return NavigationActor(*given, navigation=config.navigation, **_options(config))
+    return EstimatingModel(*given, config.estimator, **_options(config))
+
+
+def _options(config: LearningConfig) -> dict[str, Any]:
+    distribution = {"class_name": "GaussianDistribution", "init_std": config.ppo.init_std}
+    return {"distribution_cfg": distribution, **config.ppo.mlp}
 
 
 class PerceptionActor(EstimatingModel):
@@ -29,9 +44,10 @@ class PerceptionActor(EstimatingModel):
     of a :class:`WindowedObservations` is embedded once. An environment without a frame since its reset gets the
     network's embedding of an empty history.
 
-    With ``end_to_end`` the supervised loss joins whatever loss is back-propagated through the actor (paper, Sec. 3.3.1:
-    privileged height supervision). It is the mean squared error between an observation group and the part of the
-    embedding that the network sets aside for it (``perception.supervised``), over the steps that have a frame.
+    Where no supervision of its own trains the network (`perception.supervised_epochs` is 0), the gradient of the
+    policy's loss reaches it, and the supervised loss is the `auxiliary_loss` (paper, Sec. 3.3.1: privileged height
+    supervision). It is the mean squared error between an observation group and the part of the embedding that the
+    network sets aside for it (``perception.supervised``), over the steps that have a frame.
 
     With supervision of ``avoidance_target`` or ``motion_target`` an avoidance velocity is read out of the embedding and
     added to the commanded one before the MLP sees it, because that sum is what the reward wants tracked (paper,
@@ -50,75 +66,52 @@ class PerceptionActor(EstimatingModel):
             computed from; None before the first, and without a limit.
     """
 
-    def __init__(
-        self,
-        obs: TensorDict,
-        obs_groups: dict[str, list[str]],
-        obs_set: str,
-        output_dim: int,
-        perception: PerceptionNetwork,
-        supervision: Mapping[str, float] | None = None,
-        velocity_risk: VelocityRisk | None = None,
-        end_to_end: bool = True,
-        max_change: float | None = None,
-        navigation: NavigationConfig | None = None,
-        velocity_inputs: Sequence[VelocityInput] = (),
-        max_turn: float = 0.0,
-        **mlp_options,
-    ) -> None:
-        """Build the actor.
-
+    def __init__(self, obs: TensorDict, config: LearningConfig, num_actions: int) -> None:
+        """
         Args:
             obs: example observations.
-            obs_groups: groups of each observation set.
-            obs_set: this model's set; only one-dimensional groups, LiDAR frames are read besides.
-            output_dim: number of actions.
-            perception: the network.
-            supervision: positive weight of the regression on each privileged observation group.
-            velocity_risk: the controller, needed for supervision of ``motion_target``.
-            end_to_end: whether the loss of an update reaches the perception network; otherwise it is trained by
-                supervision alone (:meth:`PerceptivePpo.train_perception`).
-            max_change: of the commanded velocity with the avoidance velocity added (m/s).
-            navigation: settings of a navigation policy; None: there is none.
-            velocity_inputs: where v_x, v_y and yaw rate are observed, which it reads.
-            max_turn: most (rad/s) by which the yaw rate that navigation asks for changes from step to step.
-            mlp_options: ``estimator``, and ``hidden_dims``, ``activation``, ``obs_normalization`` (of the
-                one-dimensional groups) and ``distribution_cfg`` of rsl_rl's ``MLPModel``.
+            config: what learns; its actor's groups are one-dimensional, LiDAR frames are read besides.
+            num_actions: size of an action.
         """
-        self._feature_dim = perception.feature_dim  # read by _get_latent_dim while the base class builds the MLP
-        super().__init__(obs, obs_groups, obs_set, output_dim, **mlp_options)
+        assert config.perception is not None
+        perception, groups = config.perception.build_network(), {"actor": list(config.actor_groups)}
+        self._feature_dim = perception.feature_dim
+        super().__init__(
+            obs, groups, "actor", num_actions, config.estimator, embedding_dim=self._feature_dim, **_options(config)
+        )
         self.perception = perception
-        self._begin_blind()
-        self.supervision = dict(supervision or {})
-        self.end_to_end = end_to_end
-        self.read_out: VelocityReadOut | MotionReadOut | None = None
-        self.read_out_target = None
-        if AVOIDANCE_TARGET in self.supervision:
-            self.read_out_target, self.read_out = AVOIDANCE_TARGET, VelocityReadOut(self._feature_dim)
-        elif MOTION_TARGET in self.supervision:
-            if velocity_risk is None:
-                raise ValueError("perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk")
-            part, num_values = perception.supervised.get(MOTION_TARGET), obs[MOTION_TARGET].shape[-1]
-            self.read_out_target = MOTION_TARGET
-            risk_part = perception.supervised.get("risk")
-            self.read_out = MotionReadOut(self._feature_dim, num_values, part, velocity_risk, risk_part)
+        with torch.no_grad():  # an untrained embedding is noise to the gait; it enters as its weights learn
+            self.mlp[0].weight[:, self.blind_dim :] = 0.0
+        self.supervision = config.perception.supervision
+        self.end_to_end = config.perception.supervised_epochs == 0
+        self.read_out = self._build_read_out(obs, config)
         self.navigation: Navigator | None = None
-        if navigation is not None:
+        if config.navigation is not None:
             if not isinstance(self.read_out, MotionReadOut):
                 raise ValueError("navigation needs to know how obstacles move; set perception.motion_weight")
-            if self.read_out.risk_part is not None and navigation.risk != velocity_risk:
+            if self.read_out.risk_part is not None and config.navigation.risk != config.velocity_risk:
                 raise ValueError(
                     "navigation.risk must be rewards.avoidance.risk where the perception network says the risks itself;"
                     " set rewards.avoidance.risk=${navigation.risk}"
                 )
-            self.navigation = Navigator(navigation)
-        self.velocity_inputs = tuple(velocity_inputs)
-        self._max_turn = 0.0 if navigation is None else max_turn
-        self.max_change = max_change
+            self.navigation = Navigator(config.navigation)
+        self.velocity_inputs, self._max_turn = tuple(config.velocity_inputs), config.max_turn
+        self.max_change = config.max_change
         self.asked: torch.Tensor | None = None
         self._check_supervision(obs)
         self._newest: tuple[int, torch.Tensor, torch.Tensor] | None = None  # tick, embeddings
         self._losses: dict[str, list[torch.Tensor]] = {target: [] for target in self.supervision}
+
+    def _build_read_out(self, obs: TensorDict, config: LearningConfig) -> VelocityReadOut | MotionReadOut | None:
+        if AVOIDANCE_TARGET in self.supervision:
+            return VelocityReadOut(self._feature_dim)
+        if MOTION_TARGET not in self.supervision:
+            return None
+        if config.velocity_risk is None:
+            raise ValueError("perception.motion_weight needs rewards.avoidance.risk; use rewards=velocity_risk")
+        parts, num_values = self.perception.supervised, obs[MOTION_TARGET].shape[-1]
+        given = (self._feature_dim, num_values, parts.get(MOTION_TARGET), config.velocity_risk, parts.get("risk"))
+        return MotionReadOut(*given)
 
     def get_latent(
         self,
@@ -127,23 +120,38 @@ class PerceptionActor(EstimatingModel):
         hidden_state: HiddenState = None,
     ) -> torch.Tensor:
         """Normalised one-dimensional groups and the embedding, concatenated."""
-        if isinstance(obs, WindowedObservations):
-            with self._precision(obs.frames), torch.set_grad_enabled(torch.is_grad_enabled() and self.end_to_end):
-                features, has_frame = self.embed(obs), obs.step_count > 0
-                if self.supervision and obs.has_frames and torch.is_grad_enabled():
-                    features = _AddLoss.apply(features, self.supervised_loss(features, obs))
-                groups = self._avoiding(obs.groups, features, has_frame, acts=False)
-        else:
-            with torch.no_grad():
-                features, has_frame = self.embed_newest(obs), obs["frame_count"].squeeze(-1) > 0
-                groups = self._avoiding(obs, features, has_frame, acts=True)
+        groups, features = self._perceive(obs)
         latent = super().get_latent(groups, masks, hidden_state)
         return torch.cat([latent, features[:, : self._feature_dim]], dim=-1)
+
+    def _perceive(self, obs: TensorDict | WindowedObservations) -> tuple[TensorDict, torch.Tensor]:
+        """Observations with what the gait is asked for as the command, and features (B, D) or (B, D + K)."""
+        is_update = isinstance(obs, WindowedObservations)
+        with self._precision(), torch.set_grad_enabled(self.end_to_end and is_update and torch.is_grad_enabled()):
+            groups, features, has_frame = self._embedded(obs)
+            self.auxiliary_loss = 0.0
+            if isinstance(obs, WindowedObservations) and torch.is_grad_enabled() and obs.has_frames:
+                self.auxiliary_loss = self.supervised_loss(features, obs)
+                features = features.view_as(features)  # the policy's gradients are summed before they join this loss's
+            if self.read_out is None:
+                return groups, features
+            asked, command = self._ask(groups, features, has_frame), groups[COMMAND]
+            if not is_update and self.max_change is not None:
+                self.asked = asked
+            groups = groups.clone(recurse=False)
+            groups[COMMAND] = torch.cat((asked, command[:, asked.shape[1] :]), 1)
+            return groups, features
+
+    def _embedded(self, obs: TensorDict | WindowedObservations) -> tuple[TensorDict, torch.Tensor, torch.Tensor]:
+        """One-dimensional groups, features (B, D) or (B, D + K), and (B,) whether there is a frame."""
+        if isinstance(obs, WindowedObservations):
+            return obs.groups, self.embed(obs), obs.step_count > 0
+        return obs, self.embed_newest(obs), obs["frame_count"].squeeze(-1) > 0
 
     def reset(self, dones: torch.Tensor | None = None, hidden_state: HiddenState = None) -> None:
         """Drop the embedding of the newest frame; with ``dones`` (single environments were reset) it stays valid."""
         if dones is None:
-            self._newest = None
+            self._newest, self.auxiliary_loss = None, 0.0
 
     def embed_newest(self, obs: TensorDict) -> torch.Tensor:
         """(N, D) embeddings of the current histories, extended for the read-out; the empty one without a frame."""
@@ -191,7 +199,8 @@ class PerceptionActor(EstimatingModel):
         has_frame = obs.step_count > 0
         total = torch.zeros((), device=features.device)
         for target, weight in self.supervision.items():
-            if self.read_out is not None and target == self.read_out_target:
+            if target in (AVOIDANCE_TARGET, MOTION_TARGET):
+                assert self.read_out is not None
                 error = self.read_out.error(features, obs[target])
             else:
                 error = (features[:, self.perception.supervised[target]] - obs[target]).square().mean(dim=-1)
@@ -207,48 +216,25 @@ class PerceptionActor(EstimatingModel):
             losses.clear()
         return means
 
-    def _begin_blind(self) -> None:
-        """An untrained embedding is noise to the gait; it enters as its weights learn."""
-        with torch.no_grad():
-            self.mlp[0].weight[:, self.blind_dim :] = 0.0
-
-    def _get_latent_dim(self) -> int:
-        return super()._get_latent_dim() + self._feature_dim
-
-    def _precision(self, frames: torch.Tensor) -> AbstractContextManager:
+    def _precision(self) -> AbstractContextManager:
         """In which an update embeds: that of acting with a read-out, as V_avoid makes much of what bfloat16 rounds off
         (docs/lab/negative.md, "PPO on top"), otherwise the update's."""
-        return nullcontext() if self.read_out is None else torch.autocast(frames.device.type, enabled=False)
+        if self.read_out is None:
+            return nullcontext()
+        return torch.autocast(next(self.parameters()).device.type, enabled=False)
 
     def _extend(self, embedding: torch.Tensor) -> torch.Tensor:
         return embedding if self.read_out is None else self.read_out.extend(embedding)
 
-    def _avoiding(self, groups: TensorDict, features: torch.Tensor, has_frame: torch.Tensor, acts: bool) -> TensorDict:
-        """The observations with the avoidance velocity, 0 without a frame, added to the commanded one."""
-        if self.read_out is None:
-            return groups
-        groups = groups.clone(recurse=False)
+    def _ask(self, groups: TensorDict, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor:
+        """(B, 2) V_cmd + V_avoid, V_cmd alone without a frame, or (B, 3) what navigation asks for."""
+        assert self.read_out is not None
         command = groups[COMMAND]
         if self.navigation is not None:
-            asked = self.navigate(features, has_frame, command, self._velocity(groups), groups[LAST_ASKED])
-            if acts:
-                self.asked = asked
-            groups[COMMAND] = asked
-            return groups
+            velocity = [groups[one.group][:, one.column] / one.scale for one in self.velocity_inputs]
+            return self.navigate(features, has_frame, command, torch.stack(velocity, 1), groups[LAST_ASKED])
         asked = command[:, :2] + self.read_out.velocity(features, command[:, :2]) * has_frame[:, None]
-        if self.max_change is not None:
-            asked = moved_towards(groups[LAST_ASKED], asked, self.max_change)
-            if acts:
-                self.asked = asked
-        groups[COMMAND] = torch.cat((asked, command[:, 2:]), 1)
-        return groups
-
-    def sectors(self, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor:
-        """(B, S, 3) distance (m) and velocity (m/s, yaw-aligned frame) as perceived; without a frame (B,) nothing."""
-        assert isinstance(self.read_out, MotionReadOut)
-        sectors = decode(self.read_out.motion(features[:, : self._feature_dim]))
-        empty = torch.cat((sectors[..., :1] + torch.inf, 0.0 * sectors[..., 1:]), -1)
-        return torch.where(has_frame[:, None, None], sectors, empty)
+        return asked if self.max_change is None else moved_towards(groups[LAST_ASKED], asked, self.max_change)
 
     def navigate(
         self,
@@ -267,31 +253,32 @@ class PerceptionActor(EstimatingModel):
             command, velocity, last_asked: (B, 3) v_x, v_y (m/s) and yaw rate (rad/s).
         """
         assert self.navigation is not None and self.max_change is not None
-        risks = self._known_risks(features, has_frame)
-        wanted = self.navigation(self.sectors(features, has_frame), command, velocity, last_asked, risks)
+        sectors, risks = self._surroundings(features, has_frame)
+        wanted = self.navigation(sectors, command, velocity, last_asked, risks)
         wanted = torch.where(has_frame[:, None], wanted, command)
         linear = moved_towards(last_asked[:, :2], wanted[:, :2], self.max_change)
         turn = last_asked[:, 2:] + (wanted - last_asked)[:, 2:].clamp(-self._max_turn, self._max_turn)
         return torch.cat((linear, turn), 1)
 
-    def _known_risks(self, features: torch.Tensor, has_frame: torch.Tensor) -> torch.Tensor | None:
-        """(B, K) risks of navigation's candidates, 0 without a frame; None where the read-out has others."""
+    def _surroundings(
+        self, features: torch.Tensor, has_frame: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """(B, S, 3) distance (m) and velocity (m/s, yaw-aligned frame) as perceived, nothing without a frame; (B, K)
+        risks of navigation's candidates, 0 without a frame, None where the read-out has others."""
         assert isinstance(self.read_out, MotionReadOut) and self.navigation is not None
+        sectors = decode(self.read_out.motion(features[:, : self._feature_dim]))
+        empty = torch.cat((sectors[..., :1] + torch.inf, 0.0 * sectors[..., 1:]), -1)
+        sectors = torch.where(has_frame[:, None, None], sectors, empty)
         if self.navigation.risk != self.read_out.velocity_risk:
-            return None
+            return sectors, None
         extended = features if features.shape[1] > self._feature_dim else self.read_out.extend(features)
-        return extended[:, self._feature_dim :] * has_frame[:, None]
-
-    def _velocity(self, groups: TensorDict) -> torch.Tensor:
-        """(B, 3) the robot's own velocity as observed."""
-        parts = [groups[one.group][:, one.column] / one.scale for one in self.velocity_inputs]
-        return torch.stack(parts, 1)
+        return sectors, extended[:, self._feature_dim :] * has_frame[:, None]
 
     def _check_supervision(self, obs: TensorDict) -> None:
         """Every target is observed, in the size that the network gives; what changes the command observes it."""
         for target in self.supervision:
             part = self.perception.supervised.get(target)
-            if part is None and target == self.read_out_target:
+            if part is None and target in (AVOIDANCE_TARGET, MOTION_TARGET):
                 continue
             if part is None:
                 raise ValueError(
@@ -325,9 +312,9 @@ class PerceivingNavigator(PerceptionActor):
     Its actions are the velocities (N, 3) that a gait is asked for. It observes the groups COMMAND, MOTION and ASKED.
     """
 
-    def __init__(self, obs: TensorDict, *args, **options) -> None:
-        """Arguments as `PerceptionActor` takes them, with a `navigation`."""
-        super().__init__(obs, *args, **options)
+    def __init__(self, obs: TensorDict, config: LearningConfig, num_actions: int) -> None:
+        """As of `PerceptionActor`, with a `config.navigation`."""
+        super().__init__(obs, config, num_actions)
         missing = [name for name in (COMMAND, MOTION, ASKED) if name not in self.obs_groups]
         if missing:
             raise ValueError(
@@ -337,6 +324,7 @@ class PerceivingNavigator(PerceptionActor):
         self.mlp = self.navigation.mlp
         self.max_change = None  # the simulator limits it
 
+    @torch.no_grad()
     def get_latent(
         self,
         obs: TensorDict | WindowedObservations,
@@ -345,27 +333,6 @@ class PerceivingNavigator(PerceptionActor):
     ) -> torch.Tensor:
         """The inputs of navigation."""
         assert self.navigation is not None
-        with torch.no_grad():
-            if isinstance(obs, WindowedObservations):
-                groups, features, has_frame = obs.groups, self.embed(obs), obs.step_count > 0
-            else:
-                groups, features, has_frame = obs, self.embed_newest(obs), obs["frame_count"].squeeze(-1) > 0
-            sectors, risks = self.sectors(features, has_frame), self._known_risks(features, has_frame)
-            return self.navigation.inputs(sectors, groups[COMMAND], groups[MOTION], groups[ASKED], risks)
-
-    def _begin_blind(self) -> None:
-        """The correction begins at 0."""
-
-
-class _AddLoss(torch.autograd.Function):
-    """Identity on the features whose backward pass also starts that of an auxiliary loss, at unit scale."""
-
-    @staticmethod
-    def forward(ctx, features: torch.Tensor, loss: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(loss)
-        return features.view_as(features)
-
-    @staticmethod
-    def backward(ctx, gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        (loss,) = ctx.saved_tensors
-        return gradient, torch.ones_like(loss)
+        groups, features, has_frame = self._embedded(obs)
+        sectors, risks = self._surroundings(features, has_frame)
+        return self.navigation.inputs(sectors, groups[COMMAND], groups[MOTION], groups[ASKED], risks)

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
 from tensordict import TensorDict
 from torch import nn
 
 from omniperception.avoidance.navigation import navigation_inputs, num_inputs, within_barrier
 from omniperception.avoidance.velocity_risk import VelocityRisk
+from omniperception.learning.estimator import EstimatingModel
 
 MOTION, ASKED = "motion", "asked"
 """Groups of observations: the robot's own velocity, and what its gait is asked for, (n, 3) each."""
@@ -62,10 +62,6 @@ class NavigationConfig:
         if self.barrier is not None and self.barrier <= 0:
             raise ValueError(f"navigation.barrier={self.barrier} must be positive (1/s), or null for none")
 
-    def build_network(self) -> CorrectedChoice:
-        """From `navigation_inputs` to velocities."""
-        return CorrectedChoice(self)
-
 
 class CorrectedChoice(nn.Module):
     """The choice without learning, which its inputs begin with, plus a network's correction of it, which begins at 0;
@@ -85,7 +81,7 @@ class CorrectedChoice(nn.Module):
         return wanted if self._barrier is None else within_barrier(wanted, inputs, self._barrier, self._radius)
 
 
-class NavigationActor(MLPModel):
+class NavigationActor(EstimatingModel):
     """Velocities (N, 3) that a gait is asked for, from `avoidance.navigation.navigation_inputs`, which is all that it
     observes."""
 
@@ -100,7 +96,7 @@ class NavigationActor(MLPModel):
                 f"a navigation policy reads the {expected} numbers of NavigationView alone, and observes {self.obs_dim}"
                 f" ({', '.join(self.obs_groups)}); use observations=navigate"
             )
-        self.mlp = navigation.build_network()
+        self.mlp = CorrectedChoice(navigation)
 
 
 class Navigator(nn.Module):
@@ -115,7 +111,7 @@ class Navigator(nn.Module):
         for name, values in zip(("least", "most"), zip(*config.ranges, strict=True), strict=True):
             self.register_buffer(name, torch.tensor(values), persistent=False)
         self.risk = config.risk
-        self.mlp = config.build_network()
+        self.mlp = CorrectedChoice(config)
         self.register_buffer("candidates", config.risk.candidates(), persistent=False)
 
     def inputs(
@@ -129,14 +125,7 @@ class Navigator(nn.Module):
         """`navigation_inputs` (n, D)."""
         return navigation_inputs(sectors, reference, velocity, asked, self.risk, self.candidates, risks)
 
-    def forward(
-        self,
-        sectors: torch.Tensor,
-        reference: torch.Tensor,
-        velocity: torch.Tensor,
-        asked: torch.Tensor,
-        risks: torch.Tensor | None = None,
-    ) -> torch.Tensor:
-        """(n, 3) what a gait is to be asked for; arguments as `navigation_inputs` takes them."""
-        wanted = self.mlp(self.inputs(sectors, reference, velocity, asked, risks))
+    def forward(self, *given: torch.Tensor | None) -> torch.Tensor:
+        """(n, 3) what a gait is to be asked for; arguments as `inputs` takes them."""
+        wanted = self.mlp(self.inputs(*given))  # type: ignore[arg-type]
         return torch.minimum(torch.maximum(wanted, self.least), self.most)

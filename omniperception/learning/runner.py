@@ -35,7 +35,7 @@ from omniperception.learning.divergence import TrainingDiverged
 from omniperception.learning.estimator import estimates_velocity
 from omniperception.learning.logger import Logger
 from omniperception.learning.ppo import PerceptivePpo
-from omniperception.learning.warm_start import estimating, observing_more, perceive_as, start_from, take_parts
+from omniperception.learning.warm_start import estimating, start_from, take_parts
 from omnirobot.common.errors import one_line
 
 
@@ -72,7 +72,7 @@ class Runner:
         """
         distributed.connect(device)
         self.env, self.config, self.device = env, config, device
-        self.alg = PerceptivePpo.build(env, config, device, distributed.multi_gpu())
+        self.alg = PerceptivePpo(env, config, device, distributed.multi_gpu())
         actor = self.alg.actor
         if config.estimator is not None and estimates_velocity(env.config.observations):
             env.state.measure_velocity_by(lambda: actor.estimate)
@@ -196,13 +196,12 @@ class Runner:
     def start_from(self, *run_dirs: Path, observations: ObservationsConfig | None = None) -> list[Path]:
         """Begin with the newest weights of other runs.
 
-        The last one gives the actor's, and the critic's where it observes the same; one before it gives what it
-        perceives with, otherwise the last one does where that fits.
+        The last one moves the legs, where there are any: it gives the actor's, and the critic's where it observes the
+        same. One before it gives what it perceives or navigates with; without one the last one does where that fits.
 
         Args:
-            run_dirs: of these runs, one or two.
-            observations: of the last one, which may observe what this one estimates, or less than this one; None: the
-                same as here.
+            run_dirs: of these runs.
+            observations: of the last one, which may observe what this one estimates; None: the same as here.
 
         Returns:
             The runs whose perception goes on here.
@@ -210,53 +209,44 @@ class Runner:
         Raises:
             CheckpointError: they do not fit: what they observe, perceive, estimate or move differs.
         """
-        if self.config.navigation is not None:
-            return self._take_parts(run_dirs, observations)
-        *seeing, run_dir = run_dirs
-        for other in seeing:
-            perceive_as(self.alg.actor, self._weights(other)["actor_state_dict"], str(other))
-        return self._walk_as(run_dir, seeing, observations)
-
-    def _take_parts(self, run_dirs: Sequence[Path], observations: ObservationsConfig | None) -> list[Path]:
-        """`start_from` of a policy that navigates: each run gives what it has, but for the last one, where there are
-        legs, which moves them."""
-        gait = run_dirs[-1] if self.config.moves_joints else None
-        seeing = []
-        for other in run_dirs[:-1] if gait is not None else run_dirs:
+        others, seeing = run_dirs[:-1] if self.config.moves_joints else run_dirs, []
+        for other in others:
             state = self._weights(other)
             if take_parts(self.alg.actor, state["actor_state_dict"], str(other)):
                 seeing.append(other)
-            with contextlib.suppress(CheckpointError):  # it values something else
-                start_from(self.alg.critic, state.get("critic_state_dict", {}), str(other))
+            if self.config.navigation is not None:
+                with contextlib.suppress(CheckpointError):  # it values something else
+                    start_from(self.alg.critic, state.get("critic_state_dict", {}), str(other))
+        if self.config.moves_joints:
+            seeing = self._walk_as(run_dirs[-1], seeing, observations or self.env.config.observations)
         self.alg.is_new = False
         self.alg.actor.reset()
-        return seeing if gait is None else self._walk_as(gait, seeing, observations)
+        return seeing
 
-    def _walk_as(self, run_dir: Path, seeing: list[Path], observations: ObservationsConfig | None) -> list[Path]:
-        """Moves as another run does."""
-        state = self._weights(run_dir)
-        weights = state["actor_state_dict"]
-        own, theirs = self.env.config.observations, observations or self.env.config.observations
-        inputs, given = self.env.actor_inputs(own), self._inputs(theirs, theirs.actor)
+    def _walk_as(self, run_dir: Path, seeing: list[Path], theirs: ObservationsConfig) -> list[Path]:
+        """Moves as another run does, whose observations are given; returns the runs whose perception goes on."""
+        state, actor, own = self._weights(run_dir), self.alg.actor, self.env.config.observations
+        weights, inputs, given = (
+            state["actor_state_dict"],
+            self.env.actor_inputs(own),
+            self._inputs(theirs, theirs.actor),
+        )
         if given is None:
             raise CheckpointError(
                 f"init={run_dir} does not fit: that run's policy observes what this task does not have; give both the"
                 " same observations"
             )
         if reason := first_difference(inputs, given):
-            weights = observing_more(weights, inputs, given)
             if self.config.estimator is not None and theirs.estimated is None:
                 truth = self.env.actor_inputs(replace(own, actor=[self.config.estimator.group]))
-                weights = estimating(self.alg.actor, weights, inputs, given, truth)
+                weights = estimating(actor, weights, inputs, given, truth)
             if weights is state["actor_state_dict"]:  # nothing has rearranged them
                 raise CheckpointError(f"init={run_dir} does not fit: {reason}; give both the same observations")
-        if start_from(self.alg.actor, weights, str(run_dir), with_perception=not seeing):
+        if start_from(actor, weights, str(run_dir), with_perception=not seeing):
             seeing = [run_dir]
         if self.config.ppo.start_std is not None:
             with torch.no_grad():
-                self.alg.actor.distribution.std_param.fill_(self.config.ppo.start_std)
-        self.alg.actor.reset()
-        self.alg.is_new = False
+                actor.distribution.std_param.fill_(self.config.ppo.start_std)
         valued, given = self.env.actor_inputs(replace(own, actor=own.critic)), self._inputs(theirs, theirs.critic)
         if given is not None and first_difference(valued, given) is None:
             with contextlib.suppress(CheckpointError):  # other hidden layers

@@ -9,10 +9,6 @@ import torch
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-FRAME_GROUPS = ("frames", "frame_count", "frame_tick")
-"""Observations that describe LiDAR frames: (N, H, P, 3) newest last, (N, 1) valid frames, (N, 1) number of the newest
-frame, the same in all environments."""
-
 
 @dataclass(frozen=True)
 class Embedded:
@@ -72,6 +68,9 @@ def max_windows(num_steps: int, steps_per_frame: int) -> int:
 class PerceptiveStorage(RolloutStorage):
     """Rollout storage for PPO, with or without LiDAR frames.
 
+    Observations describe LiDAR frames as `frames` (N, H, P, 3) newest last, `frame_count` (N, 1) valid ones and
+    `frame_tick` (N, 1) the number of the newest, the same in all environments.
+
     One-dimensional groups are stored per step by rsl_rl. With frames, the H frames seen at the first step are copied
     and then one frame per tick; a step keeps its tick and its count of valid frames. Mini-batches are then random
     subsets of environments with all their steps, so that each window is embedded once per mini-batch. Without frames
@@ -111,12 +110,6 @@ class PerceptiveStorage(RolloutStorage):
         self.has_frames = frames
         if not frames:
             return
-        missing = [name for name in FRAME_GROUPS if name not in obs]
-        if missing:
-            raise ValueError(
-                f"the actor reads LiDAR frames but the environment gives no observations {missing};"
-                " choose a perception that fits the environment"
-            )
         self.history = obs["frames"].shape[1]
         self.steps_per_frame = steps_per_frame
         capacity = self.history - 1 + max_windows(num_steps, steps_per_frame)
@@ -137,11 +130,6 @@ class PerceptiveStorage(RolloutStorage):
             obs: observations of the step.
             tick: number of their newest frame, which is the same in all environments.
         """
-        if len(self._ticks) != self.step:
-            raise RuntimeError(
-                f"storage: frames recorded for {len(self._ticks)} steps, transitions for"
-                f" {self.step}; call record_frames once before each add_transition"
-            )
         if not self._ticks:
             self.frames[:, : self.history].copy_(obs["frames"])
         elif tick != self._ticks[-1]:

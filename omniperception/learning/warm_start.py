@@ -14,32 +14,8 @@ from omniperception.learning.estimator import EstimatingModel
 
 _FIRST_LAYER, _FIRST_BIAS = "mlp.0.weight", "mlp.0.bias"
 _TRUE = "true_"  # how the observation begins that an estimator of another one is fitted to
-_OPTIONAL = ("perception.", "read_out.", "navigation.")
-_PERCEIVED = ("perception.", "read_out.")
-_NAVIGATION, _LAYERS = "navigation.", "mlp.network."
-
-
-def perceive_as(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> None:
-    """Copies the perception network of another run, and what reads it out, into a model, whatever the rest observes.
-
-    Args:
-        model: whose weights are replaced in place.
-        weights: the state of the other.
-        source: names the other run in an error.
-
-    Raises:
-        CheckpointError: the other run perceives nothing, or otherwise.
-    """
-    state = model.state_dict()
-    perceived = [name for name in state if name.startswith(_PERCEIVED)]
-    for name in perceived:
-        own, other = state[name], weights.get(name)
-        if other is None or other.shape != own.shape:
-            raise _misfit(f"init={source} does not give its perception", name, own, other, "perception")
-    if not perceived:
-        raise CheckpointError(f"init={source} is to give its perception, but this run has none; give one run alone")
-    for name in perceived:
-        state[name].copy_(weights[name])
+_PERCEIVED, _NAVIGATION, _LAYERS = ("perception.", "read_out."), "navigation.", "mlp.network."
+_OPTIONAL = (*_PERCEIVED, _NAVIGATION)
 
 
 def take_parts(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str) -> bool:
@@ -56,18 +32,15 @@ def take_parts(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
     Raises:
         CheckpointError: the other run has neither, or in another form.
     """
-    state, given = model.state_dict(), dict(weights)
-    given |= {name.removeprefix(_NAVIGATION): value for name, value in weights.items() if name.startswith(_NAVIGATION)}
-    copies, perceives = [], False
+    given = {name.removeprefix(_NAVIGATION): value for name, value in weights.items()}
+    state, copies = model.state_dict(), []
+    perceives = all(any(name.startswith(_PERCEIVED) for name in one) for one in (state, weights))
     for name, own in state.items():
-        other = given.get(name.removeprefix(_NAVIGATION) if name.startswith(_NAVIGATION) else name)
-        if name.startswith(_PERCEIVED):
-            perceives |= other is not None
-        elif not name.removeprefix(_NAVIGATION).startswith(_LAYERS):
+        part = name.removeprefix(_NAVIGATION)
+        if not (perceives if name.startswith(_PERCEIVED) else part.startswith(_LAYERS) and part in given):
             continue
-        if other is None:
-            continue
-        if other.shape != own.shape:
+        other = given.get(part)
+        if other is None or other.shape != own.shape:
             raise _misfit(f"init={source} does not fit", name, own, other, "perception and navigation")
         copies.append((own, other))
     if not copies:
@@ -97,13 +70,15 @@ def start_from(model: MLPModel, weights: Mapping[str, torch.Tensor], source: str
     """
     alike = "observations (groups, history and what is estimated), ppo.hidden_dims and ppo.obs_normalization"
     state, copies = model.state_dict(), []
-    optional = {name for name in state if name.startswith(_OPTIONAL)}
+    optional = [name for name in state if name.startswith(_OPTIONAL)]
     alike_shaped = (name in weights and weights[name].shape == state[name].shape for name in optional)
     fits = with_perception and bool(optional) and all(alike_shaped)
-    for name in [name for name in state if fits or name not in optional]:
-        own, other = state[name], weights.get(name)
+    for name, own in state.items():
+        if name in optional and not fits:
+            continue
+        other = weights.get(name)
         if name == _FIRST_LAYER and other is not None and not fits:
-            own = own[:, : _blind_dim(model)]
+            own = own[:, : model.blind_dim if isinstance(model, EstimatingModel) else model.obs_dim]
             if any(name.startswith("perception.") for name in weights):  # its embedding stays behind
                 other = other[:, : own.shape[1]]
         if other is None or other.shape != own.shape:
@@ -163,36 +138,6 @@ def estimating(
             rearranged[name] = weights[name][:, kept]
     untrained = {name: value for name, value in model.state_dict().items() if name.startswith("estimator.")}
     return rearranged | untrained
-
-
-def observing_more(
-    weights: Mapping[str, torch.Tensor], own: Sequence[ActorInput], given: Sequence[ActorInput]
-) -> Mapping[str, torch.Tensor]:
-    """The weights of an actor that observes less, for one whose added inputs have zero weights.
-
-    The running mean and standard deviation of the inputs it adds start at 0 and 1 with the sample count of the others,
-    so new samples move them slowly. The weights of an actor that differs in anything else are returned unchanged.
-
-    Args:
-        weights: the state of the other actor.
-        own: inputs of the one that observes more.
-        given: inputs of the other.
-    """
-    if not set(given) < set(own):
-        return weights
-    at = [own.index(one) for one in given]
-    layer, wider = weights[_FIRST_LAYER], dict(weights)
-    wider[_FIRST_LAYER] = layer.new_zeros(len(layer), len(own) + layer.shape[1] - len(given))
-    wider[_FIRST_LAYER][:, [*at, *range(len(own), wider[_FIRST_LAYER].shape[1])]] = layer
-    for name, unknown in (("_mean", 0.0), ("_var", 1.0), ("_std", 1.0)):
-        if (name := f"obs_normalizer.{name}") in weights:
-            wider[name] = weights[name].new_full((1, len(own)), unknown)
-            wider[name][:, at] = weights[name]
-    return wider
-
-
-def _blind_dim(model: MLPModel) -> int:
-    return model.blind_dim if isinstance(model, EstimatingModel) else model.obs_dim
 
 
 def _misfit(what: str, name: str, own: torch.Tensor, other: torch.Tensor | None, alike: str) -> CheckpointError:

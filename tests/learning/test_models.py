@@ -1,26 +1,29 @@
 """The perceptive actor: caching, windows of an update, supervision, the avoidance velocity."""
 
 import functools
+from dataclasses import replace
 
 import pytest
 import torch
-from test_ppo import collect
-from toy_env import HISTORY, ToyEnv, config, rollout
+from toy_env import HISTORY, ToyEnv, collect, config, rollout
 
 from omniperception.learning import PerceptionActor, PerceptivePpo, PerceptiveStorage
-from omniperception.perception import FpsMlp, PdRiskNet
+from omniperception.perception import FpsMlp, FpsSampler
 
-NETWORKS = {
-    "pd": functools.partial(PdRiskNet, 2, 1, HISTORY, proximal_dim=5, distal_dim=3),
-    "mlp": functools.partial(FpsMlp, 3, HISTORY, (6,), 8),
+FPS = {
+    "sampler": functools.partial(FpsSampler, 3, max_range=5.0),
+    "network": functools.partial(FpsMlp, hidden=(6,), feature_dim=8),
 }
 
 
-def actor_for(env, network="pd", **options):
+def actor_for(env, network="pd", normalize=False, max_change=None, groups=("command",), obs=None, **weights):
+    """An actor whose perception the policy's loss trains, supervised with the weights that are given."""
     torch.manual_seed(1)
-    groups = {"actor": ["command"]}
-    options = {"hidden_dims": [8], "distribution_cfg": {"class_name": "GaussianDistribution"}, **options}
-    return PerceptionActor(env.get_observations(), groups, "actor", 2, perception=NETWORKS[network](), **options)
+    given = config(hidden_dims=[8], obs_normalization=normalize)
+    weights = {"height_weight": 0.0, **(FPS if network == "mlp" else {}), **weights}
+    perception = replace(given.perception, **weights)
+    learning = replace(given, perception=perception, actor_groups=groups, max_change=max_change)
+    return PerceptionActor(env.get_observations() if obs is None else obs, learning, 2)
 
 
 def advance(env, steps):
@@ -44,7 +47,7 @@ def test_update_equals_rollout(network, normalize):
     torch.manual_seed(3)
     env = ToyEnv(5, episode=11)
     advance(env, 13)
-    actor = actor_for(env, network, obs_normalization=normalize)
+    actor = actor_for(env, network, normalize)
     torch.nn.init.normal_(actor.mlp[0].weight)  # an untrained actor ignores its features
     storage = PerceptiveStorage(5, 12, env.get_observations(), ["command"], 2, frames=True, steps_per_frame=5)
     seen = rollout(env, storage, 12)
@@ -78,7 +81,7 @@ def test_features_once_per_tick_until_the_actor_is_reset():
 
 def test_weights_that_learn_or_are_loaded_are_used_at_once():
     env = ToyEnv(6)
-    alg, other = (PerceptivePpo.build(env, config(supervised=True), "cpu") for _ in range(2))
+    alg, other = (PerceptivePpo(env, config(supervised=True), "cpu") for _ in range(2))
     collect(alg, env, 8)
     obs = env.get_observations()
     with torch.inference_mode():
@@ -125,7 +128,7 @@ def height_case(weight):
     torch.manual_seed(5)
     env = ToyEnv(5, episode=11)
     advance(env, 7)
-    actor = actor_for(env, supervision={"height_target": weight} if weight else None)
+    actor = actor_for(env, height_weight=weight)
     storage = PerceptiveStorage(5, 9, env.get_observations(), ["command", "height_target"], 2, frames=True)
     rollout(env, storage, 9)
     torch.manual_seed(6)
@@ -134,9 +137,9 @@ def height_case(weight):
 
 
 @pytest.mark.parametrize("weight", [0.5, 3.0])
-def test_height_loss_joins_the_backward_pass_at_unit_scale(weight):
+def test_the_height_loss_is_added_at_unit_scale(weight):
     actor, obs = height_case(weight)
-    (1e-3 * actor(obs).square().sum()).backward()  # the main loss is scaled, the height loss must not be
+    (1e-3 * actor(obs).square().sum() + actor.auxiliary_loss).backward()
     got = [p.grad.clone() for p in actor.parameters() if p.grad is not None]
 
     plain, _ = height_case(0.0)
@@ -155,7 +158,7 @@ def test_height_loss_joins_the_backward_pass_at_unit_scale(weight):
 def test_no_step_with_a_frame_gives_zero_height_loss():
     actor, obs = height_case(1.0)
     obs.step_count.zero_()
-    actor(obs).sum().backward()
+    (actor(obs).sum() + actor.auxiliary_loss).backward()
     assert actor.pop_supervised_losses() == {"height_target": 0.0}
     assert all(torch.isfinite(p.grad).all() for p in actor.parameters() if p.grad is not None)
 
@@ -163,17 +166,15 @@ def test_no_step_with_a_frame_gives_zero_height_loss():
 def test_height_supervision_needs_a_predictor_and_a_fitting_target():
     env = ToyEnv(3)
     with pytest.raises(ValueError, match="sets nothing aside for height_target"):
-        actor_for(env, "mlp", supervision={"height_target": 1.0})
+        actor_for(env, "mlp", height_weight=1.0)
     obs = env.get_observations()
     obs["height_target"] = torch.zeros(3, 7)
     with pytest.raises(ValueError, match="of 5 values within the embedding's 8, the environment gives 7"):
-        PerceptionActor(
-            obs, {"actor": ["command"]}, "actor", 2, NETWORKS["pd"](), {"height_target": 1.0}, hidden_dims=[8]
-        )
+        actor_for(env, height_weight=1.0, obs=obs)
 
 
 def avoiding_actor(env, network="mlp", **options):
-    actor = actor_for(env, network, supervision={"avoidance_target": 1.0}, **options)
+    actor = actor_for(env, network, avoidance_weight=1.0, **options)
     with torch.no_grad():
         actor.read_out.layers[-1].weight.normal_()
         actor.read_out.layers[-1].bias.normal_()
@@ -187,7 +188,7 @@ def test_avoidance_velocity_shifts_the_command(normalize):
     advance(env, 7)
     env.frame_count[2] = 0
     obs = env.get_observations()
-    actor = avoiding_actor(env, obs_normalization=normalize)
+    actor = avoiding_actor(env, normalize=normalize)
     if normalize:
         actor.update_normalization(obs)
     with torch.no_grad():
@@ -203,7 +204,7 @@ def test_avoidance_velocity_shifts_the_command(normalize):
 def test_an_untrained_actor_follows_the_command_alone():
     env = ToyEnv(4)
     advance(env, 7)
-    actor = actor_for(env, supervision={"avoidance_target": 1.0})
+    actor = actor_for(env, avoidance_weight=1.0)
     with torch.no_grad():
         assert torch.equal(actor.get_latent(env.get_observations())[:, :3], env.get_observations()["command"])
 
@@ -221,7 +222,8 @@ def test_avoidance_velocity_of_an_update_equals_that_of_the_rollout_and_is_learn
     losses = []
     for _ in range(150):
         optimizer.zero_grad()
-        (0.0 * actor(batch.observations).sum()).backward()
+        actor(batch.observations)
+        actor.auxiliary_loss.backward()
         optimizer.step()
         losses.append(actor.pop_supervised_losses()["avoidance_target"])
     assert losses[-1] < 0.2 * losses[0]
@@ -252,8 +254,5 @@ def test_a_limit_needs_to_observe_what_was_asked_for():
 
 
 def test_avoidance_needs_an_observed_command():
-    obs = ToyEnv(3).get_observations()
     with pytest.raises(ValueError, match="need the actor to observe 'command', it observes \\['height_target'\\]"):
-        PerceptionActor(
-            obs, {"actor": ["height_target"]}, "actor", 2, NETWORKS["pd"](), {"avoidance_target": 1.0}, hidden_dims=[8]
-        )
+        actor_for(ToyEnv(3), groups=("height_target",), avoidance_weight=1.0)

@@ -65,16 +65,10 @@ def test_without_frames_the_mini_batches_are_shuffled_steps():
     assert not hasattr(storage, "frames")
 
 
-def test_too_many_frames_and_missing_calls_are_reported():
+def test_more_frames_than_there_is_room_for_are_reported():
     env = ToyEnv(2, period=2)
     with pytest.raises(ValueError, match="set it to the environment's value"):
         rollout(env, storage_for(env, 8, steps_per_frame=5), 8)
-    storage = storage_for(env, 8)
-    storage.record_frames(env.get_observations(), env.tick)
-    with pytest.raises(RuntimeError, match="once before each"):
-        storage.record_frames(env.get_observations(), env.tick)
-    with pytest.raises(ValueError, match="no observations"):
-        PerceptiveStorage(2, 4, ToyEnv(2, frames=False).get_observations(), ["command"], 2, frames=True)
 
 
 @pytest.mark.parametrize(("steps", "period", "expected"), [(24, 5, 6), (1, 5, 1), (5, 5, 2), (6, 5, 2), (7, 1, 7)])

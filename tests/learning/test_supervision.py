@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_ppo import collect
-from toy_env import ToyEnv, config
+from toy_env import ToyEnv, collect, config
 
 from omniperception.learning import PerceptivePpo
 from omniperception.perception import FpsMlp, FpsSampler
@@ -19,7 +18,7 @@ def algorithm(env, avoidance_weight=0.0, network=None, **ppo):
     if network is not None:
         sampler = functools.partial(FpsSampler, 3, max_range=5.0)
         perception = replace(perception, sampler=sampler, network=functools.partial(network), height_weight=0.0)
-    return PerceptivePpo.build(env, replace(cfg, perception=perception), "cpu")
+    return PerceptivePpo(env, replace(cfg, perception=perception), "cpu")
 
 
 def parameters(module):
@@ -28,12 +27,11 @@ def parameters(module):
 
 def test_supervision_learns_the_target():
     env = ToyEnv(6)
-    alg = algorithm(env)
+    alg = algorithm(env, num_learning_epochs=0)
     collect(alg, env, 8)
     errors = []
     for _ in range(60):
-        alg.train_perception()
-        errors.append(alg.actor.pop_supervised_losses()["height_target"])
+        errors.append(alg.fitting["perception"].update(alg.storage)["height_target"])
     assert errors[-1] < 0.3 * errors[0]
 
 
@@ -55,31 +53,28 @@ def test_ppo_sees_what_the_policy_acted_on_and_does_not_change_it(avoidance_weig
     env = ToyEnv(6, episode=9)
     alg = algorithm(env, avoidance_weight, network)
     collect(alg, env, 8)
-    acted_on = alg._embed_rollout()
     before = list(alg.actor.perception_parameters())[-1].detach().clone()
-    alg.train_perception()
-    alg.storage.acted_on = acted_on
+    alg.fitting.pop("perception").update(alg.storage)  # what follows is PPO alone
     after_supervision = [p.detach().clone() for p in alg.actor.perception_parameters()]
     assert not avoidance_weight or (after_supervision[-1] - before).abs().max() > 1e-3  # the read-out's bias
-    alg.perception_optimizer = None  # what follows is PPO alone
     for batch in alg.storage.mini_batch_generator(2, 1):
         alg.actor(batch.observations, stochastic_output=True)
         log_prob = alg.actor.get_output_log_prob(batch.actions)
         has_frame = batch.observations.step_count > 0
         assert has_frame.any() and not has_frame.all()
         assert torch.allclose(log_prob, batch.old_actions_log_prob.squeeze(-1), atol=1e-4)
-    super(PerceptivePpo, alg).update()
+    alg.update()
     assert all(map(torch.equal, after_supervision, alg.actor.perception_parameters()))
 
 
 def test_a_policy_may_be_supervised_from_some_iteration_on():
     env = ToyEnv(6)
-    alone = PerceptivePpo.build(env, config(), "cpu")
+    alone = PerceptivePpo(env, config(), "cpu")
     collect(alone, env, 8)
     alone.update()
     supervised = algorithm(env)
     supervised.load(alone.save())
-    assert not supervised.perception_optimizer.state
+    assert not supervised.fitting["perception"].optimizer.state
     collect(supervised, env, 8)
     assert supervised.update()["height_target"] > 0
 
@@ -111,9 +106,9 @@ def test_without_epochs_of_ppo_the_policy_stays_as_it_is():
 def test_the_learning_rate_falls():
     env, cfg = ToyEnv(4), config(max_iterations=4, num_learning_epochs=0)
     perception = replace(cfg.perception, supervised_epochs=1, learning_rate=1e-3, final_learning_rate=2e-4)
-    alg, rates = PerceptivePpo.build(env, replace(cfg, perception=perception), "cpu"), []
+    alg, rates = PerceptivePpo(env, replace(cfg, perception=perception), "cpu"), []
     for _ in range(5):
         collect(alg, env, 8)
         alg.update()
-        rates.append(alg.perception_optimizer.param_groups[0]["lr"])
+        rates.append(alg.fitting["perception"].optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4, 2e-4])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -58,57 +59,40 @@ class LoggerConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WandbConfig(LoggerConfig):
-    """Weights & Biases. Its own environment variables hold, such as WANDB_MODE=offline.
+class ServiceConfig(LoggerConfig):
+    """A service beside the TensorBoard files.
 
     Attributes:
         project: in which the run appears.
     """
 
     project: str = "omniperception"
+
+    def open(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> LogWriter:
+        """See `LoggerConfig.open`."""
+        module = importlib.import_module(f"omniperception.learning.log_writers.{self.extra}")
+        return module.Writer(run_dir, first_iteration, settings, self.project)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WandbConfig(ServiceConfig):
+    """Weights & Biases. Its own environment variables hold, such as WANDB_MODE=offline."""
+
     extra: ClassVar[str] = "wandb"
 
-    def open(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> LogWriter:
-        """See `LoggerConfig.open`."""
-        from omniperception.learning.log_writers.wandb import WandbWriter
-
-        return WandbWriter(run_dir, first_iteration, settings, self.project)
-
 
 @dataclass(frozen=True, kw_only=True)
-class MlflowConfig(LoggerConfig):
-    """MLflow. Its own environment variables hold, such as MLFLOW_TRACKING_URI.
+class MlflowConfig(ServiceConfig):
+    """MLflow, whose experiment is the project. Its own environment variables hold, such as MLFLOW_TRACKING_URI."""
 
-    Attributes:
-        project: name of the experiment in which the run appears.
-    """
-
-    project: str = "omniperception"
     extra: ClassVar[str] = "mlflow"
 
-    def open(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> LogWriter:
-        """See `LoggerConfig.open`."""
-        from omniperception.learning.log_writers.mlflow import MlflowWriter
-
-        return MlflowWriter(run_dir, first_iteration, settings, self.project)
-
 
 @dataclass(frozen=True, kw_only=True)
-class TrackioConfig(LoggerConfig):
-    """Trackio. Its own environment variables hold, such as TRACKIO_DIR.
+class TrackioConfig(ServiceConfig):
+    """Trackio. Its own environment variables hold, such as TRACKIO_DIR."""
 
-    Attributes:
-        project: in which the run appears.
-    """
-
-    project: str = "omniperception"
     extra: ClassVar[str] = "trackio"
-
-    def open(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any]) -> LogWriter:
-        """See `LoggerConfig.open`."""
-        from omniperception.learning.log_writers.trackio import TrackioWriter
-
-        return TrackioWriter(run_dir, first_iteration, settings, self.project)
 
 
 def run_name(run_dir: Path) -> str:

@@ -18,7 +18,7 @@ ID_FILE = "mlflow_id.txt"
 """In the run directory: under which a resumed run goes on."""
 
 
-class MlflowWriter(SummaryWriter, LogWriter):
+class Writer(SummaryWriter, LogWriter):
     """Metrics; seed, num_envs and PPO's settings as parameters; the configuration and videos as artifacts."""
 
     def __init__(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any], project: str) -> None:

@@ -18,7 +18,7 @@ NAME_FILE = "trackio_name.txt"
 """In the run directory: the name under which a resumed run goes on; no other run has it."""
 
 
-class TrackioWriter(SummaryWriter, LogWriter):
+class Writer(SummaryWriter, LogWriter):
     """Metrics by iteration, the configuration, and videos."""
 
     def __init__(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any], project: str) -> None:

@@ -16,7 +16,7 @@ ID_FILE = "wandb_id.txt"
 """In the run directory: under which a resumed run goes on."""
 
 
-class WandbWriter(WandbLogWriter):
+class Writer(WandbLogWriter):
     """rsl_rl's writer; a resumed run goes on as the same run."""
 
     def __init__(self, run_dir: Path, first_iteration: int, settings: Mapping[str, Any], project: str) -> None:
