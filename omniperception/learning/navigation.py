@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -14,6 +12,7 @@ from torch import nn
 
 from omniperception.avoidance.navigation import navigation_inputs, num_inputs, within_barrier
 from omniperception.avoidance.velocity_risk import VelocityRisk
+from omniperception.common.checked import Pair, Positive, Widths, checked
 
 MOTION, ASKED = "motion", "asked"
 """Groups of observations: the robot's own velocity, and what its gait is asked for, (n, 3) each."""
@@ -33,7 +32,7 @@ class VelocityInput(NamedTuple):
     scale: float
 
 
-@dataclass(frozen=True)
+@checked("navigation")
 class NavigationConfig:
     """Configuration of a navigation policy.
 
@@ -47,20 +46,10 @@ class NavigationConfig:
     """
 
     risk: VelocityRisk
-    ranges: Sequence[Sequence[float]]
-    hidden_dims: Sequence[int] = (128, 128, 64)
-    turn_acceleration: float = 8.0
-    barrier: float | None = None
-
-    def __post_init__(self) -> None:
-        if len(self.ranges) != 3 or any(len(ends) != 2 or not ends[0] <= ends[1] for ends in self.ranges):
-            raise ValueError(f"navigation.ranges={list(map(list, self.ranges))} must be three pairs [low, high]")
-        if not self.hidden_dims or min(self.hidden_dims) < 1:
-            raise ValueError(f"navigation.hidden_dims={list(self.hidden_dims)} must be widths of hidden layers")
-        if self.turn_acceleration <= 0:
-            raise ValueError(f"navigation.turn_acceleration={self.turn_acceleration} must be positive")
-        if self.barrier is not None and self.barrier <= 0:
-            raise ValueError(f"navigation.barrier={self.barrier} must be positive (1/s), or null for none")
+    ranges: tuple[Pair, Pair, Pair]
+    hidden_dims: Widths = (128, 128, 64)
+    turn_acceleration: Positive = 8.0
+    barrier: Positive | None = None
 
     def build_network(self) -> CorrectedChoice:
         """From `navigation_inputs` to velocities."""

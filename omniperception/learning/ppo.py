@@ -21,6 +21,7 @@ from omniperception.learning.estimator import EstimatingModel
 from omniperception.learning.models import PerceivingNavigator, PerceptionActor
 from omniperception.learning.navigation import NavigationActor
 from omniperception.learning.storage import Embedded, PerceptiveStorage, WindowedObservations
+from omnirobot.common.errors import UserError
 
 ESTIMATOR_LEARNING_RATE = 1.0e-3
 """Of the estimator's own optimiser, which passes over each rollout once."""
@@ -48,7 +49,7 @@ def check_rollout(num_envs: int, num_steps: int, num_mini_batches: int, has_fram
         )
 
 
-class RolloutTooSmall(ValueError):
+class RolloutTooSmall(UserError, ValueError):
     """There is too little in a rollout to learn from it."""
 
 

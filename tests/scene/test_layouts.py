@@ -284,8 +284,8 @@ class TestCorridor:
         [
             ({"width": (0.5, 1.0)}, "leaves no room with margin=0.3"),
             ({"length": (1.0, 2.0)}, "must be beyond lead=1.5"),
-            ({"pieces": 0}, "pieces=0 of a corridor's wall must be at least 1"),
-            ({"width": (3.0, 2.0)}, "must be a range"),
+            ({"pieces": 0}, "pieces=0 must be at least 1"),
+            ({"width": (3.0, 2.0)}, r"must be \[low, high\] with 0 < low <= high"),
         ],
     )
     def test_impossible_corridors_are_refused(self, settings, message):
