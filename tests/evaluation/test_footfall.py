@@ -59,6 +59,6 @@ def test_one_that_falls_has_no_figures_and_none_is_asked_for_more_than_it_is_for
 
 def test_other_environments_are_refused(make_env):
     with pytest.raises(ConfigError, match="the command alone, trained with observations.groups.command.history=1"):
-        watch(make_env(*TASK, "observations.groups.command.history=2"), None)
+        watch(make_env(*TASK, "+observations.groups.command.history=2"), None)
     with pytest.raises(ValueError, match=r"velocity commands and num_envs=7"):
         watch(make_env(*BLIND, "scenario=static", "num_envs=2"), None)
