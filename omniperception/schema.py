@@ -81,7 +81,7 @@ NAMES: dict[str, Kind] = {
         | _members("learning.log_writers", trackio="TrackioConfig")
     ),
     "lidar.consumers.*": Kind("omniperception.env.consumers", built=False),
-    "lidar.pattern": Kind(_members("lidar", **{name: name for name in _PATTERNS.split()}), built=False),
+    "lidar.pattern": Kind({name: f"omnilidar.{name}" for name in _PATTERNS.split()}, built=False),
     "perception.sampler": Kind(
         _members("perception", raw="RawSampler", fps="FpsSampler", pd="PdSampler", proximity="ProximitySampler")
         | _members("perception", standing="StandingSampler"),

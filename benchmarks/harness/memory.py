@@ -38,7 +38,7 @@ def _children(thing: object) -> list[object]:
         return list(thing)
     kind: Any = type(thing)
     of_warp = any(base.__name__ in ("StructInstance", "Mesh") for base in kind.__mro__)
-    ours = kind.__module__.startswith("omniperception.")
+    ours = kind.__module__.startswith(("omnilidar.", "omniperception."))
     return list(vars(thing).values()) if hasattr(thing, "__dict__") and (of_warp or ours) else []
 
 
