@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from omniperception.avoidance.sector_motion import NEARNESS_RANGE, sector_bearings
+from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.avoidance.velocity_risk import VelocityRisk
 
 NUM_SECTORS = 36
@@ -54,35 +54,3 @@ def navigation_inputs(
     chosen = reference[:, :2] + risk.avoidance(risks, reference[:, :2], candidates)
     parts = (chosen, reference[:, 2:], nearness, closeness, moving.flatten(1), reference, velocity, asked, risks)
     return torch.cat(parts, 1)
-
-
-BARRIER_PASSES = 4
-"""Projections of a velocity onto what a barrier allows, each for the sector that it violates most."""
-
-
-def within_barrier(velocity: torch.Tensor, inputs: torch.Tensor, rate: float, radius: float) -> torch.Tensor:
-    """Velocities whose approach to no obstacle is faster than a control barrier allows.
-
-    With the gap h = d - `radius` to the obstacle of a sector, h' >= -`rate` h: the velocity along the sector's bearing
-    is at most `rate` h plus the obstacle's own. Of a single obstacle the nearest such velocity, in closed form; of
-    several one that is found by BARRIER_PASSES projections, as far as there is one.
-
-    Args:
-        velocity: (n, 3) v_x, v_y (m/s) and yaw rate, which stays, in the yaw-aligned frame.
-        inputs: (n, D) `navigation_inputs`, from which the sectors are read, out to NEARNESS_RANGE.
-        rate: 1/s.
-        radius: m, from the base's origin.
-
-    Returns:
-        (n, 3).
-    """
-    bearings = sector_bearings(NUM_SECTORS, inputs.device)  # (S, 2)
-    nearness, moving = inputs[:, 3 : 3 + NUM_SECTORS], inputs[:, 3 + 2 * NUM_SECTORS : 3 + 4 * NUM_SECTORS]
-    own = SPEED * (moving.unflatten(1, (NUM_SECTORS, 2)) * bearings).sum(-1)
-    most = rate * (NEARNESS_RANGE * (1.0 - nearness) - radius) + own
-    most = torch.where(nearness > 0, most, torch.inf)
-    planar = velocity[:, :2]
-    for _ in range(BARRIER_PASSES):
-        excess, sector = (planar @ bearings.T - most).max(1)
-        planar = planar - excess.clamp(min=0.0)[:, None] * bearings[sector]
-    return torch.cat((planar, velocity[:, 2:]), 1)

@@ -11,7 +11,7 @@ from rsl_rl.modules import MLP
 from tensordict import TensorDict
 from torch import nn
 
-from omniperception.avoidance.navigation import navigation_inputs, num_inputs, within_barrier
+from omniperception.avoidance.navigation import navigation_inputs, num_inputs
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.learning.estimator import EstimatingModel
 
@@ -42,15 +42,12 @@ class NavigationConfig:
         ranges: (low, high) of v_x, v_y (m/s) and yaw rate (rad/s) that a gait is asked for.
         hidden_dims: hidden layers of the correction.
         turn_acceleration: most (rad/s^2) by which the yaw rate that a gait is asked for changes.
-        barrier: rate (1/s) of a control barrier behind the network (`avoidance.navigation.within_barrier`), as far from
-            obstacles as the robot's radius; None: there is none.
     """
 
     risk: VelocityRisk
     ranges: Sequence[Sequence[float]]
     hidden_dims: Sequence[int] = (128, 128, 64)
     turn_acceleration: float = 8.0
-    barrier: float | None = None
 
     def __post_init__(self) -> None:
         if len(self.ranges) != 3 or any(len(ends) != 2 or not ends[0] <= ends[1] for ends in self.ranges):
@@ -59,26 +56,21 @@ class NavigationConfig:
             raise ValueError(f"navigation.hidden_dims={list(self.hidden_dims)} must be widths of hidden layers")
         if self.turn_acceleration <= 0:
             raise ValueError(f"navigation.turn_acceleration={self.turn_acceleration} must be positive")
-        if self.barrier is not None and self.barrier <= 0:
-            raise ValueError(f"navigation.barrier={self.barrier} must be positive (1/s), or null for none")
 
 
 class CorrectedChoice(nn.Module):
-    """The choice without learning, which its inputs begin with, plus a network's correction of it, which begins at 0;
-    behind that the barrier, if there is one."""
+    """The choice without learning, with which its inputs begin, plus a network's correction, which begins at 0."""
 
     def __init__(self, config: NavigationConfig) -> None:
         super().__init__()
         self.network = MLP(num_inputs(config.risk), 3, list(config.hidden_dims), "elu")
-        self._barrier, self._radius = config.barrier, config.risk.robot_radius
         last = [layer for layer in self.network.modules() if isinstance(layer, nn.Linear)][-1]
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """(n, 3) velocities from `navigation_inputs` (n, D)."""
-        wanted = inputs[:, :3] + self.network(inputs)
-        return wanted if self._barrier is None else within_barrier(wanted, inputs, self._barrier, self._radius)
+        return inputs[:, :3] + self.network(inputs)
 
 
 class NavigationActor(EstimatingModel):
