@@ -4,8 +4,8 @@
     python -m benchmarks.perceived_windows runs=outputs/narrow,outputs/wide scenarios=moving,hold
 
 A gait walks among the obstacles of `scenarios` (split=dev), driven by the velocity risk of the true obstacles. On its
-frames the network of each checkpoint of runs of `experiment=perceive` says nearness and velocity by sector; R^2 of both,
-velocities where an obstacle is within 2.5 m. Table and figure go into `folder`.
+frames the network of each checkpoint of runs of `experiment=perceive` says nearness and velocity by sector; R^2 of
+both, velocities where an obstacle is within 2.5 m. Table and figure go into `folder`.
 """
 
 from __future__ import annotations
