@@ -60,7 +60,7 @@ class Shown:
     Attributes:
         run_dir: run directory.
         overrides: changes to its configuration, presets and values.
-        policy: "run" or a name of `evaluation.baselines.BASELINES`.
+        policy: "run" or a name of `evaluation.trials.baselines.BASELINES`.
         checkpoint: file of weights; None: the run's newest.
         trust: packages of one's own that the configuration may name.
     """

@@ -17,7 +17,7 @@ HERE = Path(__file__).parent
 def torchrun(script, *arguments, processes=2):
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])]),
+        "PYTHONPATH": os.pathsep.join([str(HERE), *filter(None, sys.path)]),
         "OMP_NUM_THREADS": "1",
     }
     command = [

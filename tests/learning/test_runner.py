@@ -51,7 +51,7 @@ def test_resume_in_a_new_process_is_exact(tmp_path):
         part = runner_for(tmp_path / kind / "part", **options)
         part.learn(2)
         times[kind] = part.total_time
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *filter(None, sys.path)])}
     command = [sys.executable, str(HERE / "resume_process.py"), str(tmp_path), "3"]
     subprocess.run(command, check=True, env=environment, capture_output=True)
     for kind in KINDS:
