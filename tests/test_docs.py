@@ -95,7 +95,7 @@ def test_files_and_presets_that_a_page_names_exist(page):
     assert not {
         f"{group}={name}"
         for group, name in presets
-        if name not in ("mine", "all", "null") and not (ROOT / "conf" / group / f"{name}.yaml").exists()
+        if name not in ("mine", "watched", "all", "null") and not (ROOT / "conf" / group / f"{name}.yaml").exists()
     }
 
 
