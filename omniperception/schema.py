@@ -93,7 +93,7 @@ NAMES: dict[str, Kind] = {
         given=None,
     ),
     "perception.network.rings": Kind(_members("perception", rings="RingPath"), built=False, given=None),
-    "ppo.phases.*": Kind({}, built=False, given=1),
+    "ppo.phases.*": Kind({}, built=False, given=None),
 }
 """Names allowed, by key; `*` is any one name."""
 
