@@ -63,7 +63,7 @@ LINES = [
     ("gait run=RUN what=response condition=ideal", "condition= would mean nothing: it is not read for what=response"),
     ("gait run=RUN what=response terrain=mixed", "this command sets terrain=flat itself"),
     ("gait run=RUN what=response conditions=calm", "condition=calm"),
-    ("gait run=RUN preset=lidar", "nothing is left to measure: preset=lidar"),
+    ("gait run=RUN preset=lidar", "nothing to measure: preset=lidar"),
     ("gait run=RUN factors=0", "no factor is above 0"),
     ("gait run=RUN what=feet obstacles.split=test", "evaluate split=test"),
     ("ablate seeds=1,2,1", "names one twice"),
