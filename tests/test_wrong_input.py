@@ -208,7 +208,7 @@ LINES = [
     ("evaluate run=RUN condition=dream", "condition=dream is unknown"),
     ("evaluate run=RUN policy=oracle walker=nowhere", "walker=nowhere"),
     ("evaluate run=RUN plots=maybe", "plots=maybe must be true or false"),
-    ("evaluate run=RUN obstacles=moving plots=false", "scenario=corridor defines the obstacles"),
+    ("evaluate run=pretrained/avoider obstacles=moving plots=false", "scenario=corridor defines the obstacles"),
     ("evaluate run=RUN num_envs=0", "num_envs=0"),
     ("ablate stage=dance", "stage=dance"),
     ("ablate study=perceptoin", "study=perceptoin is unknown; did you mean perception?"),
