@@ -43,11 +43,9 @@ class TrueSectors:
         field = self._field
         if field is None:
             return torch.zeros(self._num_envs, 0, dtype=torch.bool, device=self._device)
-        place = rotate_yaw(-yaw, field.pos_w[..., :2].float() - base_pos_w[:, None, :2])
-        x, y = place.unbind(-1)
-        distance = torch.hypot(x, y)
-        width = torch.asin((field.radius.float() / distance.clamp(min=1e-6)).clamp(max=1.0))
-        return (torch.atan2(y, x).abs() - width <= half_angle) | (distance <= field.radius)
+        x, y = self._places(field, base_pos_w, yaw).unbind(-1)
+        reach = (field.radius.float() / torch.hypot(x, y).clamp(min=1e-6)).clamp(max=1.0)
+        return (torch.atan2(y, x).abs() - torch.asin(reach) <= half_angle) | (reach == 1.0)
 
     def measure(self, base_pos_w: torch.Tensor, yaw: torch.Tensor, known: torch.Tensor | None = None) -> torch.Tensor:
         """Distances and velocities at the present state of the obstacles.
@@ -66,7 +64,7 @@ class TrueSectors:
             counts = field.in_the_way()
             if known is not None:
                 counts = counts & known
-            place = rotate_yaw(-yaw, field.pos_w[..., :2].float() - base_pos_w[:, None, :2])
+            place = self._places(field, base_pos_w, yaw)
             velocity = rotate_yaw(-yaw, field.velocity_w.float())
             heading = field.yaw.float() - yaw[:, None]
             axis, outline = torch.stack((heading.cos(), heading.sin()), -1), field.outline.float()
@@ -80,3 +78,8 @@ class TrueSectors:
             ]
             launch_over_envs(nearest_by_sector, self._num_envs, inputs, self._device)
         return out
+
+    @staticmethod
+    def _places(field: ObstacleField, base_pos_w: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
+        """(num_envs, O, 2) m, yaw-aligned frame: the obstacles' middles."""
+        return rotate_yaw(-yaw, field.pos_w[..., :2].float() - base_pos_w[:, None, :2])

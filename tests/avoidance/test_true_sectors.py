@@ -74,6 +74,17 @@ def test_an_obstacle_is_in_sectors_whose_middle_it_covers_and_in_that_of_its_nea
     assert measured[18].item() == pytest.approx(distance - radius, rel=1e-2)
 
 
+@pytest.mark.parametrize(("bearing_deg", "seen"), [(0, True), (110, True), (-110, True), (117, False), (180, False)])
+def test_an_obstacle_is_in_view_where_its_circle_reaches_into_it(bearing_deg, seen):
+    scene = Scene({"post": POST}, base=(1.0, 1.0), yaw=0.5)  # radius 0.5 at 3.5 m: 8.2 degrees to either side
+    bearing = math.radians(bearing_deg) + 0.5
+    scene.field.pos_w[0, 0] = torch.tensor([1.0 + 3.5 * math.cos(bearing), 1.0 + 3.5 * math.sin(bearing), 0.5])
+    sectors = TrueSectors(36, scene.config, scene.field, 1, CPU)
+    assert sectors.in_view(scene.base_pos_w, scene.yaw, math.radians(108.0)).tolist() == [[seen]]
+    scene.field.pos_w[0, 0] = torch.tensor([0.7, 1.0, 0.5])  # around the robot
+    assert sectors.in_view(scene.base_pos_w, scene.yaw, math.radians(45.0)).tolist() == [[True]]
+
+
 def test_what_hangs_overhead_is_parked_or_unknown_does_not_count():
     wall = ObstacleGroup("box", 1, [[3.0, 3.0], [0.1, 0.1], [0.5, 0.5]], poses=[[0.0, -2.0, 0.0]])
     scene = Scene({"post": POST, "wall": wall})

@@ -158,6 +158,7 @@ class TestErrors:
         robots = 400
         around = torch.tensor([2.0, 1.0, -0.5]).expand(robots, 36, 3).clone()
         here = SimpleNamespace(sectors=around, num_envs=robots, device="cpu", control_dt=0.1)
+        here.true_sectors = SimpleNamespace(names=())
         view._candidates = RISK.candidates()
         view._begin(here)
         return view, here
@@ -197,3 +198,29 @@ class TestErrors:
         view.reset(torch.arange(400))
         here.sectors = here.sectors + 1.0
         assert (view._with_errors(here, view._errors)[..., 0] != 3.0).all()  # nothing of the episode before
+
+
+def test_what_was_not_seen_lately_is_not_known(make_env):
+    """A post stands behind a robot; what its LiDAR saw is known for 0.25 s."""
+    post = ["obstacles=none", "+obstacles.groups.post={kind: cylinder, count: 1, size: [[0.3, 0.3], [0.5, 0.5]]}"]
+    env = make_env(*post, num_envs=2, blind=True)
+    field, state = env.obstacles, env.state
+    field.pos_w[:, 0, :2] = state.kinematics.base_pos_w[:, :2] + torch.tensor([2.0, 0.0], dtype=field.pos_w.dtype)
+    here = SimpleNamespace(true_sectors=state.true_sectors, num_envs=2, device="cpu", control_dt=0.1)
+    here.kinematics = SimpleNamespace(base_pos_w=state.kinematics.base_pos_w, yaw=torch.zeros(2))
+    here.sectors = state.sectors
+    errors = SectorErrors(0.0, 0.0, [1.0, 1.0], 0.0, 0.0, 0.3, seen_deg=108.0, remembered_s=0.25)
+    view = NavigationView(RISK, errors)
+    view._candidates = RISK.candidates()
+    view._begin(here)
+
+    def known(yaw):
+        here.kinematics.yaw = torch.full((2,), yaw)
+        return view._with_errors(here, errors)[..., 0].isfinite().any(1).tolist()
+
+    assert known(math.pi) == [False, False]  # behind, and never seen
+    assert known(0.0) == [True, True]
+    assert [known(math.pi) for _ in range(3)] == [[True, True], [True, True], [False, False]]
+    assert known(math.radians(115.0)) == [True, True]  # its edge reaches into the view: asin(0.3 / 2) is 8.6 degrees
+    view.reset(torch.tensor([1]))
+    assert known(math.radians(118.0)) == [True, False]

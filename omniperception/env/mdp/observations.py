@@ -201,7 +201,8 @@ class NavigationView(StatefulTerm):
         self.slowed, self.level = torch.ones(2, state.num_envs, device=state.device).unbind(0)
         self.before = torch.zeros_like(state.sectors)
         self.before[..., 0] = torch.inf
-        self.unseen_s = torch.zeros(0, 0, device=state.device)
+        obstacles = len(state.true_sectors.names) if self._errors is not None else 0
+        self.unseen_s = torch.full((state.num_envs, obstacles), torch.inf, device=state.device)
         if self._errors is not None:
             self.reset(torch.arange(state.num_envs, device=state.device))
 
@@ -223,8 +224,6 @@ class NavigationView(StatefulTerm):
             return state.sectors
         kinematics = state.kinematics
         seen = state.true_sectors.in_view(kinematics.base_pos_w, kinematics.yaw, math.radians(errors.seen_deg))
-        if self.unseen_s.shape != seen.shape:  # the first step
-            self.unseen_s = torch.full(seen.shape, torch.inf, device=seen.device)
         self.unseen_s = torch.where(seen, 0.0, self.unseen_s + state.control_dt)
         known = self.unseen_s <= errors.remembered_s
         return state.true_sectors.measure(kinematics.base_pos_w, kinematics.yaw, known)
@@ -232,7 +231,7 @@ class NavigationView(StatefulTerm):
     def reset(self, env_ids: torch.Tensor) -> None:
         if self._errors is None or self._candidates is None:
             return
-        self.unseen_s = self.unseen_s.index_fill(0, env_ids, torch.inf) if len(self.unseen_s) else self.unseen_s
+        self.unseen_s = self.unseen_s.index_fill(0, env_ids, torch.inf)
         low, high = self._errors.slowed
         self.slowed[env_ids] = low + (high - low) * torch.rand(len(env_ids), device=self.slowed.device)
         self.level[env_ids] = torch.rand(len(env_ids), device=self.level.device)

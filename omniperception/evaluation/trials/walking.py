@@ -113,7 +113,7 @@ class Walking:
         }
 
     def end(self, env_ids: torch.Tensor, trials: torch.Tensor, done: torch.Tensor) -> None:
-        """Files what is no sum of environments (n,) in trials (n,), and begins anew where done (num_envs,)."""
+        """Files what is no sum of environments (n,) in trials (n,), and starts again where done (num_envs,)."""
         self._filed_fastest[trials] = self._fastest[env_ids]
         self._fastest *= ~done
         self._was_down &= ~done[:, None]

@@ -84,7 +84,7 @@ class Message:
             yield
         except ModuleNotFoundError:
             raise
-        except Exception as error:  # rosbags raises whatever its parsing meets
+        except Exception as error:  # rosbags raises errors of many kinds
             raise ValueError(f"{self.topic}: a message is damaged, or no {self.kind}") from error
 
 
