@@ -249,6 +249,16 @@ def test_a_missing_library_names_its_extra(monkeypatch, suffix, tmp_path):
         write_points(tmp_path / f"a{suffix}", a_table())
 
 
+def test_recordings_are_written_without_the_package_that_reads_them(monkeypatch, tmp_path):
+    pytest.importorskip("mcap_ros2", reason="extra clouds")
+    for name in [name for name in sys.modules if name.partition(".")[0] == "omnirobot"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "omnirobot", None)
+    write_points(tmp_path / "a.mcap", a_table())
+    with pytest.raises(ModuleNotFoundError, match=r"needs omnirobot: pip install 'packages/robot\[recordings\]'"):
+        read_points(tmp_path / "a.mcap")
+
+
 def test_frames_that_cannot_be_saved_or_loaded(frame, tmp_path):
     with pytest.raises(ValueError, match=r"env=2 must be in 0\.\.1"):
         frame.save(tmp_path / "a.ply", env=2)

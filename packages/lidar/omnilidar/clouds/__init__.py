@@ -134,4 +134,5 @@ def _needing(form: _Format, path: Path) -> Iterator[None]:
         if not form.library:
             raise
         library = (error.name or form.library).partition(".")[0]
-        raise ModuleNotFoundError(f"{path} needs {library}: pip install 'omnilidar[clouds]'", name=error.name) from None
+        what = "packages/robot[recordings]" if library == "omnirobot" else "omnilidar[clouds]"
+        raise ModuleNotFoundError(f"{path} needs {library}: pip install '{what}'", name=error.name) from None

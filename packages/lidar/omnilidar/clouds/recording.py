@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-
-from omnirobot.replay.recordings import Message, Recording
-from omnirobot.wire import custom_msg
+from typing import TYPE_CHECKING
 
 from .pointcloud2 import DEFINITION, MESSAGE, message_from_table, table_from_message
 from .table import PointTable
+
+if TYPE_CHECKING:
+    from omnirobot.replay.recordings import Message, Recording
 
 TOPIC = "/points"
 
 
 def read(path: Path, topic: str | None) -> Iterator[PointTable]:
-    """The clouds of a topic, in the order of the recording."""
+    """The clouds of a topic, in the order of the recording; omnirobot reads it, which nothing else here needs."""
+    from omnirobot.replay.recordings import Recording
+
     recording = Recording(path)
     for message in recording.messages([_chosen(recording, topic)]):
         yield _table(message)
@@ -24,12 +27,16 @@ def read(path: Path, topic: str | None) -> Iterator[PointTable]:
 def _table(message: Message) -> PointTable:
     if message.kind == MESSAGE:
         return table_from_message(message.decode())
+    from omnirobot.wire import custom_msg
+
     given = custom_msg.read(message.data)
     return PointTable(given.points, given.frame, 1e-9 * given.stamp_ns)
 
 
 def _chosen(recording: Recording, topic: str | None) -> str:
     """The topic to read among those with point clouds."""
+    from omnirobot.wire import custom_msg
+
     path, topics, missing = recording.path, recording.topics, recording.missing
     of_clouds = [name for name, kind in topics.items() if kind == MESSAGE or custom_msg.KIND.fullmatch(kind)]
     if topic is None and len(of_clouds) == 1:
