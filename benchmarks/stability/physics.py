@@ -211,7 +211,7 @@ def scenes(env: EnvConfig, num_envs: int, paper: RandomizationConfig) -> list[Sc
         sim.qpos[:, 2] += height
         listed.append(Scene(name, sim, target))
     sim, target = _standing(env, num_envs)
-    reach = FRONT + env.obstacles.parts()[0].group.largest_radius
+    reach = FRONT + env.obstacles.obstacles()[0].group.largest_radius
     sim.mocap_pos[:, 0] = torch.tensor([reach - 0.05, 0.0, 0.3])
     listed.append(Scene("5 cm inside an obstacle", sim, target))
     listed += [_impact(env, num_envs, speed) for speed in (1.5, 3.0, 5.0, 10.0)]

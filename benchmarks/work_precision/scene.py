@@ -81,7 +81,8 @@ def moving_scene(obstacles: ObstaclesConfig, num_envs: int, seed: int = 0) -> Mo
     Sizes are drawn once, the same in every environment.
     """
     rng, shapes = np.random.default_rng(seed), np.random.default_rng(0)
-    parts = [part for part in obstacles.parts() if part.group.poses is None]
+    groups = [obstacle.group for obstacle in obstacles.obstacles()]
+    parts = [part for part in obstacles.parts() if groups[part.obstacle].poses is None]
     sizes = np.zeros((len(parts), 3))
     for size, part in zip(sizes, parts, strict=True):
         size[: len(part.size)] = shapes.uniform(*np.transpose(part.size))
@@ -93,7 +94,7 @@ def moving_scene(obstacles: ObstaclesConfig, num_envs: int, seed: int = 0) -> Mo
     nearest = SPREAD[0] + radius
     distance = np.sqrt(rng.uniform(nearest**2, SPREAD[1] ** 2, shape))
     height = np.broadcast_to(half_height, shape)
-    speed = np.stack([rng.uniform(*part.group.speed, num_envs) for part in parts], axis=1)
+    speed = np.stack([rng.uniform(*groups[part.obstacle].speed, num_envs) for part in parts], axis=1)
     flat = np.zeros(shape)
     return MovingScene(
         kinds=tuple(part.kind for part in parts),
