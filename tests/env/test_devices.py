@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from stepping import random_actions
+from stepping import random_actions, tensors
 
 from omniperception import build, config
 from omniperception.build import build_runner
@@ -48,8 +48,9 @@ def actions(env, steps):
 def seen(env, action):
     """What a step gives, all of it on the environment's device."""
     observations, rewards, dones, _ = env.step(action)
-    assert {str(value.device) for value in (*observations.values(), rewards, dones)} == {env.config.sim.device}
-    return {**{name: observations[name].cpu() for name in sorted(observations.keys())}, "r": rewards.cpu(), "d": dones}
+    given = {**tensors(observations), "r": rewards, "d": dones}
+    assert {str(value.device) for value in given.values()} == {env.config.sim.device}
+    return {name: value.cpu() for name, value in given.items()}
 
 
 def test_a_step_that_resets_is_that_of_the_cpu(run):

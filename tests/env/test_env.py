@@ -237,15 +237,13 @@ def test_a_reset_after_steps_in_inference_mode(make_env, given):
 def test_obstacles_approach_along_the_route_of_their_own_episode(make_env, monkeypatch):
     given = ("scenario=maze", "+obstacles.groups.person={kind:cylinder,count:1,size:[[0.2,0.2],[0.8,0.8]],speed:[1,1]}")
     env = make_env(*given, "+obstacles.groups.person.approach={within:0.1,distance:[2.0,3.0]}", blind=True)
-    told, approach = [], env.obstacles.approach
-    monkeypatch.setattr(
-        env.obstacles, "approach", lambda ids, at, command: (told.append(command), approach(ids, at, command))
-    )
+    told, start = [], env.obstacles._start_approach
+    monkeypatch.setattr(env.obstacles, "_start_approach", lambda *given: (told.append(given[-1]), start(*given)))
     env.reset()
     ahead = (env.command.along < 3.0).sum(1, keepdim=True)[..., None].expand(-1, 1, 2)
     way = env.command.route_w.gather(1, ahead)[:, 0] - env.state.kinematics.base_pos_w[:, :2]
     speed = env.config.commands.speed
-    torch.testing.assert_close(told[0], speed * way / way.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
+    torch.testing.assert_close(told[0].float(), speed * way / way.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
 
 
 def test_nearest_obstacles_by_hand(make_env):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from rsl_rl.modules.distribution import GaussianDistribution
+from stepping import tensors
 
 from omniperception import build, config
 from omniperception.build import build_runner
@@ -56,8 +57,7 @@ def test_trajectory_observations_and_rewards_are_those_of_the_same_robot(make_en
         assert torch.equal(plain.sim.qpos, permuted.sim.qpos) and torch.equal(plain.sim.qvel, permuted.sim.qvel)
         torch.testing.assert_close(outcome[0], reward, atol=1e-7, rtol=1e-5)  # float32 sums over joints
         assert torch.equal(done, outcome[1])
-        for name in expected.keys():  # noqa: SIM118
-            group = expected[name]
+        for name, group in tensors(expected).items():
             if name in plain.config.observations.groups:
                 group = group[:, columns(plain, name)]
             assert torch.equal(group, found[name]), name

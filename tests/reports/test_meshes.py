@@ -246,7 +246,7 @@ def test_what_reads_collada_is_named(tmp_path, monkeypatch):
     pytest.importorskip("trimesh")
     monkeypatch.setitem(sys.modules, "collada", None)
     path = dae(tmp_path / "crate.dae", "<node>GEOMETRY</node>", "")
-    with pytest.raises(ImportError, match=r"needs collada: pip install 'omniperception\[meshes\]'"):
+    with pytest.raises(ImportError, match=r"needs collada: pip install 'omnilidar\[meshes\]'"):
         TriangleMesh.from_file(path)
 
 

@@ -32,6 +32,12 @@ from omnirobot.runtime import DeployError, Description, ExportedPolicy
 
 ROOT = Path(__file__).resolve().parents[2]
 SPIDER = ROOT / "tests" / "data" / "spider.urdf"
+PACKAGES = {
+    "omniperception": ROOT / "omniperception",
+    "omnilidar": ROOT / "packages/lidar/omnilidar",
+    "omnirobot": ROOT / "packages/robot/omnirobot",
+}
+BENCHMARKS = tuple(ROOT.glob("benchmarks/**/*.py"))
 SMALL = (
     *("experiment=walk", "num_envs=2", "ppo.max_iterations=1", "ppo.num_steps_per_env=8", "ppo.num_mini_batches=1"),
     *("ppo.num_learning_epochs=1", "ppo.hidden_dims=[16]", "sim.num_threads=1"),
@@ -420,7 +426,7 @@ def test_every_command_that_is_shown_is_run_here():
         rf"python \S+\.py|scripts/\w+\.py \w+=|(?<!`)omniperception ({commands})\b|\b({commands}) [a-z]+=\S"
     )
     calls = {}
-    for path in sorted([*ROOT.glob("omniperception/**/*.py"), *ROOT.glob("benchmarks/**/*.py")]):
+    for path in sorted([*(path for where in PACKAGES.values() for path in where.rglob("*.py")), *BENCHMARKS]):
         name = str(path.relative_to(ROOT))
         number, texts = shown_in(ast.parse(path.read_text()))
         calls |= {name: number} if number else {}
@@ -431,15 +437,22 @@ def test_every_command_that_is_shown_is_run_here():
 def test_the_extras_that_messages_name_are_installed_by_the_line_that_is_shown(place):
     """In every environment that has the package, though it is not on PyPI; what the extras bring is not looked for."""
     pytest.importorskip("pip")
-    texts = "".join(path.read_text() for path in ROOT.glob("omniperception/**/*.py"))
-    extras = sorted(set(re.findall(r"pip install 'omniperception\[(\w+)\]'", texts)))
-    assert {"plots", "deploy", "export", "gpu", "gym", "meshes", "robot", "tables", "viewer"} <= set(extras)
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert set(extras) <= set(project["optional-dependencies"])
-    importlib.metadata.distribution("omniperception")
     pip = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-deps"]
-    done = subprocess.run([*pip, f"omniperception[{','.join(extras)}]"], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "already satisfied" in done.stdout, done.stderr
+    found = {}
+    texts = "".join(path.read_text() for where in PACKAGES.values() for path in where.rglob("*.py"))
+    for package, where in PACKAGES.items():
+        found[package] = sorted(set(re.findall(rf"pip install '{package}\[(\w+)\]'", texts)))
+        project = tomllib.loads((where.parent / "pyproject.toml").read_text())["project"]
+        assert set(found[package]) <= set(project["optional-dependencies"])
+        importlib.metadata.distribution(package)
+        extras = f"{package}[{','.join(found[package])}]"
+        done = subprocess.run([*pip, extras], capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0 and "already satisfied" in done.stdout, done.stderr
+    assert found == {
+        "omniperception": ["export", "gpu", "gym", "viewer"],
+        "omnilidar": ["meshes", "tables"],
+        "omnirobot": ["recordings"],
+    }
 
 
 @pytest.mark.slow
