@@ -16,6 +16,8 @@ _DAMPING = 1e-6
 _ITERATIONS = 30
 _LARGEST = 0.3
 """rad: most that a joint turns in an iteration."""
+_CONVERGED = 1e-12
+"""rad: a step below this is the last."""
 _TOLERANCE = 1e-3
 """m: of where a foot is lifted to."""
 
@@ -103,6 +105,8 @@ class _Legs:
                 moves[:, beyond] = turns[:, beyond] = 0.0
                 step = np.where(beyond, step, _step(moves, turns, target - here, turned))
             data.qpos[places] = np.clip(angles + step, low, high)
+            if np.abs(step).max() < _CONVERGED:
+                break
         if np.abs(self._foot(foot) - target).max() > _TOLERANCE:
             raise ValueError(
                 f"stepping.lift={lift}: the leg of {robot.foot_names[foot]} does not lift it straight up to"
