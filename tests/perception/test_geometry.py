@@ -151,7 +151,7 @@ def test_simulated_frames_agree_with_their_labels(scenario, recall):
     """Sectors with an obstacle within 3 m that a ray hits below the headroom: found at 0.85 to 1.15 of its distance,
     there or beside, where range noise along a ray from the head may put it; and how many of the other sectors report
     one."""
-    run = build.assemble(config.load(AVOIDER, [f"scenario={scenario}", "num_envs=8", "seed=5"]))
+    run = build.assemble(config.load(AVOIDER, [f"scenario={scenario}", "num_envs=8", "seed=5", "lidar.num_rays=4000"]))
     env = OmniEnv(replace(run.env, extra_requirements=(MEASURED_CLOUD,), skip_curricula=True))
     sensor, outputs = run.env.lidar, ("ranges", "true_ranges", "directions_s", "class_id")
     lidar = Lidar(

@@ -188,10 +188,10 @@ def test_weights_of_another_network_are_refused_and_the_old_ones_walk_on(session
 def test_what_is_perceived_is_what_the_policy_acts_on(session):
     session.step()
     seen = session.perceived()
-    assert seen.sectors.shape == (36, 3) and seen.risk.shape == (97,) and seen.velocity.shape == (2,)
     risk = session.env.config.rewards.avoidance.risk
-    again = risk.risk(torch.from_numpy(seen.sectors)[None], risk.candidates())
-    assert again[0].numpy() == pytest.approx(seen.risk, abs=1e-5)
+    assert seen.sectors.shape == (36, 3) and seen.risk.shape == (risk.num_candidates,)
+    asked = session.env.state.reference[0, :2] + torch.from_numpy(seen.velocity)
+    torch.testing.assert_close(asked, session.env.get_observations()["last_asked"][0, :2].float(), atol=1e-5, rtol=0)
 
 
 def test_a_policy_that_does_not_exist_is_one_line():

@@ -25,7 +25,7 @@ class Perceived:
     Attributes:
         sectors: (S, 3) distance (m, infinite without an obstacle) and velocity (m/s, yaw-aligned frame), by sector.
         risk: (K,) of the candidate velocities.
-        velocity: (2,) V_avoid, m/s, yaw-aligned frame.
+        velocity: (2,) V_avoid, or what a navigation policy adds to the command, m/s, yaw-aligned frame.
         heights: (187,) m, base above the ground at `env.heights.height_grid`.
     """
 
@@ -59,7 +59,9 @@ def perceived(actor: nn.Module, observations: TensorDict, command: torch.Tensor,
         risk = features[0, actor.perception.feature_dim :]
     elif SECTOR_TARGET in actor.supervision:
         sectors = decode(functional.pad(embedding[:, parts[SECTOR_TARGET], None], (0, 2)))[0]  # nothing moves
-    if actor.read_out is not None:
+    if actor.navigation is not None:
+        velocity = None if actor.asked is None else (actor.asked - command)[env_id, :2]
+    elif actor.read_out is not None:
         velocity = actor.read_out.velocity(features, command[env_id, None, :2])[0]
     return Perceived(_array(sectors), _array(risk), _array(velocity), _array(heights))
 
