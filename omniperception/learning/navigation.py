@@ -11,7 +11,7 @@ from rsl_rl.modules import MLP
 from tensordict import TensorDict
 from torch import nn
 
-from omniperception.avoidance.navigation import navigation_inputs, num_inputs
+from omniperception.avoidance.navigation import NUM_SECTORS, navigation_inputs, num_inputs
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.learning.estimator import EstimatingModel
 
@@ -59,7 +59,11 @@ class NavigationConfig:
 
 
 class CorrectedChoice(nn.Module):
-    """The choice without learning, with which its inputs begin, plus a network's correction, which begins at 0."""
+    """The choice without learning, with which its inputs begin, plus a network's correction, which begins at 0.
+
+    The correction fades out between half of NEARNESS_RANGE and all of it from the nearest obstacle: where nothing is
+    near, a command is followed as it is.
+    """
 
     def __init__(self, config: NavigationConfig) -> None:
         super().__init__()
@@ -70,7 +74,8 @@ class CorrectedChoice(nn.Module):
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """(n, 3) velocities from `navigation_inputs` (n, D)."""
-        return inputs[:, :3] + self.network(inputs)
+        nearest = inputs[:, 3 : 3 + NUM_SECTORS].amax(1, keepdim=True)
+        return inputs[:, :3] + (2.0 * nearest).clamp(max=1.0) * self.network(inputs)
 
 
 class NavigationActor(EstimatingModel):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from omniperception import build, config
+from omniperception.avoidance.navigation import navigation_inputs
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.learning.checkpoint import CheckpointError
 from omniperception.learning.read_out import MotionReadOut
@@ -28,6 +29,24 @@ def test_it_begins_as_the_choice_without_learning():
     observations = begun.env.get_observations()
     with torch.no_grad():
         assert torch.equal(begun.alg.actor(observations), observations["navigation"][:, :3])
+
+
+@pytest.mark.parametrize(("distance", "share"), [(math.inf, 0.0), (4.0, 0.0), (3.0, 0.5), (2.0, 1.0), (0.3, 1.0)])
+def test_where_nothing_is_near_the_command_is_followed(distance, share):
+    """Whatever was learned; what is added fades out between 2 and 4 m."""
+    policy = runner(*TOLD).alg.actor.mlp
+    for value in policy.network.parameters():
+        torch.nn.init.normal_(value, std=0.3)
+    risk = build.assemble(config.compose([*TOLD])).env.rewards.avoidance.risk
+    sectors = torch.tensor([math.inf, 0.0, 0.0]).repeat(2, 36, 1)
+    sectors[0, 7, 0] = distance
+    command, still = torch.tensor([[0.3, -0.4, 0.5]]).repeat(2, 1), torch.zeros(2, 3)
+    no_risk = torch.zeros(2, risk.num_candidates)
+    inputs = navigation_inputs(sectors, command, still, still, risk, risk.candidates(), no_risk)
+    with torch.no_grad():
+        asked, added = policy(inputs), policy.network(inputs)
+    torch.testing.assert_close(asked[0], command[0] + share * added[0])
+    assert torch.equal(asked[1], command[1]) and added.abs().min() > 1e-3
 
 
 def test_it_learns_and_goes_on_from_a_checkpoint(tmp_path):
