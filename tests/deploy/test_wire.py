@@ -83,7 +83,8 @@ def test_it_stands_up_and_walks_and_is_damped_when_the_policy_dies(lockstep, exp
     """And what was recorded meanwhile gives the same targets again."""
     record = tmp_path / "run.mcap" if importlib.util.find_spec("mcap_ros2") else None
     robot = walking(lockstep("scenario=static", record=record), 1.5)
-    assert speed(robot) > 0.4 and robot.control.policy.frame_count == robot.control.policy.description.perception.history
+    policy = robot.control.policy
+    assert speed(robot) > 0.4 and policy.frame_count == policy.description.perception.history
     robot.policy_lives = False
     robot.run(0.05)
     assert robot.machine.mode is Mode.DAMPING and "the policy is silent" in robot.machine.reason
