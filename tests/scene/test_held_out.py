@@ -123,9 +123,7 @@ def test_no_recipe_sees_it(experiment):
     assert "split" not in (CONFIG_DIR / "experiment" / f"{experiment}.yaml").read_text()
 
 
-@pytest.mark.parametrize(
-    "given", [["obstacles.split=test"], ["--cfg", "job", "obstacles.split=test"], ["-m", "obstacles.split=test,dev"]]
-)
+@pytest.mark.parametrize("given", [["obstacles.split=test"], ["-m", "obstacles.split=test,dev"]])
 def test_training_refuses_it_in_one_line(given, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r"obstacles.split=test is for reports, .* use obstacles.split=dev") as error:
