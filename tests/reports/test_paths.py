@@ -182,7 +182,7 @@ def test_an_argument_may_be_quoted_as_an_override_is(here):
 def test_presets_are_found_in_a_folder_of_any_name(here, name, capsys):
     (here / name / "ppo").mkdir(parents=True)
     (here / name / "ppo" / "mine.yaml").write_text((config.CONFIG_DIR / "ppo" / "small.yaml").read_text())
-    main(["train", "ppo=mine", "--config-dir", name, "--cfg", "job"])
+    main(["train", "~experiment", "ppo=mine", "--config-dir", name, "--cfg", "job"])
     composed = yaml.safe_load(capsys.readouterr().out)
     assert composed[config.SEARCH_PATH] == [str(here / name)]
     run = here / "run"
