@@ -329,8 +329,9 @@ def _unknown(overrides: Sequence[Override], config: DictConfig) -> ConfigError |
             elif depth == 0:
                 return UnknownKey(text, _keys(), name)
             else:
-                hint = "" if override.is_delete() else f"; a key that is left at its default is added: +{text}"
-                return ConfigError(f"{UnknownKey(text, map(str, node), name)}{hint}")
+                error = str(UnknownKey(text, map(str, node), name))
+                hint = f"{' A' if error.endswith('?') else '; a'} key that is left at its default is added: +{text}"
+                return ConfigError(error if override.is_delete() else f"{error}{hint}")
     return None
 
 

@@ -60,12 +60,12 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
 
 def start(flags: Sequence[str], overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
     """What Hydra makes of flags and overrides; every job is composed and assembled before the first one begins."""
-    sweeps = bool({"-m", "--multirun"} & set(flags))
+    sweeps = bool({"-m", "--multirun"} & set(flags)) or "hydra.mode=MULTIRUN" in overrides
     parsed = config.parse(overrides, sweeps)
     composed = [config.compose(job) for job in config.jobs(parsed)]
-    from omniperception import training
+    if sweeps or not flags:  # it trains
+        from omniperception import training
 
-    if sweeps or not flags:
         for one in composed:
             training.assemble(one)
     folders = config.search_path(parsed)
@@ -76,6 +76,8 @@ def start(flags: Sequence[str], overrides: Sequence[str], trust: Sequence[str] =
 
     @hydra.main(config_path=str(config.CONFIG_DIR), config_name="config", version_base="1.3")
     def job(composed: DictConfig) -> None:
+        from omniperception import training
+
         settings = HydraConfig.get()
         task = [text for text in settings.overrides.task if not text.startswith(f"++{config.SEARCH_PATH}=")]
         run_dir = Path(os.path.relpath(settings.runtime.output_dir))
@@ -95,8 +97,10 @@ def start(flags: Sequence[str], overrides: Sequence[str], trust: Sequence[str] =
     os.environ["HYDRA_FULL_ERROR"] = "1"  # or it prints a traceback of what this program says in one line
     try:
         job()
-    except HydraException as error:
-        raise config.ConfigError(one_line(error)) from None
+    except (HydraException, ValueError) as error:
+        if begun and not isinstance(error, HydraException):
+            raise
+        raise config.ConfigError(one_line(error)) from None  # such as flags that exclude each other
     finally:
         sys.argv = before
     if failed:
