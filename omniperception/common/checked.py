@@ -80,28 +80,36 @@ Names = Annotated[tuple[str, ...], AsTuple, "a list of texts"]
 def checked(key: str = "") -> Callable[[_Class], _Class]:
     """Makes a frozen dataclass that checks types and declared bounds when it is built; lists become tuples.
 
-    A value that does not fit is a ValueError of one line, `<key>.<field>=<value> must be <what the type says>`.
+    A value that does not fit is a ValueError of one line, `<key>.<field>=<value> must be <what the type says>`. A
+    subclass is checked as well, undecorated, too; `@dataclass`, which would lose the bounds, is a TypeError there.
 
     Args:
         key: where it stands in a configuration, such as `terrain.curriculum`; or other words that end with a space.
     """
 
     def decorate(cls: _Class) -> _Class:
-        made: Any = dataclass(frozen=True, config=_STRICT)(cls)
-        build = made.__init__
-
-        @functools.wraps(build)
-        def __init__(self: Any, *args: Any, **keywords: Any) -> None:
-            try:
-                build(self, *args, **keywords)
-            except ValidationError as error:
-                given = inspect.signature(made).bind_partial(*args, **keywords).arguments
-                raise _refusal(error, made, given, key if key.endswith(" ") or not key else f"{key}.") from None
-
-        made.__init__ = __init__
-        return made
+        if "__pydantic_fields__" not in vars(cls):  # it has no base that is checked
+            _check(cls)
+        cls._checked_as = key if key.endswith(" ") or not key else f"{key}."  # type: ignore[attr-defined]
+        return cls
 
     return decorate
+
+
+def _check(cls: Any) -> None:
+    made = dataclass(frozen=True, config=_STRICT)(cls)
+    assert made is cls
+    build = cls.__init__
+
+    @functools.wraps(build)
+    def __init__(self: Any, *args: Any, **keywords: Any) -> None:
+        try:
+            build(self, *args, **keywords)
+        except ValidationError as error:
+            given = inspect.signature(cls).bind_partial(*args, **keywords).arguments
+            raise _refusal(error, cls, given, type(self)._checked_as) from None
+
+    cls.__init__, cls.__init_subclass__ = __init__, classmethod(_check)
 
 
 _STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
@@ -112,7 +120,8 @@ def _refusal(error: ValidationError, cls: Any, given: dict[str, Any], before: st
     first = error.errors(include_url=False)[0]
     if not first["loc"]:
         return first["ctx"]["error"]
-    name = str(first["loc"][0])
+    place = first["loc"][0]
+    name = [*given][place] if isinstance(place, int) else str(place)  # of an argument without its name
     if len(first["loc"]) == 1 and first["type"] in ("missing", "unexpected_keyword_argument"):
         return TypeError(f"{before}{name}: {first['msg']}")
     field, value = cls.__pydantic_fields__[name], given[name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import torch
 from pydantic import Field
@@ -13,19 +13,16 @@ from omniperception.common.checked import AsTuple, InOrder, Inside, NonNegativeP
 from omniperception.common.random import Branch
 from omniperception.common.stateful import Stateful
 
-KINDS = ("sector", "thin", "slice", "wedge")
+Kind = Literal["sector", "thin", "slice", "wedge"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 """What is missing of a frame: an azimuth sector, the same in all frames; all but a share of the points, at random; all
 but a share of the frame's time, the same in all frames; all but a share of the circle, another one in every frame."""
 _THIN, _SLICE, _WEDGE = 1, 2, 3
-
-
 _ANGLE = Field(ge=0, le=360)
 _Degrees = Annotated[
     tuple[Annotated[float, _ANGLE], Annotated[float, _ANGLE]], AsTuple, InOrder, "[low, high], 0 to 360"
 ]
-_Kinds = Annotated[
-    tuple[Literal["sector", "thin", "slice", "wedge"], ...], AsTuple, Field(min_length=1), f"some of {', '.join(KINDS)}"
-]
+_Kinds = Annotated[tuple[Kind, ...], AsTuple, Field(min_length=1), f"some of {', '.join(KINDS)}"]
 
 
 @checked("randomization.partial_frames")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from omniperception.common.checked import Positive, Share, checked
-
 from omniperception.common.stateful import Stateful
 
 
