@@ -73,7 +73,7 @@ class TestNames:
         assert found["slow"].func.func is rewards.velocity_tracking
 
     def test_observations(self):
-        override = "observations.groups.proprioception.terms.joint_vel={scale: 0.05}"
+        override = "+observations.groups.proprioception.terms.joint_vel={scale: 0.05}"
         group = build.assemble(config.compose([override])).env.observations.groups["proprioception"]
         assert group.terms["joint_vel"].func is observations.joint_vel
         assert group.terms["joint_vel"].keywords == {"scale": 0.05}

@@ -229,7 +229,7 @@ def test_a_run_that_goes_on_in_another_task_begins_new_episodes(tmp_path, monkey
     """Of the task before nothing stays: no drawn friction, no number of robots; but levels of curricula that go on."""
     monkeypatch.chdir(tmp_path)
     given = ["experiment=quickstart", *SMALL, *SMALL_CLOUD, "num_envs=2", "randomization=paper"]
-    run = build.assemble(config.compose([*given, "randomization.curriculum=null"]))
+    run = build.assemble(config.compose([*given, "+randomization.curriculum=null"]))
     config.save(run.composed, Path("here"))
     first = build.build_runner(run, None)
     first.env.obstacles.level = 0.7

@@ -307,6 +307,27 @@ def test_wrong_input_is_one_line(one_line, line, named):
     assert named in one_line(line)
 
 
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("train --help", 0),
+        ("evaluate --help", 0),
+        ("train --cfg job", 0),
+        ("train num_env=4", 2),
+        ("train lidar.max_rage=3", 2),
+        ("train +foo=1", 2),
+        ("train -m seed=1,2 num_env=4", 2),
+    ],
+)
+def test_what_needs_no_pytorch_is_answered_without(line, code):
+    """It takes most of the seconds after which an answer would come."""
+    program = "import sys; sys.modules['torch'] = None; from omniperception.commands import main; main(sys.argv[1:])"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *line.split()], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == code and done.stderr.count("\n") == (code == 2), done.stderr
+
+
 SCRIPTS = sorted([*ROOT.glob("scripts/*.py"), ROOT / "train.py", ROOT / "play.py"])
 
 

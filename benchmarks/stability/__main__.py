@@ -30,7 +30,7 @@ from omniperception.config import ConfigError
 from omniperception.env.config import EnvConfig
 from omnirobot.common.cli import Command, argument, refuse_arguments
 
-BLIND = ("perception=none", "lidar=none", "rewards=walk", "observations=walk")
+BLIND = ("~experiment", "perception=none", "lidar=none", "rewards=walk", "observations=walk")
 PARTS = ("floating", "standing", "scenes")
 """Of subject=physics."""
 AGREEMENT = 0.99

@@ -243,8 +243,8 @@ class TestGoal:
     @pytest.mark.parametrize(
         ("overrides", "message"),
         [
-            (("scenario=static", "commands.route_ahead=3"), "leads through a maze"),
-            (("scenario=maze", "obstacles.groups.wall.layout.cell=1.5"), r"goal is \[13.5, 13.5\] and \[0, 0\]"),
+            (("scenario=static", "+commands.route_ahead=3"), "leads through a maze"),
+            (("scenario=maze", "+obstacles.groups.wall.layout.cell=1.5"), r"goal is \[13.5, 13.5\] and \[0, 0\]"),
         ],
     )
     def test_routes_that_lead_elsewhere_are_refused(self, make_config, overrides, message):

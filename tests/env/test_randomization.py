@@ -338,7 +338,7 @@ def test_the_critic_sees_what_was_drawn(make_env):
 class TestCurriculum:
     """All rows grow together, from a robot without randomization to the whole ranges."""
 
-    SHARE = "randomization.curriculum={start: 0.0, max_velocity_error: 0.2, rise: 0.5}"
+    SHARE = "+randomization.curriculum={start: 0.0, max_velocity_error: 0.2, rise: 0.5}"
 
     def test_at_0_nothing_is_random(self, make_env):
         env = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=4)

@@ -150,6 +150,6 @@ def test_what_has_no_held_out_kind_is_one_line(tmp_path):
         (f"kind:compound,count:1,file:'{cabinet}'", "c has a mesh among its parts, .* use split=dev"),
         ("kind:mesh,count:2,files:[rock,wedge]", "c has files=.*, of which there are no held-out ones; use split=dev"),
     ):
-        given = ("experiment=quickstart", f"obstacles.groups={{c:{{{group}}}}}", "obstacles.split=test")
+        given = ("experiment=quickstart", f"+obstacles.groups={{c:{{{group}}}}}", "obstacles.split=test")
         with pytest.raises(ConfigError, match=message):
             build.assemble(config.compose(given))

@@ -31,7 +31,7 @@ from omniperception.viewer import PageOptions, serve_lab
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT, Room
 from omnirobot.common.cli import Command, argument, refuse_arguments
 
-NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
+NO_TASK = ("~experiment", "perception=none", "observations=walk", "rewards=walk")
 """A sensor is looked at, no task is run."""
 BESIDE = 1000.0
 """How far (m) beside a mesh a robot may stand."""
