@@ -109,7 +109,8 @@ def _check(cls: Any) -> None:
             given = inspect.signature(cls).bind_partial(*args, **keywords).arguments
             raise _refusal(error, cls, given, type(self)._checked_as) from None
 
-    cls.__init__, cls.__init_subclass__ = __init__, classmethod(_check)
+    for name, function in (("__init__", __init__), ("__init_subclass__", classmethod(_check))):
+        setattr(cls, name, function)
 
 
 _STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
