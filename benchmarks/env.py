@@ -35,7 +35,7 @@ from omniperception.env.env import OmniEnv
 from omniperception.evaluation.trials.exported import record
 from omniperception.sim import SimConfig
 from omnirobot.common.cli import Command, argument
-from omnirobot.runtime import DeployError, ExportedPolicy
+from omnirobot.runtime import ExportedPolicy
 from omnirobot.runtime.latency import measure
 
 BLOCK = 25
@@ -267,7 +267,7 @@ def main(given: Arguments, overrides: list[str]) -> None:
     report(compare(given.what, run, given.repeats, against), about(torch.get_num_threads()), given.out)
 
 
-command = Command(main, Arguments, __doc__, "of the task", (DeployError,))
+command = Command(main, Arguments, __doc__, "of the task")
 
 if __name__ == "__main__":
     command()

@@ -22,7 +22,7 @@ from omniperception import build, config
 from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.avoidance.velocity import AvoidanceConfig, avoidance_velocity
 from omnirobot.common.cli import Command, argument
-from omnirobot.common.figures import PlotsUnavailable, new_figure
+from omnirobot.common.figures import new_figure
 
 DISCS = ((0.9, 0.35, 0.3), (-0.2, 0.75, 0.2), (0.6, -1.5, 0.35))
 """Obstacles around the robot of the picture: x, y, radius (m)."""
@@ -172,7 +172,7 @@ def _arrow(axis: Any, start: Box, end: Box, dashed: bool = False) -> None:
     axis.annotate("", *ends, arrowprops={"arrowstyle": "->", "ls": "--" if dashed else "-", "color": "#444444"})
 
 
-command = Command(main, Arguments, __doc__, errors=(PlotsUnavailable,))
+command = Command(main, Arguments, __doc__)
 
 if __name__ == "__main__":
     command()

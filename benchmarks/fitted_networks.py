@@ -25,7 +25,6 @@ from omniperception.avoidance.sector_motion import encode
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, AvoidanceConfig, avoidance_velocity
 from omniperception.build import RunConfig
 from omniperception.env.env import OmniEnv
-from omniperception.learning import CheckpointError
 from omniperception.learning.config import PerceptionConfig
 from omnirobot.common.cli import Command, argument
 
@@ -190,7 +189,7 @@ def main(given: Arguments, overrides: list[str]) -> None:
     report([table], about(1, walker=str(given.walker), overrides=overrides), given.folder)
 
 
-command = Command(main, Arguments, __doc__, "of the task that is walked in", (CheckpointError,))
+command = Command(main, Arguments, __doc__, "of the task that is walked in")
 
 if __name__ == "__main__":
     command()

@@ -19,7 +19,7 @@ from benchmarks.fitted_networks import Recording, record, scores
 from benchmarks.harness.table import Table, about, report
 from omniperception import build, config
 from omniperception.avoidance.velocity import MOTION_TARGET
-from omniperception.learning import CheckpointError, list_checkpoints, load_checkpoint
+from omniperception.learning import list_checkpoints, load_checkpoint
 from omniperception.perception import PerceptionNetwork
 from omnirobot.common.cli import Command, argument
 from omnirobot.common.figures import new_figure, plain, save_figure
@@ -114,7 +114,7 @@ def draw(curves: dict[str, list[tuple[int, float, float]]], path: Path) -> None:
     save_figure(figure, path)
 
 
-command = Command(main, Arguments, __doc__, "of the task that is walked in", (CheckpointError,))
+command = Command(main, Arguments, __doc__, "of the task that is walked in")
 
 if __name__ == "__main__":
     command()

@@ -64,7 +64,7 @@ class Form:
     @classmethod
     def of(cls, given: Arguments, groups: tuple[int, ...] | None, overrides: Sequence[str]) -> Form:
         """The robot as geoms of some groups; None: as it collides."""
-        wanted = [] if groups is None else [f"robot.ray_groups=[{','.join(map(str, groups))}]"]
+        wanted = [] if groups is None else [f"+robot.ray_groups=[{','.join(map(str, groups))}]"]
         task = [*NO_TASK, f"robot={given.robot}", f"lidar={given.lidar}", f"obstacles={given.obstacles}"]
         env = build.assemble(config.compose([*task, f"lidar.num_rays={given.rays}", *wanted, *overrides])).env
         assert env.lidar is not None  # asked for

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import itertools
 import os
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra.core.global_hydra import GlobalHydra
+from hydra import initialize, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, Override, OverrideType, Quote, QuotedString
+from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -46,8 +45,6 @@ DEFINED_BY_SCENARIO = ("obstacles", "commands")
 """Groups that a scenario writes out in full, so that another preset would be mixed with it."""
 SEVERAL_KEYS = {"scenario": FIXED_BY_SCENARIO, "condition": FIXED_BY_CONDITION, "family": ("families",)}
 """Keys of a configuration that these groups replace, where not the one of their own name."""
-OPTIONAL_GROUPS = ("experiment", "scenario", "condition")
-"""Groups of which none may be chosen."""
 SUITES, STUDIES = "suite", "study"
 """Folders of what evaluate and ablate read; no groups of a configuration."""
 _EXAMPLES = {"obstacles": "clearance=0.5", "commands": "speed=0.8"}
@@ -96,39 +93,45 @@ OmegaConf.register_new_resolver("device", _device_figure, replace=True)
 OmegaConf.register_new_resolver("within", _within, replace=True)
 
 
-def compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
+def compose(overrides: Sequence[str]) -> DictConfig:
     """Composes `conf/config.yaml` with overrides as on Hydra's command line.
-
-    Args:
-        overrides: presets (obstacles=static), values (num_envs=64), settings of Hydra (hydra.run.dir=here).
-        with_hydra: whether the result keeps Hydra's own node.
 
     Raises:
         ConfigError: an override is wrong or fits nothing.
     """
     parsed = parse(overrides)
-    folders = search_path(parsed)
-    chosen, values = _split(parsed, folders)
-    GlobalHydra.instance().clear()
+    folders = check(parsed)
+    given = [str(o.input_line) for o in parsed if o.key_or_group != _SEARCHPATH]
     try:
-        with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
-            named = [o for o in chosen if not _chooses_none(o)]
-            given = [*(str(o.input_line) for o in named), *as_override(folders)]
-            config = hydra_compose("config", given, return_hydra_config=True)
-            condition = config.hydra.runtime.choices.get("condition")
-            if condition is not None:  # wins over what recipe and scenario say of the randomization, too
-                alone = hydra_compose("config", [f"condition={condition}", *as_override(folders)])
-                config["randomization"] = alone["randomization"]
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise ConfigError(one_line(error)) from None
-    apply(config, values)
-    remember(config, folders)
+        config = _composed([*given, *as_override(folders)])
+    except _REFUSALS as error:
+        raise _explained(error, parsed, folders) from None
+    condition = config.hydra.runtime.choices.get("condition")
+    with open_dict(config):
+        del config["hydra"]
+        if folders:
+            config[SEARCH_PATH] = [str(folder) for folder in folders]
+    return finish(config, condition)
+
+
+def finish(config: DictConfig, condition: str | None) -> DictConfig:
+    """A configuration that Hydra composed: a condition wins over what recipe and scenario say of the randomization."""
+    if condition is not None:
+        folders = [Path(folder) for folder in config.get(SEARCH_PATH) or ()]
+        alone = _composed(["~experiment", f"condition={condition}", *as_override(folders)])
+        config["randomization"] = alone["randomization"]
     _check_keys(config)
     config._set_flag(_COMPOSED, True)
-    return config if with_hydra else without_hydra(config)
+    return config
 
 
-_COMPOSED = "composed"
+_COMPOSED, _SEARCHPATH = "composed", "hydra.searchpath"
+_REFUSALS = (HydraException, OmegaConfBaseException, ValueError)
+
+
+def _composed(given: list[str]) -> DictConfig:
+    with initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
+        return hydra_compose("config", given, return_hydra_config=True)
 
 
 def is_composed(config: DictConfig) -> bool:
@@ -136,78 +139,84 @@ def is_composed(config: DictConfig) -> bool:
     return bool(config._get_flag(_COMPOSED))
 
 
-def without_hydra(config: DictConfig) -> DictConfig:
-    """A composed configuration after Hydra's own node was taken out."""
-    with open_dict(config):
-        del config["hydra"]
-    return config
-
-
 def load(run_dir: Path, overrides: Sequence[str] = ()) -> DictConfig:
     """The configuration of a run, changed by overrides in Hydra's grammar.
 
     obstacles=static replaces a whole group, dotted overrides single values; scenario=corridor replaces what
     FIXED_BY_SCENARIO names, condition=robot what FIXED_BY_CONDITION names. A run whose randomization is changed, or
-    that is given condition=null, is under no condition.
+    that is given ~condition, is under no condition.
     """
     config = read(run_dir)
+    _check_keys(config)
     parsed = parse(overrides)
-    folders = search_path(parsed, config)
-    chosen, values = _split(parsed, folders)
-    fresh = compose([*(str(o.input_line) for o in chosen), *as_override(folders)]) if chosen else {}
+    folders = check(parsed, config)
+    chosen = [o for o in parsed if _is_group(o, folders) or o.is_hydra_override()]
+    groups = [str(o.input_line) for o in chosen if not (o.is_hydra_override() or o.is_delete())]
+    fresh = compose([*groups, "~experiment", *as_override(folders)]) if groups else {}
     for override in chosen:
         group = override.key_or_group
+        if group == _SEARCHPATH:
+            continue
         if group == "experiment" or override.is_hydra_override():
             raise ConfigError(f"{override.input_line}: a run keeps its {group}; override the groups that should differ")
-        if _chooses_none(override):
+        if override.is_delete():
             config.pop(group, None)
             continue
         for key in SEVERAL_KEYS.get(group, (group,)):
             config[key] = fresh[key]
     if any(group_of(override) == "randomization" for override in parsed):
         config.pop("condition", None)
+    if folders:
+        config[SEARCH_PATH] = [str(folder) for folder in folders]
     OmegaConf.set_struct(config, True)
-    apply(config, values)
-    _check_keys(config)
-    remember(config, folders)
+    values = [override for override in parsed if override not in chosen]
+    if values:
+        ConfigStore.instance().store("run", config)
+        try:
+            with initialize(config_path=None, version_base="1.3"):
+                changed = hydra_compose("run", [str(override.input_line) for override in values])
+        except _REFUSALS as error:
+            raise _unknown(values, config) or ConfigError(one_line(error)) from None
+        _check_keys(changed)
+        return changed
     return config
 
 
 def _keys() -> set[str]:
-    """Keys at the top of a command line."""
+    """Keys at the top of a configuration."""
     groups = {path.name for path in CONFIG_DIR.iterdir() if path.is_dir()} - {SUITES, STUDIES}
     return {"seed", "num_envs", "distillation", "families", "init", "stepping", *groups}
 
 
 def _check_keys(config: DictConfig) -> None:
-    """Refuses what was added (+key=value) at the top of a configuration and nothing reads."""
+    """Refuses what stands at the top of a configuration and nothing reads."""
     for key in config:
-        if str(key) not in _keys() | {"hydra", SEARCH_PATH}:
+        if str(key) not in _keys() | {SEARCH_PATH}:
             raise UnknownKey(str(key), _keys())
 
 
-def parse(overrides: Sequence[str]) -> list[Override]:
-    """Overrides by Hydra's grammar; a sweep over several values is a ConfigError."""
-    parsed = [parse_one(text) for text in overrides]
+def parse(overrides: Sequence[str], sweeps: bool = False) -> list[Override]:
+    """Overrides by Hydra's grammar, in which = # ( [ , and others mean something; in a path they do not.
+
+    Args:
+        overrides: on a command line.
+        sweeps: whether they may have several values, as with train -m.
+    """
+    parsed = [_parse_one(text, sweeps) for text in overrides]
     for override in parsed:
-        if override.is_sweep_override():
+        if override.is_sweep_override() and not sweeps:
             raise ConfigError(f"{override.input_line} has several values, which only train -m runs; lists are [a,b]")
     return parsed
 
 
-def parse_one(text: str, sweeps: bool = False) -> Override:
-    """An override by Hydra's grammar, in which = # ( [ , and others mean something; in a path they do not.
-
-    Args:
-        text: the override.
-        sweeps: whether paths with commas between them are several.
-    """
+def _parse_one(text: str, sweeps: bool) -> Override:
     key, separator, value = text.partition("=")
     is_path = key.rpartition(".")[2].lstrip("+") in _PATHS and value != ""
     try:
         (override,) = OverridesParser.create().parse_overrides([text])
-        means_something_else = bool | int | float if sweeps else bool | int | float | ChoiceSweep
-        if not (is_path and (isinstance(override._value, means_something_else) or value != value.strip())):
+        several = override.is_sweep_override()
+        is_text = sweeps if several else value == value.strip() and not isinstance(override.value(), bool | int | float)
+        if is_text or not is_path:
             return override
     except HydraException:
         if not separator:
@@ -232,113 +241,103 @@ def quoted(text: str) -> str:
     return QuotedString(text, Quote.double).with_quotes()
 
 
-def apply(config: DictConfig, overrides: Sequence[Override]) -> None:
-    """Sets, adds (+key=value) and deletes (~key) values as Hydra does.
+def jobs(parsed: Sequence[Override]) -> list[list[str]]:
+    """The jobs of a sweep over every combination of values; none where a sweeper chooses values itself."""
+    each = [
+        [f"{o.get_key_element()}={value}" for value in (o.sweep_string_iterator() if o.is_discrete_sweep() else ())]
+        if o.is_sweep_override()
+        else [str(o.input_line)]
+        for o in parsed
+    ]
+    return [list(job) for job in itertools.product(*each)]
 
-    A key that a preset or a run's file leaves at its default need not be added: whether something takes it is checked
-    where it is built.
+
+def check(parsed: Sequence[Override], config: DictConfig | None = None) -> list[Path]:
+    """Refuses overrides that Hydra would take and that contradict each other; the folders of presets of one's own.
+
+    Args:
+        parsed: the overrides.
+        config: of a run, whose folders are searched as well.
     """
-    for override in overrides:
-        adds = override.is_add() or override.is_force_add()
-        if not adds and (not _exists(config, override) or isinstance(override.value(), dict)):
-            override = replace(override, type=OverrideType.FORCE_ADD)
-        try:
-            ConfigLoaderImpl._apply_overrides_to_config([override], config)
-        except (HydraException, OmegaConfBaseException, TypeError, ValueError) as error:
-            raise ConfigError(f"{override.input_line}: {one_line(error.__cause__ or error)}") from None
-
-
-def for_hydra(override: Override, folders: Sequence[Path]) -> str | None:
-    """An override as Hydra itself takes it: a value as one that is added where it is not there, as `apply` does; None
-    for one that leaves an optional group out, which it does not take."""
-    text = str(override.input_line)
-    if not override.is_sweep_override() and _chooses_none(override):
-        return None
-    is_value = not override.is_hydra_override() and not presets(override.key_or_group, folders)
-    return f"++{text}" if is_value and override.type is OverrideType.CHANGE else text
-
-
-def _exists(config: DictConfig, override: Override) -> bool:
-    """Tell whether the key of an override exists; raises ConfigError where it cannot."""
-    node: Any = config
-    text, names = str(override.input_line), override.key_or_group.split(".")
-    for depth, name in enumerate(names):
-        if isinstance(node, ListConfig) and name.isdecimal() and int(name) < len(node):
-            node = node[int(name)]
-        elif isinstance(node, DictConfig) and name in node:
-            node = OmegaConf.select(node, name)
-        elif isinstance(node, DictConfig) and depth == len(names) - 1 and not override.is_delete():
-            if depth == 0 and name not in _keys():
-                raise UnknownKey(text, _keys(), name)
-            return False
-        elif isinstance(node, DictConfig):
-            raise UnknownKey(text, _keys() if depth == 0 else map(str, node), name)
-        else:
-            held = "null" if node is None else f"{node}"
-            raise ConfigError(f"{text} is unknown; {'.'.join(names[:depth])} is {held}")
-    return True
-
-
-def _split(overrides: Sequence[Override], folders: Sequence[Path]) -> tuple[list[Override], list[Override]]:
-    """Presets and settings of Hydra, which compose a configuration, and values, which are applied to it."""
-    chosen: list[Override] = []
-    values: list[Override] = []
-    for override in overrides:
-        group = override.key_or_group
-        if group not in (SUITES, STUDIES) and presets(group, folders):
-            _check_preset(override, folders)
-            chosen.append(override)
-        elif group != "hydra.searchpath":
-            (chosen if override.is_hydra_override() else values).append(override)
-    by_group = {o.key_or_group: o for o in chosen}
+    folders = search_path(parsed, config)
+    by_group = {o.key_or_group: o for o in parsed if _is_group(o, folders) and not o.is_delete()}
+    for group, override in by_group.items():
+        for name in _names(override):
+            shipped, *others = (folder / group / f"{name}.yaml" for folder in (CONFIG_DIR, *folders))
+            for own in others:
+                if shipped.is_file() and own.is_file() and own.read_bytes() != shipped.read_bytes():
+                    raise ConfigError(
+                        f"{group}={name} comes with the package and would hide {own}; give yours another name"
+                    )
     for group in DEFINED_BY_SCENARIO if "scenario" in by_group else ():
         if group in by_group:
             raise ConfigError(
                 f"{by_group['scenario'].input_line} defines the {group}; leave {by_group[group].input_line} out, or"
                 f" override single values such as {group}.{_EXAMPLES[group]}"
             )
-    _check_condition(by_group.get("condition"), overrides)
-    return chosen, values
-
-
-def _check_condition(condition: Override | None, overrides: Sequence[Override]) -> None:
-    """Refuses changes to a condition, which is the same wherever its name and version stand."""
-    fixed_by = None if condition is None else condition.value()
-    for override in overrides:
+    for override in parsed:
+        given, condition = override.input_line, by_group.get("condition")
         if override.key_or_group.startswith("condition."):
-            raise ConfigError(f"{override.input_line}: a condition is chosen as a whole, such as condition=robot")
-        if fixed_by and group_of(override) == "randomization":
-            given = override.input_line
-            raise ConfigError(f"condition={fixed_by} fixes the randomization; use condition=null or leave {given} out")
+            raise ConfigError(f"{given}: a condition is chosen as a whole, such as condition=robot")
+        if condition and group_of(override) == "randomization":
+            raise ConfigError(f"{condition.input_line} fixes the randomization; use ~condition or leave {given} out")
+    return folders
+
+
+def _is_group(override: Override, folders: Sequence[Path]) -> bool:
+    """Tell whether an override chooses presets of a group."""
+    return override.key_or_group not in (SUITES, STUDIES) and bool(presets(override.key_or_group, folders))
+
+
+def _names(override: Override) -> list:
+    """The presets that an override chooses."""
+    value = override.value()
+    return value if isinstance(value, list) else [value]
+
+
+def _explained(error: BaseException, parsed: Sequence[Override], folders: Sequence[Path]) -> ConfigError:
+    """What Hydra refuses, with what may have been meant."""
+    chosen = [o for o in parsed if _is_group(o, folders)]
+    for override in chosen:
+        group, known = override.key_or_group, presets(override.key_or_group, folders)
+        for name in () if override.is_delete() else _names(override):
+            if not isinstance(name, str):
+                hint = f"known: {', '.join(known)}; ~{group} leaves it out"
+                return ConfigError(f"{override.input_line}: {group} names a preset; {hint}")
+            if name not in known:
+                hint = f"{suggest(name, known, and_all=True)}{_own(group, name)}"
+                return ConfigError(f"{group}={name} is unknown; {hint}")
+    with contextlib.suppress(*_REFUSALS):
+        config = _composed([*(str(o.input_line) for o in chosen), *as_override(folders)])
+        values = [o for o in parsed if o not in chosen and not o.is_hydra_override()]
+        return _unknown(values, config) or ConfigError(one_line(error))
+    return ConfigError(one_line(error))
+
+
+def _unknown(overrides: Sequence[Override], config: DictConfig) -> ConfigError | None:
+    """What to say of the first override whose key a configuration has not."""
+    for override in overrides:
+        node: Any = config
+        text, names = str(override.input_line), override.key_or_group.split(".")
+        for depth, name in enumerate(names if not (override.is_add() or override.is_force_add()) else ()):
+            if isinstance(node, ListConfig) and name.isdecimal() and int(name) < len(node):
+                node = node[int(name)]
+            elif not isinstance(node, DictConfig):
+                return ConfigError(f"{text} is unknown; {'.'.join(names[:depth])} is {node}")
+            elif name in node:
+                node = OmegaConf.select(node, name)
+            elif depth == 0:
+                return UnknownKey(text, _keys(), name)
+            else:
+                error = str(UnknownKey(text, map(str, node), name))
+                hint = f"{' A' if error.endswith('?') else '; a'} key that is left at its default is added: +{text}"
+                return ConfigError(error if override.is_delete() else f"{error}{hint}")
+    return None
 
 
 def group_of(override: Override) -> str:
     """The key at the top of the configuration that an override changes."""
     return override.key_or_group.partition(".")[0]
-
-
-def _chooses_none(override: Override) -> bool:
-    """Tell whether an override leaves an optional group out."""
-    return override.value() is None and override.key_or_group in OPTIONAL_GROUPS
-
-
-def _check_preset(override: Override, folders: Sequence[Path]) -> None:
-    """Refuses a preset that does not exist, or that would hide the user's own of the same name."""
-    value, group = override.value(), override.key_or_group
-    known = presets(group, folders)
-    if _chooses_none(override):
-        return
-    for name in value if isinstance(value, list) and value else [value]:
-        if override.is_delete() or not isinstance(name, str):
-            raise ConfigError(f"{override.input_line}: {group} names a preset; known: {', '.join(known)}")
-        if name not in known:
-            raise ConfigError(f"{group}={name} is unknown; {suggest(name, known, and_all=True)}{_own(group, name)}")
-        shipped, *others = (folder / group / f"{name}.yaml" for folder in (CONFIG_DIR, *folders))
-        for own in others:
-            if shipped.is_file() and own.is_file() and own.read_bytes() != shipped.read_bytes():
-                raise ConfigError(
-                    f"{group}={name} comes with the package and would hide {own}; give yours another name"
-                )
 
 
 def _own(group: str, name: str) -> str:
@@ -378,13 +377,6 @@ def _folder(entry: str) -> Path:
 def as_override(folders: Sequence[Path]) -> list[str]:
     """The override that puts folders on Hydra's search path."""
     return [f"hydra.searchpath=[{','.join(quoted(f'file://{folder}') for folder in folders)}]"] if folders else []
-
-
-def remember(config: DictConfig, folders: Sequence[Path]) -> None:
-    """Notes the search path in a configuration, so that what trains a run also replays it."""
-    if folders:
-        with open_dict(config):
-            config[SEARCH_PATH] = [str(folder) for folder in folders]
 
 
 def presets(group: str, folders: Sequence[Path] = ()) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from typing import Any
 
 import yaml
 
+from omniperception.common.checked import expected
 from omniperception.env.mdp.terms import RewardTerm
 from omnirobot.common.errors import ConfigError, DoesNotFit, UnknownKey, suggest
 
@@ -128,7 +129,7 @@ def make(hint: Any, value: object, key: str, trust: Sequence[str] | None = ()) -
             if isinstance(option, type) and dataclasses.is_dataclass(option):
                 return call(option, arguments(option, value, key, trust), key)
     if not _fits(value, hint):
-        raise DoesNotFit(f"{key}={_shown(value)} must be {_expected(hint)}")
+        raise DoesNotFit(f"{key}={_shown(value)} must {expected(hint, kinds=True)}")
     if not _is_finite(value, any(fnmatchcase(key, place) for place in _UNBOUNDED)):
         raise DoesNotFit(f"{key}={_shown(value)} must be finite")
     return tuple(make(Any, item, key, trust) for item in value) if isinstance(value, list) else value
@@ -298,18 +299,18 @@ def types_of(target: Callable) -> dict[str, Any]:
     return hints
 
 
-_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-_PLURALS = {int: "whole numbers", float: "numbers", str: "texts"}
-
-
 def _options(hint: Any) -> Sequence[Any]:
-    """Members of a union, or the type alone."""
+    """Members of a union, or the type alone, without bounds."""
+    if typing.get_origin(hint) is typing.Annotated:
+        hint = typing.get_args(hint)[0]
     return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
 
 
 def _fits(value: object, hint: Any) -> bool:
     """Tell whether plain data that is no mapping may stand for a type."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        return _fits(value, args[0])
     if hint is Any or isinstance(hint, typing.TypeVar):
         return not isinstance(value, Mapping)
     if origin in (typing.Union, types.UnionType):
@@ -325,7 +326,7 @@ def _fits(value: object, hint: Any) -> bool:
             return False
         hints = list(args) if origin is tuple and args[-1] is not Ellipsis else [args[0]] * len(value)
         return len(value) == len(hints) and all(map(_fits, value, hints))
-    return hint in _WORDS and isinstance(value, hint)
+    return hint in (bool, str) and isinstance(value, hint)
 
 
 def _is_finite(value: object, or_infinite: bool) -> bool:
@@ -333,23 +334,6 @@ def _is_finite(value: object, or_infinite: bool) -> bool:
     if isinstance(value, (list, tuple)):
         return all(_is_finite(item, or_infinite) for item in value)
     return not isinstance(value, float) or math.isfinite(value) or (or_infinite and math.isinf(value))
-
-
-def _expected(hint: Any) -> str:
-    """A type in words."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if hint in _WORDS:
-        return _WORDS[hint]
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(_expected(option) for option in args)
-    if hint is types.NoneType:
-        return "null"
-    if origin is typing.Literal:
-        return f"one of {', '.join(map(str, args))}"
-    if origin in (tuple, list, Sequence):
-        count = f"{len(args)} " if origin is tuple and args[-1] is not Ellipsis else ""
-        return f"a list of {count}{_PLURALS.get(args[0], 'lists')}"
-    return "a group of settings"
 
 
 def _shown(value: object) -> str:

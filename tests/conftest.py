@@ -43,7 +43,7 @@ def make_env():
 
     def make(*overrides: str, num_envs: int = 4, blind: bool = False) -> OmniEnv:
         given = (*(BLIND if blind else ()), *overrides, f"num_envs={num_envs}")
-        return OmniEnv(build.assemble(config.compose(given)).env)
+        return OmniEnv(assembled(*given).env)
 
     return make
 
@@ -51,7 +51,13 @@ def make_env():
 @pytest.fixture(scope="session")
 def make_config():
     """Assembles a configuration from overrides on the command line."""
-    return lambda *overrides: build.assemble(config.compose(overrides))
+    return assembled
+
+
+def assembled(*overrides: str) -> build.RunConfig:
+    """A configuration of presets, without a recipe where none is given."""
+    plain = () if any(override.startswith("experiment=") for override in overrides) else ("~experiment",)
+    return build.assemble(config.compose((*plain, *overrides)))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,22 +1,48 @@
 """Sweeps and run directories: configurations are composed, saved and replayed."""
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import yaml
 
-from omniperception import build, config
-from omniperception.commands import main
-from omniperception.commands.train import check_jobs
+from omniperception import build, config, training
+from omniperception.commands import main, train
 from omniperception.common import provenance
+from omniperception.common.checked import Positive, checked
 from omniperception.config import ConfigError
 
 
-def test_every_job_of_a_sweep_is_checked_before_the_first_starts():
-    check_jobs(["num_envs=2,4", "obstacles=static,moving"])
+def test_every_job_of_a_sweep_is_checked_before_the_first_starts(monkeypatch):
+    monkeypatch.setattr(training, "train", lambda *_: pytest.fail("a job began"))
     with pytest.raises(ConfigError, match="num_envs=0"):
-        check_jobs(["num_envs=2,0"])
+        train.start(["-m"], ["num_envs=2,0"])
+
+
+@checked("walls")
+class Walls:
+    thickness: Positive
+
+
+class TestSubclassesOfWhatIsChecked:
+    @pytest.mark.parametrize("decorate", [lambda cls: cls, checked("walls")], ids=("undecorated", "checked"))
+    def test_they_keep_the_bounds_of_their_base_and_have_their_own(self, decorate):
+        @decorate
+        class High(Walls):
+            height: Positive = 2.0
+
+        assert High(0.2) == High(thickness=0.2, height=2.0) != High(0.2, 1.0)
+        for wrong, message in (((-1.0,), "walls.thickness=-1.0"), ((0.2, 0.0), "walls.height=0.0")):
+            with pytest.raises(ValueError, match=f"^{message} must be positive$"):
+                High(*wrong)
+
+    def test_a_plain_dataclass_is_refused(self):
+        with pytest.raises(TypeError):
+
+            @dataclass(frozen=True)
+            class High(Walls):
+                height: float = 2.0
 
 
 class TestRunDirectories:
@@ -110,7 +136,7 @@ class TestRunDirectories:
         del saved["stepping"]
         path.write_text(config.as_yaml(saved))
         assert build.load_run(run_dir).env.stepping is None
-        assert build.load_run(run_dir, ["stepping={lift: 1.2, rest_s: 1.0}"]).env.stepping.lift == 1.2
+        assert build.load_run(run_dir, ["+stepping={lift: 1.2, rest_s: 1.0}"]).env.stepping.lift == 1.2
 
     def test_latest_is_the_newest(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

@@ -41,7 +41,18 @@ class Blocked:
 
 sys.meta_path.insert(0, Blocked())
 """
-EXTRAS = {"hydra", "omegaconf", "yaml", "mujoco", "rsl_rl", "tensordict", "tensorboard", "matplotlib", "trimesh"}
+EXTRAS = {
+    "hydra",
+    "omegaconf",
+    "pydantic",
+    "yaml",
+    "mujoco",
+    "rsl_rl",
+    "tensordict",
+    "tensorboard",
+    "matplotlib",
+    "trimesh",
+}
 CAST = """
 import numpy as np
 from omnilidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, vlp16

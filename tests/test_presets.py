@@ -57,7 +57,9 @@ def test_every_preset_composes_builds_and_steps(preset):
     if group == "robot":
         skip_if_not_fetched(name)
     beside = [*COMPANIONS.get(preset, []), *(QUICK if group == "lidar" and name != "none" else [])]
-    run = build.assemble(config.compose([*beside, f"{group}={name}", "num_envs=2"]))
+    given = [*beside, f"{group}={name}", "num_envs=2"]
+    plain = [] if any(override.startswith("experiment=") for override in given) else ["~experiment"]
+    run = build.assemble(config.compose([*plain, *given]))
     if preset.startswith(LEARNING):
         runner = build_runner(run, None)
         env = runner.env

@@ -213,10 +213,10 @@ def test_a_clock_without_a_gait_is_refused_in_one_line(tmp_path):
     [
         ("robot.gait.offsets=[0.0,0.5]", r"robot\.gait\.offsets=\[0\.0, 0\.5\] must have one for each of the 4 feet"),
         ("robot.gait.offsets=[0.0,0.5,0.5,1.5]", "must be shares of a period"),
-        ("robot.gait.duty=1.0", r"duty=1\.0 between 0 and 1"),
+        ("robot.gait.duty=1.0", r"duty=1\.0 must be between 0 and 1"),
         ("robot.gait.frequency=0", "frequency=0"),
         ("robot.gait.lift=0", r"robot\.gait\.lift=0 must be positive"),
-        ("robot.gait.lin_vel_x=[2,1]", r"robot\.gait\.lin_vel_x=\[2, 1\] must be the least and the most velocity"),
+        ("robot.gait.lin_vel_x=[2,1]", r"robot\.gait\.lin_vel_x=\[2, 1\] must be \[low, high\]"),
     ],
 )
 def test_a_gait_that_cannot_be_is_refused(change, message):

@@ -73,7 +73,7 @@ class TestNames:
         assert found["slow"].func.func is rewards.velocity_tracking
 
     def test_observations(self):
-        override = "observations.groups.proprioception.terms.joint_vel={scale: 0.05}"
+        override = "+observations.groups.proprioception.terms.joint_vel={scale: 0.05}"
         group = build.assemble(config.compose([override])).env.observations.groups["proprioception"]
         assert group.terms["joint_vel"].func is observations.joint_vel
         assert group.terms["joint_vel"].keywords == {"scale": 0.05}
@@ -93,11 +93,11 @@ class TestNames:
             ),
             ("+rewards.terms.x={weight: 1, func: alife}", "rewards.terms.x.func=alife is unknown; did you mean alive?"),
             (
-                "rewards.terms.tilt_squared.wieght=1",
+                "+rewards.terms.tilt_squared.wieght=1",
                 "rewards.terms.tilt_squared.wieght is unknown; did you mean rewards.terms.tilt_squared.weight?",
             ),
             (
-                "rewards.terms.closing_speed.margn=1",
+                "+rewards.terms.closing_speed.margn=1",
                 "rewards.terms.closing_speed.margn is unknown; did you mean rewards.terms.closing_speed.margin?",
             ),
             ("+rewards.terms.foot_stumble={weight: 1, unit: 1.0}", "rewards.terms.foot_stumble lacks ratio: give"),
@@ -109,11 +109,11 @@ class TestNames:
                 "rewards.terms.x.func=nowhere.x cannot be imported: No module named 'nowhere'; PYTHONPATH=. has",
             ),
             ("+rewards.terms.x={weight: 1, func: math.nothing}", "math has no function or class nothing"),
-            ("observations.groups.command.terms.command.scal=1", "observations.groups.command.terms.command.scal is"),
+            ("+observations.groups.command.terms.command.scal=1", "observations.groups.command.terms.command.scal is"),
             ("perception.network.type=pd_risk", "perception.network.type=pd_risk is unknown; did you mean pd_risknet?"),
             ("perception.sampler.type=fsp", "perception.sampler.type=fsp is unknown; did you mean fps?"),
             (
-                "perception.sampler.splitdeg=3",
+                "+perception.sampler.splitdeg=3",
                 "perception.sampler.splitdeg is unknown; did you mean perception.sampler.split_deg?",
             ),
             ("commands.type=gaol", "commands.type=gaol is unknown; did you mean goal?"),
@@ -121,7 +121,7 @@ class TestNames:
             ("+terrain.tiles={hills: {}}", "terrain.tiles is unknown"),
             ("terrain=mixed terrain.tiles.rough=3", "terrain.tiles.rough=3 must be a group of settings"),
             ("lidar.mount=had", "lidar.mount=had is unknown; robot.mounts has head"),
-            ("lidar.mount_pos=[0,0,0]", "lidar.mount_pos is unknown; a mount has it"),
+            ("+lidar.mount_pos=[0,0,0]", "lidar.mount_pos is unknown; a mount has it"),
             ("lidar.device=mid306", "lidar.device=mid306 is unknown; known: mid360"),
             ("obstacles.groups.walker.size=[1,2]", "obstacles.groups.walker.size=[1, 2] must be a list of lists"),
             ("obstacles.groups.walker.kind=null", "obstacles.groups.walker.kind=null must be text"),
@@ -145,7 +145,7 @@ class TestOnesOwn:
             terms(f"+rewards.terms.steady={{func: {own_project}.Steady, weight: 1}}")
 
     def test_networks_and_tiles(self, own_project):
-        network, tile = f"perception.network.type={own_project}.Wide", f"terrain.tiles.rough.type={own_project}.Waves"
+        network, tile = f"perception.network.type={own_project}.Wide", f"+terrain.tiles.rough.type={own_project}.Waves"
         run = build.assemble(config.compose(["perception=fps_gru", network, "terrain=rough", tile]))
         assert type(run.perception.build_network()).__name__ == "Wide"
         assert type(run.env.terrain.tiles["rough"]).__name__ == "Waves"

@@ -80,12 +80,12 @@ def test_a_sweep_gives_every_run_a_directory(tmp_path, monkeypatch, capsys):
 def test_a_sweep_takes_what_a_run_does_and_one_that_fails_does_not_end_it(tmp_path, monkeypatch, capsys):
     """A key that the preset leaves at its default; seed 1's checkpoint is not one."""
     monkeypatch.chdir(tmp_path)
-    sweep = ["seed=1,2", "condition=null", "hydra.sweep.dir=sweep", "observations.command_acceleration=[4,8]"]
+    sweep = ["seed=1,2", "~condition", "hydra.sweep.dir=sweep", "+observations.command_acceleration=[4,8]"]
     command = ["train", "-m", "experiment=walk", *sweep, "num_envs=2", "ppo.num_steps_per_env=2", *SMALL[3:]]
     command += ["ppo.max_iterations=1"]
     main(command)
     assert list(config.read(tmp_path / "sweep" / "0").observations.command_acceleration) == [4, 8]
-    assert "observations.command_acceleration=[4,8]" in config.read_recipe(tmp_path / "sweep" / "1")
+    assert "+observations.command_acceleration=[4,8]" in config.read_recipe(tmp_path / "sweep" / "1")
     for name in ("0", "1"):
         broken = tmp_path / "sweep" / name / "checkpoints" / "model_1.pt"
         (broken.write_bytes(b"no checkpoint") if name == "0" else broken.unlink())
@@ -99,7 +99,7 @@ def test_a_sweep_takes_what_a_run_does_and_one_that_fails_does_not_end_it(tmp_pa
     )
     with pytest.raises(SystemExit, match="2"):
         main(["train", "-m", "experiment=walk", "condition=null,robot"])
-    assert "condition=null,robot: null beside other values" in capsys.readouterr().err
+    assert "condition=null: condition names a preset" in capsys.readouterr().err
     assert "error: sweep/0: " in said.err and said.err.splitlines()[-1] == "error: 1 of 2 jobs failed: sweep/0"
 
 
@@ -229,7 +229,7 @@ def test_a_run_that_goes_on_in_another_task_begins_new_episodes(tmp_path, monkey
     """Of the task before nothing stays: no drawn friction, no number of robots; but levels of curricula that go on."""
     monkeypatch.chdir(tmp_path)
     given = ["experiment=quickstart", *SMALL, *SMALL_CLOUD, "num_envs=2", "randomization=paper"]
-    run = build.assemble(config.compose([*given, "randomization.curriculum=null"]))
+    run = build.assemble(config.compose([*given, "+randomization.curriculum=null"]))
     config.save(run.composed, Path("here"))
     first = build.build_runner(run, None)
     first.env.obstacles.level = 0.7

@@ -53,8 +53,8 @@ LINES = [
     ("gait run=RUN what=kicks num_envs=3", "this command sets num_envs=64 itself"),
     ("gait run=RUN what=kicks scenario=corridor", "this command sets scenario=walk itself"),
     ("gait run=RUN what=feet scenario=corridor", "this command sets scenario=walk itself"),
-    ("train job", "next to each other alone: --cfg job shows"),
-    ("train --cfg num_envs=3 job", "next to each other alone: --cfg job shows"),
+    ("train job", "argument 'job' is not of the form key=value"),
+    ("train --cfg num_envs=3 job", "argument 'job' is not of the form key=value"),
     ("train experiment=walk ppo.start_std=0.3", "is of a policy that another run gives"),
     ("train perception=direct_mlp_small perception.sampler.num_rays=7", "must be perception.sampler.num_rays=7"),
     ("gait run=RUN what=kicks trials=5", "trials= would mean nothing: it is not read for what=kicks"),
@@ -77,10 +77,11 @@ LINES = [
     ("train sede=1", "did you mean seed?"),
     ("train obstacle=static", "did you mean obstacles?"),
     ("train ~nothing", "nothing"),
-    ("train ~obstacles", "~obstacles"),
-    ("train obstacles=null", "obstacles=null"),
+    ("train obstacles=null", "obstacles=null: obstacles names a preset; known: all, corridor"),
+    ("train condition=null", "~condition leaves it out"),
     ("train lidar.max_rage=3", "did you mean lidar.max_range?"),
     ("train +lidar.rate=3", "lidar.rate"),
+    ("train observations.command_acceleration=[4,8]", "is added: +observations.command_acceleration=[4,8]"),
     ("train robot.kq=3", "robot.kq"),
     ("train rewards.terms.tilt_squred.weight=1", "did you mean rewards.terms.tilt_squared?"),
     ("train +rewards.terms.tilt_squred.weight=1", "did you mean rewards.terms.tilt_squared?"),
@@ -89,7 +90,10 @@ LINES = [
     ("train +obstacles.groups.box={kind:cone,count:1,size:[[1,1]]}", "cone"),
     ("train seed.x=3", "seed.x=3"),
     ("train experiment=quickstart observations=gait_without_velocity", "estimates would be fitted to the command"),
-    ("train experiment=avoid observations.groups.command.history=3", "observations.groups.command.history=3: an avoid"),
+    (
+        "train experiment=avoid +observations.groups.command.history=3",
+        "groups.command.history=3: an avoid",
+    ),
     # values of another type
     ("train seed=-1", "seed=-1 must lie in 0 to 8796093022207"),
     ("train seed=20000000000000", "seed=20000000000000 must lie in 0 to 8796093022207"),
@@ -102,7 +106,7 @@ LINES = [
     ("train ppo.hidden_dims=64", "ppo.hidden_dims=64"),
     ("train ppo.hidden_dims=[a]", "ppo.hidden_dims=[a]"),
     ("train ppo.symmetry=maybe", "ppo.symmetry=maybe must be true or false"),
-    ("train commands.lin_vel_x=1.0", "commands.lin_vel_x=1.0 must be a list"),
+    ("train commands.lin_vel_x=1.0", "commands.lin_vel_x=1.0 must be [low, high]"),
     ("train commands.lin_vel_x=[1.0]", "commands.lin_vel_x=[1.0] must be [low, high]"),
     ("train terminations.on_collision=3", "terminations.on_collision=3 must be true or false"),
     ("train rewards.terms.tilt_squared.weight=heavy", "rewards.terms.tilt_squared.weight=heavy must be a number"),
@@ -128,7 +132,7 @@ LINES = [
     ("train ppo.hidden_dims=[]", "ppo.hidden_dims=[] must be widths of hidden layers"),
     ("train ppo.hidden_dims=[64,0]", "ppo.hidden_dims=[64, 0] must be widths of hidden layers"),
     ("train ppo.value_loss_coef=-1", "ppo.value_loss_coef=-1 must not be negative"),
-    ("train scenario=maze obstacles.groups.wall.layout.cell=-2", "cell=-2 of a maze must be wider"),
+    ("train scenario=maze +obstacles.groups.wall.layout.cell=-2", "cell=-2.0 of a maze must be wider"),
     ("train sim.timestep=-1", "sim.timestep=-1"),
     ("train sim.decimation=0", "sim.decimation=0"),
     ("train ppo.num_mini_batches=0", "ppo.num_mini_batches=0"),
@@ -146,11 +150,11 @@ LINES = [
     ("train lidar.num_rays=0", "num_rays=0"),
     ("train lidar.selection=best", "lidar.selection=best"),
     ("train obstacles.groups.walker.count=-1", "obstacles.groups.walker: count=-1"),
-    ("train obstacles.area=[5,-5,5,-5]", "area=[5.0, -5.0"),
+    ("train obstacles.area=[5,-5,5,-5]", "obstacles.area=[5, -5, 5, -5] must be [x_low"),
     ("train obstacles.groups.walker.size=[[300,300],[1,1]]", "obstacles.groups.walker are 600 m across"),
     ("train robot.base=torso", "robot.base=torso is no body of go2.xml; known: base"),
     ("train robot.default_joint_pos.FL_calf_joint=1", "default_joint_pos.FL_calf_joint=1 is outside its range"),
-    ("train robot.ray_groups=[7]", "robot.ray_groups names 7, in which go2.xml has no geom"),
+    ("train +robot.ray_groups=[7]", "robot.ray_groups names 7, in which go2.xml has no geom"),
     ("train robot.gait.frequency=50", "robot.gait.frequency=50 is too fast for control steps of 0.02 s; at most 12.5"),
     ("train observations.actor=[smell]", "smell"),
     ("train perception.sampler.num_proximal=0", "perception.sampler.num_proximal=0"),
@@ -253,7 +257,7 @@ LINES = [
     ("runs nowhere", "folder=nowhere does not exist"),
     ("curves runs=nowhere", "runs=nowhere is no run directory"),
     ("train logger.video_interval=0", "logger.video_interval=0 must be at least 1"),
-    ("train logger.project=legs", "logger.project is unknown"),
+    ("train logger.project=legs", "logger.project=legs is unknown"),
     *((f"train {group}=dragons", f"{group}=dragons is unknown") for group in GROUPS),
     *((f"{command} --wrong", "--wrong is unknown") for command in COMMANDS),
 ]
@@ -301,6 +305,27 @@ def test_there_are_a_hundred():
 @pytest.mark.parametrize(("line", "named"), LINES, ids=[line.replace(" ", "_") for line, _ in LINES])
 def test_wrong_input_is_one_line(one_line, line, named):
     assert named in one_line(line)
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("train --help", 0),
+        ("evaluate --help", 0),
+        ("train --cfg job", 0),
+        ("train num_env=4", 2),
+        ("train lidar.max_rage=3", 2),
+        ("train +foo=1", 2),
+        ("train -m seed=1,2 num_env=4", 2),
+    ],
+)
+def test_what_needs_no_pytorch_is_answered_without(line, code):
+    """It takes most of the seconds after which an answer would come."""
+    program = "import sys; sys.modules['torch'] = None; from omniperception.commands import main; main(sys.argv[1:])"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *line.split()], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == code and done.stderr.count("\n") == (code == 2), done.stderr
 
 
 SCRIPTS = sorted([*ROOT.glob("scripts/*.py"), ROOT / "train.py", ROOT / "play.py"])

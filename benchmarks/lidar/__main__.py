@@ -29,7 +29,6 @@ import torch
 from benchmarks.harness.table import Table, about, machine_line, report
 from omniperception.config import ConfigError
 from omnirobot.common.cli import Command, argument
-from omnirobot.common.figures import PlotsUnavailable
 
 from .baselines import MUJOCO_LIDAR, NEWTON, ONE_MESH
 from .compare import Options, compare_baselines, compare_terrain, measure_features
@@ -94,7 +93,7 @@ def main(given: Arguments) -> None:
     report(STUDIES[given.what](given), about(given.threads, given.device), given.out)
 
 
-command = Command(main, Arguments, __doc__, errors=(PlotsUnavailable,))
+command = Command(main, Arguments, __doc__)
 
 if __name__ == "__main__":
     command()

@@ -28,11 +28,9 @@ from benchmarks.harness.pareto import Study, plot
 from benchmarks.harness.table import about, machine_line, report
 from omniperception import build, config
 from omniperception.config import ConfigError
-from omniperception.learning import CheckpointError
 from omniperception.perception import PdSampler
 from omnirobot.common.cli import Command, argument, refuse_arguments
-from omnirobot.common.figures import PlotsUnavailable, new_figure
-from omnirobot.runtime import DeployError
+from omnirobot.common.figures import new_figure
 
 from . import lidar, perception, physics, policy
 
@@ -114,7 +112,7 @@ def _with(preset: str, overrides: list[str]) -> list[str]:
     return overrides if any(o.startswith(group) for o in overrides) else [preset, *overrides]
 
 
-command = Command(main, Arguments, __doc__, "of the configuration", (PlotsUnavailable, CheckpointError, DeployError))
+command = Command(main, Arguments, __doc__, "of the configuration")
 
 if __name__ == "__main__":
     command()

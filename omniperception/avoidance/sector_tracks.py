@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch.nn import functional
 
+from omniperception.common.checked import AtLeastOne, Count, NonNegative, Positive, checked
 from omniperception.common.rotations import rotate_yaw
 from omniperception.common.sectors import FAR, sector_of, sums_by
 
 
-@dataclass(frozen=True)
+@checked("TracksConfig")
 class TracksConfig:
     """How frames are matched; the values were chosen on split=dev, see docs/lab/worlds.md.
 
@@ -33,27 +33,19 @@ class TracksConfig:
             little of what is close.
     """
 
-    link: float = 0.1
-    gate: float = 0.5
-    widest: float = 0.6
-    gain: float = 0.1
-    turn: float = 0.35
-    min_frames: int = 2
-    min_speed: float = 0.3
-    max_speed: float = 2.5
-    look_back: int = 5
-    stands: float = 0.95
-    remember: int = 1
-    blind: float = 0.8
-    remember_near: int = 10
-
-    def __post_init__(self) -> None:
-        for name in ("gate", "widest", "gain", "turn", "max_speed", "look_back", "stands"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"TracksConfig.{name}={getattr(self, name)} must be positive")
-        for name in ("link", "min_speed", "min_frames", "remember", "blind", "remember_near"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"TracksConfig.{name}={getattr(self, name)} must not be negative")
+    link: NonNegative = 0.1
+    gate: Positive = 0.5
+    widest: Positive = 0.6
+    gain: Positive = 0.1
+    turn: Positive = 0.35
+    min_frames: Count = 2
+    min_speed: NonNegative = 0.3
+    max_speed: Positive = 2.5
+    look_back: AtLeastOne = 5
+    stands: Positive = 0.95
+    remember: Count = 1
+    blind: NonNegative = 0.8
+    remember_near: Count = 10
 
 
 class SectorTracks:

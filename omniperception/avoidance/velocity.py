@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 
 from omniperception.avoidance.sector_motion import sector_bearings
 from omniperception.avoidance.velocity_risk import VelocityRisk
+from omniperception.common.checked import AtLeastOne, Positive, checked
 
 SECTOR_TARGET, AVOIDANCE_TARGET, MOTION_TARGET = "sector_target", "avoidance_target", "motion_target"
 """Supervision of a network: 1 - d / NEARNESS_RANGE by sector of what the LiDAR hits; the avoidance velocity; nearness
@@ -19,7 +18,7 @@ LAST_ASKED = "last_asked"
 """Observations (n, 2) of the velocity (m/s) that a policy asked its gait for in the step that ended."""
 
 
-@dataclass(frozen=True)
+@checked("rewards.avoidance")
 class AvoidanceConfig:
     """Avoidance velocity of the paper's section 'Risk-Aware Locomotion Policy'.
 
@@ -35,20 +34,12 @@ class AvoidanceConfig:
             tell whether an obstacle is near.
     """
 
-    num_sectors: int
-    threshold: float
-    alpha: float
-    max_speed: float | None = None
-    max_acceleration: float | None = None
+    num_sectors: AtLeastOne
+    threshold: Positive
+    alpha: Positive
+    max_speed: Positive | None = None
+    max_acceleration: Positive | None = None
     risk: VelocityRisk | None = None
-
-    def __post_init__(self) -> None:
-        for key in ("num_sectors", "threshold", "alpha"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"rewards.avoidance.{key}={getattr(self, key)} must be positive")
-        for key in ("max_speed", "max_acceleration"):
-            if getattr(self, key) is not None and getattr(self, key) <= 0:
-                raise ValueError(f"rewards.avoidance.{key}={getattr(self, key)} must be positive or null")
 
 
 def avoidance_velocity(distance: torch.Tensor, config: AvoidanceConfig) -> torch.Tensor:

@@ -3,28 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 
 from omniperception.avoidance.sector_motion import sector_bearings
+from omniperception.common.checked import AtLeastOne, NonNegative, Positive, Times, checked
 from omniperception.common.sectors import FAR
 
 _SLOW = 0.1
 """Commanded speed (m/s) below which the direction counts less."""
 
-_POSITIVE = (
-    "max_speed",
-    "num_rings",
-    "num_directions",
-    "decay",
-    "time_constant",
-    "weight",
-    "temperature",
-    "sideways",
-)
 
 _NO_RISK = 16.0
 """Risks below exp(-_NO_RISK), a ten-millionth, count as none where no gradient is asked for."""
@@ -40,7 +29,7 @@ def _bearings(num_sectors: int, device: torch.device) -> torch.Tensor:
         return sector_bearings(num_sectors, device).contiguous()
 
 
-@dataclass(frozen=True)
+@checked("rewards.avoidance.risk")
 class VelocityRisk:
     """Candidate velocities, their risk and the choice between them.
 
@@ -68,28 +57,17 @@ class VelocityRisk:
             than to go round it.
     """
 
-    max_speed: float
-    num_rings: int
-    num_directions: int
-    times: Sequence[float]
-    robot_radius: float
-    decay: float
-    time_constant: float
-    weight: float
-    temperature: float
-    sideways: float = 1.0
-    robot_half_length: float = 0.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "times", tuple(float(time) for time in self.times))
-        for name in _POSITIVE:
-            if getattr(self, name) <= 0:
-                raise ValueError(f"rewards.avoidance.risk.{name}={getattr(self, name)} must be positive")
-        for name in ("robot_radius", "robot_half_length"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"rewards.avoidance.risk.{name}={getattr(self, name)} must not be negative")
-        if not self.times or min(self.times) < 0:
-            raise ValueError(f"rewards.avoidance.risk.times={list(self.times)} must be times (s) of at least 0")
+    max_speed: Positive
+    num_rings: AtLeastOne
+    num_directions: AtLeastOne
+    times: Times
+    robot_radius: NonNegative
+    decay: Positive
+    time_constant: Positive
+    weight: Positive
+    temperature: Positive
+    sideways: Positive = 1.0
+    robot_half_length: NonNegative = 0.0
 
     @property
     def num_candidates(self) -> int:

@@ -30,6 +30,7 @@ EXTRAS = {
     "imageio_ffmpeg": "train",
     "mujoco": "train",
     "omegaconf": "train",
+    "pydantic": "train",
     "rsl_rl": "train",
     "tensorboard": "train",
     "tensordict": "train",

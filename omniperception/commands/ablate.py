@@ -27,8 +27,7 @@ from omniperception.evaluation.ablation import (
     train,
     write_tables,
 )
-from omniperception.evaluation.suite import POLICIES, SPLITS
-from omniperception.learning import CheckpointError
+from omniperception.evaluation.trials.policies import POLICIES, SPLITS
 from omnirobot.common.cli import Command, argument, trust
 from omnirobot.common.errors import check_known
 
@@ -91,4 +90,4 @@ def _ablation(name: str, arguments: Arguments, overrides: list[str]) -> Ablation
     return Ablation(study, arguments.out or config.OUTPUTS / name, tuple(overrides), arguments.trust)
 
 
-command = Command(main, Arguments, __doc__, "of the trainings", (CheckpointError,))
+command = Command(main, Arguments, __doc__, "of the trainings")

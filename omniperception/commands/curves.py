@@ -14,7 +14,6 @@ from pathlib import Path
 from omniperception import config
 from omniperception.evaluation.report.curves import curves_of, draw_curves
 from omnirobot.common.cli import PICTURES, Command, argument
-from omnirobot.common.figures import PlotsUnavailable
 
 TAGS = ("Train/mean_reward", "Metrics/velocity_error")
 
@@ -47,4 +46,4 @@ def main(arguments: Arguments) -> None:
     print(f"wrote {arguments.out}")
 
 
-command = Command(main, Arguments, __doc__, errors=(PlotsUnavailable,))
+command = Command(main, Arguments, __doc__)

@@ -19,8 +19,7 @@ import torch
 
 from omniperception import build, config
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
-from omniperception.learning import CheckpointError
-from omniperception.viewer import PageOptions, Shown, ViewerError, serve
+from omniperception.viewer import PageOptions, Shown, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT
 from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides
 
@@ -77,4 +76,4 @@ def has_display() -> bool:
     return sys.platform in ("darwin", "win32") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
-command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError, ViewerError))
+command = Command(main, Arguments, __doc__, "of the run's configuration")

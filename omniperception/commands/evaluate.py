@@ -32,24 +32,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omniperception import config
 from omniperception.config import ConfigError
-from omniperception.evaluation.suite import (
-    POLICIES,
-    SPLITS,
-    Evaluation,
-    World,
-    evaluate,
-    held_out_scenarios,
-    suite_worlds,
-)
-from omniperception.evaluation.trials.baselines import DRIVEN
-from omniperception.learning import CheckpointError
-from omniperception.viewer import PageOptions, Shown, ViewerError, serve
+from omniperception.evaluation.trials.policies import DRIVEN, POLICIES, SPLITS
+from omniperception.viewer import PageOptions, Shown, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT
 from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, trust
-from omnirobot.common.figures import PlotsUnavailable
+
+if TYPE_CHECKING:
+    from omniperception.evaluation.suite import World
 
 MEASURED = ("trials", "num_envs", "jobs", "plots", "again", "out", "log")
 """Arguments about what is measured."""
@@ -103,6 +96,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     names = ("split", "condition", "trials", "num_envs", "jobs", "plots", "again", "out", "log", "trust")
     given = {name: getattr(arguments, name) for name in names}
     walker = config.find_run(arguments.walker, "walker") if arguments.walker else None
+    from omniperception.evaluation.suite import Evaluation, evaluate
+
     evaluate(Evaluation(runs, worlds, policies=arguments.policy, walker=walker, overrides=tuple(overrides), **given))
 
 
@@ -120,6 +115,8 @@ def _shown(arguments: Arguments, run_dir: Path, world: World, overrides: list[st
 
 def _worlds(arguments: Arguments, folders: list[Path], terrain_given: bool) -> list[World]:
     """The worlds of a suite, or the scenarios on their own terrain."""
+    from omniperception.evaluation.suite import World, held_out_scenarios, suite_worlds  # brings PyTorch
+
     if arguments.suite is None:
         names = arguments.scenario or ("corridor",)
         if names == ("all",):
@@ -132,6 +129,4 @@ def _worlds(arguments: Arguments, folders: list[Path], terrain_given: bool) -> l
     return suite_worlds(arguments.suite, folders)
 
 
-command = Command(
-    main, Arguments, __doc__, "of the runs' configuration", (CheckpointError, PlotsUnavailable, ViewerError)
-)
+command = Command(main, Arguments, __doc__, "of the runs' configuration")

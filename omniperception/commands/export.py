@@ -20,7 +20,6 @@ from pathlib import Path
 from omniperception import config
 from omniperception.deploy.deploy_yaml import FILE as DEPLOY_YAML
 from omniperception.deploy.export import FOLDER, FORMATS, export
-from omniperception.learning import CheckpointError
 from omnirobot.common.cli import Command, argument, trust
 
 
@@ -49,4 +48,4 @@ def main(arguments: Arguments) -> None:
     print(f"wrote {', '.join(str(folder / name) for name in written)}")
 
 
-command = Command(main, Arguments, __doc__, errors=(CheckpointError,))
+command = Command(main, Arguments, __doc__)

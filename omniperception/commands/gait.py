@@ -42,12 +42,11 @@ from omniperception.evaluation.gait.response_fit import SETTLES_S as UNSETTLED_S
 from omniperception.evaluation.gait.response_fit import fit, kept
 from omniperception.evaluation.report.records import FOLDER, merge
 from omniperception.evaluation.suite import Evaluation, World
-from omniperception.learning import CheckpointError
 from omniperception.scene.build import FOOT_FORCE
 from omniperception.sim.response import AXES, ConditionResponse, GaitResponse
 from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, refuse_overrides, trust
 from omnirobot.common.errors import ConfigError
-from omnirobot.common.figures import PlotsUnavailable, check_figures
+from omnirobot.common.figures import check_figures
 
 RANGES, KICKS = ("rows", "factors", "preset", "trials", "out"), ("speeds", "bearings", "repeats")
 RESPONSE = ("conditions", "robots", "seconds")
@@ -229,4 +228,4 @@ def response_table(response: GaitResponse) -> str:
     return "\n\n".join((units, markdown(heads, rows), fell, markdown(["jump", *falls], jumps), size))
 
 
-command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError, PlotsUnavailable))
+command = Command(main, Arguments, __doc__, "of the run's configuration")

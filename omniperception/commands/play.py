@@ -22,9 +22,8 @@ from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.common.provenance import provenance
 from omniperception.evaluation.report.tables import summary_table, times_line
 from omniperception.evaluation.trials.episodes import run_episodes
-from omniperception.learning import CheckpointError
 from omniperception.learning.progress import ProgressLine
-from omniperception.viewer import PageOptions, Shown, ViewerError, serve
+from omniperception.viewer import PageOptions, Shown, serve
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT
 from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides, trust
 from omnirobot.common.files import write_whole
@@ -102,4 +101,4 @@ def _progress(trials: int) -> Iterator[Callable[[int], None]]:
 INTERVAL_S = 10.0
 """Between two lines of progress."""
 
-command = Command(main, Arguments, __doc__, "of the run's configuration", (CheckpointError, ViewerError))
+command = Command(main, Arguments, __doc__, "of the run's configuration")

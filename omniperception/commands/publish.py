@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omniperception import config
-from omniperception.learning import CheckpointError
 from omniperception.publish import publish
 from omnirobot.common.cli import Command, argument
 
@@ -31,4 +30,4 @@ def main(arguments: Arguments) -> None:
     print(f"{arguments.to}: {record['iterations']} iterations, {record['training_hours']} h of training")
 
 
-command = Command(main, Arguments, __doc__, errors=(CheckpointError,))
+command = Command(main, Arguments, __doc__)

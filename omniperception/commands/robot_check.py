@@ -21,7 +21,7 @@ from omniperception.robots.stand import NEAR, Stance, flat_world, reached_limits
 from omniperception.scene import World
 from omnirobot.common.cli import Command, argument, refuse_overrides
 
-NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
+NO_TASK = ("~experiment", "perception=none", "observations=walk", "rewards=walk")
 """A robot is looked at, no task is run."""
 MANY_OWN = 0.3
 """A mount from which more than this share of the rays hits the robot deserves a look."""

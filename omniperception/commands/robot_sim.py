@@ -25,7 +25,6 @@ from omniperception.deploy.faults import FAULTS
 from omniperception.deploy.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
 from omniperception.env.env import OmniEnv
 from omnirobot.common.cli import Command, argument, refuse_overrides, trust
-from omnirobot.runtime.description import DeployError
 
 WIRE = {
     "sim": "mujoco",
@@ -94,4 +93,4 @@ def world(run_dir: Path, overrides: list[str], trust: Sequence[str] = ()) -> Omn
     return OmniEnv(replace(run.env, skip_curricula=True, trials=True))
 
 
-command = Command(main, Arguments, __doc__, overrides="of the run's configuration", errors=(DeployError,))
+command = Command(main, Arguments, __doc__, overrides="of the run's configuration")

@@ -25,7 +25,6 @@ from omniperception import config
 from omniperception.deploy.trials import KNOWN_FAULTS, NO_FAULT, TrialsConfig, results, run, table
 from omnirobot.common.cli import Command, argument, trust
 from omnirobot.common.errors import check_known
-from omnirobot.runtime.description import DeployError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,4 +65,4 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     print(table(results(arguments.out)))
 
 
-command = Command(main, Arguments, __doc__, overrides="of the run's configuration", errors=(DeployError,))
+command = Command(main, Arguments, __doc__, overrides="of the run's configuration")

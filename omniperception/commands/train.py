@@ -1,55 +1,39 @@
 """Trains a policy, or goes on with a run.
 
-    train experiment=quickstart obstacles=mixed num_envs=256
+    train                                       # the quickstart recipe
+    train experiment=walk obstacles=mixed num_envs=256
     train run=outputs/2026-01-31/12-00-00
-    train -m experiment=quickstart seed=1,2 perception=pd_risknet,fps_mlp
+    train -m seed=1,2 perception=pd_risknet,fps_mlp
 
 A run's directory is outputs/<date>/<time>, or hydra.run.dir=<folder>. `run` goes on exactly where a stopped run was,
-and so does a command line whose run directory holds checkpoints of the same configuration. `-m` runs every combination
-of values with commas, on a cluster with hydra/launcher=submitit_slurm. `--cfg job` prints the composed configuration.
+and so does a command line whose run directory holds checkpoints of the same configuration. All else is Hydra's: `-m`
+runs every combination of values with commas, on a cluster with hydra/launcher=submitit_slurm, `--cfg job` prints the
+composed configuration, `--hydra-help` lists the other flags.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import hydra
-import torch
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from omniperception import build, config
-from omniperception.common import provenance
-from omniperception.common.checkpoints import checkpoint_path
-from omniperception.learning import (
-    CheckpointError,
-    RolloutTooSmall,
-    TrainingDiverged,
-    distributed,
-    latest_checkpoint,
-)
-from omniperception.learning.log_writers import LoggerError
-from omniperception.learning.ppo import check_rollout
-from omniperception.learning.progress import say
-from omniperception.plan import parts_of, summary
-from omniperception.schema import words_of
+from omniperception import config
 from omnirobot.common.cli import Command, argument, fail, trust
-from omnirobot.common.errors import one_line
-from omnirobot.common.files import try_lock
-from omnirobot.common.shell import command_line
+from omnirobot.common.errors import UserError, one_line
 
-ERRORS = (CheckpointError, LoggerError, RolloutTooSmall, TrainingDiverged)
-_OF_A_BEGINNING = ("seed", "init", "ppo.critic_warmup", "ppo.init_std", "ppo.start_std")
-SWEEP, SHOW = {"-m", "--multirun"}, ("--cfg", "job")
+HYDRAS = (
+    *("-m", "--multirun", "--cfg", "-c", "--resolve", "--package", "-p", "--info", "-i", "--hydra-help"),
+    *("--shell-completion", "-sc", "--experimental-rerun"),
+)
+"""Flags that Hydra reads."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,279 +45,66 @@ class Arguments:
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
-    """Resumes a run, runs a sweep, or trains one run."""
-    flags = {text for text in overrides if text in SWEEP | set(SHOW)}
-    values, shows = [text for text in overrides if text not in flags], flags & set(SHOW)
-    if shows and SHOW not in itertools.pairwise(overrides):
-        raise config.ConfigError("--cfg and job mean something next to each other alone: --cfg job shows what a run is")
-    if arguments.run is not None:
-        if flags:
-            raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
-        go_on(config.find_run(arguments.run), values, arguments.trust)
-    elif shows:
-        print(config.as_yaml(assemble(config.compose(values)).composed), end="")
-    elif flags:
-        sweep(values, arguments.trust)
-    else:
-        composed = config.compose(values, with_hydra=True)
-        HydraConfig.instance().set_config(composed)  # for ${hydra:...} in hydra.run.dir
-        run_dir = Path(os.path.relpath(composed.hydra.run.dir))
-        train(config.without_hydra(composed), run_dir, values, arguments.trust)
+    """Goes on with a run, or lets Hydra start one, several, or what else its flags say."""
+    values = [text for text in overrides if text.startswith("~") or (not text.startswith("-") and "=" in text)]
+    flags = [text for text in overrides if text not in values]
+    if arguments.run is None:
+        return start(flags, values, arguments.trust)
+    if flags:
+        raise config.ConfigError(f"{' '.join(flags)}: a run goes on by itself; leave it out")
+    run_dir = config.find_run(arguments.run)
+    from omniperception import training  # brings PyTorch, without which what is wrong so far is said
+
+    training.go_on(run_dir, values, arguments.trust)
 
 
-def go_on(run_dir: Path, overrides: Sequence[str], trust: Sequence[str]) -> None:
-    """Goes on with a run; what overrides change is written into its directory, for whoever reads it next."""
-    for override in config.parse(overrides):
-        if override.key_or_group in _OF_A_BEGINNING:
-            raise config.ConfigError(
-                f"{override.input_line}: {run_dir} has begun already and goes on from its newest checkpoint; leave it"
-                " out, or train a run of its own"
-            )
-    run = _trainable(build.load_run(run_dir, overrides, trust))
-    if run.ppo.schedule == "adaptive":
-        for override in config.parse(overrides):
-            if override.key_or_group == "ppo.learning_rate":
-                raise config.ConfigError(
-                    f"{override.input_line}: ppo.schedule=adaptive goes on from the checkpoint's; leave it out, or give"
-                    " ppo.schedule=fixed with it"
-                )
-    with _exclusive_run_dir(run_dir):
-        learn(run, run_dir, resume=True, changes=overrides, trust=trust)
+def start(flags: Sequence[str], overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
+    """What Hydra makes of flags and overrides; every job is composed and assembled before the first one begins."""
+    sweeps = bool({"-m", "--multirun"} & set(flags)) or "hydra.mode=MULTIRUN" in overrides
+    parsed = config.parse(overrides, sweeps)
+    composed = [config.compose(job) for job in config.jobs(parsed)]
+    if sweeps or not flags:  # it trains
+        from omniperception import training
 
+        for one in composed:
+            training.assemble(one)
+    folders = config.search_path(parsed)
+    texts = [str(o.input_line) for o in parsed if o.key_or_group != "hydra.searchpath"]
+    remembered = f"++{config.SEARCH_PATH}=[{','.join(config.quoted(str(folder)) for folder in folders)}]"
+    found = [*config.as_override(folders), remembered] if folders else []
+    failed, begun = list[Path](), list[Path]()
 
-def assemble(composed: DictConfig) -> build.RunConfig:
-    """Builds and validates a run that may be trained; see `build.assemble`.
+    @hydra.main(config_path=str(config.CONFIG_DIR), config_name="config", version_base="1.3")
+    def job(composed: DictConfig) -> None:
+        from omniperception import training
 
-    Raises:
-        ConfigError: it would see obstacles of the test split, or gives noise to a policy that nothing begins with.
-        LoggerError: a library is missing.
-    """
-    run = build.assemble(composed)
-    if run.ppo.start_std is not None and not run.init:
-        raise config.ConfigError(
-            f"ppo.start_std={run.ppo.start_std} is of a policy that another run gives (init=); give ppo.start_std=null,"
-            " and ppo.init_std for the noise of a new one"
-        )
-    return _trainable(run)
-
-
-def _trainable(run: build.RunConfig) -> build.RunConfig:
-    """Refuses a run that would see obstacles of the test split, or whose logger lacks its library."""
-    build.check_split(run, "training")
-    run.family_envs()
-    if run.logger is not None:
-        run.logger.check()
-    return run
-
-
-def train(composed: DictConfig, run_dir: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
-    """Trains the configuration that overrides composed, in its directory."""
-    run = assemble(composed)
-    distributed.connect(run.env.sim.torch_device)
-    run_dir = distributed.of_first(run_dir)
-    begun = distributed.of_first(config.is_begun(run_dir, run.composed))
-    if not begun:
-        _check_sources(run)
-        ppo = run.ppo
-        check_rollout(run.env.num_envs, ppo.num_steps_per_env, ppo.num_mini_batches, run.perception is not None)
-    with _exclusive_run_dir(run_dir):
-        begun = distributed.of_first(config.is_begun(run_dir, run.composed))  # another process may have ended meanwhile
-        if distributed.rank() == 0:
-            config.save(run.composed, run_dir)
-            if not begun:
-                provenance.write(run_dir, provenance.provenance(run.env.sim.torch_device, seed=run.env.seed))
-                config.save_recipe(overrides, run_dir)
-        learn(run, run_dir, resume=begun, trust=trust)
-
-
-@contextmanager
-def _exclusive_run_dir(run_dir: Path) -> Iterator[None]:
-    """Refuses to train in a directory in which another process trains: it holds the folder of the checkpoints."""
-    if distributed.rank() > 0:
-        yield
-        return
-    checkpoints = checkpoint_path(run_dir, 0).parent
-    try:
-        checkpoints.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise config.ConfigError(
-            f"{run_dir} cannot be written: {error.strerror}; choose another hydra.run.dir"
-        ) from None
-    with try_lock(checkpoints) as alone:
-        if not alone:
-            raise config.ConfigError(f"{run_dir}: another process trains there; wait for its end, or stop it and go on")
-        yield
-
-
-def _check_sources(run: build.RunConfig) -> None:
-    """Refuses runs to begin from that have no weights, or moved otherwise, before a directory is written."""
-    if run.init and run.env.sim.has_legs:
-        _check_motion(OmegaConf.create(run.composed), run.init[-1])
-    for name in run.init:
-        latest_checkpoint(config.find_run(name, "init"))
-    if run.distillation is not None:
-        latest_checkpoint(config.find_run(run.distillation.teacher, "distillation.teacher"))
-
-
-def learn(
-    run: build.RunConfig, run_dir: Path, resume: bool, changes: Sequence[str] = (), trust: Sequence[str] = ()
-) -> None:
-    """Trains a run to its end in `run_dir`; of several processes the first one reports.
-
-    Args:
-        run: the configuration.
-        run_dir: its directory.
-        resume: whether it goes on from its newest checkpoint.
-        changes: overrides of what it was before.
-        trust: packages of one's own whose names the configurations of `init` and the teacher may build.
-    """
-    torch.set_flush_denormal(True)  # gradients of faint activations are, and one convolution took 40 times as long
-    runner, composed = build.build_runner(run, run_dir), OmegaConf.create(run.composed)
-    if resume:
-        if not runner.load(latest_checkpoint(run_dir)):
-            report("its task is another now: new episodes begin")
-        if changes and distributed.rank() == 0:  # the weights fit
-            config.save(run.composed, run_dir)
-            config.save_recipe([*config.read_recipe(run_dir), *changes], run_dir)
-        report(f"resuming {run_dir} after {runner.current_learning_iteration} iterations")
-    else:
-        if run.init:
-            given = [config.find_run(name, "init") for name in run.init]
-            theirs = build.load_run(given[-1], trust=trust)
-            seeing = runner.start_from(*given, observations=theirs.env.observations)
-            for source in seeing:
-                _report_other_sampler(composed, source)
-            if run.perception is not None and theirs.perception is not None and not seeing:
-                report(f"init={given[-1]}: its perception or its read-out has another form, and both stay behind")
-            _report_other_terms(composed, given[-1], "init")
-        report(f"run directory: {run_dir}")
-    if run.distillation is not None and runner.current_learning_iteration < run.distillation.iterations:
-        name, key = run.distillation.teacher, "distillation.teacher"
-        teacher = config.find_run(name, key)
-        _check_motion(composed, name, key)
-        _report_other_terms(composed, teacher, key)
-        runner.alg.learn_from(build.load_teacher(teacher, runner.env, trust))
-
-    report(summary(parts_of(runner), run.families))
-    if distributed.rank() == 0 and run.logger is not None and run.logger.video_interval is not None:
-        from omniperception.evaluation.film.training_videos import TrainingVideos
-
-        videos = TrainingVideos(runner, run_dir, run.logger.video_interval, run.logger.video_s)
-        runner.step_hooks.append(videos.step)
-        runner.end_hooks.append(videos.close)
-    runner.learn(max(run.ppo.max_iterations - runner.current_learning_iteration, 0), init_at_random_ep_len=not resume)
-    play = command_line("play", *words_of(run_dir, run.composed))
-    report(f"{runner.stop_reason}: {runner.current_learning_iteration} iterations; next: {play}")
-    distributed.disconnect()
-
-
-def _check_motion(composed: DictConfig, source: str, name: str = "init") -> None:
-    """Refuses weights whose actions meant another motion in the run that they come from; nothing in them shows it."""
-    other = config.read(config.find_run(source, name))
-    robots = [OmegaConf.select(one, "robot.file") for one in (composed, other)]
-    for key in ("stepping", "robot.joints", "robot.default_joint_pos", "robot.action_scale"):
-        own, given = OmegaConf.select(composed, key), OmegaConf.select(other, key)
-        if own != given:
-            if robots[0] != robots[1]:
-                raise config.ConfigError(
-                    f"{name}={source}: it moves the robot of {robots[1]}, this one is that of {robots[0]}, and {key}"
-                    f" differs; give {name}=<a run with this robot>, such as one of experiment=gait"
-                )
-            wanted = "null" if given is None else str(given).replace("'", "").replace(": ", ":")
-            raise config.ConfigError(
-                f"{name}={source}: its actions meant another motion, that of '{key}={wanted}'; give the same here"
-            )
-    if robots[0] != robots[1]:
-        report(f"{name}={source}: it was learned by the robot of {robots[1]}, this one is that of {robots[0]}")
-
-
-def _report_other_sampler(composed: DictConfig, source: Path) -> None:
-    """Says where a perception network goes on with inputs that are made otherwise; nothing in its weights shows it."""
-    changes = _changes(*(one.perception.sampler for one in (config.read(source), composed)))
-    if changes:
-        report(f"init={source}: its perception was learned from another sampler ({changes}) and goes on from there")
-
-
-def _report_other_terms(composed: DictConfig, source: Path, name: str) -> None:
-    """Says where what a policy observes has other parameters, such as a scale, than in the run that it comes from."""
-    own, given = (_terms(one) for one in (composed, config.read(source)))
-    for term, parameters in own.items():
-        if term in given and (changes := _changes(given[term], parameters)):
-            report(f"{name}={source}: what it observes as {term} is made otherwise here ({changes})")
-
-
-def _terms(composed: DictConfig) -> dict[str, DictConfig]:
-    """Parameters of the terms that the actor observes."""
-    groups = [composed.observations.groups[name] for name in composed.observations.actor]
-    return {
-        str(term): parameters for group in groups for term, parameters in group.terms.items() if parameters is not None
-    }
-
-
-def _changes(before: DictConfig, now: DictConfig) -> str:
-    keys = [key for key in dict.fromkeys((*before, *now)) if before.get(key) != now.get(key)]
-    return ", ".join(f"{key} {before.get(key)} -> {now.get(key)}" for key in keys)
-
-
-def report(text: str) -> None:
-    """Prints a line, once however many processes learn."""
-    if distributed.rank() == 0:
-        say(text)
-
-
-def sweep(overrides: Sequence[str], trust: Sequence[str] = ()) -> None:
-    """Runs every combination of overrides with several values, by Hydra and the launcher that is chosen."""
-    parsed = check_jobs(overrides)
-    searched = config.search_path([override for override in parsed if override.is_hydra_override()])
-    given = {str(override.input_line): config.for_hydra(override, searched) for override in parsed}
-    left_out = [text for text, passed in given.items() if passed is None]
-    added = {override.key_or_group for override in parsed if given[str(override.input_line)] != override.input_line}
-    jobs, failed = 0, list[Path]()
-
-    def job(_: DictConfig) -> None:
-        nonlocal jobs
-        jobs += 1
         settings = HydraConfig.get()
-        folders = [f"hydra.searchpath={list(settings.searchpath)}"] if settings.searchpath else []
-        task = [*(_as_given(text, added) for text in settings.overrides.task), *left_out]
+        task = [text for text in settings.overrides.task if not text.startswith(f"++{config.SEARCH_PATH}=")]
         run_dir = Path(os.path.relpath(settings.runtime.output_dir))
+        begun.append(run_dir)
         try:
-            train(config.compose([*task, *folders]), run_dir, task, trust)
-        except (config.ConfigError, *ERRORS) as error:
-            if distributed.world_size() > 1 or not settings.launcher["_target_"].endswith("BasicLauncher"):
+            training.train(config.finish(composed, settings.runtime.choices.get("condition")), run_dir, task, trust)
+        except UserError as error:
+            with suppress(OSError):  # nothing was written into it
+                run_dir.rmdir()
+            in_turn = sweeps and settings.launcher["_target_"].endswith("BasicLauncher")
+            if not in_turn or training.distributed.world_size() > 1:
                 fail(error)  # this process has others that wait for it, or is the job's own
             print(f"error: {run_dir}: {one_line(error)}", file=sys.stderr, flush=True)
             failed.append(run_dir)
 
-    before, sys.argv = sys.argv, [sys.argv[0], "-m", *(text for text in given.values() if text is not None)]
+    before, sys.argv = sys.argv, [sys.argv[0], *flags, *texts, *found]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # or it prints a traceback of what this program says in one line
     try:
-        hydra.main(config_path=str(config.CONFIG_DIR), config_name="config", version_base="1.3")(job)()
-    except HydraException as error:
-        raise config.ConfigError(one_line(error)) from None
+        job()
+    except (HydraException, ValueError) as error:
+        if begun and not isinstance(error, HydraException):
+            raise
+        raise config.ConfigError(one_line(error)) from None  # such as flags that exclude each other
     finally:
         sys.argv = before
     if failed:
-        raise config.ConfigError(f"{len(failed)} of {jobs} jobs failed: {', '.join(map(str, failed))}")
+        raise config.ConfigError(f"{len(failed)} of {len(begun)} jobs failed: {', '.join(map(str, failed))}")
 
 
-def _as_given(text: str, added: set[str]) -> str:
-    """An override of a job, as it was before `config.for_hydra`."""
-    key = text.removeprefix("++").partition("=")[0]
-    return text.removeprefix("++") if key in added else text
-
-
-def check_jobs(overrides: Sequence[str]) -> list[Override]:
-    """Composes and validates every job of a sweep before the first is started; the overrides as Hydra reads them."""
-    parsed = [config.parse_one(text, sweeps=True) for text in overrides]
-    for override in parsed:
-        several = override.is_sweep_override() and override.key_or_group in config.OPTIONAL_GROUPS
-        if several and "null" in override.sweep_string_iterator():
-            raise config.ConfigError(f"{override.input_line}: null beside other values; give it to a sweep of its own")
-    for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None):
-        for job in batch:
-            assemble(config.compose(job))
-    return parsed
-
-
-command = Command(main, Arguments, __doc__, "of the configuration", ERRORS, flags=(*sorted(SWEEP), *SHOW))
+command = Command(main, Arguments, __doc__, "of the configuration", flags=HYDRAS)

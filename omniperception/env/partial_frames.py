@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated, Literal, get_args
 
 import torch
+from pydantic import Field
 
+from omniperception.common.checked import AsTuple, InOrder, Inside, NonNegativePair, checked
 from omniperception.common.random import Branch
 from omniperception.common.stateful import Stateful
 
-KINDS = ("sector", "thin", "slice", "wedge")
+Kind = Literal["sector", "thin", "slice", "wedge"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 """What is missing of a frame: an azimuth sector, the same in all frames; all but a share of the points, at random; all
 but a share of the frame's time, the same in all frames; all but a share of the circle, another one in every frame."""
 _THIN, _SLICE, _WEDGE = 1, 2, 3
+_ANGLE = Field(ge=0, le=360)
+_Degrees = Annotated[
+    tuple[Annotated[float, _ANGLE], Annotated[float, _ANGLE]], AsTuple, InOrder, "[low, high], 0 to 360"
+]
+_Kinds = Annotated[tuple[Kind, ...], AsTuple, Field(min_length=1), f"some of {', '.join(KINDS)}"]
 
 
-@dataclass(frozen=True)
+@checked("randomization.partial_frames")
 class PartialFramesConfig:
     """Spells in which every frame lacks a part of its points, as of a driver that loses packets or a covered sensor.
 
@@ -30,25 +38,11 @@ class PartialFramesConfig:
         keep: share of the points that is left, of the other kinds.
     """
 
-    every_s: Sequence[float]
-    lasts_s: Sequence[float]
-    kinds: Sequence[str] = KINDS
-    width_deg: Sequence[float] = (40.0, 180.0)
-    keep: float = 0.1
-
-    def __post_init__(self) -> None:
-        for name, most in (("every_s", math.inf), ("lasts_s", math.inf), ("width_deg", 360.0)):
-            value = getattr(self, name)
-            if len(value) != 2 or not 0 <= value[0] <= value[1] <= most or math.isinf(value[1]):
-                raise ValueError(
-                    f"randomization.partial_frames.{name}={list(value)} must be [low, high], 0 to {most:g}"
-                )
-        if not self.kinds or not set(self.kinds) <= set(KINDS):
-            raise ValueError(
-                f"randomization.partial_frames.kinds={list(self.kinds)} must be some of {', '.join(KINDS)}"
-            )
-        if not 0 < self.keep < 1:
-            raise ValueError(f"randomization.partial_frames.keep={self.keep} must be a share between 0 and 1")
+    every_s: NonNegativePair
+    lasts_s: NonNegativePair
+    kinds: _Kinds = KINDS
+    width_deg: _Degrees = (40.0, 180.0)
+    keep: Inside = 0.1
 
 
 class PartialFrames(Stateful):

@@ -18,8 +18,6 @@ from omniperception.evaluation.report.pages import by_training
 from omniperception.evaluation.report.records import Record, read, write
 from omniperception.evaluation.report.studies import study_table
 from omniperception.evaluation.suite import (
-    POLICIES,
-    SPLITS,
     Evaluation,
     Task,
     World,
@@ -27,6 +25,7 @@ from omniperception.evaluation.suite import (
     measure_all,
     suite_worlds,
 )
+from omniperception.evaluation.trials.policies import POLICIES, SPLITS
 from omnirobot.common.errors import check_known, one_line
 from omnirobot.common.files import write_whole
 from omnirobot.common.signals import interruptible
@@ -71,7 +70,7 @@ class Study:
         arms: ways of training by name; one that begins with the weights of another stands behind it.
         overrides: of the experiment, that all arms share.
         conditions: presets of `condition`.
-        policies: names from `suite.POLICIES`.
+        policies: names from `trials.policies.POLICIES`.
         split: dev or test.
     """
 

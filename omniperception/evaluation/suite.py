@@ -28,9 +28,10 @@ from omniperception.evaluation.report.gaits import walking_table
 from omniperception.evaluation.report.plots import draw_worlds
 from omniperception.evaluation.report.records import FOLDER, Record, merge, read, write
 from omniperception.evaluation.report.tables import progress_line, table
-from omniperception.evaluation.trials.baselines import BASELINES, DRIVEN, baseline, commanded_ranges, prepared
+from omniperception.evaluation.trials.baselines import baseline, commanded_ranges, prepared
 from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.evaluation.trials.exported import ExportedPolicies
+from omniperception.evaluation.trials.policies import BASELINES, DRIVEN, POLICIES
 from omniperception.evaluation.trials.tracks import Tracks
 from omniperception.learning import CheckpointError, latest_checkpoint
 from omnirobot.common.errors import check_known, naming, one_line
@@ -39,14 +40,6 @@ from omnirobot.runtime import ExportedPolicy
 from omnirobot.runtime.description import FILE as DESCRIPTION
 from omnirobot.runtime.description import checksum
 
-POLICIES = {
-    "run": "the run's policy",
-    **BASELINES,
-    "exported": "the run's exported policy on what a robot measures: onnxruntime",
-}
-"""Policies to evaluate; the gait is the run's own, which then sees nothing, or that of `walker`."""
-
-SPLITS = ("dev", "test")
 LOG = Path("docs") / "lab" / "evaluations.jsonl"
 """Where evaluations on the test split are noted, below a checkout."""
 _SCENE = (*config.FIXED_BY_SCENARIO, *config.FIXED_BY_CONDITION)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from omniperception.common.checkpoints import checkpoint_path, list_checkpoints
-from omnirobot.common.errors import of_a_disk
+from omnirobot.common.errors import UserError, of_a_disk
 from omnirobot.common.files import write_whole
 from omnirobot.common.shell import command_line
 
@@ -25,7 +25,7 @@ VERSION = 1
 _LAYER = re.compile(r"mlp\.(?:network\.)?(\d+)\.weight")
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(UserError, RuntimeError):
     """A checkpoint is missing, damaged, foreign or does not fit what it is loaded into."""
 
 

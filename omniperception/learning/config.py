@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from rsl_rl.utils import resolve_nn_activation
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, MOTION_TARGET, SECTOR_TARGET
 from omniperception.avoidance.velocity_risk import VelocityRisk
+from omniperception.common.checked import AtLeastOne, Count, NonNegative, Positive, Share, Widths, checked
 from omniperception.env.config import HEIGHT_TARGET
 from omniperception.env.odometry import TimedOdometry
 from omniperception.learning.distillation import DistillationConfig
@@ -19,7 +20,7 @@ from omniperception.learning.navigation import NavigationConfig, VelocityInput
 from omniperception.perception import PerceptionNetwork, Sampler
 
 
-@dataclass(frozen=True)
+@checked("perception")
 class PerceptionConfig:
     """Configuration of the actor's perception.
 
@@ -45,33 +46,26 @@ class PerceptionConfig:
 
     sampler: Callable[[], Sampler]
     network: Callable[..., PerceptionNetwork]
-    history: int
-    height_weight: float
-    sector_weight: float
-    avoidance_weight: float = 0.0
-    motion_weight: float = 0.0
-    supervised_epochs: int = 0
-    learning_rate: float = 1.0e-3
-    final_learning_rate: float | None = None
+    history: AtLeastOne
+    height_weight: NonNegative
+    sector_weight: NonNegative
+    avoidance_weight: NonNegative = 0.0
+    motion_weight: NonNegative = 0.0
+    supervised_epochs: Count = 0
+    learning_rate: Positive = 1.0e-3
+    final_learning_rate: Positive | None = None
     base_motion: bool = False
     frame_times: bool = False
 
     def __post_init__(self) -> None:
         if self.frame_times and not self.base_motion:
             raise ValueError("perception.frame_times=true needs perception.base_motion=true")
-        if self.history < 1:
-            raise ValueError(f"perception.history={self.history} must be at least 1")
-        for name in ("height_weight", "sector_weight", "avoidance_weight", "motion_weight", "supervised_epochs"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"perception.{name}={getattr(self, name)} must not be negative")
         if self.avoidance_weight and self.motion_weight:
             raise ValueError(
                 f"perception.avoidance_weight={self.avoidance_weight} and motion_weight={self.motion_weight} would both"
                 " change the command; set one of them to 0"
             )
-        if self.learning_rate <= 0:
-            raise ValueError(f"perception.learning_rate={self.learning_rate} must be positive")
-        if self.final_learning_rate is not None and not 0 < self.final_learning_rate <= self.learning_rate:
+        if self.final_learning_rate is not None and self.final_learning_rate > self.learning_rate:
             raise ValueError(
                 f"perception.final_learning_rate={self.final_learning_rate} must lie in (0, {self.learning_rate}], or"
                 " be null"
@@ -108,7 +102,7 @@ class PerceptionConfig:
         return {target: weight for target, weight in weights.items() if weight > 0}
 
 
-@dataclass(frozen=True)
+@checked("ppo")
 class PPOConfig:
     """PPO after the paper's Table 'PPO Hyperparameters'.
 
@@ -139,66 +133,39 @@ class PPOConfig:
         The others are rsl_rl's PPO arguments.
     """
 
-    max_iterations: int
-    max_minutes: float | None
-    save_interval: int
-    keep_checkpoints: int
-    num_steps_per_env: int
-    num_learning_epochs: int
-    num_mini_batches: int
-    clip_param: float
-    gamma: float
-    lam: float
-    learning_rate: float
-    schedule: str
-    desired_kl: float
-    value_loss_coef: float
+    max_iterations: AtLeastOne
+    max_minutes: Positive | None
+    save_interval: AtLeastOne
+    keep_checkpoints: AtLeastOne
+    num_steps_per_env: AtLeastOne
+    num_learning_epochs: Count
+    num_mini_batches: AtLeastOne
+    clip_param: Positive
+    gamma: Share
+    lam: Share
+    learning_rate: Positive
+    schedule: Literal["adaptive", "fixed"]
+    desired_kl: Positive
+    value_loss_coef: NonNegative
     use_clipped_value_loss: bool
-    entropy_coef: float
-    max_grad_norm: float
-    hidden_dims: Sequence[int]
+    entropy_coef: NonNegative
+    max_grad_norm: Positive
+    hidden_dims: Widths
     activation: str
-    init_std: float
+    init_std: Positive
     obs_normalization: bool
-    start_std: float | None = None
+    start_std: Positive | None = None
     mixed_precision: bool | None = False
-    final_entropy_coef: float | None = None
-    final_desired_kl: float | None = None
-    critic_warmup: int = 0
-    critic_learning_rate: float | None = None
+    final_entropy_coef: NonNegative | None = None
+    final_desired_kl: Positive | None = None
+    critic_warmup: Count = 0
+    critic_learning_rate: Positive | None = None
     symmetry: bool = False
     phases: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in (
-            "max_iterations",
-            "save_interval",
-            "keep_checkpoints",
-            "num_steps_per_env",
-            "num_mini_batches",
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"ppo.{name}={getattr(self, name)} must be at least 1")
-        for name in ("num_learning_epochs", "critic_warmup", "value_loss_coef", "entropy_coef", "final_entropy_coef"):
-            if (getattr(self, name) or 0) < 0:
-                raise ValueError(f"ppo.{name}={getattr(self, name)} must not be negative")
-        if not self.hidden_dims or min(self.hidden_dims) < 1:
-            raise ValueError(f"ppo.hidden_dims={list(self.hidden_dims)} must be widths of hidden layers, one or more")
-        for name in ("clip_param", "learning_rate", "max_grad_norm", "init_std", "desired_kl"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive")
-        for name in ("start_std", "final_desired_kl", "critic_learning_rate"):
-            if getattr(self, name) is not None and getattr(self, name) <= 0:
-                raise ValueError(f"ppo.{name}={getattr(self, name)} must be positive or null")
         if self.final_desired_kl is not None and self.schedule != "adaptive":
             raise ValueError("ppo.final_desired_kl is for ppo.schedule=adaptive; give one of them")
-        for name in ("gamma", "lam"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"ppo.{name}={getattr(self, name)} must lie in [0, 1]")
-        if self.max_minutes is not None and self.max_minutes <= 0:
-            raise ValueError(f"ppo.max_minutes={self.max_minutes} must be positive or null")
-        if self.schedule not in ("adaptive", "fixed"):
-            raise ValueError(f"ppo.schedule={self.schedule} must be adaptive or fixed")
         try:
             resolve_nn_activation(self.activation)
         except ValueError as error:

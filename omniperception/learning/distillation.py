@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch.nn import functional
 
 from omniperception.avoidance.velocity import AVOIDANCE_TARGET, COMMAND
+from omniperception.common.checked import AtLeastOne, Positive, checked
 
 
-@dataclass(frozen=True)
+@checked("distillation")
 class DistillationConfig:
     """Configuration of the beginning of a training in which the actor is fitted to a teacher's actions.
 
@@ -23,14 +22,8 @@ class DistillationConfig:
     """
 
     teacher: str
-    iterations: int
-    learning_rate: float = 1.0e-3
-
-    def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(f"distillation.iterations={self.iterations} must be at least 1, or distillation=null")
-        if self.learning_rate <= 0:
-            raise ValueError(f"distillation.learning_rate={self.learning_rate} must be positive")
+    iterations: AtLeastOne
+    learning_rate: Positive = 1.0e-3
 
 
 class Teacher:

@@ -8,11 +8,13 @@ from collections.abc import Sequence
 import torch
 from rsl_rl.algorithms import PPO
 
+from omnirobot.common.errors import UserError
+
 _MAX_LOG_RATIO = math.log(torch.finfo(torch.float32).max)
 _LARGEST = math.sqrt(torch.finfo(torch.float32).max)
 
 
-class TrainingDiverged(RuntimeError):
+class TrainingDiverged(UserError, RuntimeError):
     """A loss, gradient or parameter is no longer finite; no step has been taken with it."""
 
 

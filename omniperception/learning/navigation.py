@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -13,6 +11,7 @@ from torch import nn
 
 from omniperception.avoidance.navigation import NUM_SECTORS, navigation_inputs, num_inputs
 from omniperception.avoidance.velocity_risk import VelocityRisk
+from omniperception.common.checked import Pair, Positive, Widths, checked
 from omniperception.learning.estimator import EstimatingModel
 
 MOTION, ASKED = "motion", "asked"
@@ -33,7 +32,7 @@ class VelocityInput(NamedTuple):
     scale: float
 
 
-@dataclass(frozen=True)
+@checked("navigation")
 class NavigationConfig:
     """Configuration of a navigation policy.
 
@@ -45,17 +44,9 @@ class NavigationConfig:
     """
 
     risk: VelocityRisk
-    ranges: Sequence[Sequence[float]]
-    hidden_dims: Sequence[int] = (128, 128, 64)
-    turn_acceleration: float = 8.0
-
-    def __post_init__(self) -> None:
-        if len(self.ranges) != 3 or any(len(ends) != 2 or not ends[0] <= ends[1] for ends in self.ranges):
-            raise ValueError(f"navigation.ranges={list(map(list, self.ranges))} must be three pairs [low, high]")
-        if not self.hidden_dims or min(self.hidden_dims) < 1:
-            raise ValueError(f"navigation.hidden_dims={list(self.hidden_dims)} must be widths of hidden layers")
-        if self.turn_acceleration <= 0:
-            raise ValueError(f"navigation.turn_acceleration={self.turn_acceleration} must be positive")
+    ranges: tuple[Pair, Pair, Pair]
+    hidden_dims: Widths = (128, 128, 64)
+    turn_acceleration: Positive = 8.0
 
 
 class CorrectedChoice(nn.Module):

@@ -16,9 +16,10 @@ from omniperception.learning.divergence import DivergenceGuard
 from omniperception.learning.models import PerceptionActor, build_actor
 from omniperception.learning.phases import Distil, FitEstimator, FitPerception, Normalize, Phase, Ppo, WarmCritic
 from omniperception.learning.storage import PerceptiveStorage
+from omnirobot.common.errors import UserError
 
 
-class RolloutTooSmall(ValueError):
+class RolloutTooSmall(UserError, ValueError):
     """There is too little in a rollout to learn from it."""
 
 

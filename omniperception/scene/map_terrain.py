@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 from zipfile import BadZipFile
 
 import mujoco
@@ -16,8 +15,19 @@ import numpy as np
 from PIL import Image
 
 from omnilidar.mesh_files import AXES, read_mesh, unit_hint, up_of
+from omniperception.common.checked import (
+    AsTuple,
+    AtLeastOne,
+    Cell,
+    Count,
+    Inside,
+    NonNegative,
+    Place2,
+    Positive,
+    Share,
+    checked,
+)
 from omniperception.scene.height_field import EDGE, add_height_field
-from omniperception.scene.terrain import check_contact
 
 MAX_POINTS = 16_000_000
 """Grid points of a map."""
@@ -25,7 +35,7 @@ _OFF_LINE = (1.3e-4, 0.7e-4)
 """Share of a cell by which a mesh is looked at beside the grid, so that points lie on no edge of it."""
 
 
-@dataclass(frozen=True)
+@checked("terrain.start")
 class StartsConfig:
     """Places where robots start: level, free of walls, on ground that hangs together.
 
@@ -38,26 +48,15 @@ class StartsConfig:
         seed: of the choice.
     """
 
-    num: int = 64
-    radius: float = 0.5
-    step: float = 0.05
-    climb: float = 0.2
-    inside: Sequence[float] | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.num < 1:
-            raise ValueError(f"terrain.start.num={self.num} must be at least 1")
-        if self.seed < 0:
-            raise ValueError(f"terrain.start.seed={self.seed} must not be negative")
-        for key in ("radius", "step", "climb"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"terrain.start.{key}={getattr(self, key)} must be positive")
-        if self.inside is not None and len(self.inside) != 2:
-            raise ValueError(f"terrain.start.inside={list(self.inside)} must be [x, y] (m) or null")
+    num: AtLeastOne = 64
+    radius: Positive = 0.5
+    step: Positive = 0.05
+    climb: Positive = 0.2
+    inside: Place2 | None = None
+    seed: Count = 0
 
 
-@dataclass(frozen=True)
+@checked("terrain")
 class MapTerrainConfig:
     """A height field from a file; what kind of file, a subclass says.
 
@@ -74,19 +73,16 @@ class MapTerrainConfig:
     """
 
     file: str
-    cell: float = 0.05
+    cell: Cell = 0.05
     start: StartsConfig = StartsConfig()
-    friction: float = 0.8
-    restitution: float = 0.0
+    friction: NonNegative = 0.8
+    restitution: Share = 0.0
 
     suffixes: ClassVar[tuple[str, ...]] = (".png",)
     columns: ClassVar[int] = 1
     curriculum: ClassVar[None] = None
 
     def __post_init__(self) -> None:
-        check_contact(self.friction, self.restitution)
-        if not 0 < self.cell <= 0.5:
-            raise ValueError(f"terrain.cell={self.cell} must lie in (0, 0.5]")
         if Path(self.file).suffix.lower() not in self.suffixes:
             raise ValueError(f"terrain.file={self.file} must end with {' or '.join(self.suffixes)}")
         if not Path(self.file).is_file():
@@ -177,7 +173,10 @@ class MapTerrainConfig:
         add_height_field(spec, heights - heights.min(), self.cell, self.friction, self.restitution)
 
 
-@dataclass(frozen=True)
+_Heights = Annotated[tuple[float, float], AsTuple, "the heights [black, white] (m)"]
+
+
+@checked("terrain")
 class HeightMapConfig(MapTerrainConfig):
     """Heights from a grey PNG or a NumPy file, a grid point for each pixel; (0, 0) is the map's middle.
 
@@ -187,7 +186,7 @@ class HeightMapConfig(MapTerrainConfig):
         heights: of a picture: heights (m) of black and of white. A NumPy file has metres.
     """
 
-    heights: Sequence[float] | None = None
+    heights: _Heights | None = None
 
     suffixes: ClassVar[tuple[str, ...]] = (".png", ".npy")
 
@@ -198,8 +197,6 @@ class HeightMapConfig(MapTerrainConfig):
                 f"terrain.heights={self.heights} with terrain.file={self.file}: a PNG needs the heights [black, white]"
                 " (m), a .npy file has metres and takes null"
             )
-        if self.heights is not None and len(self.heights) != 2:
-            raise ValueError(f"terrain.heights={list(self.heights)} must be the heights [black, white] (m)")
 
     def read(self) -> tuple[np.ndarray, tuple[float, float]]:
         if self.heights is None:
@@ -210,7 +207,7 @@ class HeightMapConfig(MapTerrainConfig):
         return heights, _first_of(heights, self.cell)
 
 
-@dataclass(frozen=True)
+@checked("terrain")
 class FloorPlanConfig(MapTerrainConfig):
     """Walls from a PNG of a floor plan, a grid point for each pixel: dark is wall. The frame is that of a height map.
 
@@ -220,7 +217,7 @@ class FloorPlanConfig(MapTerrainConfig):
     """
 
     wall_height: float = 1.5
-    threshold: float = 0.5
+    threshold: Inside = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -229,8 +226,6 @@ class FloorPlanConfig(MapTerrainConfig):
                 f"terrain.wall_height={self.wall_height} must be above terrain.start.climb={self.start.climb}: walls"
                 " are what cannot be climbed"
             )
-        if not 0 < self.threshold < 1:
-            raise ValueError(f"terrain.threshold={self.threshold} must lie in (0, 1)")
 
     def read(self) -> tuple[np.ndarray, tuple[float, float]]:
         heights = np.where(read_image(self.file) < self.threshold, float(self.wall_height), 0.0)
@@ -240,7 +235,7 @@ class FloorPlanConfig(MapTerrainConfig):
         return heights == 0.0
 
 
-@dataclass(frozen=True)
+@checked("terrain")
 class PlaceConfig(MapTerrainConfig):
     """A whole place from a mesh, seen from above: a height field has no overhangs, so what is above `ceiling` is left
     out, and below a table's top it is solid. x and y are the mesh's.
@@ -254,7 +249,7 @@ class PlaceConfig(MapTerrainConfig):
         outside: height (m) where there is nothing; None: that of the lowest point.
     """
 
-    scale: float = 1.0
+    scale: Positive = 1.0
     up: str | None = None
     ceiling: float | None = None
     outside: float | None = None
@@ -265,8 +260,6 @@ class PlaceConfig(MapTerrainConfig):
         super().__post_init__()
         if self.up not in (*AXES, None):
             raise ValueError(f"terrain.up={self.up} must be {', '.join(AXES)} or null")
-        if not 0 < self.scale < math.inf:
-            raise ValueError(f"terrain.scale={self.scale} must be positive")
 
     def read(self) -> tuple[np.ndarray, tuple[float, float]]:
         vertices, triangles = read_mesh(self.file, self.scale, self.up)

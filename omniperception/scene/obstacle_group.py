@@ -5,7 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
+from pydantic import Field
+
+from omniperception.common.checked import NonNegative, Pair, PositivePair, Share, checked
 from omniperception.scene.layouts import Layout
 from omniperception.scene.meshes import own_size
 from omniperception.scene.part_shapes import reach
@@ -16,7 +20,7 @@ COMPOUND = "compound"
 """Kind of an obstacle of several parts."""
 
 
-@dataclass(frozen=True)
+@checked("obstacles: approach")
 class ApproachConfig:
     """Approach of obstacles to the robot: each walks straight on, on a course that leads past the robot.
 
@@ -30,21 +34,21 @@ class ApproachConfig:
         distance: (low, high) range (m) of the distance from the robot at which one starts.
     """
 
-    within: float
-    distance: Sequence[float]
+    within: NonNegative
+    distance: Pair
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "distance", tuple(float(d) for d in self.distance))
-        if self.within < 0:
-            raise ValueError(f"obstacles: approach.within={self.within} must not be negative")
-        if len(self.distance) != 2 or not self.within < self.distance[0] <= self.distance[1]:
+        if not self.within < self.distance[0]:
             raise ValueError(
                 f"obstacles: approach.distance={list(self.distance)} must be a range [low, high] with low >"
                 f" approach.within={self.within}"
             )
 
 
-@dataclass(frozen=True)
+_HalfTurn = Annotated[float, Field(ge=0, le=180), "in 0 to 180"]
+
+
+@checked("obstacles: motion")
 class MotionConfig:
     """Random changes of heading of what moves: after random times an obstacle stands, heads for the robot, or turns.
 
@@ -55,18 +59,13 @@ class MotionConfig:
         home: probability that it heads for where the robot is instead.
     """
 
-    every_s: Sequence[float]
-    turn_deg: float = 0.0
-    stop: float = 0.0
-    home: float = 0.0
+    every_s: PositivePair
+    turn_deg: _HalfTurn = 0.0
+    stop: Share = 0.0
+    home: Share = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "every_s", tuple(float(s) for s in self.every_s))
-        if len(self.every_s) != 2 or not 0 < self.every_s[0] <= self.every_s[1]:
-            raise ValueError(f"obstacles: motion.every_s={list(self.every_s)} must be a range 0 < low <= high")
-        if not 0 <= self.turn_deg <= 180:
-            raise ValueError(f"obstacles: motion.turn_deg={self.turn_deg} must lie in 0 to 180")
-        if self.stop < 0 or self.home < 0 or self.stop + self.home > 1:
+        if self.stop + self.home > 1:
             raise ValueError(
                 f"obstacles: motion.stop={self.stop} and motion.home={self.home} must be probabilities whose sum is at"
                 " most 1"

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import mujoco
+from pydantic import SkipValidation
 
+from omniperception.common.checked import Area, NonNegative, Positive, checked
 from omniperception.scene.layouts import CorridorLayout, MazeLayout
-from omniperception.scene.obstacle_group import ObstacleGroup, checked_area
+from omniperception.scene.obstacle_group import ObstacleGroup
 from omniperception.scene.parts import Part
-
-SPLITS = ("dev", "test")
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Obstacle:
         return None if self.group.poses is None else self.group.poses[self.index]
 
 
-@dataclass(frozen=True)
+@checked("obstacles.curriculum")
 class ObstacleCurriculumConfig:
     """Raises the share and the speed of obstacles as walking improves.
 
@@ -45,17 +46,12 @@ class ObstacleCurriculumConfig:
         rise: how much the level (0 to 1) rises per second of simulated time of each environment.
     """
 
-    start_velocity_error: float = 0.25
-    max_velocity_error: float = 0.25
-    rise: float = 0.02
-
-    def __post_init__(self) -> None:
-        for key in ("start_velocity_error", "max_velocity_error", "rise"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"obstacles.curriculum.{key}={getattr(self, key)} must be positive")
+    start_velocity_error: Positive = 0.25
+    max_velocity_error: Positive = 0.25
+    rise: Positive = 0.02
 
 
-@dataclass(frozen=True)
+@checked("obstacles.free_path")
 class FreePathConfig:
     """A path from the robot's start to its goal that no standing obstacle blocks, drawn at every reset.
 
@@ -67,17 +63,11 @@ class FreePathConfig:
         bend: (m).
     """
 
-    width: float
-    bend: float
-
-    def __post_init__(self) -> None:
-        if self.width <= 0:
-            raise ValueError(f"obstacles.free_path.width={self.width} must be positive")
-        if self.bend < 0:
-            raise ValueError(f"obstacles.free_path.bend={self.bend} must not be negative")
+    width: Positive
+    bend: NonNegative
 
 
-@dataclass(frozen=True)
+@checked("obstacles")
 class ObstaclesConfig:
     """Configuration of the obstacles around the robot.
 
@@ -101,28 +91,17 @@ class ObstaclesConfig:
     off the free path is left out of the episode.
     """
 
-    groups: Mapping[str, ObstacleGroup] = field(default_factory=dict)
-    area: Sequence[float] = (-5.0, 5.0, -5.0, 5.0)
-    boundary: str = "bounce"
-    clearance: float = 0.8
+    groups: Mapping[str, SkipValidation[ObstacleGroup]] = field(default_factory=dict)
+    area: Area = (-5.0, 5.0, -5.0, 5.0)
+    boundary: Literal["bounce", "wrap"] = "bounce"
+    clearance: Positive = 0.8
     curriculum: ObstacleCurriculumConfig | None = None
-    spacing: float = 0.0
+    spacing: NonNegative = 0.0
     free_path: FreePathConfig | None = None
-    headroom: float = 0.45
-    split: str = "dev"
+    headroom: NonNegative = 0.45
+    split: Literal["dev", "test"] = "dev"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "groups", dict(self.groups))
-        object.__setattr__(self, "area", checked_area("area", self.area))
-        if self.boundary not in ("bounce", "wrap"):
-            raise ValueError(f"obstacles.boundary={self.boundary} must be bounce or wrap")
-        if self.clearance <= 0:
-            raise ValueError(f"obstacles.clearance={self.clearance} must be positive")
-        if self.split not in SPLITS:
-            raise ValueError(f"obstacles.split={self.split} must be dev or test")
-        for key in ("spacing", "headroom"):
-            if getattr(self, key) < 0:
-                raise ValueError(f"obstacles.{key}={getattr(self, key)} must not be negative")
         corridors = [name for name, group in self.groups.items() if isinstance(group.layout, CorridorLayout)]
         if len(corridors) > 1 or (corridors and self.boundary == "wrap"):
             raise ValueError(

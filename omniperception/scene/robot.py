@@ -7,10 +7,13 @@ import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import mujoco
 import numpy as np
+from pydantic import Field
 
+from omniperception.common.checked import AsTuple, Inside, Pair, Positive, checked
 from omniperception.scene.fetched import SCHEME, fetched
 from omniperception.scene.robot_file import (
     FRAME,
@@ -61,7 +64,10 @@ class SensorPose:
     quat: tuple[float, float, float, float]
 
 
-@dataclass(frozen=True)
+_Phases = Annotated[tuple[Annotated[float, Field(ge=0, lt=1)], ...], AsTuple, "shares of a period, from 0 to below 1"]
+
+
+@checked("robot.gait")
 class Gait:
     """How a robot walks: its rhythm, for rewards and observations that follow a clock, and how fast it shall be.
 
@@ -74,31 +80,14 @@ class Gait:
         lin_vel_x, lin_vel_y, ang_vel_z: least and most velocity (m/s, m/s, rad/s) that experiment=gait asks of it.
     """
 
-    frequency: float
-    offsets: tuple[float, ...]
-    duty: float
-    foot_height: float
-    lift: float
-    lin_vel_x: tuple[float, float]
-    lin_vel_y: tuple[float, float]
-    ang_vel_z: tuple[float, float]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "offsets", tuple(float(offset) for offset in self.offsets))
-        if self.frequency <= 0 or self.foot_height <= 0 or not 0 < self.duty < 1:
-            raise ValueError(
-                f"robot.gait: frequency={self.frequency} and foot_height={self.foot_height} must be positive,"
-                f" duty={self.duty} between 0 and 1"
-            )
-        if not all(0 <= offset < 1 for offset in self.offsets):
-            raise ValueError(f"robot.gait.offsets={list(self.offsets)} must be shares of a period, from 0 to below 1")
-        if self.lift <= 0:
-            raise ValueError(f"robot.gait.lift={self.lift} must be positive")
-        for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z"):
-            low, high = (float(end) for end in getattr(self, name))
-            object.__setattr__(self, name, (low, high))
-            if not low <= high:
-                raise ValueError(f"robot.gait.{name}=[{low:g}, {high:g}] must be the least and the most velocity")
+    frequency: Positive
+    offsets: _Phases
+    duty: Inside
+    foot_height: Positive
+    lift: Positive
+    lin_vel_x: Pair
+    lin_vel_y: Pair
+    ang_vel_z: Pair
 
 
 _BY_JOINT = ("kp", "kv", "torque_limits", "action_scale", "frictionloss", "armature", "damping")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from omniperception.common.checked import NonNegative, Positive, checked
 from omniperception.scene.robot import RobotConfig
 
 ROWS = 40
@@ -22,7 +22,7 @@ _TOLERANCE = 1e-3
 """m: of where a foot is lifted to."""
 
 
-@dataclass(frozen=True)
+@checked("stepping")
 class SteppingConfig:
     """A robot that steps on the spot by the clock of `robot.gait` while its actions are zero.
 
@@ -34,12 +34,8 @@ class SteppingConfig:
         rest_s: how long (s) the command has to be to stand until the feet stay down.
     """
 
-    lift: float
-    rest_s: float
-
-    def __post_init__(self) -> None:
-        if self.lift <= 0 or self.rest_s < 0:
-            raise ValueError(f"stepping.lift={self.lift} must be positive and rest_s={self.rest_s} not negative")
+    lift: Positive
+    rest_s: NonNegative
 
 
 def stepping_offsets(robot: RobotConfig, lift: float) -> np.ndarray:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import mujoco
 import torch
+
+from omniperception.common.checked import NonNegative, Share, checked
 
 GROUND = "ground"
 """Name of the ground's geom, and of the body that carries it where it is a height field."""
 
 
-@dataclass(frozen=True)
+@checked("terrain")
 class TerrainConfig:
     """A flat ground plane at height 0 of every environment.
 
@@ -21,24 +22,13 @@ class TerrainConfig:
         restitution: the ground's coefficient of restitution in [0, 1]; a contact has half of it, see `ground_solrefs`.
     """
 
-    friction: float = 0.8
-    restitution: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_contact(self.friction, self.restitution)
+    friction: NonNegative = 0.8
+    restitution: Share = 0.0
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Adds the ground geom, whose contact parameters take priority over the robot's."""
         geom = spec.worldbody.add_geom(name=GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
         set_contact(geom, self.friction, self.restitution)
-
-
-def check_contact(friction: float, restitution: float) -> None:
-    """Refuses parameters that no ground can have."""
-    if friction < 0:
-        raise ValueError(f"terrain.friction={friction} must not be negative")
-    if not 0 <= restitution <= 1:
-        raise ValueError(f"terrain.restitution={restitution} must lie in [0, 1]")
 
 
 def set_contact(geom: mujoco.MjsGeom, friction: float, restitution: float) -> None:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Annotated
 
 import mujoco
 import numpy as np
+from pydantic import SkipValidation
 
+from omniperception.common.checked import AsTuple, AtLeastOne, Cell, Count, InOrder, NonNegative, Share, checked
 from omniperception.scene.height_field import add_height_field
-from omniperception.scene.terrain import check_contact
 from omniperception.scene.tiles import Tile, TileGrid
 
 
-@dataclass(frozen=True)
+@checked("terrain.curriculum")
 class TerrainCurriculumConfig:
     """When an environment moves to a harder or an easier tile, judged at the end of every episode.
 
@@ -28,20 +29,21 @@ class TerrainCurriculumConfig:
         down_share: see above.
     """
 
-    start_level: int = 0
+    start_level: Count = 0
     up_share: float = 0.8
-    down_share: float = 0.5
+    down_share: NonNegative = 0.5
 
     def __post_init__(self) -> None:
-        if self.start_level < 0:
-            raise ValueError(f"terrain.curriculum.start_level={self.start_level} must not be negative")
-        if not 0 <= self.down_share <= self.up_share:
+        if self.down_share > self.up_share:
             raise ValueError(
                 f"terrain.curriculum.down_share={self.down_share} must lie between 0 and up_share={self.up_share}"
             )
 
 
-@dataclass(frozen=True)
+_Difficulty = Annotated[tuple[Share, Share], AsTuple, InOrder, "[low, high] with 0 <= low <= high <= 1"]
+
+
+@checked("terrain")
 class TiledTerrainConfig:
     """Square tiles in rows of equal difficulty and columns of one kind, with a flat border around them.
 
@@ -64,36 +66,23 @@ class TiledTerrainConfig:
         restitution: the ground's coefficient of restitution in [0, 1]; a contact has half of it, see `ground_solrefs`.
     """
 
-    tiles: Mapping[str, Tile]
-    levels: int = 10
-    columns: int = 10
+    tiles: Mapping[str, SkipValidation[Tile]]
+    levels: AtLeastOne = 10
+    columns: AtLeastOne = 10
     tile_size: float = 8.0
     platform: float = 2.0
-    cell: float = 0.1
+    cell: Cell = 0.1
     border: float = 10.0
-    seed: int = 0
-    difficulty: Sequence[float] = (0.0, 1.0)
+    seed: Count = 0
+    difficulty: _Difficulty = (0.0, 1.0)
     curriculum: TerrainCurriculumConfig | None = None
-    friction: float = 0.8
-    restitution: float = 0.0
+    friction: NonNegative = 0.8
+    restitution: Share = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tiles", {name: tile for name, tile in self.tiles.items() if tile is not None})
-        object.__setattr__(self, "difficulty", tuple(float(d) for d in self.difficulty))
-        check_contact(self.friction, self.restitution)
         if not self.tiles:
             raise ValueError("terrain.tiles is empty; name a kind of tile, or use terrain=flat")
-        for key in ("levels", "columns"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"terrain.{key}={getattr(self, key)} must be at least 1")
-        if self.seed < 0:
-            raise ValueError(f"terrain.seed={self.seed} must not be negative")
-        if len(self.difficulty) != 2 or not 0 <= self.difficulty[0] <= self.difficulty[1] <= 1:
-            raise ValueError(
-                f"terrain.difficulty={list(self.difficulty)} must be [low, high] with 0 <= low <= high <= 1"
-            )
-        if not 0 < self.cell <= 0.5:
-            raise ValueError(f"terrain.cell={self.cell} must lie in (0, 0.5]")
         if abs(self.tile_size / self.cell / 2 - self.grid.half) > 1e-6 or self.grid.half < 2:
             raise ValueError(f"terrain.tile_size={self.tile_size} must be an even number of cells of {self.cell} m")
         if not (self.platform >= 1.0 and self.grid.platform < self.grid.half):

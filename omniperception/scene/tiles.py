@@ -9,6 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
+from omniperception.common.checked import NonNegativePair, Positive, PositivePair, checked
+
 
 @dataclass(frozen=True)
 class TileGrid:
@@ -54,7 +56,7 @@ class Tile(Protocol):
         """(num, num) heights (m) of a tile of a difficulty in [0, 1]."""
 
 
-@dataclass(frozen=True)
+@checked("terrain: ")
 class Rough:
     """Uniform noise on a grid, linear in between.
 
@@ -64,13 +66,9 @@ class Rough:
         share: see `Tile`.
     """
 
-    height: Sequence[float]
-    spacing: float = 0.2
-    share: float = 1.0
-
-    def __post_init__(self) -> None:
-        _check_tile(self, "height")
-        _check_positive(self, "spacing")
+    height: NonNegativePair
+    spacing: Positive = 0.2
+    share: Positive = 1.0
 
     def heights(self, grid: TileGrid, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         coarse = np.arange(math.ceil(2 * grid.half * grid.cell / self.spacing) + 1) * self.spacing
@@ -80,7 +78,7 @@ class Rough:
         return np.stack([np.interp(fine, coarse, column) for column in along.T], 1) * grid.around_platform()
 
 
-@dataclass(frozen=True)
+@checked("terrain: ")
 class Slope:
     """A square pyramid with the platform on top, or at the bottom of a pit.
 
@@ -90,12 +88,11 @@ class Slope:
         share: see `Tile`.
     """
 
-    angle_deg: Sequence[float]
+    angle_deg: NonNegativePair
     rises: bool = True
-    share: float = 1.0
+    share: Positive = 1.0
 
     def __post_init__(self) -> None:
-        _check_tile(self, "angle_deg")
         if self.angle_deg[1] >= 60:
             raise ValueError(f"terrain: angle_deg={list(self.angle_deg)} must stay below 60")
 
@@ -104,7 +101,7 @@ class Slope:
         return (1.0 if self.rises else -1.0) * rise * grid.ring()
 
 
-@dataclass(frozen=True)
+@checked("terrain: ")
 class Stairs:
     """A square pyramid of steps with the platform on top, or at the bottom of a pit.
 
@@ -117,21 +114,17 @@ class Stairs:
         share: see `Tile`.
     """
 
-    step: Sequence[float]
-    tread: float = 0.3
+    step: NonNegativePair
+    tread: Positive = 0.3
     rises: bool = True
-    share: float = 1.0
-
-    def __post_init__(self) -> None:
-        _check_tile(self, "step")
-        _check_positive(self, "tread")
+    share: Positive = 1.0
 
     def heights(self, grid: TileGrid, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         tread = max(2, round(self.tread / grid.cell))
         return (1.0 if self.rises else -1.0) * _at(self.step, difficulty) * (grid.ring() // tread)
 
 
-@dataclass(frozen=True)
+@checked("terrain: ")
 class Stones:
     """Rectangular blocks and holes, one over the other.
 
@@ -142,17 +135,10 @@ class Stones:
         share: see `Tile`.
     """
 
-    height: Sequence[float]
-    size: Sequence[float] = (0.4, 1.0)
-    count: float = 1.0
-    share: float = 1.0
-
-    def __post_init__(self) -> None:
-        _check_tile(self, "height")
-        object.__setattr__(self, "size", tuple(float(s) for s in self.size))
-        if len(self.size) != 2 or not 0 < self.size[0] <= self.size[1]:
-            raise ValueError(f"terrain: size={list(self.size)} must be a range 0 < low <= high")
-        _check_positive(self, "count")
+    height: NonNegativePair
+    size: PositivePair = (0.4, 1.0)
+    count: Positive = 1.0
+    share: Positive = 1.0
 
     def heights(self, grid: TileGrid, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         heights, highest = np.zeros((grid.num, grid.num)), _at(self.height, difficulty)
@@ -167,17 +153,3 @@ class Stones:
 
 def _at(bounds: Sequence[float], difficulty: float) -> float:
     return bounds[0] + difficulty * (bounds[1] - bounds[0])
-
-
-def _check_tile(tile: Tile, key: str) -> None:
-    """Check a tile: what gets harder must be a range from easy to hard, and the share positive."""
-    bounds = tuple(float(value) for value in getattr(tile, key))
-    object.__setattr__(tile, key, bounds)
-    if len(bounds) != 2 or not 0 <= bounds[0] <= bounds[1]:
-        raise ValueError(f"terrain: {key}={list(bounds)} must be [easiest, hardest] with 0 <= easiest <= hardest")
-    _check_positive(tile, "share")
-
-
-def _check_positive(tile: Tile, key: str) -> None:
-    if not 0 < getattr(tile, key) < math.inf:
-        raise ValueError(f"terrain: {key}={getattr(tile, key)} must be positive")

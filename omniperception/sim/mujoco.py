@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from mujoco.batch import Batch, SimulationError
 
 from omnilidar.launch import default_num_threads
+from omniperception.common.checked import AtLeastOne, Count, Positive, checked
 from omniperception.scene import World
 from omniperception.sim.base import Failure, Failures, JointColumns, Simulator, SizedGeoms
 
@@ -25,7 +26,7 @@ _STAGE_POS, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_POS.value, mujoco.mjtStage.mjST
 _NO_CONTACTS = int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 
 
-@dataclass(frozen=True)
+@checked("sim")
 class SimConfig:
     """Physics settings.
 
@@ -39,28 +40,15 @@ class SimConfig:
         num_threads: CPU threads; 0 uses every core, or this process's share of them under torchrun.
     """
 
-    timestep: float = 0.005
-    decimation: int = 4
-    integrator: str = "implicitfast"
-    iterations: int = 10
-    ls_iterations: int = 20
-    cone: str = "pyramidal"
-    num_threads: int = 0
+    timestep: Positive = 0.005
+    decimation: AtLeastOne = 4
+    integrator: Literal["euler", "implicitfast", "implicit", "rk4"] = "implicitfast"
+    iterations: AtLeastOne = 10
+    ls_iterations: AtLeastOne = 20
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    num_threads: Count = 0
 
     has_legs = True
-
-    def __post_init__(self) -> None:
-        if not 0 < self.timestep < float("inf"):
-            raise ValueError(f"sim.timestep={self.timestep} must be positive")
-        for name in ("decimation", "iterations", "ls_iterations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"sim.{name}={getattr(self, name)} must be at least 1")
-        if self.num_threads < 0:
-            raise ValueError(f"sim.num_threads={self.num_threads} must be 0 (every core) or a positive number")
-        if self.integrator not in _INTEGRATORS:
-            raise ValueError(f"sim.integrator={self.integrator} is unknown; known: {', '.join(_INTEGRATORS)}")
-        if self.cone not in _CONES:
-            raise ValueError(f"sim.cone={self.cone} is unknown; known: {', '.join(_CONES)}")
 
     @property
     def control_dt(self) -> float:

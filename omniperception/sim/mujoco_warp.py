@@ -15,6 +15,7 @@ import torch
 import warp as wp
 
 from omnilidar.launch import wp_device
+from omniperception.common.checked import Count, checked
 from omniperception.scene import World
 from omniperception.sim.base import Failure, Failures, JointColumns, SizedGeoms
 from omniperception.sim.kernels import move_kinematic, record, turn_kinematic
@@ -37,7 +38,7 @@ _CONTACTS_PER_PAIR = 2
 _ROWS_PER_CONTACT = {"pyramidal": 4, "elliptic": 3}
 
 
-@dataclass(frozen=True)
+@checked("sim")
 class MujocoWarpConfig(SimConfig):
     """Physics settings of `sim=mujoco_warp`.
 
@@ -50,15 +51,11 @@ class MujocoWarpConfig(SimConfig):
     """
 
     device: str = "auto"
-    contacts_per_env: int = 0
-    rows_per_env: int = 0
+    contacts_per_env: Count = 0
+    rows_per_env: Count = 0
     deterministic: bool = False
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("contacts_per_env", "rows_per_env"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"sim.{name}={getattr(self, name)} must be 0 (from the scene) or a positive number")
         kind, _, index = self.device.partition(":")
         if kind not in ("auto", "cpu", "cuda") or (index and not (kind == "cuda" and index.isdigit())):
             raise ValueError(f"sim.device={self.device} is unknown; use auto, cpu, cuda or cuda:<index>")

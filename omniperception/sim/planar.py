@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from omniperception.common.checked import Accelerations, AtLeastOne, NonNegative, Positive, checked
 from omniperception.scene import World
 from omniperception.sim.base import Simulator
 from omniperception.sim.response import GaitResponse, NoResponse
 from omnirobot.common.shell import command_line
 
 
-@dataclass(frozen=True)
+@checked("sim")
 class PlanarConfig:
     """Settings of `sim=planar`.
 
@@ -30,23 +29,13 @@ class PlanarConfig:
 
     response: str
     under: str = "ideal"
-    timestep: float = 0.025
-    decimation: int = 4
-    acceleration: Sequence[float] = (6.0, 8.0)
-    spread: float = 1.0
+    timestep: Positive = 0.025
+    decimation: AtLeastOne = 4
+    acceleration: Accelerations = (6.0, 8.0)
+    spread: NonNegative = 1.0
     num_threads: int = 0
 
     has_legs = False
-
-    def __post_init__(self) -> None:
-        if not 0 < self.timestep < float("inf"):
-            raise ValueError(f"sim.timestep={self.timestep} must be positive")
-        if self.decimation < 1:
-            raise ValueError(f"sim.decimation={self.decimation} must be at least 1")
-        if len(self.acceleration) != 2 or min(self.acceleration) <= 0:
-            raise ValueError(f"sim.acceleration={list(self.acceleration)} must be [m/s^2, rad/s^2], both positive")
-        if self.spread < 0:
-            raise ValueError(f"sim.spread={self.spread} must not be negative")
 
     @property
     def control_dt(self) -> float:

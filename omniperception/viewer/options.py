@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from omnirobot.common.errors import UserError
+
 if TYPE_CHECKING:
     from omnilidar import RayScene
     from omniperception.scene import RobotConfig
@@ -17,7 +19,7 @@ PAGE = ("host", "port")
 """Arguments of commands that mean something with viewer=web alone."""
 
 
-class ViewerError(RuntimeError):
+class ViewerError(UserError, RuntimeError):
     """The page cannot be opened; one line says why and what to do."""
 
 
@@ -60,7 +62,7 @@ class Shown:
     Attributes:
         run_dir: run directory.
         overrides: changes to its configuration, presets and values.
-        policy: "run" or a name of `evaluation.trials.baselines.BASELINES`.
+        policy: "run" or a name of `evaluation.trials.policies.BASELINES`.
         checkpoint: file of weights; None: the run's newest.
         trust: packages of one's own that the configuration may name.
     """

@@ -12,7 +12,7 @@ from typing import Any
 
 from omniperception.config import OUTPUTS, SHIPPED_RUNS, find_runs
 from omniperception.evaluation.film.perceived import Perceived
-from omniperception.evaluation.trials.baselines import BASELINES
+from omniperception.evaluation.trials.policies import BASELINES
 from omniperception.learning.checkpoint import list_checkpoints
 from omniperception.viewer import charts
 from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, PROXIMAL

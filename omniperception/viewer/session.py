@@ -16,7 +16,8 @@ from omniperception.env.config import FROM_LIDAR, EnvConfig
 from omniperception.env.env import OmniEnv, Policy
 from omniperception.env.state import AVOIDANCE, MEASURED_CLOUD
 from omniperception.evaluation.film.perceived import Perceived, perceived
-from omniperception.evaluation.trials.baselines import BASELINES, Limits, baseline, commanded_ranges
+from omniperception.evaluation.trials.baselines import Limits, baseline, commanded_ranges
+from omniperception.evaluation.trials.policies import BASELINES
 from omniperception.learning import Runner, latest_checkpoint
 from omniperception.scene.obstacle_field import PARKED_HEIGHT
 from omniperception.scene.rays import RayShapes, ray_shapes

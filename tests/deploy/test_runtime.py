@@ -565,7 +565,7 @@ class Still:
 
 def test_an_observation_of_ones_own_is_read_by_its_name(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "own_project"))
-    own = "observations.groups.proprioception.terms.foot_load={func: own_project.observations.foot_load}"
+    own = "+observations.groups.proprioception.terms.foot_load={func: own_project.observations.foot_load}"
     run = build.assemble(config.compose(("experiment=walk", "num_envs=2", f"+{own}")))
     env = OmniEnv(run.env)
     described = describe(run, env)

@@ -225,7 +225,7 @@ class TestLate:
     [
         ("frames_lost=1.0", "frames_lost=1.0 must be a share"),
         ("frames_lost=-0.1", "frames_lost=-0.1 must be a share"),
-        ("frames_late_s=[-0.1,0.1]", r"frames_late_s=\[-0.1, 0.1\] must not be negative"),
+        ("frames_late_s=[-0.1,0.1]", r"frames_late_s=\[-0.1, 0.1\] must be \[low, high\] with 0 <= low"),
     ],
 )
 def test_frames_that_cannot_be_are_refused(make_config, row, message):

@@ -145,7 +145,7 @@ def test_a_policy_is_asked_for_the_part_of_a_family():
 
 
 def test_levels_go_on_in_families_and_without_them():
-    curriculum = "randomization.curriculum={start: 0.2, max_velocity_error: 0.3, rise: 0.1}"
+    curriculum = "+randomization.curriculum={start: 0.2, max_velocity_error: 0.3, rise: 0.1}"
     with_families, alone = families(curriculum), compose(*BLIND, "obstacles=moving", curriculum).env
     env = MixedEnv(with_families)
     assert len(env.curriculum_levels) == 4  # of randomization and obstacles, twice

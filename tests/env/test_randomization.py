@@ -256,7 +256,10 @@ def test_a_reset_draws_for_that_environment_only(make_env):
         ("added_mass=[5,-1]", r"randomization\.added_mass=\[5, -1\]"),
         ("added_mass=[nan,1]", r"added_mass=\[.nan, 1\] must be finite"),
         ("com_x=[0,inf]", r"com_x=\[0, .inf\] must be finite"),
-        ("ground_friction=[-0.1,1]", r"randomization\.ground_friction=\[-0\.1, 1\.0\] must not be negative"),
+        (
+            "ground_friction=[-0.1,1]",
+            r"randomization\.ground_friction=\[-0\.1, 1\] must be .* with 0 <= low",
+        ),
         ("ground_restitution=[0,2]", r"ground_restitution=\[0.0, 2.0\] must not exceed 1"),
         ("latency_s=[-0.005,0.045]", r"randomization\.latency_s"),
         ("added_mass=[-7,5]", "a base of 6.921 kg with -1.079 kg"),
@@ -335,7 +338,7 @@ def test_the_critic_sees_what_was_drawn(make_env):
 class TestCurriculum:
     """All rows grow together, from a robot without randomization to the whole ranges."""
 
-    SHARE = "randomization.curriculum={start: 0.0, max_velocity_error: 0.2, rise: 0.5}"
+    SHARE = "+randomization.curriculum={start: 0.0, max_velocity_error: 0.2, rise: 0.5}"
 
     def test_at_0_nothing_is_random(self, make_env):
         env = make_env("randomization=robot", self.SHARE, "obstacles=none", blind=True, num_envs=4)

@@ -116,7 +116,7 @@ class TestFromClouds:
             "terrain=flat",
             "condition=ideal",
             "obstacles=none",
-            f"obstacles.groups={wall}",
+            f"+obstacles.groups={wall}",
             *(f"commands.{value}" for value in ahead),
         )
         avoider, heard = trained(name, *given, "num_envs=2"), []

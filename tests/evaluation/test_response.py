@@ -179,7 +179,7 @@ def test_robots_are_asked_as_fast_as_may_be_and_begin_again_at_nothing(make_env)
     (fell, *_) = done[:, 1].nonzero().flatten().tolist()
     assert asked[fell + 1, 1, :2].norm() == pytest.approx(0.12)
     with pytest.raises(ConfigError, match="the command alone"):
-        next(driven(make_env(*BLIND, "num_envs=2", "observations.groups.command.history=2"), policy, None, 1))
+        next(driven(make_env(*BLIND, "num_envs=2", "+observations.groups.command.history=2"), policy, None, 1))
 
 
 def test_the_reach_is_that_of_points_on_the_geoms(make_env):

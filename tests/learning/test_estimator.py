@@ -84,7 +84,7 @@ def test_a_group_that_does_not_exist_is_refused():
     ("settings", "is_velocity"),
     [
         ((), True),
-        (("observations.groups.velocity.history=2",), False),
+        (("+observations.groups.velocity.history=2",), False),
         (("+observations.groups.extra={terms: {base_height: {}}}", "observations.estimated=extra"), False),
     ],
     ids=("velocity", "with the past", "height"),

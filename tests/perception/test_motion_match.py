@@ -77,7 +77,7 @@ def test_a_match_fades_with_distance():
     ("given", "message"),
     [
         ({"width": 0.0}, r"match\.width=0\.0 must be positive"),
-        ({"num_directions": 0}, r"match\.num_directions=0 must be positive"),
+        ({"num_directions": 0}, r"match\.num_directions=0 must be at least 1"),
         ({"speeds": ()}, r"match\.speeds=\[\] must be at least one"),
         ({"speeds": (1.0, -1.0)}, r"match\.speeds=\[1\.0, -1\.0\] must be at least one, all positive"),
     ],

@@ -55,7 +55,7 @@ CALLS = {
     "omniperception/commands/robot_fetch.py": 1,
     "omniperception/commands/robot_new.py": 1,
     "omniperception/commands/tables.py": 1,
-    "omniperception/commands/train.py": 1,
+    "omniperception/training.py": 1,
     "omniperception/config.py": 1,
     "packages/robot/omnirobot/runtime/description.py": 1,
     "omniperception/evaluation/report/pages.py": 1,

@@ -123,9 +123,7 @@ def test_no_recipe_sees_it(experiment):
     assert "split" not in (CONFIG_DIR / "experiment" / f"{experiment}.yaml").read_text()
 
 
-@pytest.mark.parametrize(
-    "given", [["obstacles.split=test"], ["--cfg", "job", "obstacles.split=test"], ["-m", "obstacles.split=test,dev"]]
-)
+@pytest.mark.parametrize("given", [["obstacles.split=test"], ["-m", "obstacles.split=test,dev"]])
 def test_training_refuses_it_in_one_line(given, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r"obstacles.split=test is for reports, .* use obstacles.split=dev") as error:
@@ -152,6 +150,6 @@ def test_what_has_no_held_out_kind_is_one_line(tmp_path):
         (f"kind:compound,count:1,file:'{cabinet}'", "c has a mesh among its parts, .* use split=dev"),
         ("kind:mesh,count:2,files:[rock,wedge]", "c has files=.*, of which there are no held-out ones; use split=dev"),
     ):
-        given = ("experiment=quickstart", f"obstacles.groups={{c:{{{group}}}}}", "obstacles.split=test")
+        given = ("experiment=quickstart", f"+obstacles.groups={{c:{{{group}}}}}", "obstacles.split=test")
         with pytest.raises(ConfigError, match=message):
             build.assemble(config.compose(given))

@@ -12,7 +12,7 @@ from omniperception.evaluation.trials.clearance_kernels import TOLERANCE
 from omniperception.scene.rays import ray_shapes
 
 NUM_ENVS, NUM_RAYS = 3, 1500
-GROUPS = """obstacles.groups={
+GROUPS = """+obstacles.groups={
   post: {kind: capsule, count: 2, size: [[0.05, 0.3], [0.1, 0.8]], speed: [0.0, 1.0]},
   rock: {kind: mesh, file: rock, count: 2, size: [[0.1, 0.5], [0.1, 0.4], [0.2, 0.6]]},
   wedge: {kind: mesh, file: wedge, count: 1, speed: [0.5, 0.5]},

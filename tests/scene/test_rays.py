@@ -66,7 +66,7 @@ def test_excluded_geoms_may_be_of_a_form_that_is_not_built(make_config, tmp_path
     assert text.count(marker) == 1
     file.write_text(text.replace(marker, drawn + marker))
     for groups, left, seen in (("null", "head_upper", "trunk"), ("[2]", "head_drawn", None)):
-        run = make_config(f"robot.file={file}", f"robot.ray_groups={groups}", "obstacles=none")
+        run = make_config(f"robot.file={file}", f"+robot.ray_groups={groups}", "obstacles=none")
         world = build_world(run.env.robot, run.env.terrain, run.env.obstacles)
         all_names = ray_shapes(world).geom_names
         names = ray_shapes(world, ("head_upper", "head_drawn")).geom_names

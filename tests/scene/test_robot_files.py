@@ -341,7 +341,7 @@ def test_a_foot_of_several_geoms_has_their_forces_and_the_mean_of_their_centres(
         folder,
         "robot=biped",
         *BLIND,
-        "rewards.terms.foot_air_time={weight: 1.0, target: 0.3, min_speed: 0.1}",
+        "+rewards.terms.foot_air_time={weight: 1.0, target: 0.3, min_speed: 0.1}",
         num_envs=1,
     )
     for _ in range(5):

@@ -184,6 +184,6 @@ def test_the_benchmark_compares_both_forms(robot, tmp_path, capsys):
 @pytest.mark.parametrize("name", ["go1", "g1"])
 def test_rays_hit_the_meshes_of_published_robots(name):
     skip_if_not_fetched(name)
-    robot = build.assemble(config.compose([*NO_TASK, f"robot={name}", "robot.ray_groups=[2]", "lidar=none"])).env.robot
+    robot = build.assemble(config.compose([*NO_TASK, f"robot={name}", "+robot.ray_groups=[2]", "lidar=none"])).env.robot
     met = assert_rays_are_mj_rays(flat_world(robot), np.random.default_rng(1), poses=3, rays=300)
     assert len(met) > 10

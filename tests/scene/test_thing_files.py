@@ -102,7 +102,7 @@ def test_parts_are_where_mujoco_has_those_of_the_file(files, file, parts):
 
 
 def test_rays_hit_them_as_mj_ray_does_and_each_environment_has_its_own(files, make_env):
-    own = "obstacles.groups={thing:{kind:compound,count:2,files:[door.xml,cart.urdf]},"
+    own = "+obstacles.groups={thing:{kind:compound,count:2,files:[door.xml,cart.urdf]},"
     own += "stone:{kind:mesh,count:4,files:[ramp.obj,slab.obj],present:[2,2]}}"
     env = make_env("perception=none", "lidar=none", "rewards=walk", "observations=walk", own, num_envs=6)
     env.step(torch.zeros(6, 12))

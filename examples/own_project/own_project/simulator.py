@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 
+from omniperception.common.checked import Positive, checked
 from omniperception.scene import World
 from omniperception.sim import MujocoSimulator, SimConfig
 
 
-@dataclass(frozen=True)
+@checked("sim")
 class LateMotorsConfig(SimConfig):
     """MuJoCo's settings and the motors'.
 
@@ -19,12 +19,7 @@ class LateMotorsConfig(SimConfig):
         time_constant_s: s until 63 % of a new target has reached the motors.
     """
 
-    time_constant_s: float = 0.02
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.time_constant_s > 0:
-            raise ValueError(f"sim.time_constant_s={self.time_constant_s} must be positive")
+    time_constant_s: Positive = 0.02
 
     def build(self, world: World, num_envs: int, record_states: bool = False) -> LateMotors:
         """`num_envs` simulations of a world."""

@@ -27,12 +27,11 @@ from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, 
 from omniperception.env.config import EnvConfig
 from omniperception.env.sensing import SensorConfig
 from omniperception.scene import RobotConfig
-from omniperception.viewer import PageOptions, ViewerError, serve_lab
+from omniperception.viewer import PageOptions, serve_lab
 from omniperception.viewer.options import LOCALHOST, PAGE, PORT, Room
 from omnirobot.common.cli import Command, argument, refuse_arguments
-from omnirobot.common.figures import PlotsUnavailable
 
-NO_TASK = ("perception=none", "observations=walk", "rewards=walk")
+NO_TASK = ("~experiment", "perception=none", "observations=walk", "rewards=walk")
 """A sensor is looked at, no task is run."""
 BESIDE = 1000.0
 """How far (m) beside a mesh a robot may stand."""
@@ -175,5 +174,5 @@ command = Command(
     Arguments,
     __doc__,
     "of the sensor's preset",
-    (PlotsUnavailable, ViewerError, ImportError, FileNotFoundError, ValueError),
+    (ImportError, FileNotFoundError, ValueError),
 )

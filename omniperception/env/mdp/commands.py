@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 
+from omniperception.common.checked import NonNegative, Pair, Positive, PositivePair, Share, checked
 from omniperception.common.random import EnvRandom
 from omniperception.common.rotations import rotate_yaw
 from omniperception.common.stateful import Stateful
@@ -16,17 +15,7 @@ from omniperception.env.kinematics import Kinematics
 from omniperception.env.mdp.curriculum import Curriculum, CurriculumConfig
 
 
-def _check_range(key: str, bounds: Sequence[float]) -> tuple[float, float]:
-    if len(bounds) != 2 or bounds[0] > bounds[1]:
-        raise ValueError(f"commands.{key}={list(bounds)} must be [low, high] with low <= high")
-    return float(bounds[0]), float(bounds[1])
-
-
-def _shown(value: float | Sequence[float]) -> str:
-    return f"{value if isinstance(value, int | float) else list(value)}"
-
-
-@dataclass(frozen=True)
+@checked("commands.spawn")
 class SpawnConfig:
     """Start pose of a robot, in its environment's frame.
 
@@ -36,16 +25,12 @@ class SpawnConfig:
         yaw_deg: range (deg).
     """
 
-    x: Sequence[float] = (0.0, 0.0)
-    y: Sequence[float] = (0.0, 0.0)
-    yaw_deg: Sequence[float] = (-180.0, 180.0)
-
-    def __post_init__(self) -> None:
-        for key in ("x", "y", "yaw_deg"):
-            object.__setattr__(self, key, _check_range(f"spawn.{key}", getattr(self, key)))
+    x: Pair = (0.0, 0.0)
+    y: Pair = (0.0, 0.0)
+    yaw_deg: Pair = (-180.0, 180.0)
 
 
-@dataclass(frozen=True)
+@checked("commands")
 class VelocityCommandConfig:
     """Velocities drawn uniformly in the base frame.
 
@@ -60,27 +45,19 @@ class VelocityCommandConfig:
             keep a gait from emerging; None: the whole ranges.
     """
 
-    lin_vel_x: Sequence[float]
-    lin_vel_y: Sequence[float]
-    ang_vel_z: Sequence[float]
-    resample_s: Sequence[float]
-    standing: float
+    lin_vel_x: Pair
+    lin_vel_y: Pair
+    ang_vel_z: Pair
+    resample_s: PositivePair
+    standing: Share
     spawn: SpawnConfig
     curriculum: CurriculumConfig | None = None
-
-    def __post_init__(self) -> None:
-        for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z", "resample_s"):
-            object.__setattr__(self, key, _check_range(key, getattr(self, key)))
-        if self.resample_s[0] <= 0:
-            raise ValueError(f"commands.resample_s={list(self.resample_s)} must be positive")
-        if not 0 <= self.standing <= 1:
-            raise ValueError(f"commands.standing={self.standing} must lie in [0, 1]")
 
     def build(self, num_envs: int, device: torch.device, random: EnvRandom) -> VelocityCommand:
         return VelocityCommand(self, num_envs, device, random)
 
 
-@dataclass(frozen=True)
+@checked("commands")
 class GoalCommandConfig:
     """Walk to a goal: the command points along the way there, and turns the robot to face it.
 
@@ -100,37 +77,21 @@ class GoalCommandConfig:
             its layout has to give: as a planner with a coarse map commands, corners cut and all. None: to the goal.
     """
 
-    goal_x: Sequence[float]
-    goal_y: Sequence[float]
-    radius: float | None
-    speed: float | Sequence[float]
-    yaw_gain: float
-    max_ang_vel_z: float
+    goal_x: Pair
+    goal_y: Pair
+    radius: Positive | None
+    speed: Positive | PositivePair
+    yaw_gain: Positive
+    max_ang_vel_z: Positive
     spawn: SpawnConfig
-    slow_within: float = 0.0
-    hold_s: float = 0.0
-    route_ahead: float | None = None
+    slow_within: NonNegative = 0.0
+    hold_s: NonNegative = 0.0
+    route_ahead: Positive | None = None
 
     def __post_init__(self) -> None:
-        for key in ("goal_x", "goal_y"):
-            object.__setattr__(self, key, _check_range(key, getattr(self, key)))
-        if not isinstance(self.speed, int | float):
-            object.__setattr__(self, "speed", _check_range("speed", self.speed))
-        for key in ("speed", "yaw_gain", "max_ang_vel_z"):
-            given = getattr(self, key)
-            if (given if isinstance(given, int | float) else given[0]) <= 0:
-                raise ValueError(f"commands.{key}={_shown(given)} must be positive")
-        if self.radius is not None and self.radius <= 0:
-            raise ValueError(f"commands.radius={self.radius} must be positive, or null for a line to cross")
         for key in ("slow_within", "hold_s"):
-            if getattr(self, key) < 0:
-                raise ValueError(f"commands.{key}={getattr(self, key)} must not be negative")
             if getattr(self, key) > 0 and self.radius is None:
                 raise ValueError(f"commands.{key}={getattr(self, key)} needs a place to stay: give commands.radius")
-        if self.route_ahead is not None and self.route_ahead <= 0:
-            raise ValueError(
-                f"commands.route_ahead={self.route_ahead} must be positive, or null for straight to the goal"
-            )
         if self.route_ahead is not None and self.radius is None:
             raise ValueError("commands.route_ahead leads to a place, not across a line: give commands.radius")
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from omniperception.common.checked import Positive, Share, checked
 from omniperception.common.stateful import Stateful
 
 
-@dataclass(frozen=True)
+@checked("curriculum")
 class CurriculumConfig:
     """When a share rises or falls, and how fast.
 
@@ -18,16 +17,9 @@ class CurriculumConfig:
         rise: how much it changes per second of simulated time of each environment.
     """
 
-    start: float
-    max_velocity_error: float
-    rise: float
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.start <= 1:
-            raise ValueError(f"curriculum.start={self.start} must be a share, 0 to 1")
-        for key in ("max_velocity_error", "rise"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"curriculum.{key}={getattr(self, key)} must be positive")
+    start: Share
+    max_velocity_error: Positive
+    rise: Positive
 
 
 class Curriculum(Stateful):

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from operator import attrgetter
+from typing import Annotated
 
 import torch
+from pydantic import Field
 
 from omnilidar import AngularJitter, DistanceNoise, Dropout, GaussianNoise, MaskNoise, MixedPixels, Noise
+from omniperception.common.checked import (
+    AtLeastOne,
+    NonNegative,
+    NonNegativePair,
+    Pair,
+    Point,
+    Positive,
+    PositivePair,
+    Text,
+    checked,
+)
 from omniperception.common.random import EnvRandom
 from omniperception.common.stateful import Stateful
 from omniperception.env.mdp.curriculum import FULL, Curriculum, CurriculumConfig
@@ -17,7 +29,7 @@ from omniperception.env.partial_frames import PartialFramesConfig
 from omniperception.scene.terrain import ground_solrefs
 from omniperception.sim import Simulator
 
-Range = Sequence[float] | None
+_Lost = Annotated[float, Field(ge=0, lt=1), "a share: at least 0 and less than 1"]
 
 _MASSES = {"added_mass", "payload_mass", "com_x", "com_y", "com_z"}
 DRAWN = (
@@ -45,17 +57,9 @@ _MEASURED = (
     "joint_vel_noise",
 )
 """Errors of what the robot measures of itself."""
-_NEVER_NEGATIVE = (
-    "ground_friction",
-    "ground_restitution",
-    "motor_strength",
-    "latency_s",
-    "velocity_scale",
-    "frames_late_s",
-)
 
 
-@dataclass(frozen=True)
+@checked("condition")
 class Condition:
     """Name of a fixed randomization (conf/condition), as a run or a result records it.
 
@@ -64,17 +68,11 @@ class Condition:
         version: raised whenever one of its values changes: results under different versions are not comparable.
     """
 
-    name: str
-    version: int
-
-    def __post_init__(self) -> None:
-        if not self.name:
-            raise ValueError("condition.name must not be empty; give it the name of its file")
-        if self.version < 1:
-            raise ValueError(f"condition.version={self.version} must be at least 1")
+    name: Text
+    version: AtLeastOne
 
 
-@dataclass(frozen=True)
+@checked("randomization: a drift's ")
 class Drift:
     """A slowly wandering error: an Ornstein-Uhlenbeck process, stationary from the first step of an episode on.
 
@@ -83,17 +81,11 @@ class Drift:
         time_s: time (s) after which a fraction 1/e of an error is left.
     """
 
-    sd: float
-    time_s: float
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.sd < math.inf:
-            raise ValueError(f"randomization: a drift's sd={self.sd} must be 0 or more, and finite")
-        if not 0 < self.time_s < math.inf:
-            raise ValueError(f"randomization: a drift's time_s={self.time_s} must be positive and finite")
+    sd: NonNegative
+    time_s: Positive
 
 
-@dataclass(frozen=True)
+@checked("randomization.pushes")
 class PushesConfig:
     """Sudden changes of the base's horizontal velocity.
 
@@ -102,17 +94,11 @@ class PushesConfig:
         speed: largest change (m/s), drawn uniformly from 0 on, in a direction drawn uniformly.
     """
 
-    every_s: Sequence[float]
-    speed: float
-
-    def __post_init__(self) -> None:
-        if len(self.every_s) != 2 or not 0 < self.every_s[0] <= self.every_s[1] < math.inf:
-            raise ValueError(f"randomization.pushes.every_s={list(self.every_s)} must be [low, high], positive")
-        if not 0 <= self.speed < math.inf:
-            raise ValueError(f"randomization.pushes.speed={self.speed} must be 0 or more, and finite")
+    every_s: PositivePair
+    speed: NonNegative
 
 
-@dataclass(frozen=True)
+@checked("randomization")
 class RandomizationConfig:
     """Ranges (low, high) drawn uniformly per environment; null leaves a row out.
 
@@ -165,52 +151,35 @@ class RandomizationConfig:
     lidar_jitter: AngularJitter | None = None
     lidar_dropout: Dropout | None = None
     lidar_mixed: MixedPixels | None = None
-    added_mass: Range = None
-    payload_mass: Range = None
-    com_x: Range = None
-    com_y: Range = None
-    com_z: Range = None
-    ground_friction: Range = None
-    ground_restitution: Range = None
-    motor_strength: Range = None
-    joint_offset: Range = None
-    gravity_offset: Range = None
-    latency_s: Range = None
-    payload_position: Sequence[float] = (0.0, 0.0, 0.1)
-    velocity_scale: Range = None
+    added_mass: Pair | None = None
+    payload_mass: Pair | None = None
+    com_x: Pair | None = None
+    com_y: Pair | None = None
+    com_z: Pair | None = None
+    ground_friction: NonNegativePair | None = None
+    ground_restitution: NonNegativePair | None = None
+    motor_strength: NonNegativePair | None = None
+    joint_offset: Pair | None = None
+    gravity_offset: Pair | None = None
+    latency_s: NonNegativePair | None = None
+    payload_position: Point = (0.0, 0.0, 0.1)
+    velocity_scale: NonNegativePair | None = None
     velocity_drift: Drift | None = None
-    gyro_bias: Range = None
-    gyro_noise: Range = None
-    attitude_bias_deg: Range = None
-    attitude_noise_deg: Range = None
-    joint_pos_noise: Range = None
-    joint_vel_noise: Range = None
-    frames_lost: float | None = None
-    frames_late_s: Range = None
+    gyro_bias: Pair | None = None
+    gyro_noise: Pair | None = None
+    attitude_bias_deg: Pair | None = None
+    attitude_noise_deg: Pair | None = None
+    joint_pos_noise: Pair | None = None
+    joint_vel_noise: Pair | None = None
+    frames_lost: _Lost | None = None
+    frames_late_s: NonNegativePair | None = None
     partial_frames: PartialFramesConfig | None = None
     pushes: PushesConfig | None = None
     curriculum: CurriculumConfig | None = None
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name == "payload_position" or not isinstance(value, Sequence):
-                continue
-            if len(value) != 2 or not -math.inf < value[0] <= value[1] < math.inf:
-                raise ValueError(f"randomization.{item.name}={list(value)} must be [low, high] or null")
-            object.__setattr__(self, item.name, (float(value[0]), float(value[1])))
-        if len(self.payload_position) != 3:
-            raise ValueError(f"randomization.payload_position={list(self.payload_position)} must be [x, y, z]")
-        for name in _NEVER_NEGATIVE:
-            value = getattr(self, name)
-            if value is not None and value[0] < 0:
-                raise ValueError(f"randomization.{name}={list(value)} must not be negative")
         if self.ground_restitution is not None and self.ground_restitution[1] > 1:
             raise ValueError(f"randomization.ground_restitution={list(self.ground_restitution)} must not exceed 1")
-        if self.frames_lost is not None and not 0 <= self.frames_lost < 1:
-            raise ValueError(
-                f"randomization.frames_lost={self.frames_lost} must be a share: at least 0 and less than 1"
-            )
 
     @property
     def measures_exactly(self) -> bool:

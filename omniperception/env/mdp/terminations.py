@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from pydantic import Field
 
+from omniperception.common.checked import NonNegative, Positive, checked
 from omniperception.env.kinematics import Kinematics
 
+_Tilt = Annotated[float, Field(gt=0, le=180), "in (0, 180]"]
 
-@dataclass(frozen=True)
+
+@checked("terminations")
 class TerminationsConfig:
     """Ends of an episode besides the time limit, a reached goal and diverged physics.
 
@@ -21,18 +25,10 @@ class TerminationsConfig:
         on_collision: whether touching an obstacle ends the episode; the paper's collisions do not.
     """
 
-    episode_length_s: float
-    min_base_height: float
-    max_tilt_deg: float
+    episode_length_s: Positive
+    min_base_height: NonNegative
+    max_tilt_deg: _Tilt
     on_collision: bool
-
-    def __post_init__(self) -> None:
-        if self.episode_length_s <= 0:
-            raise ValueError(f"terminations.episode_length_s={self.episode_length_s} must be positive")
-        if self.min_base_height < 0:
-            raise ValueError(f"terminations.min_base_height={self.min_base_height} must not be negative")
-        if not 0 < self.max_tilt_deg <= 180:
-            raise ValueError(f"terminations.max_tilt_deg={self.max_tilt_deg} must lie in (0, 180]")
 
     def fallen(self, kinematics: Kinematics, base_height: torch.Tensor) -> torch.Tensor:
         """(num_envs,) bool: the base lies too low, `base_height` (num_envs,) (m), or is inclined too far."""

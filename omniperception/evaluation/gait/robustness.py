@@ -183,5 +183,5 @@ def _cell(record: Record | None) -> str:
 
 def _rows(preset: str, folders: Sequence[Path] = ()) -> dict[str, Any]:
     """The rows of a preset of `randomization`, as plain data; `folders`: the user's, of presets."""
-    composed = config.compose([*config.as_override(folders), f"randomization={preset}"])
+    composed = config.compose([*config.as_override(folders), f"randomization={preset}", "~experiment"])
     return cast(dict, OmegaConf.to_container(composed["randomization"]))

@@ -27,7 +27,7 @@ class Record:
     """Trials of one policy in one world.
 
     Attributes:
-        policy: name in `suite.POLICIES`.
+        policy: name in `trials.policies.POLICIES`.
         world: preset of `scenario`.
         terrain: preset of `terrain`; "own" for what the scenario says.
         condition: preset of `condition`; "none" where randomization was chosen otherwise.

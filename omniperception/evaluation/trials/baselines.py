@@ -19,25 +19,11 @@ from omniperception.env.mdp.commands import VelocityCommandConfig
 from omniperception.env.odometry import Odometry
 from omniperception.env.sensing import SensorConfig
 from omniperception.env.state import MEASURED_CLOUD
+from omniperception.evaluation.trials.policies import BASELINES
 from omniperception.perception import Attitude
 from omniperception.perception.geometry import NUM_SECTORS, GeometryConfig, Nearest, Standing, nearest_obstacles
 from omniperception.scene import RobotConfig
 from omniperception.scene.build import FOOT_FORCE
-
-BASELINES = {
-    "blind": "the run's policy as it acts before its first frame: it never has one",
-    "stop": "the gait follows V_cmd, which falls to zero while the raw noisy cloud has something near ahead",
-    "histogram": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the raw noisy cloud"
-    " by geometry: nearest return by sector, ground removed, velocities from successive frames, nothing learned",
-    "ground_truth": "the gait follows what the run's navigation policy asks for, given the true places and velocities"
-    " of all obstacles",
-    "oracle": "the gait follows V_cmd + V_avoid, V_avoid by the run's avoidance controller from the true places and"
-    " velocities of all obstacles",
-}
-"""Policies to compare with; the gait is the run's own, which then sees nothing, or that of another run."""
-
-DRIVEN = ("stop", "histogram", "ground_truth", "oracle")
-"""Those that drive a gait by its command."""
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
 """Ranges of v_x and v_y (m/s)."""

@@ -11,8 +11,10 @@ from typing import Any, ClassVar
 
 from rsl_rl.utils.log_writer import LogWriter
 
+from omnirobot.common.errors import UserError
 
-class LoggerError(Exception):
+
+class LoggerError(UserError):
     """A service that does not take what is logged."""
 
 

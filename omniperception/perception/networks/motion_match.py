@@ -4,14 +4,14 @@ hits of that frame. A cost volume around the azimuth, as in stereo and optical f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 
+from omniperception.common.checked import AtLeastOne, Positive, Positives, checked
 from omniperception.common.sectors import FAR
 
 
-@dataclass(frozen=True)
+@checked("perception.network.rings.match")
 class MotionMatch:
     """Candidate velocities and the width of a match.
 
@@ -22,19 +22,10 @@ class MotionMatch:
         period_s: time between two frames, seconds.
     """
 
-    speeds: tuple[float, ...]
-    num_directions: int
-    width: float
-    period_s: float
-
-    def __post_init__(self) -> None:
-        for name in ("num_directions", "width", "period_s"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"perception.network.rings.match.{name}={getattr(self, name)} must be positive")
-        if not self.speeds or min(self.speeds) <= 0:
-            raise ValueError(
-                f"perception.network.rings.match.speeds={list(self.speeds)} must be at least one, all positive (m/s)"
-            )
+    speeds: Positives
+    num_directions: AtLeastOne
+    width: Positive
+    period_s: Positive
 
     @property
     def num_velocities(self) -> int:

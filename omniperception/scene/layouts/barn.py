@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
-from omniperception.scene.layouts.base import ROW, check_not_negative, check_range, check_worlds, draw, stream
+from omniperception.common.checked import AsTuple, AtLeastOne, NonNegative, Positive, PositivePair, checked
+from omniperception.scene.layouts.base import ROW, draw, stream
 
 _BATCHES = 500
 """Batches of 64 worlds of barn that are drawn before the settings count as impossible."""
 
 
-@dataclass(frozen=True)
+_SIDE, _STEPS = Field(ge=3), Field(ge=0)
+_Cells = Annotated[tuple[Annotated[int, _SIDE], Annotated[int, _SIDE]], AsTuple, "[along x, along y], 3 or more"]
+_Fill = Annotated[
+    tuple[Annotated[float, Field(ge=0, le=0.5)], ...], AsTuple, Field(min_length=1), "shares from 0 to 0.5"
+]
+_Smoothing = Annotated[tuple[Annotated[int, _STEPS], ...], AsTuple, Field(min_length=1), "numbers of steps"]
+_Boxes = Annotated[int, Field(ge=2), "2 or more, as both edges of the field are filled"]
+
+
+@checked("obstacles: ")
 class BarnLayout:
     """Cluttered fields from a cellular automaton, as BARN's (Perille et al. 2020, arXiv 2008.13315).
 
@@ -41,36 +51,20 @@ class BarnLayout:
         worlds: see `Layout`.
     """
 
-    cells: Sequence[int] = (30, 30)
-    cell: float = 0.2
-    fill: Sequence[float] = (0.15, 0.2, 0.25, 0.3)
-    smoothing: Sequence[int] = (2, 3, 4)
+    cells: _Cells = (30, 30)
+    cell: Positive = 0.2
+    fill: _Fill = (0.15, 0.2, 0.25, 0.3)
+    smoothing: _Smoothing = (2, 3, 4)
     robot: int = 2
-    lead: float = 1.5
-    boxes: int = 64
-    height: Sequence[float] = (0.5, 1.0)
-    depth: float = 0.0
-    worlds: int = 300
+    lead: Positive = 1.5
+    boxes: _Boxes = 64
+    height: PositivePair = (0.5, 1.0)
+    depth: NonNegative = 0.0
+    worlds: AtLeastOne = 300
 
     def __post_init__(self) -> None:
-        check_range(self, "height")
-        for key in ("cells", "fill", "smoothing"):
-            object.__setattr__(self, key, tuple(getattr(self, key)))
-        if len(self.cells) != 2 or min(self.cells) < 3:
-            raise ValueError(f"obstacles: cells={list(self.cells)} of barn must be [along x, along y], 3 or more")
-        if not self.fill or any(not 0 <= share <= 0.5 for share in self.fill):
-            raise ValueError(f"obstacles: fill={list(self.fill)} of barn must be shares from 0 to 0.5")
-        if not self.smoothing or min(self.smoothing) < 0:
-            raise ValueError(f"obstacles: smoothing={list(self.smoothing)} of barn must be numbers of steps")
         if not 0 <= self.robot < self.cells[1] // 2:
             raise ValueError(f"obstacles: robot={self.robot} of barn must be cells, fewer than half the field's width")
-        for key in ("cell", "lead"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"obstacles: {key}={getattr(self, key)} of barn must be positive")
-        if self.boxes < 2:
-            raise ValueError(f"obstacles: boxes={self.boxes} of barn must be 2 or more, as both its edges are filled")
-        check_not_negative(self, "depth")
-        check_worlds(self)
 
     @property
     def count(self) -> int:

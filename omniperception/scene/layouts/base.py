@@ -36,22 +36,3 @@ def stream(seed: int, world: int) -> np.random.Generator:
 
 def draw(rng: np.random.Generator, bounds: Sequence[float], num: int) -> np.ndarray:
     return rng.uniform(bounds[0], bounds[1], num)
-
-
-def check_range(layout: object, key: str) -> None:
-    bounds = tuple(float(bound) for bound in getattr(layout, key))
-    object.__setattr__(layout, key, bounds)
-    if len(bounds) != 2 or not 0 < bounds[0] <= bounds[1]:
-        raise ValueError(
-            f"obstacles: {key}={list(bounds)} of a layout must be a range [low, high] with 0 < low <= high"
-        )
-
-
-def check_not_negative(layout: object, key: str) -> None:
-    if getattr(layout, key) < 0:
-        raise ValueError(f"obstacles: {key}={getattr(layout, key)} of a layout must not be negative")
-
-
-def check_worlds(layout: Layout) -> None:
-    if layout.worlds < 1:
-        raise ValueError(f"obstacles: worlds={layout.worlds} of a layout must be at least 1")

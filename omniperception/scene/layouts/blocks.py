@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from omniperception.scene.layouts.base import ROW, check_not_negative, check_range, check_worlds, draw, stream
+from omniperception.common.checked import Area, AtLeastOne, Cells, NonNegative, PositivePair, checked
+from omniperception.scene.layouts.base import ROW, draw, stream
 
 
-@dataclass(frozen=True)
+@checked("obstacles: ")
 class BlocksLayout:
     """Clusters of blocks on a staggered grid: each two boxes side by side.
 
@@ -31,28 +30,15 @@ class BlocksLayout:
         worlds: see `Layout`.
     """
 
-    area: Sequence[float] = (1.0, 10.0, -3.75, 3.75)
-    grid: Sequence[int] = (3, 3)
-    side: Sequence[float] = (0.1, 0.3)
-    height: Sequence[float] = (0.5, 1.5)
-    stagger: float = 0.25
-    jitter: float = 0.1
-    free: float = 0.0
-    depth: float = 0.0
-    worlds: int = 300
-
-    def __post_init__(self) -> None:
-        for key in ("side", "height"):
-            check_range(self, key)
-        object.__setattr__(self, "area", tuple(float(x) for x in self.area))
-        object.__setattr__(self, "grid", tuple(self.grid))
-        if len(self.area) != 4 or self.area[0] >= self.area[1] or self.area[2] >= self.area[3]:
-            raise ValueError(f"obstacles: area={list(self.area)} of blocks must be [x_low, x_high, y_low, y_high]")
-        if len(self.grid) != 2 or min(self.grid) < 1:
-            raise ValueError(f"obstacles: grid={list(self.grid)} of blocks must be [along x, along y]")
-        for key in ("stagger", "jitter", "free", "depth"):
-            check_not_negative(self, key)
-        check_worlds(self)
+    area: Area = (1.0, 10.0, -3.75, 3.75)
+    grid: Cells = (3, 3)
+    side: PositivePair = (0.1, 0.3)
+    height: PositivePair = (0.5, 1.5)
+    stagger: NonNegative = 0.25
+    jitter: NonNegative = 0.1
+    free: NonNegative = 0.0
+    depth: NonNegative = 0.0
+    worlds: AtLeastOne = 300
 
     @property
     def count(self) -> int:

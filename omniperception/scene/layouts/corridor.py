@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
-from omniperception.scene.layouts.base import check_not_negative, check_range, check_worlds, draw, stream
+from omniperception.common.checked import AtLeastOne, NonNegative, PositivePair, checked
+from omniperception.scene.layouts.base import draw, stream
 
 
-@dataclass(frozen=True)
+@checked("obstacles: ")
 class CorridorLayout:
     """Straight corridors along x around the origin, of drawn widths and lengths, closed behind it and open ahead.
 
@@ -30,31 +28,24 @@ class CorridorLayout:
         worlds: see `Layout`.
     """
 
-    width: Sequence[float] = (2.5, 7.0)
-    length: Sequence[float] = (8.0, 16.0)
-    back: float = 1.1
-    pieces: int = 4
-    thickness: Sequence[float] = (0.08, 0.3)
-    height: Sequence[float] = (0.6, 2.0)
-    lead: float = 1.5
-    margin: float = 0.3
-    depth: float = 0.0
-    worlds: int = 300
+    width: PositivePair = (2.5, 7.0)
+    length: PositivePair = (8.0, 16.0)
+    back: NonNegative = 1.1
+    pieces: AtLeastOne = 4
+    thickness: PositivePair = (0.08, 0.3)
+    height: PositivePair = (0.6, 2.0)
+    lead: NonNegative = 1.5
+    margin: NonNegative = 0.3
+    depth: NonNegative = 0.0
+    worlds: AtLeastOne = 300
 
     def __post_init__(self) -> None:
-        for key in ("width", "length", "thickness", "height"):
-            check_range(self, key)
-        for key in ("back", "lead", "margin", "depth"):
-            check_not_negative(self, key)
-        if self.pieces < 1:
-            raise ValueError(f"obstacles: pieces={self.pieces} of a corridor's wall must be at least 1")
         if not self.width[0] > 2 * self.margin:
             raise ValueError(
                 f"obstacles: width={list(self.width)} of a corridor leaves no room with margin={self.margin}"
             )
         if not self.length[0] > self.lead:
             raise ValueError(f"obstacles: length={list(self.length)} of a corridor must be beyond lead={self.lead}")
-        check_worlds(self)
 
     @property
     def count(self) -> int:

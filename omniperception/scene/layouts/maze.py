@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from omniperception.scene.layouts.base import check_not_negative, check_range, check_worlds, draw, stream
+from omniperception.common.checked import AtLeastOne, Counts, NonNegative, PositivePair, checked
+from omniperception.scene.layouts.base import draw, stream
 
 ROUTE_PIECES = 8
 """Pieces of a route from the middle of one cell of a maze to that of the next."""
 
 
-@dataclass(frozen=True)
+@checked("obstacles: ")
 class MazeLayout:
     """Walls on the edges of a grid of square cells, inside a closed border.
 
@@ -40,16 +40,13 @@ class MazeLayout:
     rows: int = 5
     cell: float = 2.0
     walls: int = 27
-    thickness: Sequence[float] = (0.15, 0.4)
-    height: Sequence[float] = (0.3, 2.0)
-    depth: float = 0.0
-    lanes: Sequence[int] = ()
-    worlds: int = 300
+    thickness: PositivePair = (0.15, 0.4)
+    height: PositivePair = (0.3, 2.0)
+    depth: NonNegative = 0.0
+    lanes: Counts = ()
+    worlds: AtLeastOne = 300
 
     def __post_init__(self) -> None:
-        for key in ("thickness", "height"):
-            check_range(self, key)
-        object.__setattr__(self, "lanes", tuple(self.lanes))
         if self.columns < 2 or self.rows < 1 or self.rows % 2 == 0:
             raise ValueError(
                 f"obstacles: a maze has 2 columns or more and an odd number of rows, not columns={self.columns}"
@@ -57,13 +54,11 @@ class MazeLayout:
             )
         if not self.cell > self.thickness[1]:
             raise ValueError(f"obstacles: cell={self.cell} of a maze must be wider than its walls are thick")
-        if any(not 0 <= lane < self.columns for lane in self.lanes):
+        if any(lane >= self.columns for lane in self.lanes):
             raise ValueError(f"obstacles: lanes={list(self.lanes)} of a maze must lie in 0 to {self.columns - 1}")
-        check_not_negative(self, "depth")
         most = min((self.columns - 1) * (self.rows - 1), len(self._inner_edges()))  # a path to every cell remains
         if not 0 <= self.walls <= most:
             raise ValueError(f"obstacles: walls={self.walls} of a maze must lie in 0 to {most}")
-        check_worlds(self)
 
     @property
     def goal(self) -> tuple[float, float]:

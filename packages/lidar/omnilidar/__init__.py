@@ -1,6 +1,6 @@
 """A stand-alone LiDAR toolkit: scan patterns, scenes, sensors and noise, for many environments at once.
 
-Descriptions (patterns, devices, noise) are loaded at once; what needs Warp is loaded when it is first used.
+Figures of devices and noise are loaded at once; what needs PyTorch or Warp is loaded when it is first used.
 """
 
 from importlib import import_module
@@ -18,37 +18,6 @@ from .noise import (
     TabulatedNoise,
     max_deviation,
 )
-from .patterns import (
-    LIVOX,
-    ScanPattern,
-    Selection,
-    airy,
-    avia,
-    custom,
-    grid,
-    hap,
-    hdl32e,
-    hdl64e,
-    height_scanner,
-    horizon,
-    make_selection,
-    mid40,
-    mid70,
-    mid360,
-    mid360_measured,
-    os0,
-    os1,
-    os2,
-    ouster,
-    spinning,
-    tele15,
-    unitree_l1,
-    unitree_l2,
-    vlp16,
-    vlp32c,
-    xt16,
-    xt32,
-)
 
 if TYPE_CHECKING:
     from .clouds import PointTable, read_points, read_scans, write_points, write_scans
@@ -57,6 +26,37 @@ if TYPE_CHECKING:
     from .meshes import TriangleMesh
     from .motion import PoseTrack
     from .mujoco import GeomShapes, MujocoScene, geom_shapes
+    from .patterns import (
+        LIVOX,
+        ScanPattern,
+        Selection,
+        airy,
+        avia,
+        custom,
+        grid,
+        hap,
+        hdl32e,
+        hdl64e,
+        height_scanner,
+        horizon,
+        make_selection,
+        mid40,
+        mid70,
+        mid360,
+        mid360_measured,
+        os0,
+        os1,
+        os2,
+        ouster,
+        spinning,
+        tele15,
+        unitree_l1,
+        unitree_l2,
+        vlp16,
+        vlp32c,
+        xt16,
+        xt32,
+    )
     from .rotations import quat_from_rpy
     from .scene import RayHits, RayScene
     from .sectors import SectorDistances
@@ -70,6 +70,12 @@ _LOADED_WHEN_USED = {
     "meshes": ("TriangleMesh",),
     "motion": ("PoseTrack",),
     "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
+    "patterns": (
+        *("LIVOX", "ScanPattern", "Selection", "custom", "grid", "height_scanner", "make_selection"),
+        *("avia", "hap", "horizon", "mid40", "mid70", "mid360", "mid360_measured", "tele15"),
+        *("airy", "hdl32e", "hdl64e", "os0", "os1", "os2", "ouster", "spinning", "vlp16", "vlp32c", "xt16", "xt32"),
+        *("unitree_l1", "unitree_l2"),
+    ),
     "rotations": ("quat_from_rpy",),
     "scene": ("RayHits", "RayScene"),
     "sectors": ("SectorDistances",),

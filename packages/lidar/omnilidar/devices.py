@@ -4,34 +4,17 @@
 commonly quoted datasheet values without the document at hand.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 from .noise import AngularJitter, GaussianNoise, Noise, TabulatedNoise
-from .patterns import (
-    ScanPattern,
-    airy,
-    avia,
-    hap,
-    hdl32e,
-    hdl64e,
-    horizon,
-    mid40,
-    mid70,
-    mid360,
-    mid360_measured,
-    os0,
-    os1,
-    os2,
-    tele15,
-    unitree_l1,
-    unitree_l2,
-    vlp16,
-    vlp32c,
-    xt16,
-    xt32,
-)
+
+if TYPE_CHECKING:
+    from .patterns import ScanPattern
 
 
 @dataclass(frozen=True)
@@ -82,40 +65,41 @@ class DeviceSpec:
 
 
 _COLUMNS = (
-    *("pattern", "horizontal_fov_deg", "elevation_deg", "channels", "points_per_second", "min_range"),
-    *("max_range", "range_sigma", "angle_sigma_deg"),
+    *("horizontal_fov_deg", "elevation_deg", "channels", "points_per_second", "min_range", "max_range"),
+    *("range_sigma", "angle_sigma_deg"),
 )
 # fmt: off
 _TABLE = {
-    # preset           pattern             fov    elevation        lasers points/s        near  far    sigma  angle
-    "mid360":          (mid360,            360.0, (-7.0, 52.0),    4,     200_000.0,      0.1,  40.0,  0.02,  0.15),
-    "mid360_measured": (mid360_measured,   360.0, (-7.1, 52.5),    4,     200_000.0,      0.1,  40.0,  0.02,  0.15),
-    "avia":            (avia,              70.4,  (-38.6, 38.6),   6,     240_000.0,      1.0,  190.0, 0.02,  0.05),
-    "hap":             (hap,               120.0, (-12.5, 12.5),   6,     452_000.0,      0.5,  150.0, 0.02,  0.1),
-    "horizon":         (horizon,           81.7,  (-12.55, 12.55), 6,     240_000.0,      0.5,  90.0,  0.02,  0.05),
-    "mid40":           (mid40,             38.4,  (-19.2, 19.2),   1,     100_000.0,      1.0,  90.0,  0.02,  0.1),
-    "mid70":           (mid70,             70.4,  (-35.2, 35.2),   1,     100_000.0,      0.05, 90.0,  0.02,  0.1),
-    "tele15":          (tele15,            14.5,  (-8.1, 8.1),     6,     240_000.0,      3.0,  320.0, 0.02,  0.03),
-    "hdl64e":          (hdl64e,            360.0, (-24.33, 2.0),   64,    4e6 / 3.0,      0.9,  120.0, 0.02,  None),
-    "hdl32e":          (hdl32e,            360.0, (-30.67, 10.67), 32,    32 / 46.08e-6,  1.0,  100.0, 0.02,  None),
-    "vlp16":           (vlp16,             360.0, (-15.0, 15.0),   16,    16 / 55.296e-6, 0.5,  100.0, 0.03,  None),
-    "vlp32c":          (vlp32c,            360.0, (-25.0, 15.0),   32,    32 / 55.296e-6, 1.0,  200.0, 0.03,  None),
-    "os0_128":         (partial(os0, 128), 360.0, (-45.0, 45.0),   128,   1_310_720.0,    0.5,  35.0,  0.02,  0.01),
-    "os0_64":          (partial(os0, 64),  360.0, (-45.0, 45.0),   64,    655_360.0,      0.5,  35.0,  0.02,  0.01),
-    "os0_32":          (partial(os0, 32),  360.0, (-45.0, 45.0),   32,    327_680.0,      0.5,  35.0,  0.02,  0.01),
-    "os1_128":         (partial(os1, 128), 360.0, (-22.5, 22.5),   128,   1_310_720.0,    0.5,  90.0,  0.01,  0.01),
-    "os1_64":          (partial(os1, 64),  360.0, (-22.5, 22.5),   64,    655_360.0,      0.5,  90.0,  0.01,  0.01),
-    "os1_32":          (partial(os1, 32),  360.0, (-22.5, 22.5),   32,    327_680.0,      0.5,  90.0,  0.01,  0.01),
-    "os2_128":         (partial(os2, 128), 360.0, (-11.25, 11.25), 128,   1_310_720.0,    0.8,  200.0, 0.03,  0.01),
-    "os2_64":          (partial(os2, 64),  360.0, (-11.25, 11.25), 64,    655_360.0,      0.8,  200.0, 0.03,  0.01),
-    "os2_32":          (partial(os2, 32),  360.0, (-11.25, 11.25), 32,    327_680.0,      0.8,  200.0, 0.03,  0.01),
-    "xt32":            (xt32,              360.0, (-16.0, 15.0),   32,    640_000.0,      0.05, 80.0,  0.005, None),
-    "xt16":            (xt16,              360.0, (-15.0, 15.0),   16,    320_000.0,      0.05, 80.0,  0.005, None),
-    "unitree_l1":      (unitree_l1,        360.0, (0.0, 90.0),     1,     21_600.0,       0.05, 30.0,  0.02,  None),
-    "unitree_l2":      (unitree_l2,        360.0, (0.0, 90.0),     1,     63_936.0,       0.05, 30.0,  0.02,  None),
-    "airy":            (airy,              360.0, (0.0, 90.0),     96,    864_000.0,      0.1,  30.0,  0.02,  None),
+    # preset           fov    elevation        lasers points/s        near  far    sigma  angle
+    "mid360":          (360.0, (-7.0, 52.0),    4,     200_000.0,      0.1,  40.0,  0.02,  0.15),
+    "mid360_measured": (360.0, (-7.1, 52.5),    4,     200_000.0,      0.1,  40.0,  0.02,  0.15),
+    "avia":            (70.4,  (-38.6, 38.6),   6,     240_000.0,      1.0,  190.0, 0.02,  0.05),
+    "hap":             (120.0, (-12.5, 12.5),   6,     452_000.0,      0.5,  150.0, 0.02,  0.1),
+    "horizon":         (81.7,  (-12.55, 12.55), 6,     240_000.0,      0.5,  90.0,  0.02,  0.05),
+    "mid40":           (38.4,  (-19.2, 19.2),   1,     100_000.0,      1.0,  90.0,  0.02,  0.1),
+    "mid70":           (70.4,  (-35.2, 35.2),   1,     100_000.0,      0.05, 90.0,  0.02,  0.1),
+    "tele15":          (14.5,  (-8.1, 8.1),     6,     240_000.0,      3.0,  320.0, 0.02,  0.03),
+    "hdl64e":          (360.0, (-24.33, 2.0),   64,    4e6 / 3.0,      0.9,  120.0, 0.02,  None),
+    "hdl32e":          (360.0, (-30.67, 10.67), 32,    32 / 46.08e-6,  1.0,  100.0, 0.02,  None),
+    "vlp16":           (360.0, (-15.0, 15.0),   16,    16 / 55.296e-6, 0.5,  100.0, 0.03,  None),
+    "vlp32c":          (360.0, (-25.0, 15.0),   32,    32 / 55.296e-6, 1.0,  200.0, 0.03,  None),
+    "os0_128":         (360.0, (-45.0, 45.0),   128,   1_310_720.0,    0.5,  35.0,  0.02,  0.01),
+    "os0_64":          (360.0, (-45.0, 45.0),   64,    655_360.0,      0.5,  35.0,  0.02,  0.01),
+    "os0_32":          (360.0, (-45.0, 45.0),   32,    327_680.0,      0.5,  35.0,  0.02,  0.01),
+    "os1_128":         (360.0, (-22.5, 22.5),   128,   1_310_720.0,    0.5,  90.0,  0.01,  0.01),
+    "os1_64":          (360.0, (-22.5, 22.5),   64,    655_360.0,      0.5,  90.0,  0.01,  0.01),
+    "os1_32":          (360.0, (-22.5, 22.5),   32,    327_680.0,      0.5,  90.0,  0.01,  0.01),
+    "os2_128":         (360.0, (-11.25, 11.25), 128,   1_310_720.0,    0.8,  200.0, 0.03,  0.01),
+    "os2_64":          (360.0, (-11.25, 11.25), 64,    655_360.0,      0.8,  200.0, 0.03,  0.01),
+    "os2_32":          (360.0, (-11.25, 11.25), 32,    327_680.0,      0.8,  200.0, 0.03,  0.01),
+    "xt32":            (360.0, (-16.0, 15.0),   32,    640_000.0,      0.05, 80.0,  0.005, None),
+    "xt16":            (360.0, (-15.0, 15.0),   16,    320_000.0,      0.05, 80.0,  0.005, None),
+    "unitree_l1":      (360.0, (0.0, 90.0),     1,     21_600.0,       0.05, 30.0,  0.02,  None),
+    "unitree_l2":      (360.0, (0.0, 90.0),     1,     63_936.0,       0.05, 30.0,  0.02,  None),
+    "airy":            (360.0, (0.0, 90.0),     96,    864_000.0,      0.1,  30.0,  0.02,  None),
 }
 # fmt: on
+_OUSTERS = {f"os{k}_{channels}": (k, channels) for k in range(3) for channels in (128, 64, 32)}
 _OUSTER = "Ouster {} datasheet, Rev 7; precision depends on range, a middle value; minimum range 0.3-0.5 m by firmware"
 _NAMES_AND_SOURCES = {
     "mid360": ("Livox Mid-360", "Livox Mid-360 user manual v1.0, specifications: sigma at 10 m"),
@@ -152,15 +136,26 @@ _NAMES_AND_SOURCES = {
         "not re-checked: 64,000 points/s, sweeps and turns/s, range at 90 %, sigma",
     ),
     "airy": ("RoboSense Airy", "RoboSense Airy product page and driver (rs_driver); ranges not re-checked"),
-    **{
-        f"os{k}_{channels}": (f"Ouster OS{k}-{channels}", _OUSTER.format(f"OS{k}"))
-        for k in range(3)
-        for channels in (128, 64, 32)
-    },
+    **{name: (f"Ouster OS{k}-{channels}", _OUSTER.format(f"OS{k}")) for name, (k, channels) in _OUSTERS.items()},
 }
 
+
+def _pattern(preset: str) -> ScanPattern:
+    """The scan pattern of a device; PyTorch, which it needs, is loaded here."""
+    from . import patterns
+
+    if preset in _OUSTERS:
+        k, channels = _OUSTERS[preset]
+        return getattr(patterns, f"os{k}")(channels)
+    return getattr(patterns, preset)()
+
+
 DEVICES: dict[str, DeviceSpec] = {
-    preset: DeviceSpec(*_NAMES_AND_SOURCES[preset], **dict(zip(_COLUMNS, row, strict=True)))  # type: ignore[arg-type]
+    preset: DeviceSpec(
+        *_NAMES_AND_SOURCES[preset],
+        pattern=partial(_pattern, preset),
+        **dict(zip(_COLUMNS, row, strict=True)),  # type: ignore[arg-type]
+    )
     for preset, row in _TABLE.items()
 }
 """Every commercial sensor, by the name of its preset."""

@@ -89,4 +89,4 @@ def _extrinsic(text: str | None) -> Extrinsic:
     return Extrinsic(numbers[:3], numbers[3:])
 
 
-command = Command(main, Arguments, __doc__, errors=(DeployError,))
+command = Command(main, Arguments, __doc__)

@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 
 from omnirobot.common.cli import PICTURES, Command, argument
-from omnirobot.common.figures import PlotsUnavailable
 from omnirobot.replay.bags import Topics, events
 from omnirobot.replay.replay import draw, replay
 from omnirobot.runtime import DeployError, ExportedPolicy
@@ -67,4 +66,4 @@ def _command(text: str | None) -> np.ndarray | None:
     return numbers
 
 
-command = Command(main, Arguments, __doc__, errors=(DeployError, PlotsUnavailable), first="file")
+command = Command(main, Arguments, __doc__, first="file")

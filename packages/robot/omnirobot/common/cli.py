@@ -44,7 +44,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omnirobot.common.errors import ConfigError, UnknownKey, of_a_disk, one_line
+from omnirobot.common.errors import ConfigError, UnknownKey, UserError, of_a_disk, one_line
 
 INTERRUPTED, UNREAD = 130, 141  # as of a shell: 128 + SIGINT, 128 + SIGPIPE
 _SIMPLER, _SIGNS = "omniperception.simpler", {"–": "-", "…": "..."}
@@ -98,8 +98,8 @@ class Command:
         doc: help; its first line says what the command does.
         overrides: what other `key=value` arguments and `--config-dir` change, such as "of the run's configuration";
             empty: they are refused.
-        errors: exceptions beside ConfigError whose message is for the user.
-        flags: words such as -m that stay among the overrides.
+        errors: exceptions beside UserError whose message is for the user.
+        flags: such as -m, that stay among the overrides, each with the words without '=' after it.
         first: argument that a first word without '=' gives, such as `file` of `robot-new FILE`; empty: none.
     """
 
@@ -120,7 +120,7 @@ class Command:
         if {"-h", "--help"} & set(argv):
             print(self.help(name or f"python {sys.argv[0]}"))
             return
-        for_the_user: tuple[type[Exception], ...] = (ConfigError, *self.errors)
+        for_the_user: tuple[type[Exception], ...] = (UserError, *self.errors)
         try:
             arguments, overrides = self.parse(argv)
             self.main(arguments, overrides) if self.overrides else self.main(arguments)
@@ -137,12 +137,15 @@ class Command:
         """Arguments and overrides of a command line."""
         fields = {field.name: field for field in dataclasses.fields(self.arguments)}
         hints = typing.get_type_hints(self.arguments)
-        given, keys, overrides = {}, set(), []
+        given, keys, overrides, is_of_flag = {}, set(), [], False
         for k, text in enumerate(self._without_flags(argv)):
+            if is_of_flag := text.startswith("-") or (is_of_flag and "=" not in text and not text.startswith("~")):
+                overrides.append(text)
+                continue
             if k == 0 and self.first and (Path(text).exists() or not ("=" in text or text.startswith("~"))):
                 text = f"{self.first}={text}"
             key, separator, value = text.partition("=")
-            if not separator and not text.startswith("~") and text not in self.flags:
+            if not separator and not text.startswith("~"):
                 raise ConfigError(f"argument '{text}' is not of the form key=value")
             if key in keys:
                 raise ConfigError(f"{key} is given twice")
@@ -170,10 +173,8 @@ class Command:
                 if not folder or not os.path.isdir(path):
                     raise ConfigError(f"{flag} {folder}: there is no such folder")
                 folders.append("'file://{}'".format(path.replace("'", r"\'")))
-            elif word in self.flags:
-                rest.append(word)
-            elif word.startswith("-"):
-                known = ["--help", *self.flags, *(["--config-dir DIR"] if self.overrides else [])]
+            elif word.startswith("-") and flag not in self.flags:
+                known = ["--help", *(["--config-dir DIR"] if self.overrides else []), *self.flags]
                 raise ConfigError(f"{word} is unknown; known flags: {', '.join(known)}")
             else:
                 rest.append(word)

@@ -17,7 +17,11 @@ _OF_A_DISK = {
 """What mends an error of a file system, by names of its number."""
 
 
-class ConfigError(ValueError):
+class UserError(Exception):
+    """An error whose message is one line for the user; a command ends with it and exit code 2."""
+
+
+class ConfigError(UserError, ValueError):
     """A configuration that cannot run; the message is one line that says what to change."""
 
 

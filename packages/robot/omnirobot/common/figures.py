@@ -6,13 +6,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnirobot.common.errors import naming
+from omnirobot.common.errors import UserError, naming
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class PlotsUnavailable(ImportError):
+class PlotsUnavailable(UserError, ImportError):
     """matplotlib is not installed."""
 
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 from omnirobot.common.coverage import NUM_SECTORS
-from omnirobot.common.errors import naming
+from omnirobot.common.errors import UserError, naming
 from omnirobot.common.shell import command_line
 
 FORMAT = "omniperception-policy"
@@ -19,7 +19,7 @@ FINGERPRINT = "omniperception-description"
 """Key of the ONNX file's metadata: fingerprint of the description that belongs to it."""
 
 
-class DeployError(ValueError):
+class DeployError(UserError, ValueError):
     """An exported policy cannot be read or was given something else than it expects; the message is one line."""
 
 
