@@ -43,11 +43,11 @@ ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("num_envs=2", "ppo.hidden_dims=[32,16]", "seed=3")
 RECIPES = {
     "none": ("experiment=walk",),
-    "fps_mlp": ("perception=fps_mlp", "perception.sampler.num_points=64", "observations=paper"),
-    "fps_gru": ("perception=fps_gru", "perception.sampler.num_points=64"),
-    "direct_mlp": ("perception=direct_mlp", "perception.history=3"),
-    "pd_risknet": ("perception=pd_risknet", "obstacles=static"),
-    "proximity_gru": ("perception=proximity_gru", "randomization=paper"),
+    "fps_mlp": ("~experiment", "perception=fps_mlp", "perception.sampler.num_points=64", "observations=paper"),
+    "fps_gru": ("~experiment", "perception=fps_gru", "perception.sampler.num_points=64"),
+    "direct_mlp": ("~experiment", "perception=direct_mlp", "perception.history=3"),
+    "pd_risknet": ("~experiment", "perception=pd_risknet", "obstacles=static"),
+    "proximity_gru": ("~experiment", "perception=proximity_gru", "randomization=paper"),
     "pd_risknet_no_distal": overrides_of("pd_risknet_no_distal"),
     "proximity_gru_no_proximal": overrides_of("proximity_gru_no_proximal"),
     "polar_rings": ("experiment=avoid", "init=unread", "rewards.avoidance.max_acceleration=2.0"),
@@ -178,7 +178,8 @@ def test_the_actions_are_those_of_torch(exported_run, recipe):
 def test_a_policy_sees_with_a_head_that_turns(tmp_path):
     """What it makes of points is what training made of them, with the neck bent."""
     folder = write_preset(tmp_path, BIPED.replace('name="neck" axis="0 0 1"', 'name="neck" axis="0.3 1 0"'))
-    given = ("robot=biped", "lidar.mount=eyes", "perception=proximity_gru", "obstacles=static", "lidar.num_rays=300")
+    given = ("~experiment", "robot=biped", "lidar.mount=eyes", "perception=proximity_gru", "obstacles=static")
+    given += ("lidar.num_rays=300",)
     down = ("robot.mounts.eyes.rpy=[3.0,0.2,0.3]", "perception.sampler.band_edges=[-0.6,-0.4,-0.2,0.0,0.15,0.5,3.0]")
     run = build.assemble(config.compose([folder, *given, *down, *SMALL]))
     config.save(run.composed, tmp_path)
@@ -218,7 +219,9 @@ GIMBAL = """<body name="gimbal" pos="0.04 0 0.08" euler="20 0 50">
 
 def _lidar_of(folder, text=BIPED, preset=BIPED_PRESET):
     run = build.assemble(
-        config.compose([write_preset(folder, text, preset), "robot=biped", "lidar=vlp16", "perception=none"])
+        config.compose(
+            ["~experiment", write_preset(folder, text, preset), "robot=biped", "lidar=vlp16", "perception=none"]
+        )
     )
     return export_module._lidar(run.env.lidar, run.env.robot), run.env.robot
 
@@ -545,7 +548,8 @@ def test_what_cannot_be_exported_is_named(exported_run, tmp_path):
 
 
 def test_a_range_that_is_not_the_sensors_cannot_be_exported():
-    run = build.assemble(config.compose(("perception=fps_mlp_small", "perception.sampler.max_range=5", "num_envs=1")))
+    farther = ("~experiment", "perception=fps_mlp_small", "perception.sampler.max_range=5", "num_envs=1")
+    run = build.assemble(config.compose(farther))
     with pytest.raises(config.ConfigError, match=r"perception\.sampler\.max_range=5(\.0)? cannot be exported"):
         describe(run, OmniEnv(run.env))
 

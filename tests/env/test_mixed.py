@@ -24,7 +24,7 @@ SHORT = ("families.crossing.episode_length_s=0.2", "families.hold.episode_length
 
 
 def compose(*overrides, num_envs=5):
-    return build.assemble(config.compose([f"num_envs={num_envs}", *overrides]))
+    return build.assemble(config.compose(["~experiment", f"num_envs={num_envs}", *overrides]))
 
 
 def families(*overrides, num_envs=5, task="blind"):
