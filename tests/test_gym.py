@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv  # noqa: E402
 
 BLIND = ("experiment=walk", "obstacles=none")
 WITH_LIDAR = ("experiment=quickstart", "obstacles.curriculum=null", "lidar.num_rays=100")
-SEEING = ("lidar.num_rays=200", "randomization=robot", "obstacles=moving")
+SEEING = ("~experiment", "lidar.num_rays=200", "randomization=robot", "obstacles=moving")
 STYLE = "symmetric and normalized|probably too|inf|env.spec"
 """What the checker would rather have, and says so."""
 

@@ -34,6 +34,7 @@ ROLES = {
     "scene": "robot, terrain, obstacles",
     "schema": "text to checked objects",
     "sim": "MuJoCo, MuJoCo Warp, planar",
+    "training": "a training from begin to end",
     "viewer": "a task live in the browser",
 }
 """What a box says; `packages` has to find exactly these."""

@@ -26,7 +26,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from omniperception import config
-from omnirobot.common.cli import Command, argument, fail, trust
+from omnirobot.common.cli import Command, argument, fail, terminal, trust
 from omnirobot.common.errors import UserError, one_line
 
 HYDRAS = (
@@ -83,7 +83,8 @@ def start(flags: Sequence[str], overrides: Sequence[str], trust: Sequence[str] =
         run_dir = Path(os.path.relpath(settings.runtime.output_dir))
         begun.append(run_dir)
         try:
-            training.train(config.finish(composed, settings.runtime.choices.get("condition")), run_dir, task, trust)
+            with terminal():  # or Hydra says more than what a disk refuses
+                training.train(config.finish(composed, settings.runtime.choices.get("condition")), run_dir, task, trust)
         except UserError as error:
             with suppress(OSError):  # nothing was written into it
                 run_dir.rmdir()

@@ -204,7 +204,7 @@ def test_a_reset_elsewhere_changes_no_error(blind):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("velocity_scale=[-0.1,1]", r"velocity_scale=\[-0.1, 1.0\] must not be negative"),
+        ("velocity_scale=[-0.1,1]", r"velocity_scale=\[-0.1, 1\] must be \[low, high\] with 0 <= low <= high"),
         ("gyro_noise=[0.2,-0.2]", r"gyro_noise=\[0.2, -0.2\] must be \[low, high\]"),
         ("velocity_drift={sd: -1, time_s: 1}", "a drift's sd=-1"),
         ("velocity_drift={sd: 1, time_s: 0}", "a drift's time_s=0"),

@@ -73,7 +73,7 @@ def test_the_free_time_is_that_of_the_straight_way(make_env):
     for commands, goal, expected in (
         (("commands=goal", "commands.radius=0.5"), (6.0, -5.0), 19.0),  # 6 m ahead, 8 m aside
         (("commands=goal", "commands.radius=null"), (12.0, 0.0), 24.0),
-        (("commands=goal", "commands.radius=0.5", "commands.hold_s=20.0"), (6.0, -5.0), 20.0),
+        (("commands=goal", "commands.radius=0.5", "+commands.hold_s=20.0"), (6.0, -5.0), 20.0),
     ):
         at = tuple(f"commands.goal_{axis}=[{x},{x}]" for axis, x in zip("xy", goal, strict=True))
         episodes = run_episodes(make_env(*BLIND, *commands, *spawn, *at, SHORT, "num_envs=2"), stand, 3)

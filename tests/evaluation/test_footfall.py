@@ -25,7 +25,7 @@ def test_shares_frequencies_and_bars_of_a_known_pattern():
 
 
 def test_robots_that_stand_have_all_feet_down_and_each_is_commanded_its_own(make_env, tmp_path):
-    env = make_env(*TASK, "observations.command_acceleration=[4,8]", extra_requirements=("foot_force",))
+    env = make_env(*TASK, "+observations.command_acceleration=[4,8]", extra_requirements=("foot_force",))
     seen = []
 
     def stand(observations):

@@ -21,7 +21,6 @@ import torch
 
 from omniperception import config
 from omniperception.commands import COMMANDS, main
-from omniperception.commands import evaluate as evaluate_command
 from omniperception.commands import robot_fetch as robot_fetch_command
 from omniperception.evaluation.report import gaits
 from omniperception.robots import fetch
@@ -125,7 +124,7 @@ def run(place):
 def asked(monkeypatch):
     """What an `evaluate` that is shown would measure, in all its worlds."""
     measured = []
-    monkeypatch.setattr(evaluate_command, "evaluate", measured.append)
+    monkeypatch.setattr("omniperception.evaluation.suite.evaluate", measured.append)
 
     def ask(words):
         main(words)

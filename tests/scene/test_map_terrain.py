@@ -235,7 +235,7 @@ PLAN, PLACE = ("terrain=plan",), ("terrain=place",)
         (("terrain=heights", "terrain.file=cube.npy", "terrain.heights=null"), r"holds \(2, 3, 4\); \(rows, cols\)"),
         ((*PLACE, "terrain.file=text.obj"), "terrain.file=text.obj|text.obj (cannot be read|holds no triangles)"),
         ((*PLACE, "terrain.scale=10000"), "too large for terrain.cell"),
-        ((*PLACE, "terrain.start.inside=[90,0]"), r"terrain.start.inside=\[90, 0\] lies beside the map"),
+        ((*PLACE, "terrain.start.inside=[90,0]"), r"terrain.start.inside=\[90.0, 0.0\] lies beside the map"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said_in_one_line(files, make_env, overrides, message):
