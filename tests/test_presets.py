@@ -52,14 +52,12 @@ def test_every_preset_says_what_it_is():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_composes_builds_and_steps(preset):
+def test_every_preset_composes_builds_and_steps(preset, make_config):
     group, name = preset.split("/")
     if group == "robot":
         skip_if_not_fetched(name)
     beside = [*COMPANIONS.get(preset, []), *(QUICK if group == "lidar" and name != "none" else [])]
-    given = [*beside, f"{group}={name}", "num_envs=2"]
-    plain = [] if any(override.startswith("experiment=") for override in given) else ["~experiment"]
-    run = build.assemble(config.compose([*plain, *given]))
+    run = make_config(*beside, f"{group}={name}", "num_envs=2")
     if preset.startswith(LEARNING):
         runner = build_runner(run, None)
         env = runner.env

@@ -13,6 +13,8 @@ CLOSE = 0.4
 """Decay (m) of the second number of a sector's distance, which resolves what is close."""
 SPEED = 1.5
 """Obstacles' velocities are divided by it (m/s)."""
+NEARNESS = slice(3, 3 + NUM_SECTORS)
+"""Where in `navigation_inputs` the nearness of the sectors is, behind the choice and the commanded yaw rate."""
 OWN_MOTION = 9
 """Numbers of the robot's own motion: reference, velocity and asked velocity, three each."""
 

@@ -9,7 +9,7 @@ from rsl_rl.modules import MLP
 from tensordict import TensorDict
 from torch import nn
 
-from omniperception.avoidance.navigation import NUM_SECTORS, navigation_inputs, num_inputs
+from omniperception.avoidance.navigation import NEARNESS, navigation_inputs, num_inputs
 from omniperception.avoidance.velocity_risk import VelocityRisk
 from omniperception.common.checked import Pair, Positive, Widths, checked
 from omniperception.learning.estimator import EstimatingModel
@@ -65,7 +65,7 @@ class CorrectedChoice(nn.Module):
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """(n, 3) velocities from `navigation_inputs` (n, D)."""
-        nearest = inputs[:, 3 : 3 + NUM_SECTORS].amax(1, keepdim=True)
+        nearest = inputs[:, NEARNESS].amax(1, keepdim=True)
         return inputs[:, :3] + (2.0 * nearest).clamp(max=1.0) * self.network(inputs)
 
 
