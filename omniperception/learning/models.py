@@ -167,6 +167,11 @@ class PerceptionActor(EstimatingModel):
         """Number of the newest LiDAR frame acted on; None after a reset."""
         return None if self._newest is None else self._newest[0]
 
+    @property
+    def newest(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """(N, D + K) embeddings that it acts on since that frame, and (1, D + K) the one of no frame."""
+        return None if self._newest is None else self._newest[1:]
+
     def embed(self, obs: WindowedObservations) -> torch.Tensor:
         """(B, D) embeddings of the steps of an update, or (B, D + K) those that were acted on; each window is embedded
         once."""
@@ -179,10 +184,6 @@ class PerceptionActor(EstimatingModel):
             windows = self.perception(obs.frames, obs.window_count)
         table = torch.cat([windows.flatten(0, 1), empty])
         return table[torch.where(obs.step_count > 0, obs.step_window, table.shape[0] - 1)]
-
-    def embed_windows(self, obs: WindowedObservations) -> torch.Tensor:
-        """(E, W, D) embeddings of an update's windows, extended for the read-out."""
-        return self._extend(self.perception(obs.frames, obs.window_count))
 
     def embed_empty(self, frames: torch.Tensor) -> torch.Tensor:
         """(1, D) embedding of a history without a frame, extended for the read-out; see `PerceptionNetwork.empty`."""

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn import functional
 
 from omniperception.learning import distributed
-from omniperception.learning.storage import Embedded, PerceptiveStorage, WindowedObservations
+from omniperception.learning.storage import PerceptiveStorage, WindowedObservations
 
 if TYPE_CHECKING:
     from omniperception.learning.ppo import PerceptivePpo
@@ -88,7 +88,7 @@ class FitPerception(Phase):
         """
         alg, first, last = self.alg, self.config.learning_rate, self.config.final_learning_rate
         self.optimizer.param_groups[0]["lr"] = alg.annealed(first, last)
-        acted_on = self._embedded(storage) if alg.learns_policy else None
+        acted_on, storage.acted_on = storage.acted_on, None
         for _ in range(self.config.supervised_epochs):
             for env_ids in storage.shuffled_envs(alg.num_mini_batches):
                 obs = storage.observations_of(env_ids, storage.first_steps)
@@ -99,16 +99,6 @@ class FitPerception(Phase):
                 self.step(loss)
         storage.acted_on = acted_on
         return alg.actor.pop_supervised_losses()
-
-    def _embedded(self, storage: PerceptiveStorage) -> Embedded | None:
-        """What the policy acted on, in as many parts as there are mini-batches; None without a frame."""
-        if not storage.frame_count.any():
-            return None
-        actor, env_ids = self.alg.actor, torch.arange(storage.num_envs, device=self.alg.device)
-        parts = [storage.observations_of(part) for part in env_ids.tensor_split(self.alg.num_mini_batches)]
-        with torch.no_grad():
-            windows = torch.cat([actor.embed_windows(part) for part in parts])
-            return Embedded(windows, actor.embed_empty(storage.frames))
 
 
 class FitEstimator(Phase):

@@ -156,7 +156,8 @@ class PerceptivePpo(PPO):
         """Sample actions; LiDAR frames are copied now because the environment may reuse their memory."""
         actions = super().act(obs)
         if self.storage.has_frames:
-            self.storage.record_frames(obs, self.actor.tick)
+            fixed = "perception" in self.fitting and self.learns_policy
+            self.storage.record_frames(obs, self.actor.tick, self.actor.newest if fixed else None)
         return actions
 
     def annealed(self, first: float, last: float | None) -> float:

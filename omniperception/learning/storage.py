@@ -79,7 +79,7 @@ class PerceptiveStorage(RolloutStorage):
     Attributes:
         has_frames: whether the actor reads LiDAR frames.
         frames: (N, H - 1 + W, P, 3) frames of the rollout, oldest first.
-        acted_on: see `Embedded`.
+        acted_on: embeddings that the policy acted on, where they were recorded.
     """
 
     def __init__(
@@ -123,12 +123,16 @@ class PerceptiveStorage(RolloutStorage):
         """The first control step of this rollout at which each window is the newest."""
         return [self._ticks.index(tick) for tick in range(self._ticks[0], self._ticks[-1] + 1)]
 
-    def record_frames(self, obs: TensorDict, tick: int) -> None:
+    def record_frames(
+        self, obs: TensorDict, tick: int, embedded: tuple[torch.Tensor, torch.Tensor] | None = None
+    ) -> None:
         """Copy what is new in the observations of the current step; call before the environment moves on.
 
         Args:
             obs: observations of the step.
             tick: number of their newest frame, which is the same in all environments.
+            embedded: (N, D) embeddings that the policy acts on and (1, D) that of no frame, to be the update's; None:
+                the update embeds the frames itself.
         """
         if not self._ticks:
             self.frames[:, : self.history].copy_(obs["frames"])
@@ -146,8 +150,17 @@ class PerceptiveStorage(RolloutStorage):
                     f" but steps_per_frame={self.steps_per_frame}; set it to the environment's value"
                 )
             self.frames[:, slot].copy_(obs["frames"][:, -1])
+        if embedded is not None and (not self._ticks or tick != self._ticks[-1]):
+            self._record_embedded(tick - self._ticks[0] if self._ticks else 0, *embedded)
         self._ticks.append(tick)
         self.frame_count[self.step].copy_(obs["frame_count"].squeeze(-1))
+
+    def _record_embedded(self, window: int, newest: torch.Tensor, empty: torch.Tensor) -> None:
+        """Copy embeddings (N, D) of a window of all environments, and (1, D) of no frame."""
+        if self.acted_on is None:
+            num_windows = self.frames.shape[1] - self.history + 1
+            self.acted_on = Embedded(newest.new_zeros(len(newest), num_windows, newest.shape[1]), empty.clone())
+        self.acted_on.windows[:, window].copy_(newest)
 
     def add_transition(self, transition: RolloutStorage.Transition) -> None:
         """Store one transition; of the observations only the groups that are read."""
@@ -220,5 +233,5 @@ class PerceptiveStorage(RolloutStorage):
             window_count=count.t().contiguous().long(),
             step_window=(first + windows.unsqueeze(1)).flatten(),
             step_count=step_count.flatten().long(),
-            acted_on=fixed and Embedded(fixed.windows[env_ids], fixed.empty),
+            acted_on=fixed and Embedded(fixed.windows[env_ids, :num_windows], fixed.empty),
         )
