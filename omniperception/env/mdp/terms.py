@@ -10,6 +10,7 @@ from typing import NamedTuple, cast
 import torch
 
 from omniperception.avoidance.velocity import AvoidanceConfig
+from omniperception.common.checked import AtLeastOne, checked
 from omniperception.env.state import EnvState, Marked, requirements
 
 Term = Callable[..., torch.Tensor]
@@ -107,7 +108,7 @@ class RewardsConfig:
         return frozenset().union(*(requirements(term.func) for term in self.terms.values()))
 
 
-@dataclass(frozen=True)
+@checked("observations: ")
 class ObservationGroup:
     """Terms concatenated in order, `history` control steps of them (newest last).
 
@@ -117,11 +118,7 @@ class ObservationGroup:
     """
 
     terms: Mapping[str, Term]
-    history: int = 1
-
-    def __post_init__(self) -> None:
-        if self.history < 1:
-            raise ValueError(f"observations: history={self.history} must be at least 1")
+    history: AtLeastOne = 1
 
 
 class ActorInput(NamedTuple):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 from rsl_rl.utils.log_writer import LogWriter
 
+from omniperception.common.checked import AtLeastOne, Positive, checked
 from omnirobot.common.errors import UserError
 
 
@@ -18,7 +18,7 @@ class LoggerError(UserError):
     """A service that does not take what is logged."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("logger")
 class LoggerConfig:
     """TensorBoard files in the run directory; the other loggers write them as well, and more.
 
@@ -27,16 +27,10 @@ class LoggerConfig:
         video_s: their length (s).
     """
 
-    video_interval: int | None = None
-    video_s: float = 10.0
+    video_interval: AtLeastOne | None = None
+    video_s: Positive = 10.0
     extra: ClassVar[str] = ""
     """Extra of this package, and library, that it needs."""
-
-    def __post_init__(self) -> None:
-        if self.video_interval is not None and self.video_interval < 1:
-            raise ValueError(f"logger.video_interval={self.video_interval} must be at least 1, or null for no videos")
-        if self.video_s <= 0:
-            raise ValueError(f"logger.video_s={self.video_s} must be positive")
 
     def check(self) -> None:
         """Raises LoggerError where the library is missing."""
@@ -60,7 +54,6 @@ class LoggerConfig:
         return TensorBoardWriter(run_dir, first_iteration, settings)
 
 
-@dataclass(frozen=True, kw_only=True)
 class ServiceConfig(LoggerConfig):
     """A service beside the TensorBoard files.
 
@@ -76,21 +69,18 @@ class ServiceConfig(LoggerConfig):
         return module.Writer(run_dir, first_iteration, settings, self.project)
 
 
-@dataclass(frozen=True, kw_only=True)
 class WandbConfig(ServiceConfig):
     """Weights & Biases. Its own environment variables hold, such as WANDB_MODE=offline."""
 
     extra: ClassVar[str] = "wandb"
 
 
-@dataclass(frozen=True, kw_only=True)
 class MlflowConfig(ServiceConfig):
     """MLflow, whose experiment is the project. Its own environment variables hold, such as MLFLOW_TRACKING_URI."""
 
     extra: ClassVar[str] = "mlflow"
 
 
-@dataclass(frozen=True, kw_only=True)
 class TrackioConfig(ServiceConfig):
     """Trackio. Its own environment variables hold, such as TRACKIO_DIR."""
 
