@@ -48,7 +48,9 @@ FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
 def blocks() -> dict[str, str]:
     """The blocks of Python of the LiDAR's page, by what is in and out of them."""
     found = re.findall(r"```python\n(.*?)```", LIDAR.read_text(), flags=re.DOTALL)
-    return dict(zip(("numpy", "torch", "mujoco", "simulators", "mesh", "sizes", "table", "files"), found, strict=True))
+    return dict(
+        zip(("numpy", "torch", "mujoco", "newton", "simulators", "mesh", "sizes", "table", "files"), found, strict=True)
+    )
 
 
 @pytest.fixture
@@ -186,6 +188,15 @@ def test_torch(run):
     floor, box = (cloud.points_w[cloud.class_id == k] for k in (0, 1))
     assert len(box) > 1000 and floor[:, 2].abs().max() < 0.1  # five sigma of the noise
     assert (box[:, :2].median(0).values - torch.tensor([2.0, 1.0])).abs().max() < 0.4
+
+
+def test_a_newton_model(run):
+    pytest.importorskip("newton")
+    names = run("newton")
+    scene, ranges = names["scene"], names["ranges"]
+    assert scene.num_envs == 16 and ranges.shape == (16, 2000)
+    below = ranges.isfinite().float().mean(1)  # the ground, under scans that begin elsewhere
+    assert float(below.min()) > 0.02 and float(below.max()) < 0.4, below
 
 
 def test_a_compiled_mujoco_model(run):

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .meshes import TriangleMesh
     from .motion import PoseTrack
     from .mujoco import GeomShapes, MujocoScene, geom_shapes
+    from .newton import NewtonScene
     from .patterns import (
         LIVOX,
         ScanPattern,
@@ -70,6 +71,7 @@ _LOADED_WHEN_USED = {
     "meshes": ("TriangleMesh",),
     "motion": ("PoseTrack",),
     "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
+    "newton": ("NewtonScene",),
     "patterns": (
         *("LIVOX", "ScanPattern", "Selection", "custom", "grid", "height_scanner", "make_selection"),
         *("avia", "hap", "horizon", "mid40", "mid70", "mid360", "mid360_measured", "tele15"),
@@ -100,6 +102,7 @@ __all__ = [
     "MaskNoise",
     "MixedPixels",
     "MujocoScene",
+    "NewtonScene",
     "Noise",
     "PointTable",
     "PoseTrack",
