@@ -23,12 +23,12 @@ from omnilidar import DEVICES, TriangleMesh
 from omnilidar.mesh_files import AXES, read_mesh, unit_hint
 from omniperception import build, config
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
-from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene, demo_scene, mesh_scene
+from omniperception.commands.scan.room import DemoScene, demo_scene, mesh_scene
 from omniperception.env.config import EnvConfig
 from omniperception.env.sensing import SensorConfig
 from omniperception.scene import RobotConfig
 from omniperception.viewer import PageOptions, serve_lab
-from omniperception.viewer.options import LOCALHOST, PAGE, PORT, Room
+from omniperception.viewer.options import LOCALHOST, PAGE, PORT
 from omnirobot.common.cli import Command, argument, refuse_arguments
 
 NO_TASK = ("~experiment", "perception=none", "observations=walk", "rewards=walk")
@@ -101,27 +101,10 @@ def _task(name: str, overrides: list[str]) -> EnvConfig:
 
 def _serve(arguments: Arguments, out: Path, overrides: list[str]) -> None:
     """The scan lab."""
-    robot = _task(arguments.lidar[0], overrides).robot
+    room = _surroundings(arguments, _task(arguments.lidar[0], overrides).robot, walkers=WALKERS)
     names = [name for name in config.presets("lidar", config.search_path(overrides)) if name != "none"]
     sensors = {name: partial(_device, name, arguments, overrides) for name in (*arguments.lidar, *names)}
-    room = lab_room(robot, _surroundings(arguments, robot, walkers=WALKERS))
     serve_lab(room, sensors, out, PageOptions(arguments.host, arguments.port))
-
-
-def lab_room(robot: RobotConfig, demo: DemoScene) -> Room:
-    """The demonstration scene as the scan lab takes it."""
-    return Room(
-        demo.scene,
-        robot,
-        demo.bodies,
-        demo.robot_geoms,
-        demo.movers,
-        demo.extent[:2],
-        demo.open_side,
-        {int(kind): COLOURS[kind] for kind in DemoClass},
-        {int(kind): value for kind, value in REFLECTIVITY.items()},
-        {int(kind): kind.name.lower() for kind in DemoClass},
-    )
 
 
 def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConfig:
