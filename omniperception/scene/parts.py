@@ -21,7 +21,7 @@ SIZES = {
     "mesh": ("half x", "half y", "half z"),
 }
 """Sizes (m) of each kind, in MuJoCo's order; those of a mesh are of the box around it."""
-_GEOM_TYPES = {
+GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -153,7 +153,7 @@ class Part:
         body = spec.worldbody.add_body(name=self.name, mocap=True)
         body.add_geom(
             name=self.name,
-            type=_GEOM_TYPES[self.kind],
+            type=GEOM_TYPES[self.kind],
             size=size,
             contype=1,
             conaffinity=0,

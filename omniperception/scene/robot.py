@@ -94,11 +94,8 @@ _BY_JOINT = ("kp", "kv", "torque_limits", "action_scale", "frictionloss", "armat
 """What a preset has as one number, or as one by joint."""
 
 
-_Positive, _NonNegative = Annotated[float, Field(gt=0)], Annotated[float, Field(ge=0)]
-_Outline = Annotated[
-    tuple[_Positive, _Positive, _Positive], AsTuple, "three positive lengths (m): behind, before, beside"
-]
-_Footprint = Annotated[tuple[_NonNegative, _NonNegative], AsTuple, "[half length, half width] (m), not negative"]
+_Outline = Annotated[tuple[Positive, Positive, Positive], AsTuple, "three positive lengths (m): behind, before, beside"]
+_Footprint = Annotated[tuple[NonNegative, NonNegative], AsTuple, "[half length, half width] (m), not negative"]
 _Pairs = Annotated[tuple[Annotated[tuple[str, str], AsTuple], ...], AsTuple, "pairs of bodies"]
 _Feet = Annotated[tuple[str | Names, ...], AsTuple, "a list of geoms, or of lists of them"]
 

@@ -176,7 +176,10 @@ class Panels:
         }
         for key, (label, done) in keys.items():
             command = self._gui.add_command(label, hotkey=key)  # type: ignore[arg-type]  # viser's literals
-            command.on_trigger(lambda event, done=done: self._page.ask(done))
+            command.on_trigger(partial(self._pressed, done))
+
+    def _pressed(self, act: Callable[[], None], event: Any) -> None:
+        self._page.ask(act)
 
     def _stick(self) -> Velocity:
         ahead, aside, turn = (float(slider.value) for slider in self._sliders)

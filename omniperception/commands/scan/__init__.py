@@ -27,8 +27,8 @@ from omniperception.commands.scan.room import DemoScene, demo_scene, mesh_scene
 from omniperception.env.config import EnvConfig
 from omniperception.env.sensing import SensorConfig
 from omniperception.scene import RobotConfig
-from omniperception.viewer import PageOptions, serve_lab
-from omniperception.viewer.options import LOCALHOST, PAGE, PORT
+from omniperception.viewer import serve_lab
+from omniperception.viewer.options import PAGE, PageArguments
 from omnirobot.common.cli import Command, argument, refuse_arguments
 
 NO_TASK = ("~experiment", "perception=none", "observations=walk", "rewards=walk")
@@ -40,7 +40,7 @@ WALKERS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(PageArguments):
     """The command's own arguments."""
 
     lidar: tuple[str, ...] = argument(("mid360",), "presets of conf/lidar")
@@ -57,10 +57,6 @@ class Arguments:
     )
     at: tuple[float, ...] = argument((0.0, 0.0, 0.0), "where in the mesh the robot's feet stand (m, z up)")
     viewer: str = argument("none", "web: the scan lab in the browser", choices=("none", "web"))
-    host: str = argument(
-        LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
-    )
-    port: int = argument(PORT, "port at which viewer=web listens", least=1)
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
@@ -104,7 +100,7 @@ def _serve(arguments: Arguments, out: Path, overrides: list[str]) -> None:
     room = _surroundings(arguments, _task(arguments.lidar[0], overrides).robot, walkers=WALKERS)
     names = [name for name in config.presets("lidar", config.search_path(overrides)) if name != "none"]
     sensors = {name: partial(_device, name, arguments, overrides) for name in (*arguments.lidar, *names)}
-    serve_lab(room, sensors, out, PageOptions(arguments.host, arguments.port))
+    serve_lab(room, sensors, out, arguments.page)
 
 
 def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConfig:
