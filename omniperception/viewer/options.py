@@ -26,7 +26,7 @@ SWITCHED = ("scenario", "condition", "terrain", "obstacles", "lidar", "robot")
 """Groups of presets that are switched on the page; a scenario brings its own terrain and obstacles."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PageArguments:
     """Arguments of commands that mean something with viewer=web alone."""
 
@@ -45,7 +45,7 @@ PAGE = tuple(field.name for field in fields(PageArguments))
 """Their names."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PageOptions(PageArguments):
     """Where the page listens, and until when.
 
