@@ -34,6 +34,8 @@ PROCESS_FAULTS = {
 NO_FAULT = "none"
 KNOWN_FAULTS = (NO_FAULT, *PROCESS_FAULTS, *FAULTS)
 _STANDING_UP_S = 10.0
+_STARTUP_S = 600.0
+"""Longest that the simulation may take to start."""
 _FIRST_DOMAIN, _DOMAINS = 100, 100
 _NOT_THE_SAME = "are not from the same export"
 _LYING = 0.2
@@ -54,7 +56,6 @@ class TrialsConfig:
         limit_s: time from standing up within which the goal has to be reached.
         overrides: of the run's configuration.
         trust: packages of one's own that the run may name.
-        startup_s: longest that the simulation may take to start.
     """
 
     run: str
@@ -66,7 +67,6 @@ class TrialsConfig:
     limit_s: float
     overrides: Sequence[str] = ()
     trust: Sequence[str] = ()
-    startup_s: float = 600.0
 
     def __post_init__(self) -> None:
         if not (self.policy / FILE).is_file():
@@ -128,16 +128,16 @@ def _trial(config: TrialsConfig, scenario: str, fault: str, trial: int, domain: 
     simulation = _Simulation(words)
     robot: subprocess.Popen | None = None
     try:
-        simulation.await_line("robot-sim: ready", config.startup_s)
+        simulation.await_line("robot-sim: ready", _STARTUP_S)
         wire = [f"policy={policy}", "points=packets", "host=127.0.0.1", f"point_port={lidar}", f"steer=udp:{steer}"]
         robot = _start_robot([*wire, f"domain={domain}", f"report={work / 'robot.json'}"], work / "robot.txt")
         if fault == "swap":
-            robot.wait(config.startup_s)
+            robot.wait(_STARTUP_S)
             simulation.end(0.0)
-        elif fault == "kill" and simulation.await_line("robot-sim: walks", config.startup_s):
+        elif fault == "kill" and simulation.await_line("robot-sim: walks", _STARTUP_S):
             time.sleep(1.0)
             robot.kill()
-        simulation.join(config.startup_s + 10 * config.limit_s)
+        simulation.join(_STARTUP_S + 10 * config.limit_s)
     finally:
         if robot is not None and robot.poll() is None:
             robot.send_signal(signal.SIGINT)
