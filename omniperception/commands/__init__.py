@@ -24,17 +24,9 @@ COMMANDS = {
     "robot-fetch": "downloads robots that presets name and this package does not ship: Go1, G1",
     "plan": "lists what a configuration consists of and what was left out",
 }
+_TRAIN = "PIL hydra imageio_ffmpeg mujoco omegaconf pydantic rsl_rl tensorboard tensordict yaml"
 EXTRAS = {
-    "PIL": "train",
-    "hydra": "train",
-    "imageio_ffmpeg": "train",
-    "mujoco": "train",
-    "omegaconf": "train",
-    "pydantic": "train",
-    "rsl_rl": "train",
-    "tensorboard": "train",
-    "tensordict": "train",
-    "yaml": "train",
+    **dict.fromkeys(_TRAIN.split(), "train"),
     "matplotlib": "plots",
     "onnx": "export",
     **dict.fromkeys(("collada", "trimesh"), "meshes"),

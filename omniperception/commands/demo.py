@@ -20,14 +20,14 @@ import torch
 from omniperception import build, config
 from omniperception.commands.filming import FILM, FilmArguments, file_stem, film
 from omniperception.viewer import PageOptions, Shown, serve
-from omniperception.viewer.options import LOCALHOST, PAGE, PORT
+from omniperception.viewer.options import PAGE, PageArguments
 from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides
 
 RUN, SCENARIO = "avoider", "scenario=moving"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments(FilmArguments):
+class Arguments(FilmArguments, PageArguments):
     """The command's own arguments. The film is short and small: set-up and film take two minutes on two cores."""
 
     video_s: float = argument(8.0, "length of the video (s)", positive=True)
@@ -36,22 +36,21 @@ class Arguments(FilmArguments):
     viewer: str | None = argument(
         None, "how it is shown; null: in the browser where there is a display", choices=("web", "video")
     )
-    host: str = argument(LOCALHOST, "address of the page; the default is reached from this machine alone")
-    port: int = argument(PORT, "port of the page", least=1)
     stop_after_s: float | None = argument(None, "s after which the page is taken down; null: by Ctrl-C", positive=True)
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Opens the page, or writes the film."""
     run_dir, path = config.SHIPPED_RUNS / RUN, Path(f"{file_stem('demo', overrides)}.mp4")
-    num_envs = max(arguments.video.env_ids) + 1
+    num_envs = max(arguments.video_envs) + 1
     refuse_overrides(overrides, {"num_envs": num_envs})
     if not any(override.startswith(("scenario=", "obstacles=", "commands=")) for override in overrides):
         overrides = [SCENARIO, *overrides]
     viewer = arguments.viewer or ("web" if has_display() and importlib.util.find_spec("viser") else "video")
     if viewer == "web":
         refuse_arguments(arguments, FILM, "viewer=web films nothing")
-        options = PageOptions(arguments.host, arguments.port, arguments.stop_after_s, open_browser=has_display())
+        given = {name: getattr(arguments, name) for name in (*PAGE, "stop_after_s")}
+        options = PageOptions(**given, open_browser=has_display())
         return serve(Shown(run_dir, tuple(overrides)), options)
     if arguments.viewer == "video":
         refuse_arguments(arguments, (*PAGE, "stop_after_s"), "viewer=video has no page")

@@ -30,16 +30,16 @@ written, and the page switches worlds, conditions and policies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omniperception import config
 from omniperception.config import ConfigError
-from omniperception.evaluation.trials.policies import DRIVEN, POLICIES, SPLITS
-from omniperception.viewer import PageOptions, Shown, serve
-from omniperception.viewer.options import LOCALHOST, PAGE, PORT
-from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, trust
+from omniperception.evaluation.trials.policies import DRIVEN, POLICIES, Settings
+from omniperception.viewer import Shown, serve
+from omniperception.viewer.options import PAGE, PageArguments
+from omnirobot.common.cli import Command, argument, refuse_arguments
 
 if TYPE_CHECKING:
     from omniperception.evaluation.suite import World
@@ -49,7 +49,7 @@ MEASURED = ("trials", "num_envs", "jobs", "plots", "again", "out", "log")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(Settings, PageArguments):
     """The command's own arguments."""
 
     run: tuple[Path, ...] = argument((Path("latest"),), "run directories, or latest for the newest under outputs/")
@@ -57,27 +57,11 @@ class Arguments:
     scenario: tuple[str, ...] = argument(
         (), "scenarios in place of a suite, or all of held_out; corridor without either"
     )
-    split: str = argument("dev", "obstacles and seeds for choosing, or for reporting", choices=SPLITS)
-    condition: str | None = argument("ideal", "preset of conf/condition; null: the run's own randomization")
     policy: tuple[str, ...] = argument(("run",), "policies", choices=tuple(POLICIES))
-    trials: int = argument(250, "trials of each policy in each world", least=1)
-    num_envs: int = argument(64, "environments at a time in each process", least=1)
-    jobs: int | None = argument(
-        None, "worlds at a time, in a process of one thread each; null: as many as cores", least=1
-    )
     walker: str | None = argument(
         None, "run directory of experiment=walk or gait, whose gait stop, histogram and oracle drive"
     )
-    plots: bool = argument(False, "whether the worlds are drawn from above, with the ways")
-    again: bool = argument(False, "whether to measure again what has been measured before")
-    out: Path | None = argument(None, "file that the results are added to, for tables", suffixes=RESULTS)
-    log: Path | None = argument(None, "where split=test is noted; null: docs/lab/evaluations.jsonl of the checkout")
     viewer: str = argument("none", "web: look at the first policy in the first world", choices=("none", "web"))
-    host: str = argument(
-        LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
-    )
-    port: int = argument(PORT, "port at which viewer=web listens", least=1)
-    trust: tuple[str, ...] = trust()
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
@@ -87,14 +71,13 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
     worlds = _worlds(arguments, folders, any(o.split("=", 1)[0] == "terrain" for o in overrides))
     if arguments.viewer == "web":
         refuse_arguments(arguments, MEASURED, "viewer=web measures nothing")
-        return serve(_shown(arguments, runs[0], worlds[0], overrides), PageOptions(arguments.host, arguments.port))
+        return serve(_shown(arguments, runs[0], worlds[0], overrides), arguments.page)
     refuse_arguments(arguments, PAGE, f"viewer={arguments.viewer} has no page")
     if arguments.split != "test":
         refuse_arguments(arguments, ("log",), "only split=test is noted")
     if not set(DRIVEN) & set(arguments.policy):
         refuse_arguments(arguments, ("walker",), f"none of policy={','.join(arguments.policy)} drives a gait")
-    names = ("split", "condition", "trials", "num_envs", "jobs", "plots", "again", "out", "log", "trust")
-    given = {name: getattr(arguments, name) for name in names}
+    given = {field.name: getattr(arguments, field.name) for field in fields(Settings)}
     walker = config.find_run(arguments.walker, "walker") if arguments.walker else None
     from omniperception.evaluation.suite import Evaluation, evaluate
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omniperception.env.env import OmniEnv, Policy
-from omniperception.evaluation.film.camera import CAMERAS
 from omniperception.evaluation.film.video_options import VideoOptions
 from omnirobot.common.cli import argument
 
@@ -18,20 +17,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FilmArguments:
+class FilmArguments(VideoOptions):
     """Arguments that say what a film shows."""
 
     video_s: float = argument(20.0, "length of the video (s)", positive=True)
-    camera: str = argument(VideoOptions.camera, "where the video is taken from", choices=tuple(CAMERAS))
-    video_size: tuple[int, ...] = argument(VideoOptions.size, "width and height of the video (pixels)", least=2)
-    video_envs: tuple[int, ...] = argument(
-        VideoOptions.env_ids, "environments in the video; several make a grid", least=0
-    )
-
-    @property
-    def video(self) -> VideoOptions:
-        """The same, checked."""
-        return VideoOptions(self.video_size, self.video_envs, self.camera)
 
 
 FILM = tuple(field.name for field in fields(FilmArguments))
@@ -53,7 +42,7 @@ def film(arguments: FilmArguments, env: OmniEnv, policy: Policy, path: Path) -> 
     """
     from omniperception.evaluation.film.video import Recorder
 
-    recorder = Recorder(env, path, arguments.video_s, arguments.video, policy)
+    recorder = Recorder(env, path, arguments.video_s, arguments, policy)
     try:
         yield recorder
     finally:

@@ -48,8 +48,12 @@ from omnirobot.common.cli import RESULTS, Command, argument, refuse_arguments, r
 from omnirobot.common.errors import ConfigError
 from omnirobot.common.figures import check_figures
 
-RANGES, KICKS = ("rows", "factors", "preset", "trials", "out"), ("speeds", "bearings", "repeats")
-RESPONSE = ("conditions", "robots", "seconds")
+READ = {
+    "ranges": ("rows", "factors", "preset", "trials", "out"),
+    "kicks": ("speeds", "bearings", "repeats", "condition"),
+    "feet": ("condition",),
+    "response": ("conditions", "robots", "seconds"),
+}
 """Arguments that mean something for these alone."""
 OWN: dict[str, dict[str, object]] = {
     "ranges": {"num_envs": Evaluation.num_envs, "scenario": "walk"},
@@ -65,7 +69,7 @@ class Arguments:
     """The command's own arguments."""
 
     run: str = argument("latest", "run directory, or latest for the newest under outputs/")
-    what: str = argument("ranges", "what is tried", choices=("ranges", "kicks", "feet", "response"))
+    what: str = argument("ranges", "what is tried", choices=tuple(READ))
     rows: tuple[str, ...] = argument((), "rows of the randomization; none: all that have a range and concern the robot")
     factors: tuple[float, ...] = argument((0.5, 1.0, 1.5, 2.0, 2.5, 3.0), "multiples of the ranges")
     preset: str = argument("robot", "preset of randomization that has the ranges")
@@ -83,12 +87,7 @@ class Arguments:
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
     """Measures, prints a table and draws a picture."""
-    others = {
-        "ranges": (*KICKS, "condition", *RESPONSE),
-        "kicks": (*RANGES, *RESPONSE),
-        "feet": (*RANGES, *KICKS, *RESPONSE),
-        "response": (*RANGES, *KICKS, "condition"),
-    }[arguments.what]
+    others = {name for names in READ.values() for name in names} - {*READ[arguments.what]}
     refuse_arguments(arguments, others, f"it is not read for what={arguments.what}")
     refuse_overrides(overrides, OWN[arguments.what])
     run_dir = config.find_run(arguments.run)

@@ -23,23 +23,19 @@ from omniperception.common.provenance import provenance
 from omniperception.evaluation.report.tables import summary_table, times_line
 from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.learning.progress import ProgressLine
-from omniperception.viewer import PageOptions, Shown, serve
-from omniperception.viewer.options import LOCALHOST, PAGE, PORT
+from omniperception.viewer import Shown, serve
+from omniperception.viewer.options import PAGE, PageArguments
 from omnirobot.common.cli import Command, argument, refuse_arguments, refuse_overrides, trust
 from omnirobot.common.files import write_whole
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments(FilmArguments):
+class Arguments(FilmArguments, PageArguments):
     """The command's own arguments."""
 
     run: str = argument("latest", "run directory, or latest for the newest under outputs/")
     viewer: str = argument("video", "how it is shown", choices=("video", "web", "none"))
     trials: int = argument(200, "trials", least=1)
-    host: str = argument(
-        LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
-    )
-    port: int = argument(PORT, "port at which viewer=web listens", least=1)
     trust: tuple[str, ...] = trust()
 
 
@@ -50,18 +46,18 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         refuse_arguments(arguments, (*FILM, "trials"), "viewer=web counts and films nothing")
         refuse_overrides(overrides, {"num_envs": 1})
         shown = Shown(run_dir, tuple(overrides), trust=arguments.trust)
-        return serve(shown, PageOptions(arguments.host, arguments.port))
+        return serve(shown, arguments.page)
     refuse_arguments(arguments, PAGE, f"viewer={arguments.viewer} has no page")
     if arguments.viewer == "none":
         refuse_arguments(arguments, FILM, "viewer=none films nothing")
-    video, stem = arguments.video, file_stem("replay", overrides)
+    stem = file_stem("replay", overrides)
     run = build.load_run(run_dir, overrides, arguments.trust)
     build.check_split(run, "replay", run_dir)
     if not any(override.startswith("num_envs=") for override in overrides):
         run = replace(run, env=replace(run.env, num_envs=min(run.env.num_envs, arguments.trials)))
     films = arguments.viewer == "video"
     if films:
-        video.check_fits(run.env.num_envs)
+        arguments.check_fits(run.env.num_envs)
     trained = build.load_policy(run, run_dir)
     with ExitStack() as stack:
         movie = run_dir / f"{stem}.mp4"

@@ -26,18 +26,13 @@ from omnirobot.common.shell import command_line
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(Options):
     """The command's own arguments."""
 
     file: Path = argument(doc="MJCF or URDF of the robot; the preset names it like this")
     name: str | None = argument(None, "of the preset; null: the file's")
     out: Path = argument(Path("conf/robot"), "folder of the preset, called robot")
     again: bool = argument(False, "whether a preset of that name is written over")
-    joints: tuple[str, ...] = argument((), "actuated joints; none given: those with an actuator in the file, or all")
-    frequency: float = argument(2.0, "of a joint, with what hangs on it, as a spring (Hz)", positive=True)
-    damping_ratio: float = argument(0.5, "of that spring; 1 is critical", positive=True)
-    self_collision: bool = argument(True, "whether links that can touch each other do")
-    lidar: str | None = argument(None, "link that carries the LiDAR; null: the highest of no leg or arm")
 
 
 def main(arguments: Arguments) -> None:
@@ -56,14 +51,7 @@ def main(arguments: Arguments) -> None:
     path = arguments.out / f"{name}.yaml"
     if path.exists() and not arguments.again:
         raise ConfigError(f"{path} exists; give another name=..., or again=true to write over it")
-    options = Options(
-        arguments.joints,
-        arguments.frequency,
-        arguments.damping_ratio,
-        arguments.self_collision,
-        arguments.lidar,
-    )
-    found = guess(arguments.file, str(arguments.file), options)
+    found = guess(arguments.file, str(arguments.file), arguments)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, text_of(found, arguments.file))
     print(table_of(found))

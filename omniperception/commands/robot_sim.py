@@ -21,7 +21,6 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from omniperception import build, config
-from omniperception.deploy.faults import FAULTS
 from omniperception.deploy.simulated import CONTROL_STEPS, STEP_S, SimulatedConfig, run
 from omniperception.env.env import OmniEnv
 from omnirobot.common.cli import Command, argument, refuse_overrides, trust
@@ -37,21 +36,10 @@ WIRE = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(SimulatedConfig):
     """The command's arguments."""
 
     run: str = argument("latest", "run directory, for the robot, its LiDAR and the world")
-    interface: str = argument("lo", "network interface of DDS")
-    domain: int = argument(0, "of DDS", least=0)
-    crc: bool = argument(True, "whether states carry a checksum and commands without theirs are refused")
-    point_to: int = argument(56301, "UDP port of this machine that LiDAR packets go to", least=1)
-    steer_to: int | None = argument(None, "UDP port that the world's commands are sent to; null: none are")
-    hold_last: bool = argument(True, "whether motors go on with the last command when none comes")
-    sport_mode: str | None = argument(None, "name of a controller of its own, which runs until it is released")
-    fault: str | None = argument(None, "fault of the wire a second after it has begun to walk", choices=tuple(FAULTS))
-    fault_s: float = argument(2.0, "how long the fault lasts", positive=True)
-    report: Path | None = argument(None, "file of what became of the robot; null: none", suffixes=(".json",))
-    seconds: float | None = argument(None, "simulated time; null: until the goal or an interrupt", positive=True)
     trust: tuple[str, ...] = trust()
 
 
@@ -62,20 +50,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         if port is not None and not 0 < port < 65536:
             raise config.ConfigError(f"{name}={port} must be a port, 1 to 65535")
     env = world(config.find_run(arguments.run), overrides, arguments.trust)
-    wire = SimulatedConfig(
-        interface=arguments.interface,
-        domain=arguments.domain,
-        crc=arguments.crc,
-        point_to=("127.0.0.1", arguments.point_to),
-        steer_to=arguments.steer_to,
-        hold_last=arguments.hold_last,
-        sport_mode=arguments.sport_mode or "",
-        fault=arguments.fault or "",
-        fault_s=arguments.fault_s,
-        report=arguments.report,
-        seconds=arguments.seconds,
-    )
-    print(run(env, wire))
+    print(run(env, arguments))
 
 
 def world(run_dir: Path, overrides: list[str], trust: Sequence[str] = ()) -> OmniEnv:

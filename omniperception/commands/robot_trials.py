@@ -49,19 +49,8 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         folder = str(config.find_run(arguments.run))
         known = config.presets("scenario", config.search_path(overrides, config.read(Path(folder))))
         check_known("scenario", arguments.scenario, known)
-        run(
-            TrialsConfig(
-                run=folder,
-                policy=arguments.policy,
-                out=arguments.out,
-                scenarios=arguments.scenario,
-                faults=faults,
-                trials=arguments.trials,
-                limit_s=arguments.limit_s,
-                overrides=overrides,
-                trust=arguments.trust,
-            )
-        )
+        given = {name: getattr(arguments, name) for name in ("policy", "out", "trials", "limit_s", "trust")}
+        run(TrialsConfig(folder, scenarios=arguments.scenario, faults=faults, overrides=overrides, **given))
     print(table(results(arguments.out)))
 
 

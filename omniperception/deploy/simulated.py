@@ -14,17 +14,14 @@ import numpy as np
 import torch
 
 from omnilidar import Lidar
-from omniperception.deploy.faults import Faults
+from omniperception.deploy.faults import FAULTS, Faults
 from omniperception.env.env import OmniEnv
+from omnirobot.common.cli import argument
 from omnirobot.drive.machine import Request
 from omnirobot.runtime.description import DeployError
 from omnirobot.runtime.go2 import MOTORS
 from omnirobot.wire.dds import LOW_CMD_TOPIC, LOW_STATE_TOPIC, Network
-from omnirobot.wire.livox import (
-    POINT_PORT,
-    POINTS_PER_PACKET,
-    write_points,
-)
+from omnirobot.wire.livox import POINTS_PER_PACKET, write_points
 from omnirobot.wire.messages import LOW_CMD, LOW_STATE, MOTOR_ON, crc, sealed
 from omnirobot.wire.switcher import SwitcherService
 
@@ -39,39 +36,24 @@ _AFTER_FAULT_S = 6.0
 """From a fault's beginning to the end of the simulation."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SimulatedConfig:
-    """How the simulated robot behaves on the wire.
+    """How the simulated robot behaves on the wire; what it is in a world, `robot-sim` adds.
 
-    Attributes:
-        interface: network interface of DDS.
-        domain: of DDS.
-        crc: whether states carry a checksum, and commands without theirs are refused.
-        host: where LiDAR packets come from.
-        point_to: address and port that packets go to.
-        steer_to: UDP port of this machine that the world's commands are sent to, for `robot steer=udp:PORT`, with
-            stand and walk when the robot is ready; None: none are sent.
-        hold_last: whether the motors go on with the last command when none comes; otherwise they are limp after 0.1 s.
-            What a Go2 does is not known here: the first is the worst case.
-        sport_mode: name of a controller of its own, for which it ignores commands until it is released; empty: none.
-        fault: of faults.FAULTS, one second after it has begun to walk; empty: none.
-        fault_s: how long the fault lasts.
-        report: .json file of the outcome, for `robot-trials`; None: none is written.
-        seconds: simulated time; None: until it is ended.
+    What a Go2's motors do when no command comes is not known here: that they go on with the last is the worst case.
     """
 
-    interface: str = "lo"
-    domain: int = 0
-    crc: bool = True
-    host: str = "127.0.0.1"
-    point_to: tuple[str, int] = ("127.0.0.1", 56301)
-    steer_to: int | None = None
-    hold_last: bool = True
-    sport_mode: str = ""
-    fault: str = ""
-    fault_s: float = 2.0
-    report: Path | None = None
-    seconds: float | None = None
+    interface: str = argument("lo", "network interface of DDS")
+    domain: int = argument(0, "of DDS", least=0)
+    crc: bool = argument(True, "whether states carry a checksum and commands without theirs are refused")
+    point_to: int = argument(56301, "UDP port of this machine that LiDAR packets go to", least=1)
+    steer_to: int | None = argument(None, "UDP port that the world's commands are sent to; null: none are")
+    hold_last: bool = argument(True, "whether motors go on with the last command when none comes")
+    sport_mode: str | None = argument(None, "name of a controller of its own, which runs until it is released")
+    fault: str | None = argument(None, "fault of the wire a second after it has begun to walk", choices=tuple(FAULTS))
+    fault_s: float = argument(2.0, "how long the fault lasts", positive=True)
+    report: Path | None = argument(None, "file of what became of the robot; null: none", suffixes=(".json",))
+    seconds: float | None = argument(None, "simulated time; null: until the goal or an interrupt", positive=True)
 
 
 @dataclass
@@ -163,8 +145,8 @@ class Scanner:
         self._period_ns, self._rays = round(1e9 * period_s), rays
         self._left, self._number = np.zeros((0, 3), np.float32), 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind((config.host, 0 if config.host == "127.0.0.1" else POINT_PORT))
-        self._to: tuple[str, int] | None = config.point_to
+        self._socket.bind(("127.0.0.1", 0))
+        self._to: tuple[str, int] | None = ("127.0.0.1", config.point_to)
 
     def scan(self, time_s: float, faults: Faults) -> None:
         """Sends the packets of the points measured since the call before; time_s: now; faults: on their way."""
@@ -211,11 +193,11 @@ class SimulatedRobot:
         self.scanner = Scanner(env, config) if env.sensing is not None else None
         self._commands = network.reader(LOW_CMD_TOPIC, LOW_CMD, 2)
         self._states = network.writer(LOW_STATE_TOPIC, LOW_STATE)
-        self._switcher = SwitcherService(network, config.sport_mode)
+        self._switcher = SwitcherService(network, config.sport_mode or "")
         self._operator = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.outcome, self.time_s = Outcome(), 0.0
         self.up_since: float | None = None
-        self.faults, self._walks_since = Faults(config.fault, config.fault_s), math.inf
+        self.faults, self._walks_since = Faults(config.fault or "", config.fault_s), math.inf
         self._ticks, self._last_command = 0, -1.0
         self._path: tuple[torch.Tensor, torch.Tensor | None] | None = None
 
@@ -279,15 +261,13 @@ class SimulatedRobot:
         state["head"], state["level_flag"] = (0xFE, 0xEF), 0xFF
         imu, motors = state["imu_state"], state["motor_state"]
         imu["quaternion"], imu["gyroscope"] = positions[3:7], velocities[3:6]
-        for name, values in (("q", positions[7:]), ("dq", velocities[6:]), ("tau_est", self._torques())):
+        torques = self._env.sim.joint_torque()[0].numpy()
+        for name, values in (("q", positions[7:]), ("dq", velocities[6:]), ("tau_est", torques)):
             motors[name][order] = values
         motors["mode"][:12], motors["temperature"][:12] = MOTOR_ON, _TEMPERATURE
         state["tick"] = round(1e3 * self.time_s)
         state["power_v"] = 29.0
         return sealed(state) if self._config.crc else state
-
-    def _torques(self) -> np.ndarray:
-        return self._env.sim.joint_torque()[0].numpy()
 
     def _judge(self, moved: float) -> None:
         """Follows what becomes of the robot."""

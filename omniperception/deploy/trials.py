@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from omniperception.common.statistics import wilson
+from omniperception.common.tables import markdown
 from omniperception.deploy.faults import FAULTS, SENSORS
 from omnirobot.common.files import write_whole
 from omnirobot.common.shell import command_line
@@ -33,6 +34,8 @@ PROCESS_FAULTS = {
 NO_FAULT = "none"
 KNOWN_FAULTS = (NO_FAULT, *PROCESS_FAULTS, *FAULTS)
 _STANDING_UP_S = 10.0
+_STARTUP_S = 600.0
+"""Longest that the simulation may take to start."""
 _FIRST_DOMAIN, _DOMAINS = 100, 100
 _NOT_THE_SAME = "are not from the same export"
 _LYING = 0.2
@@ -53,7 +56,6 @@ class TrialsConfig:
         limit_s: time from standing up within which the goal has to be reached.
         overrides: of the run's configuration.
         trust: packages of one's own that the run may name.
-        startup_s: longest that the simulation may take to start.
     """
 
     run: str
@@ -65,12 +67,8 @@ class TrialsConfig:
     limit_s: float
     overrides: Sequence[str] = ()
     trust: Sequence[str] = ()
-    startup_s: float = 600.0
 
     def __post_init__(self) -> None:
-        unknown = [fault for fault in self.faults if fault not in KNOWN_FAULTS]
-        if unknown:
-            raise DeployError(f"faults={unknown[0]}: {', '.join(KNOWN_FAULTS)} were expected")
         if not (self.policy / FILE).is_file():
             line = command_line("export", f"run={self.run}", f"out={self.policy}")
             raise DeployError(f"policy={self.policy}: a folder that export has written was expected; write it: {line}")
@@ -130,16 +128,16 @@ def _trial(config: TrialsConfig, scenario: str, fault: str, trial: int, domain: 
     simulation = _Simulation(words)
     robot: subprocess.Popen | None = None
     try:
-        simulation.await_line("robot-sim: ready", config.startup_s)
+        simulation.await_line("robot-sim: ready", _STARTUP_S)
         wire = [f"policy={policy}", "points=packets", "host=127.0.0.1", f"point_port={lidar}", f"steer=udp:{steer}"]
         robot = _start_robot([*wire, f"domain={domain}", f"report={work / 'robot.json'}"], work / "robot.txt")
         if fault == "swap":
-            robot.wait(config.startup_s)
+            robot.wait(_STARTUP_S)
             simulation.end(0.0)
-        elif fault == "kill" and simulation.await_line("robot-sim: walks", config.startup_s):
+        elif fault == "kill" and simulation.await_line("robot-sim: walks", _STARTUP_S):
             time.sleep(1.0)
             robot.kill()
-        simulation.join(config.startup_s + 10 * config.limit_s)
+        simulation.join(_STARTUP_S + 10 * config.limit_s)
     finally:
         if robot is not None and robot.poll() is None:
             robot.send_signal(signal.SIGINT)
@@ -282,26 +280,25 @@ def _files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*-*-*.json"))
 
 
+_OUTCOMES = ("scenario", "fault", "trials", "untouched at the goal", "touched", "fell", "lay at the end", "refused")
+_TIMES = (
+    *("scenario", "fault", "steps", "p50", "p99", "begin late: p50", "p99", "late steps", "skipped", "frames"),
+    *("missed", "late points", "packets lost", "lag"),
+)
+
+
 def table(trials: Sequence[dict]) -> str:
     """Outcomes and timing, in Markdown; rates with 95 % Wilson intervals."""
-    head = "| scenario | fault | trials | untouched at the goal | touched | fell | lay at the end | refused |"
-    rows = [head, "|---" * 8 + "|"]
-    timing = [
-        "| scenario | fault | steps | p50 | p99 | begin late: p50 | p99 | late steps | skipped | frames | missed"
-        " | late points | packets lost | lag |"
-    ]
-    timing.append("|---" * 14 + "|")
-    keys = dict.fromkeys((trial["scenario"], trial["fault"]) for trial in trials)
-    for scenario, fault in keys:
-        group = [trial for trial in trials if (trial["scenario"], trial["fault"]) == (scenario, fault)]
-        cells = [_share(happened, len(group)) for happened in _counts(group)]
-        rows.append(f"| {scenario} | {fault} | {len(group)} | {' | '.join(cells)} |")
-        timing.append(f"| {scenario} | {fault} | {' | '.join(_timing(group))} |")
+    rows, timing = [], []
+    for key in dict.fromkeys((trial["scenario"], trial["fault"]) for trial in trials):
+        group = [trial for trial in trials if (trial["scenario"], trial["fault"]) == key]
+        rows.append([*key, len(group), *(_share(happened, len(group)) for happened in _counts(group))])
+        timing.append([*key, *_timing(group)])
     notes = (
         "Steps and their beginnings in ms; late: more than half a period; skipped: cost by a stall; missed: frames that"
         " were due and did not come; lag: most behind real time, ms (median, max)."
     )
-    return "\n".join([*rows, "", *timing, "", notes])
+    return "\n\n".join((markdown(_OUTCOMES, rows), markdown(_TIMES, timing), notes))
 
 
 def _counts(group: Sequence[dict]) -> list[int]:

@@ -259,7 +259,7 @@ def _tasks(ablation: Ablation) -> list[Task]:
         if not run_dir.is_dir():
             raise ConfigError(f"{run_dir} has not been trained; use stage=train or stage=all")
     same = Evaluation(
-        runs, worlds, policies=study.policies, split=study.split, trials=study.trials, trust=ablation.trust
+        runs, worlds, policies=study.policies, split=study.split, trials=study.trials, trust=tuple(ablation.trust)
     )
     return [task for condition in study.conditions for task in replace(same, condition=condition).tasks()]
 

@@ -31,7 +31,7 @@ from omniperception.evaluation.report.tables import progress_line, table
 from omniperception.evaluation.trials.baselines import baseline, commanded_ranges, prepared
 from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.evaluation.trials.exported import ExportedPolicies
-from omniperception.evaluation.trials.policies import BASELINES, DRIVEN, POLICIES
+from omniperception.evaluation.trials.policies import BASELINES, DRIVEN, POLICIES, Settings
 from omniperception.evaluation.trials.tracks import Tracks
 from omniperception.learning import CheckpointError, latest_checkpoint
 from omnirobot.common.errors import check_known, naming, one_line
@@ -62,42 +62,22 @@ class World:
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Settings of an evaluation.
+class Evaluation(Settings):
+    """An evaluation.
 
     Attributes:
         runs: run directories; several are the same training with other seeds.
         worlds: where.
         policies: names from POLICIES.
-        split: dev or test.
-        condition: preset of `condition`; None: the randomization that the run has, or the overrides give it.
-        trials: of each policy of each run in each world.
-        num_envs: environments at a time in each process.
-        jobs: tasks at a time, each in a process of one thread; None: as many as there are cores, 1 on a GPU.
         walker: run directory of a policy that follows velocity commands, for the policies that drive a gait; or None.
-        plots: whether ways are kept and drawn.
-        again: whether to measure what has been measured before.
-        out: file that the results are added to, beside the run's folder; or None.
-        log: where evaluations on the test split are noted; None: LOG in a checkout, otherwise the run's folder.
         overrides: changes to the configuration, on top of the scenario's.
-        trust: packages of one's own whose names the run's configuration may build.
     """
 
     runs: Sequence[Path]
     worlds: Sequence[World]
     policies: Sequence[str] = ("run",)
-    split: str = "dev"
-    condition: str | None = "ideal"
-    trials: int = 250
-    num_envs: int = 64
-    jobs: int | None = None
     walker: Path | None = None
-    plots: bool = False
-    again: bool = False
-    out: Path | None = None
-    log: Path | None = None
     overrides: Sequence[str] = ()
-    trust: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         folders = config.search_path(self.overrides, config.read(self.runs[0]))

@@ -123,10 +123,8 @@ class Body:
     def leg(self, link: int) -> list[int]:
         """Joints that carry a foot, from the base downwards."""
         links = self.above(link)[::-1][1:]
-        return [joint for at in links for joint in self.joints if self.model.body_weldid[self.joint_body(joint)] == at]
-
-    def joint_body(self, joint: int) -> int:
-        return int(self.model.jnt_bodyid[joint])
+        carrier = self.model.body_weldid[self.model.jnt_bodyid]
+        return [joint for at in links for joint in self.joints if carrier[joint] == at]
 
     def bounds(self, geoms: Iterable[int], frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """(3,) least and greatest coordinates (m) of geoms, in the world or in the frame of a body."""

@@ -72,7 +72,7 @@ def gains_of(
     limits = np.where(stated > 0, stated, guessed)
     missing = model.dof_armature[dofs] == 0
     armature = np.where(missing, ROTOR * limits, model.dof_armature[dofs])
-    inertia = _inertia(model, data)[dofs] - model.dof_armature[dofs] + armature
+    inertia = mass_matrix(model, data).diagonal()[dofs] - model.dof_armature[dofs] + armature
     held = np.abs(_holding_torque(body, feet)[dofs])
     load = STIFFNESS * np.array([_load(body, joint, feet) for joint in joints])
     kp = np.max([inertia * (2 * np.pi * frequency) ** 2, held / SAG, load], axis=0)
@@ -87,12 +87,12 @@ def gains_of(
     )
 
 
-def _inertia(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """(nv,) diagonal of the mass matrix."""
+def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """(nv, nv)."""
     mujoco.mj_forward(model, data)
     full = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, full)
-    return full.diagonal().copy()
+    return full
 
 
 def _holding_torque(body: Body, feet: list[Foot]) -> np.ndarray:

@@ -11,12 +11,13 @@ import numpy as np
 
 from omniperception.env.mirror import joint_twins
 from omniperception.robots.body import Body
-from omniperception.robots.gains import REACH, SAG, Gains, gains_of
+from omniperception.robots.gains import REACH, SAG, Gains, gains_of, mass_matrix
 from omniperception.robots.pose import BENT, Foot, feet_of, first_pose, standing_pose
 from omniperception.robots.stand import Stance, flat_world, stand
 from omniperception.scene import RobotConfig
 from omniperception.scene.robot_file import FRAME, compile_robot, drop_unseen, parse, read_robot, weighs_as_water
 from omniperception.schema import make
+from omnirobot.common.cli import argument
 
 SURE, LIKELY, GUESSED = "sure", "likely", "guess"
 _POSES = ("home", "stand", "standing", "default", "init")
@@ -73,23 +74,15 @@ class Guess:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the user can say about a preset.
+    """What the user can say about a preset."""
 
-    Attributes:
-        joints: those that are actuated; empty: those with an actuator in the file, or all.
-        frequency: of a joint as a spring (Hz).
-        damping_ratio: of such a spring.
-        self_collision: whether links that can touch each other do.
-        lidar: link that carries the LiDAR; None: the highest that belongs to no leg.
-    """
-
-    joints: tuple[str, ...] = ()
-    frequency: float = 2.0
-    damping_ratio: float = 0.5
-    self_collision: bool = True
-    lidar: str | None = None
+    joints: tuple[str, ...] = argument((), "actuated joints; none given: those with an actuator in the file, or all")
+    frequency: float = argument(2.0, "of a joint, with what hangs on it, as a spring (Hz)", positive=True)
+    damping_ratio: float = argument(0.5, "of that spring; 1 is critical", positive=True)
+    self_collision: bool = argument(True, "whether links that can touch each other do")
+    lidar: str | None = argument(None, "link that carries the LiDAR; null: the highest of no leg or arm")
 
 
 def guess(file: Path, written: str, options: Options = Options()) -> Guess:
@@ -225,10 +218,7 @@ def mirror_error(body: Body, index: np.ndarray, sign: np.ndarray, poses: int = 2
         both = []
         for angles in (q, q[index] * sign):
             body.place(dict(zip(body.joints, angles.tolist(), strict=True)))
-            mujoco.mj_forward(model, data)
-            full = np.zeros((model.nv, model.nv))
-            mujoco.mj_fullM(model, data, full)
-            both.append(full[np.ix_(dofs, dofs)])
+            both.append(mass_matrix(model, data)[np.ix_(dofs, dofs)])
         image = both[1][np.ix_(index, index)] * np.outer(sign, sign)
         worst = max(worst, float(np.abs(both[0] - image).max() / np.abs(both[0]).max()))
     return worst
@@ -378,7 +368,7 @@ def _numbers(draft: _Draft, gains: Gains, factor: float) -> dict[str, object]:
     for key, value in values.items():
         if value is None:
             continue
-        rounded = [_round(x) for x in _mirrored_mean(draft, value)]
+        rounded = [float(f"{x:.3g}") for x in _mirrored_mean(draft, value)]
         names = [draft.body.name(joint) for joint in draft.joints]
         found[key] = rounded[0] if len(set(rounded)) == 1 else dict(zip(names, rounded, strict=True))
     return found
@@ -390,11 +380,6 @@ def _mirrored_mean(draft: _Draft, values: np.ndarray) -> list[float]:
         return list(by_joint.values())
     twin = {joint: draft.body.joints[k] for joint, k in zip(draft.body.joints, draft.twins[0], strict=True)}
     return [(value + by_joint.get(twin[joint], value)) / 2 for joint, value in by_joint.items()]
-
-
-def _round(value: float) -> float:
-    """Three significant digits."""
-    return float(f"{value:.3g}")
 
 
 def self_collisions(body: Body, pose: dict[int, float]) -> list[tuple[str, str]]:

@@ -9,6 +9,7 @@ import torch
 
 from omnilidar import quat_from_rpy
 from omniperception.common.rotations import matrix_of, multiply, rotate, yaw_quat
+from omniperception.common.stateful import Stateful
 from omniperception.scene.part_shapes import quat_about
 from omniperception.scene.parts import Part, PartConfig
 
@@ -19,7 +20,7 @@ _WHOLE = PartConfig("sphere", (1.0,))
 """Form of an obstacle that is its own only part: its middle is half its height above its root."""
 
 
-class Articulation:
+class Articulation(Stateful):
     """Parts in their obstacles. An obstacle's root is the point on its underside from which its parts are measured.
 
     Attributes:
@@ -32,6 +33,8 @@ class Articulation:
         seconds: (num_envs,) s since then.
         metres: (num_envs, O) m moved since then.
     """
+
+    buffers = ("scale", "lift", "cycle", "seconds", "metres")
 
     def __init__(self, parts: Sequence[Part], num_envs: int, dtype: torch.dtype, device: torch.device) -> None:
         def column(rows: list) -> torch.Tensor:
@@ -125,14 +128,6 @@ class Articulation:
         swing = rotate(self._rest, torch.linalg.cross(self._axis.expand_as(arm), arm))
         swing = rotate(yaw_quat(yaw)[:, self.obstacle], swing * rate[..., None])
         return whole + swing[..., :2]
-
-    def state_dict(self) -> dict:
-        names = ("scale", "lift", "cycle", "seconds", "metres")
-        return {name: getattr(self, name).clone() for name in names}
-
-    def load_state_dict(self, state: dict) -> None:
-        for name, value in state.items():
-            getattr(self, name).copy_(value)
 
 
 def tilt_of(quat: torch.Tensor) -> torch.Tensor:

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import field
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, SkipValidation
 
-from omniperception.common.checked import NonNegative, Pair, PositivePair, Share, checked
+from omniperception.common.checked import (
+    Area,
+    AsTuple,
+    AtLeastOne,
+    InOrder,
+    Names,
+    NonNegative,
+    NonNegativePair,
+    Pair,
+    Point,
+    PositivePair,
+    Share,
+    checked,
+)
 from omniperception.scene.layouts import Layout
 from omniperception.scene.meshes import own_size
 from omniperception.scene.part_shapes import reach
-from omniperception.scene.parts import SIZES, Part, PartConfig, check_kind, check_sizes
+from omniperception.scene.parts import SIZES, Part, PartConfig, check_kind, size_names
 from omniperception.scene.thing_file import SUFFIXES, is_thing, parts_of
 
 COMPOUND = "compound"
@@ -46,6 +59,9 @@ class ApproachConfig:
 
 
 _HalfTurn = Annotated[float, Field(ge=0, le=180), "in 0 to 180"]
+_Sizes = Annotated[tuple[PositivePair, ...], AsTuple, "ranges 0 < low <= high"]
+_Poses = Annotated[tuple[Point, ...], AsTuple, "triples (x, y, yaw_deg)"]
+_Present = Annotated[tuple[Annotated[int, Field(ge=0)], int], AsTuple, InOrder, "[low, high] with 0 <= low <= high"]
 
 
 @checked("obstacles: motion")
@@ -72,7 +88,7 @@ class MotionConfig:
             )
 
 
-@dataclass(frozen=True)
+@checked("obstacles: ")
 class ObstacleGroup:
     """Obstacles of one kind. What is a range is drawn uniformly for every obstacle at every reset.
 
@@ -105,50 +121,36 @@ class ObstacleGroup:
     """
 
     kind: str
-    count: int
-    size: Sequence[Sequence[float]] = ()
-    speed: Sequence[float] = (0.0, 0.0)
-    poses: Sequence[Sequence[float]] | None = None
-    bottom: Sequence[float] = (0.0, 0.0)
-    heading_deg: Sequence[float] = (-180.0, 180.0)
-    yaw_deg: Sequence[float] = (-180.0, 180.0)
-    area: Sequence[float] | None = None
+    count: AtLeastOne
+    size: _Sizes = ()
+    speed: NonNegativePair = (0.0, 0.0)
+    poses: _Poses | None = None
+    bottom: Pair = (0.0, 0.0)
+    heading_deg: Pair = (-180.0, 180.0)
+    yaw_deg: Pair = (-180.0, 180.0)
+    area: Area | None = None
     approach: ApproachConfig | None = None
     motion: MotionConfig | None = None
     file: str | None = None
-    files: Sequence[str] = ()
-    swing_frequency: float = 0.2
-    parts: Mapping[str, PartConfig] = field(default_factory=dict)
-    scale: Sequence[float] = (1.0, 1.0)
-    present: Sequence[int] | None = None
-    layout: Layout | None = None
+    files: Names = ()
+    swing_frequency: NonNegative = 0.2
+    parts: Mapping[str, SkipValidation[PartConfig]] = field(default_factory=dict)
+    scale: PositivePair = (1.0, 1.0)
+    present: _Present | None = None
+    layout: SkipValidation[Layout] | None = None
 
     def __post_init__(self) -> None:
         self._check_files()
-        if self.count < 1:
-            raise ValueError(f"obstacles: count={self.count} must be at least 1; leave the group out instead")
-        for key in ("speed", "bottom", "heading_deg", "yaw_deg", "scale"):
-            bounds = tuple(float(bound) for bound in getattr(self, key))
-            object.__setattr__(self, key, bounds)
-            if len(bounds) != 2 or bounds[0] > bounds[1]:
-                raise ValueError(f"obstacles: {key}={list(bounds)} must be a range [low, high] with low <= high")
-        if self.speed[0] < 0:
-            raise ValueError(f"obstacles: speed={list(self.speed)} must be a range 0 <= low <= high")
-        if self.area is not None:
-            object.__setattr__(self, "area", checked_area("a group's area", self.area))
         self._check_shape()
         self._check_places()
         self._check_motion()
 
     def _check_files(self) -> None:
-        object.__setattr__(self, "files", tuple(self.files))
         if self.files and (self.file is not None or len(self.files) > self.count):
             raise ValueError(
                 f"obstacles: files={list(self.files)} with file={self.file} and count={self.count}; give either, and at"
                 " least as many obstacles as files"
             )
-        if self.swing_frequency < 0:
-            raise ValueError(f"obstacles: swing_frequency={self.swing_frequency} must not be negative")
         own = self.files or (self.file,)
         if self.kind != COMPOUND:
             for file in own:
@@ -171,19 +173,19 @@ class ObstacleGroup:
         return self.parts if file is None else parts_of(file, self.swing_frequency)
 
     def _check_shape(self) -> None:
-        object.__setattr__(self, "parts", dict(self.parts))
         if self.kind != COMPOUND:
             if self.parts or self.scale != (1.0, 1.0):
                 raise ValueError(f"obstacles: a {self.kind} has no parts and no scale; use kind=compound")
             own_size = self.layout is not None or self.file_of(0) is not None
-            if self.size or not own_size:
-                object.__setattr__(self, "size", check_sizes(self.kind, self.size))
+            if (self.size or not own_size) and len(self.size) != len(SIZES[self.kind]):
+                raise ValueError(
+                    f"obstacles: a {self.kind} has {len(SIZES[self.kind])} size ranges [low, high]"
+                    f" ({size_names(self.kind)}), got {len(self.size)}"
+                )
             return
         every = [self.parts_of(index) for index in range(len(self.files) or 1)]
         if not all(every) or self.size:
             raise ValueError("obstacles: a compound has parts, and each of them its size; give parts, leave out size")
-        if self.scale[0] <= 0:
-            raise ValueError(f"obstacles: scale={list(self.scale)} must be a range 0 < low <= high")
         meshes = [name for parts in every for name, part in parts.items() if part.kind == "mesh"]
         if meshes and self.scale[0] < self.scale[1]:
             raise ValueError(
@@ -191,16 +193,10 @@ class ObstacleGroup:
             )
 
     def _check_places(self) -> None:
-        if self.present is not None:
-            object.__setattr__(self, "present", tuple(self.present))
-            if len(self.present) != 2 or not 0 <= self.present[0] <= self.present[1] <= self.count:
-                raise ValueError(
-                    f"obstacles: present={list(self.present)} must be a range within 0 to count={self.count}"
-                )
-        if self.poses is not None:
-            object.__setattr__(self, "poses", tuple(tuple(float(x) for x in pose) for pose in self.poses))
-            if len(self.poses) != self.count or any(len(pose) != 3 for pose in self.poses):
-                raise ValueError(f"obstacles: poses must be {self.count} triples (x, y, yaw_deg)")
+        if self.present is not None and self.present[1] > self.count:
+            raise ValueError(f"obstacles: present={list(self.present)} must be a range within 0 to count={self.count}")
+        if self.poses is not None and len(self.poses) != self.count:
+            raise ValueError(f"obstacles: poses must be {self.count} triples (x, y, yaw_deg)")
         if self.layout is not None and (self.kind != "box" or self.size or self.poses is not None or self.present):
             raise ValueError("obstacles: a layout is for boxes and decides size, poses and present; leave them out")
         if self.layout is not None and self.count != self.layout.count:
@@ -238,7 +234,7 @@ class ObstacleGroup:
             return ((0.1, 0.1),) * 3  # until the first reset
         file = self.file_of(index)
         if file is None:
-            return tuple((low, high) for low, high in self.size)
+            return self.size
         if not self.size:
             return tuple((half, half) for half in own_size(file))
         share = index / max(self.count - 1, 1)
@@ -262,11 +258,3 @@ class ObstacleGroup:
             sizes = tuple((low * size, high * size) for size in form.size)
             parts.append(Part(f"{name}_{key}", obstacle, form.kind, sizes, form.file, form, self.moves, low < high))
         return tuple(parts)
-
-
-def checked_area(name: str, bounds: Sequence[float]) -> tuple[float, float, float, float]:
-    """Bounds of an area; raises a ValueError in one line that names it."""
-    area = tuple(float(x) for x in bounds)
-    if len(area) != 4 or area[0] >= area[1] or area[2] >= area[3]:
-        raise ValueError(f"obstacles: {name}={list(area)} must be [x_low, x_high, y_low, y_high]")
-    return area

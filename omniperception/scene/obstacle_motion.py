@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from omniperception.common.random import EnvRandom
+from omniperception.common.stateful import Stateful
 from omniperception.scene.obstacle_group import MotionConfig, ObstacleGroup
 from omniperception.scene.placement import unit, within
 
@@ -112,13 +113,15 @@ class Approach:
         return robot[:, None] + bearing * distance[..., None], velocity
 
 
-class Wander:
+class Wander(Stateful):
     """Obstacles of groups with `motion`, which choose again where they go after random times.
 
     Attributes:
         timer: (num_envs, O) s until an obstacle chooses again.
         course: (num_envs, O) rad, of the way in which it moved last.
     """
+
+    buffers = ("timer", "course")
 
     def __init__(self, groups: Sequence[ObstacleGroup], num_envs: int, random: EnvRandom, like: torch.Tensor) -> None:
         """`groups` of the O obstacles; `like` has the precision and the device of their positions."""
@@ -166,10 +169,3 @@ class Wander:
         velocity[env_ids] = torch.where(due[..., None], new, now)
         self.course[env_ids] = torch.where(due, course, self.course[env_ids])
         self.timer[env_ids] = torch.where(due, within(self._every, u[:, 0]), self.timer[env_ids])
-
-    def state_dict(self) -> dict:
-        return {"timer": self.timer.clone(), "course": self.course.clone()}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.timer.copy_(state["timer"])
-        self.course.copy_(state["course"])

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import mujoco
+from pydantic import Field
 
+from omniperception.common.checked import AsTuple, NonNegative, Point, checked
 from omniperception.scene.meshes import check_mesh, mesh_points, own_size
 
 SIZES = {
@@ -18,7 +21,7 @@ SIZES = {
     "mesh": ("half x", "half y", "half z"),
 }
 """Sizes (m) of each kind, in MuJoCo's order; those of a mesh are of the box around it."""
-_GEOM_TYPES = {
+GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -26,9 +29,11 @@ _GEOM_TYPES = {
     "mesh": mujoco.mjtGeom.mjGEOM_MESH,
 }
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_Amplitude = Annotated[float, Field(gt=0, le=180), "above 0, up to 180"]
+_Lengths = Annotated[tuple[Annotated[float, Field(gt=0)], ...], AsTuple, "positive sizes (m)"]
 
 
-@dataclass(frozen=True)
+@checked("obstacles: swing")
 class SwingConfig:
     """Swing of a part about its joint: its angle is amplitude sin(2 pi c + phase) after c cycles.
 
@@ -42,20 +47,16 @@ class SwingConfig:
         phase_deg: (deg).
     """
 
-    axis: str | Sequence[float]
-    amplitude_deg: float
-    frequency: float = 0.0
-    per_metre: float = 0.0
+    axis: Literal["x", "y", "z"] | Point
+    amplitude_deg: _Amplitude
+    frequency: NonNegative = 0.0
+    per_metre: NonNegative = 0.0
     phase_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.axis not in AXES if isinstance(self.axis, str) else len(self.axis) != 3 or not any(self.axis):
-            raise ValueError(f"obstacles: swing.axis={self.axis} must be one of {', '.join(AXES)}, or [x, y, z]")
-        if not isinstance(self.axis, str):
-            object.__setattr__(self, "axis", tuple(float(x) for x in self.axis))
-        if not 0 < self.amplitude_deg <= 180:
-            raise ValueError(f"obstacles: swing.amplitude_deg={self.amplitude_deg} must lie above 0, up to 180")
-        if self.frequency < 0 or self.per_metre < 0 or (self.frequency > 0) == (self.per_metre > 0):
+        if not any(self.axis):
+            raise ValueError("obstacles: swing.axis=[0, 0, 0] has no direction")
+        if (self.frequency > 0) == (self.per_metre > 0):
             raise ValueError(
                 f"obstacles: swing has frequency={self.frequency} and per_metre={self.per_metre}; give one of them,"
                 " positive"
@@ -69,7 +70,7 @@ class SwingConfig:
         return x / length, y / length, z / length
 
 
-@dataclass(frozen=True)
+@checked("obstacles: ")
 class PartConfig:
     """A part of a compound, in a frame on the ground below the obstacle, x ahead, at scale 1.
 
@@ -84,26 +85,23 @@ class PartConfig:
     """
 
     kind: str
-    size: Sequence[float] = ()
-    pos: Sequence[float] = (0.0, 0.0, 0.0)
-    rpy_deg: Sequence[float] = (0.0, 0.0, 0.0)
-    hang: float | Sequence[float] = 0.0
+    size: _Lengths = ()
+    pos: Point = (0.0, 0.0, 0.0)
+    rpy_deg: Point = (0.0, 0.0, 0.0)
+    hang: float | Point = 0.0
     swing: SwingConfig | None = None
     file: str | None = None
 
     def __post_init__(self) -> None:
         check_kind(self.kind, self.file, tuple(SIZES))
-        hang = (0.0, 0.0, -float(self.hang)) if isinstance(self.hang, int | float) else self.hang
-        for key, value in (("pos", self.pos), ("rpy_deg", self.rpy_deg), ("hang", hang)):
-            if len(value) != 3:
-                raise ValueError(f"obstacles: {key}={list(value)} of a part must have 3 numbers")
-            object.__setattr__(self, key, tuple(float(x) for x in value))
-        size = tuple(float(x) for x in self.size)
-        if self.file is not None and not size:
-            size = own_size(self.file)
-        object.__setattr__(self, "size", size)
-        if len(size) != len(SIZES[self.kind]) or min(size) <= 0:
-            raise ValueError(f"obstacles: size={list(size)} of a {self.kind} must be positive: {_names(self.kind)}")
+        if isinstance(self.hang, float):
+            object.__setattr__(self, "hang", (0.0, 0.0, -self.hang))
+        if self.file is not None and not self.size:
+            object.__setattr__(self, "size", own_size(self.file))
+        if len(self.size) != len(SIZES[self.kind]):
+            raise ValueError(
+                f"obstacles: size={list(self.size)} of a {self.kind} must be positive: {size_names(self.kind)}"
+            )
 
 
 def check_kind(kind: str, file: str | None, known: Sequence[str]) -> None:
@@ -116,19 +114,8 @@ def check_kind(kind: str, file: str | None, known: Sequence[str]) -> None:
         check_mesh(file)
 
 
-def check_sizes(kind: str, size: Sequence[Sequence[float]]) -> tuple[tuple[float, float], ...]:
-    """Ranges of sizes as floats; raises a ValueError in one line if they do not fit the kind."""
-    if len(size) != len(SIZES[kind]) or any(len(bounds) != 2 for bounds in size):
-        raise ValueError(
-            f"obstacles: a {kind} has {len(SIZES[kind])} size ranges [low, high] ({_names(kind)}), got {len(size)}"
-        )
-    ranges = tuple((float(low), float(high)) for low, high in size)
-    if any(not 0 < low <= high for low, high in ranges):
-        raise ValueError(f"obstacles: size={ranges} must be ranges 0 < low <= high")
-    return ranges
-
-
-def _names(kind: str) -> str:
+def size_names(kind: str) -> str:
+    """Names of a kind's sizes, in words."""
     return ", ".join(SIZES[kind])
 
 
@@ -166,7 +153,7 @@ class Part:
         body = spec.worldbody.add_body(name=self.name, mocap=True)
         body.add_geom(
             name=self.name,
-            type=_GEOM_TYPES[self.kind],
+            type=GEOM_TYPES[self.kind],
             size=size,
             contype=1,
             conaffinity=0,

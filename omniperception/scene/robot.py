@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import importlib.resources
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import mujoco
 import numpy as np
-from pydantic import Field
+from pydantic import Field, SkipValidation
 
-from omniperception.common.checked import AsTuple, Inside, Pair, Positive, checked
+from omniperception.common.checked import AsTuple, Counts, Inside, Names, NonNegative, Pair, Point, Positive, checked
 from omniperception.scene.fetched import SCHEME, fetched
 from omniperception.scene.robot_file import (
     FRAME,
@@ -31,7 +31,7 @@ ByJoint = float | Mapping[str, float]
 """One number for all joints, or one for each by name."""
 
 
-@dataclass(frozen=True)
+@checked("robot.mounts: ")
 class Mount:
     """A place for a LiDAR on the robot.
 
@@ -43,9 +43,9 @@ class Mount:
         body: link that carries the sensor; None: the base.
     """
 
-    pos: Sequence[float]
-    rpy: Sequence[float] = (0.0, 0.0, 0.0)
-    exclude_geoms: Sequence[str] = ()
+    pos: Point
+    rpy: Point = (0.0, 0.0, 0.0)
+    exclude_geoms: Names = ()
     body: str | None = None
 
 
@@ -94,7 +94,13 @@ _BY_JOINT = ("kp", "kv", "torque_limits", "action_scale", "frictionloss", "armat
 """What a preset has as one number, or as one by joint."""
 
 
-@dataclass(frozen=True)
+_Outline = Annotated[tuple[Positive, Positive, Positive], AsTuple, "three positive lengths (m): behind, before, beside"]
+_Footprint = Annotated[tuple[NonNegative, NonNegative], AsTuple, "[half length, half width] (m), not negative"]
+_Pairs = Annotated[tuple[Annotated[tuple[str, str], AsTuple], ...], AsTuple, "pairs of bodies"]
+_Feet = Annotated[tuple[str | Names, ...], AsTuple, "a list of geoms, or of lists of them"]
+
+
+@checked("robot")
 class RobotConfig:
     """A legged robot.
 
@@ -140,33 +146,32 @@ class RobotConfig:
 
     file: str
     base: str
-    joints: tuple[str, ...]
+    joints: Names
     default_joint_pos: Mapping[str, float]
-    base_height: float
+    base_height: Positive
     kp: ByJoint
     kv: ByJoint
     torque_limits: ByJoint
     action_scale: ByJoint
-    foot_geoms: tuple[str | tuple[str, ...], ...]
-    penalized_geoms: tuple[str, ...]
-    footprint: tuple[float, float]
-    footing: float
-    outline: tuple[float, float, float]
-    height: float
-    radius: float
-    min_base_height: float
+    foot_geoms: _Feet
+    penalized_geoms: Names
+    footprint: _Footprint
+    footing: Positive
+    outline: _Outline
+    height: Positive
+    radius: Positive
+    min_base_height: NonNegative
     frictionloss: ByJoint | None = None
     armature: ByJoint | None = None
     damping: ByJoint | None = None
-    self_collision: tuple[tuple[str, str], ...] = ()
-    ray_groups: tuple[int, ...] | None = None
-    mounts: Mapping[str, Mount] = field(default_factory=dict)
+    self_collision: _Pairs = ()
+    ray_groups: Counts | None = None
+    mounts: Mapping[str, SkipValidation[Mount]] = field(default_factory=dict)
     locked: Mapping[str, float] = field(default_factory=dict)
     gait: Gait | None = None
-    half_length: float = 0.0
+    half_length: NonNegative = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "penalized_geoms", tuple(self.penalized_geoms))
         object.__setattr__(self, "joints", tuple(joint for joint in self.joints if joint not in self.locked))
         if not self.joints:
             raise ValueError("robot.joints without those of robot.locked is empty; a robot needs a joint to drive")
@@ -175,33 +180,18 @@ class RobotConfig:
             if isinstance(given, Mapping):
                 kept = {joint: value for joint, value in given.items() if joint not in self.locked}
                 object.__setattr__(self, name, kept)
-        feet = tuple(foot if isinstance(foot, str) else tuple(foot) for foot in self.foot_geoms)
-        object.__setattr__(self, "foot_geoms", feet)
-        if not feet or not all(feet):
+        if not self.foot_geoms or not all(self.foot_geoms):
             raise ValueError("robot.foot_geoms has an empty list; a robot needs feet, and a foot at least one geom")
         geoms = [geom for foot in self.feet for geom in foot]
         for name, names in (("joints", self.joints), ("foot_geoms", geoms)):
             if twice := repeated(names):
                 raise ValueError(f"robot.{name} names {', '.join(twice)} more than once")
-        for name in ("base_height", "footing", "height", "radius"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"robot.{name}={getattr(self, name)} must be positive")
-        object.__setattr__(self, "outline", tuple(self.outline))
-        if len(self.outline) != 3 or min(self.outline) <= 0:
-            raise ValueError(
-                f"robot.outline={list(self.outline)} must be three positive lengths (m): behind, before, beside"
-            )
-        if self.min_base_height < 0 or self.half_length < 0 or min(self.footprint) < 0:
-            raise ValueError(
-                f"robot.min_base_height={self.min_base_height}, robot.half_length={self.half_length} and"
-                f" robot.footprint={list(self.footprint)} must not be negative"
-            )
         missing = sorted(set(self.joints) - set(self.default_joint_pos))
         if missing:
             raise ValueError(f"robot.default_joint_pos must name all of robot.joints; missing: {missing}")
-        if self.gait is not None and len(self.gait.offsets) != len(feet):
+        if self.gait is not None and len(self.gait.offsets) != len(self.feet):
             raise ValueError(
-                f"robot.gait.offsets={list(self.gait.offsets)} must have one for each of the {len(feet)} feet"
+                f"robot.gait.offsets={list(self.gait.offsets)} must have one for each of the {len(self.feet)} feet"
             )
         for name in _BY_JOINT:
             self._check_by_joint(name, positive=name in ("kp", "torque_limits", "action_scale"))
@@ -333,14 +323,18 @@ class RobotConfig:
         """Height (m) of a moving link's origin above the ground in the default pose; of the base's for None."""
         if link is None:
             return self.base_height
-        model = self.compiled()
+        data = self.posed(self.compiled())
+        return self.base_height + float(data.body(link).xpos[2] - data.body(self.base).xpos[2])
+
+    def posed(self, model: mujoco.MjModel) -> mujoco.MjData:
+        """The default pose, the base upright at its height above where it is in the file; kinematics are up to date."""
         data = mujoco.MjData(model)
         start = model.jnt_qposadr[model.body(self.base).jntadr[0]]
-        data.qpos[start + 3 : start + 7] = 1.0, 0.0, 0.0, 0.0  # upright, however the file has it
+        data.qpos[start + 2 : start + 7] = self.base_height, 1.0, 0.0, 0.0, 0.0
         for name, angle in self.default_joint_pos.items():
             data.joint(name).qpos = angle
         mujoco.mj_kinematics(model, data)
-        return self.base_height + float(data.body(link).xpos[2] - data.body(self.base).xpos[2])
+        return data
 
     def path(self) -> Path:
         """The robot's file; a packaged one by its name alone, a downloaded one as `fetched:...`."""

@@ -67,14 +67,9 @@ class _Legs:
     def __init__(self, robot: RobotConfig, foot_height: float) -> None:
         self._foot_height = foot_height
         self._robot, self._model = robot, robot.compiled()
-        model, self._data = self._model, mujoco.MjData(self._model)
+        self._data = robot.posed(self._model)
         self._pose = self._data.qpos.copy()
-        base = model.body(robot.base)
-        start = model.jnt_qposadr[base.jntadr[0]]
-        self._pose[start + 2 : start + 7] = robot.base_height, 1.0, 0.0, 0.0, 0.0  # upright, however the file has it
-        for name, angle in robot.default_joint_pos.items():
-            self._pose[model.joint(name).qposadr[0]] = angle
-        self._feet = [[model.geom(name).id for name in foot] for foot in robot.feet]
+        self._feet = [[self._model.geom(name).id for name in foot] for foot in robot.feet]
 
     def lifted(self, foot: int, lift: float, share: float) -> np.ndarray:
         """(num_joints,) rad: change of the pose that lifts a foot by a share of the way to `lift` times its height."""

@@ -10,17 +10,11 @@ import mujoco
 import numpy as np
 
 from omniperception.scene.meshes import compiled, mesh_vertices
-from omniperception.scene.parts import PartConfig, SwingConfig
+from omniperception.scene.parts import GEOM_TYPES, SIZES, PartConfig, SwingConfig
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
-_KINDS = {
-    int(mujoco.mjtGeom.mjGEOM_BOX): ("box", 3),
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): ("cylinder", 2),
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): ("sphere", 1),
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): ("capsule", 2),
-}
-"""Kind of a part and how many sizes it has, by the type of its geom."""
-_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+_KINDS = {int(geom_type): kind for kind, geom_type in GEOM_TYPES.items()}
+"""Kind of a part by the type of its geom."""
 
 
 def is_thing(file: str) -> bool:
@@ -61,14 +55,14 @@ def _part(file: str, model: mujoco.MjModel, data: mujoco.MjData, geom: int, freq
     """The part that a geom is, with hinges in the middles of their ranges."""
     kind, mesh, size = int(model.geom_type[geom]), None, model.geom_size[geom]
     turn, middle = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
-    if kind == _MESH:
+    kind_name = _KINDS.get(kind)
+    if kind_name == "mesh":
         name = model.mesh(model.geom_dataid[geom]).name
         vertices = mesh_vertices(file, name)
         low, high = vertices.min(0), vertices.max(0)
-        kind_name, size, mesh, middle = "mesh", (high - low) / 2, f"{file}#{name}", middle + turn @ (low + high) / 2
-    elif kind in _KINDS:
-        kind_name, count = _KINDS[kind]
-        size = size[:count]
+        size, mesh, middle = (high - low) / 2, f"{file}#{name}", middle + turn @ (low + high) / 2
+    elif kind_name is not None:
+        size = size[: len(SIZES[kind_name])]
     else:
         found = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
         raise ValueError(

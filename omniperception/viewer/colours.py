@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from omnilidar import LidarFrame
 from omniperception.scene.rays import HitClass
 
 Rgb = tuple[int, int, int]
@@ -43,6 +44,33 @@ def heat(share: float) -> tuple[int, ...]:
 def scale(share: np.ndarray) -> np.ndarray:
     """(P, 3) uint8, blue over green to yellow as shares (P,) go from 0 to 1."""
     return _mixed(share, _STOPS)
+
+
+def of_points(
+    frame: LidarFrame, by: str, classes: Mapping[int, Sequence[int]], period_s: float, top: float
+) -> np.ndarray:
+    """(P, 3) uint8, of the points of a frame's first environment that hit something.
+
+    Args:
+        frame: of all that is asked for.
+        by: "time", "intensity", "height" or what it hit.
+        classes: colours of what can be hit.
+        period_s: the time (s) of the last colour.
+        top: its height (m).
+    """
+    assert frame.valid is not None and frame.points_w is not None
+    hit = frame.valid[0]
+
+    def column(name: str) -> np.ndarray:
+        return getattr(frame, name)[0, hit].numpy(force=True)
+
+    if by == "time":
+        return scale(column("time_s") / period_s)
+    if by == "intensity":
+        return scale(np.sqrt(column("intensity")) / 3.0)
+    if by == "height":
+        return scale(column("points_w")[:, 2] / top)
+    return np.array([classes[k] for k in sorted(classes)], np.uint8)[column("class_id")]
 
 
 def _mixed(share: np.ndarray, stops: np.ndarray) -> np.ndarray:

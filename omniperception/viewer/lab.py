@@ -26,7 +26,7 @@ from omnilidar import (
 from omniperception.common.rotations import multiply, rotate, yaw_quat
 from omniperception.env.sensing import SensorConfig
 from omniperception.viewer import charts
-from omniperception.viewer.colours import scale
+from omniperception.viewer.colours import of_points, scale
 from omniperception.viewer.meshes import triangles
 from omniperception.viewer.options import PageOptions, Room
 from omniperception.viewer.page import Page, add_points, check_free, show_points
@@ -380,25 +380,17 @@ class Lab(Page):
         hit = frame.valid[0]
         points = frame.points_w[0, hit].numpy(force=True)
         with self.server.atomic():
-            show_points(self._points, points, self._colours(frame, hit, points), self.point_size)
+            show_points(self._points, points, self._colours(frame, hit), self.point_size)
         self.clock.clouds += 1
 
-    def _colours(self, frame: LidarFrame, hit: torch.Tensor, points: np.ndarray) -> np.ndarray:
-        def column(name: str) -> np.ndarray:
-            return getattr(frame, name)[0, hit].numpy(force=True)
-
-        if self.coloured_by == "range":
-            return scale(column("ranges") / self.bench.knobs.max_range)
-        if self.coloured_by == "error":
-            return scale(np.abs(column("ranges") - column("true_ranges")) / 0.2)
-        if self.coloured_by == "time":
-            return scale(column("time_s") / self.bench.knobs.period_s)
-        if self.coloured_by == "intensity":
-            return scale(np.sqrt(column("intensity")) / 3.0)
-        if self.coloured_by == "height":
-            return scale(points[:, 2] / 2.6)
-        table = np.array([_rgb(self._room.colours[k]) for k in sorted(self._room.colours)], np.uint8)
-        return table[column("class_id")]
+    def _colours(self, frame: LidarFrame, hit: torch.Tensor) -> np.ndarray:
+        knobs = self.bench.knobs
+        if self.coloured_by in ("range", "error"):
+            assert frame.ranges is not None and frame.true_ranges is not None
+            ranges, true = (one[0, hit].numpy(force=True) for one in (frame.ranges, frame.true_ranges))
+            return scale(ranges / knobs.max_range if self.coloured_by == "range" else np.abs(ranges - true) / 0.2)
+        classes = {kind: _rgb(colour) for kind, colour in self._room.colours.items()}
+        return of_points(frame, self.coloured_by, classes, knobs.period_s, top=2.6)
 
     def _draw_status(self) -> None:
         frame, clock = self.bench.frame, self.clock

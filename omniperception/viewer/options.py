@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from omnirobot.common.cli import argument
 from omnirobot.common.errors import UserError
 
 if TYPE_CHECKING:
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
 
 LOCALHOST = "127.0.0.1"
 PORT = 8080
-PAGE = ("host", "port")
-"""Arguments of commands that mean something with viewer=web alone."""
 
 
 class ViewerError(UserError, RuntimeError):
@@ -28,18 +27,33 @@ SWITCHED = ("scenario", "condition", "terrain", "obstacles", "lidar", "robot")
 
 
 @dataclass(frozen=True)
-class PageOptions:
+class PageArguments:
+    """Arguments of commands that mean something with viewer=web alone."""
+
+    host: str = argument(
+        LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
+    )
+    port: int = argument(PORT, "port at which viewer=web listens", least=1)
+
+    @property
+    def page(self) -> PageOptions:
+        """The same, checked."""
+        return PageOptions(host=self.host, port=self.port)
+
+
+PAGE = tuple(field.name for field in fields(PageArguments))
+"""Their names."""
+
+
+@dataclass(frozen=True)
+class PageOptions(PageArguments):
     """Where the page listens, and until when.
 
     Attributes:
-        host: address; the default is reached from this machine alone.
-        port: TCP port.
         stop_after_s: s of wall time after which the viewer ends by itself; None: never.
         open_browser: whether the page is opened in this machine's browser.
     """
 
-    host: str = LOCALHOST
-    port: int = PORT
     stop_after_s: float | None = None
     open_browser: bool = False
 

@@ -55,7 +55,6 @@ class Session:
         shown: what this is.
         env, policy, checkpoint: the task, who acts in it, and where its weights came from.
         rewards: weighted reward of each term in the last control step, per second.
-        reward: their sum.
         outcomes: of the trials that have ended.
         shapes: what rays can hit, and its bodies.
         frames: LiDAR frames shown so far.

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from omnilidar import LidarFrame
 from omniperception.avoidance.sector_motion import NEARNESS_RANGE
 from omniperception.env.heights import height_grid
 from omniperception.env.sensing import split_elevation
 from omniperception.evaluation.film.perceived import Perceived
 from omniperception.scene.rays import HitClass
-from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, HEIGHTS, OBSTACLE, PROXIMAL, SECTORS, TERRAIN, scale
+from omniperception.viewer import colours
+from omniperception.viewer.colours import ARROWS, CLASSES, DISTAL, HEIGHTS, OBSTACLE, PROXIMAL, SECTORS, TERRAIN
 from omniperception.viewer.meshes import grid_surface, robot_looks, triangles
 from omniperception.viewer.page import add_points, show_points
 from omniperception.viewer.session import Session
@@ -143,10 +145,7 @@ class Stage:
             for name, rgb in HEIGHTS.items()
         }
         self._stick = self.scene.add_icosphere(f"{ROOT}/stick", 0.07, color=ARROWS["command"])
-        self._stick.on_drag(self._stick_moved)
-        self._build_obstacles()
-
-    def _build_obstacles(self) -> None:
+        self._stick.on_drag(lambda event: self.on_stick(self._on_level(event)))
         for k in self._obstacle_shapes:
             self._build_obstacle(k, self._size(k))
 
@@ -211,27 +210,14 @@ class Stage:
         with self._server.atomic():
             self._points.visible = True
             self._points.position = (0.0, 0.0, self.point_size / 2)  # on what they lie on, not half in it
-            show_points(self._points, points, self._point_colours(hit, points), self.point_size)
+            show_points(self._points, points, self._point_colours(cloud, hit), self.point_size)
         return len(points)
 
-    def _point_colours(self, hit: torch.Tensor, points: np.ndarray) -> np.ndarray:
-        assert self._session.cloud is not None
-        cloud, sensor = self._session.cloud, self._session.env.config.lidar
-        assert sensor is not None
-        if self.points_by == "what it hit":
-            assert cloud.class_id is not None
-            table = np.array([CLASSES[k] for k in sorted(CLASSES)], np.uint8)
-            return table[cloud.class_id[0, hit].numpy(force=True)]
-        if self.points_by == "time":
-            assert cloud.time_s is not None
-            return scale(cloud.time_s[0, hit].numpy(force=True) / sensor.period_s)
-        if self.points_by == "intensity":
-            assert cloud.intensity is not None
-            return scale(np.sqrt(cloud.intensity[0, hit].numpy(force=True)) / 3.0)
-        if self.points_by == "height":
-            return scale(points[:, 2] / 2.0)
-        assert cloud.elevation is not None
-        sensing = self._session.env.sensing
+    def _point_colours(self, cloud: LidarFrame, hit: torch.Tensor) -> np.ndarray:
+        sensor, sensing = self._session.env.config.lidar, self._session.env.sensing
+        assert sensor is not None and cloud.elevation is not None
+        if self.points_by != "proximal/distal":
+            return colours.of_points(cloud, self.points_by, CLASSES, sensor.period_s, top=2.0)
         split = split_elevation(None if sensing is None else sensing.history, sensor)
         proximal = cloud.elevation[0, hit].numpy(force=True) > split
         return np.where(proximal[:, None], np.array(PROXIMAL), np.array(DISTAL)).astype(np.uint8)
@@ -241,8 +227,7 @@ class Stage:
         visible = "robot" in self.shows
         for handle, at, turned in zip(self._links, pos[0].tolist(), quat[0].tolist(), strict=True):
             handle.position, handle.wxyz = at, turned
-            if handle.visible != visible:
-                handle.visible = visible
+            _make_visible(handle, visible)
 
     def _draw_ground(self) -> None:
         """A ground that is not flat, around the origin; each trial may have another tile."""
@@ -275,8 +260,7 @@ class Stage:
             if self._poses.get(shape) != pose:
                 if there:
                     handle.position, handle.wxyz = pos[part], quat[part]
-                if handle.visible != there:
-                    handle.visible = there
+                _make_visible(handle, there)
                 self._poses[shape] = pose
 
     def _draw_arrows(self, perceived: Perceived | None, true: Perceived, stick: bool) -> None:
@@ -299,8 +283,7 @@ class Stage:
                 handle.points = np.stack((start, start + STICK_REACH * np.array([*turned(velocity[:2], yaw), 0.0])))[
                     None
                 ]
-            if handle.visible != there:
-                handle.visible = there
+            _make_visible(handle, there)
         command = turned(commanded, yaw) * STICK_REACH
         self._stick.position = (base[0] + command[0], base[1] + command[1], base[2] + 0.16)
         self._stick.color = ARROWS["command"] if stick else (150, 170, 155)
@@ -317,8 +300,7 @@ class Stage:
             there = len(segments) > 0
             if there:
                 handle.points = segments
-        if handle.visible != there:
-            handle.visible = there
+        _make_visible(handle, there)
 
     def _draw_heights(self, name: str, seen: Perceived | None) -> None:
         handle = self._heights[name]
@@ -327,12 +309,9 @@ class Stage:
             assert seen is not None and seen.heights is not None
             kinematics = self._session.env.state.kinematics
             base, yaw = kinematics.base_pos_w[0].numpy(force=True), float(kinematics.yaw[0])
-            grid = height_grid().numpy()
-            cos, sin = math.cos(yaw), math.sin(yaw)
-            x, y = grid[:, 0] * cos - grid[:, 1] * sin, grid[:, 0] * sin + grid[:, 1] * cos
+            x, y = turned(height_grid().numpy().T, yaw)
             handle.points = np.stack((base[0] + x, base[1] + y, base[2] - seen.heights), 1).astype(np.float16)
-        if handle.visible != there:
-            handle.visible = there
+        _make_visible(handle, there)
 
     # ---- the mouse ---------------------------------------------------------------------------------------------------
 
@@ -343,14 +322,17 @@ class Stage:
         x, y = on_level(camera, np.asarray(event.end_position) - camera, level, np.asarray(event.end_position))
         return x + float(self.origin[0]), y + float(self.origin[1])
 
-    def _stick_moved(self, event: viser.SceneNodeDragEvent) -> None:
-        self.on_stick(self._on_level(event))
-
     def _pushed(self, event: Any) -> None:
         direction = np.asarray(event.ray_direction)[:2]
         norm = float(np.hypot(*direction))
         if norm > 1e-6:
             self.on_push((float(direction[0] / norm), float(direction[1] / norm)))
+
+
+def _make_visible(handle: Any, visible: bool) -> None:
+    """Only what changes is sent to the browsers."""
+    if handle.visible != visible:
+        handle.visible = visible
 
 
 def on_level(start: np.ndarray, direction: np.ndarray, level: float, otherwise: np.ndarray) -> tuple[float, float]:
@@ -361,7 +343,7 @@ def on_level(start: np.ndarray, direction: np.ndarray, level: float, otherwise: 
 
 
 def turned(vector: np.ndarray, yaw: float) -> np.ndarray:
-    """A vector (2,) turned by `yaw` (rad)."""
+    """A vector (2,), or several (2, n), turned by `yaw` (rad)."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return np.array([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])
 

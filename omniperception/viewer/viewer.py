@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import queue
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -306,43 +304,6 @@ class Viewer(Page):
             self.follows = False
             self.say(f"refused: {' '.join(str(error).split())}; following ends")
             self.panels.show_follow(False)
-
-    # ---- for whoever asks --------------------------------------------------------------------------------------------
-
-    def state(self, timeout_s: float = 60.0) -> dict[str, Any]:
-        """What is the case now, in plain numbers; from any thread while the viewer runs.
-
-        Raises:
-            TimeoutError: it does not run.
-        """
-        answer: queue.Queue[dict[str, Any]] = queue.Queue()
-        self._requests.put(lambda: answer.put(self._state()))
-        try:
-            return answer.get(timeout=timeout_s)
-        except queue.Empty:
-            raise TimeoutError(f"the viewer has not answered in {timeout_s:g} s; is it running?") from None
-
-    def _state(self) -> dict[str, Any]:
-        env = self.session.env
-        kinematics, field = env.state.kinematics, env.obstacles
-        return {
-            "time_s": self.session.time_s,
-            "steps": env.step_count,
-            "position": kinematics.base_pos_w[0].tolist(),
-            "yaw": float(kinematics.yaw[0]),
-            "velocity": kinematics.base_lin_vel_yaw[0].tolist(),
-            "command": env.command.value[0].tolist(),
-            "driven": self.session.driven,
-            "paused": self.paused,
-            "checkpoint": str(self.session.checkpoint),
-            "choices": self.choices,
-            "obstacles": [] if field is None else field.root_pos_w[0].tolist(),
-            "present": [] if field is None else field.root_active[0].tolist(),
-            "trials": len(self.session.outcomes),
-            "points": self._shown_points,
-            "message": self.message,
-            "real_time": self.clock.reached,
-        }
 
 
 def _split(overrides: tuple[str, ...]) -> tuple[dict[str, str | None], tuple[str, ...]]:

@@ -69,7 +69,7 @@ class Lockstep:
         env = OmniEnv(build.assemble(config.load(run_dir, [*overrides, *steps])).env)
         self.network, description = Memory(), ExportedPolicy.load(exported).description
         lidar, self.operator = _free_port(), _free_port()
-        wire = SimulatedConfig(point_to=("127.0.0.1", lidar), steer_to=self.operator, **changes)
+        wire = SimulatedConfig(point_to=lidar, steer_to=self.operator, **changes)
         self.robot = SimulatedRobot(env, wire, self.network)
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.link, crc = Link(ours), wire.crc

@@ -12,7 +12,7 @@ from omniperception import build, config
 from omniperception.commands.robot_sim import world
 from omniperception.deploy import trials
 from omniperception.deploy.faults import FAULTS, Faults
-from omniperception.deploy.trials import KNOWN_FAULTS, TrialsConfig, results, run, table
+from omniperception.deploy.trials import TrialsConfig, results, run, table
 from omniperception.sim.mujoco import SimConfig
 from omnirobot.common.errors import ConfigError
 from omnirobot.runtime import DeployError
@@ -37,8 +37,6 @@ def test_packets_meet_their_fault():
     assert 0.65 < len(dropped) / 1000 < 0.75 and set(dropped) == set(sent)
     for name in FAULTS:
         assert arrived(name, now=2.5) == sent  # it is over
-    with pytest.raises(DeployError, match="fault=rain: one of unplug, drop"):
-        Faults("rain", 1.0)
 
 
 def test_what_was_held_back_comes_at_the_end():
@@ -85,7 +83,7 @@ def test_the_table_counts(tmp_path):
     for k, why in enumerate(("p.onnx and policy.json are not from the same export", "motion_switcher is silent")):
         ended = a_result(k, stood=False) | {"fault": "swap", "robot": None, "robot_exit": 2, "robot_said": why}
         (tmp_path / f"moving-swap-{k:03d}.json").write_text(json.dumps(ended))
-    lines = table(results(tmp_path)).splitlines()
+    lines = [" ".join(line.split()) for line in table(results(tmp_path)).splitlines()]
     one = "1 (25 % [5, 70])"
     none = "0 (0 % [0, 49])"
     assert lines[2] == f"| moving | none | 4 | {one} | {one} | {one} | {none} | {none} |"
@@ -97,8 +95,6 @@ def test_the_table_counts(tmp_path):
 
 def test_what_cannot_be_tried_is_said(tmp_path):
     parts = {"run": "a", "out": tmp_path, "scenarios": ("moving",), "trials": 1, "limit_s": 30.0}
-    with pytest.raises(DeployError, match=f"faults=rain: {', '.join(KNOWN_FAULTS)} were expected"):
-        TrialsConfig(policy=tmp_path, faults=("rain",), **parts)
     with pytest.raises(DeployError, match="a folder that export has written was expected"):
         TrialsConfig(policy=tmp_path, faults=("none",), **parts)
 

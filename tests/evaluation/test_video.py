@@ -217,11 +217,11 @@ def test_a_grid_of_environments_plays(make_env, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"size": (63, 36)}, "video_size=63,36 must be width,height, two even numbers such as 1280,720"),
-        ({"size": (64,)}, "video_size=64 must be width,height"),
-        ({"env_ids": (1, 1)}, "video_envs=1,1 must be different numbers"),
-        ({"size": (64, 36), "env_ids": tuple(range(16))}, "leaves 16 x 9 pixels for each"),
-        ({"env_ids": (0, 4)}, "video_envs=0,4: there are 4 environments, from 0 on; num_envs=5 would do"),
+        ({"video_size": (63, 36)}, "video_size=63,36 must be width,height, two even numbers such as 1280,720"),
+        ({"video_size": (64,)}, "video_size=64 must be width,height"),
+        ({"video_envs": (1, 1)}, "video_envs=1,1 must be different numbers"),
+        ({"video_size": (64, 36), "video_envs": tuple(range(16))}, "leaves 16 x 9 pixels for each"),
+        ({"video_envs": (0, 4)}, "video_envs=0,4: there are 4 environments, from 0 on; num_envs=5 would do"),
     ],
 )
 def test_wrong_options_are_refused(options, message):

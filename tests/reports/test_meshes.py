@@ -195,8 +195,8 @@ def test_the_axis_that_points_up_is_the_formats(tmp_path, make_config):
     assert bounds(TriangleMesh.from_file(path, up="z")) == pytest.approx([0, 0, -2, 1, 3, 0], abs=1e-6)
     assert mesh_points(str(path))[1] == pytest.approx((0.5, 1.0, 1.5))
     robot = make_config("perception=none", "observations=walk", "rewards=walk", "lidar=none").env.robot
-    assert scan._surroundings(scan.Arguments(mesh=path), robot).extent[2] == pytest.approx(3.0)
-    assert scan._surroundings(scan.Arguments(mesh=path, up="z"), robot).extent[2] == pytest.approx(0.0, abs=1e-6)
+    assert scan._surroundings(scan.Arguments(mesh=path), robot).top == pytest.approx(3.0)
+    assert scan._surroundings(scan.Arguments(mesh=path, up="z"), robot).top == pytest.approx(0.0, abs=1e-6)
     with pytest.raises(ValueError, match="up=w of mesh .* must be z, y, x"):
         TriangleMesh.from_file(path, up="w")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from pathlib import Path
@@ -22,57 +23,80 @@ RUN = Path(__file__).parents[2] / "pretrained" / "avoider"
 PORT = 18231
 
 
+def state(viewer: Viewer) -> dict[str, Any]:
+    """What is the case between two steps, in plain numbers."""
+    answer: queue.Queue[dict[str, Any]] = queue.Queue()
+    viewer.ask(lambda: answer.put(_state(viewer)))
+    return answer.get(timeout=60.0)
+
+
+def _state(viewer: Viewer) -> dict[str, Any]:
+    session = viewer.session
+    kinematics, field = session.env.state.kinematics, session.env.obstacles
+    return {
+        "time_s": session.time_s,
+        "steps": session.env.step_count,
+        "position": kinematics.base_pos_w[0].tolist(),
+        "yaw": float(kinematics.yaw[0]),
+        "driven": session.driven,
+        "paused": viewer.paused,
+        "checkpoint": str(session.checkpoint),
+        "obstacles": field.root_pos_w[0].tolist(),
+        "present": field.root_active[0].tolist(),
+        "trials": len(session.outcomes),
+        "message": viewer.message,
+    }
+
+
 def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
     """Keys, an obstacle that is brought, time, and the weights."""
     page.goto(f"http://127.0.0.1:{PORT}")
     page.get_by_text("I command").wait_for()
     picture(page, pictures / "1_opened.png")
 
-    assert viewer.state()["driven"] is None
-    start = np.array(viewer.state()["position"][:2])
+    assert state(viewer)["driven"] is None
+    start = np.array(state(viewer)["position"][:2])
     (client,) = viewer.server.get_clients().values()
     eye = np.array(client.camera.position)
     for _ in range(3):
         page.keyboard.press("i")
-    wait_for(lambda: viewer.state()["driven"] == (0.6, 0.0, 0.0), "three presses of I command 0.6 m/s")
-    yaw = viewer.state()["yaw"]
+    wait_for(lambda: state(viewer)["driven"] == (0.6, 0.0, 0.0), "three presses of I command 0.6 m/s")
+    yaw = state(viewer)["yaw"]
     heading = np.array([np.cos(yaw), np.sin(yaw)])
-    wait_for(lambda: (np.array(viewer.state()["position"][:2]) - start) @ heading > 0.3, "the robot walks ahead")
+    wait_for(lambda: (np.array(state(viewer)["position"][:2]) - start) @ heading > 0.3, "the robot walks ahead")
     page.keyboard.press("x")
-    wait_for(lambda: viewer.state()["driven"] == (0.0, 0.0, 0.0), "X stands")
+    wait_for(lambda: state(viewer)["driven"] == (0.0, 0.0, 0.0), "X stands")
     assert np.allclose(client.camera.position, eye, atol=1e-3), "keys that drive leave the view where it is"
     client.camera.position = tuple(eye + 2.0)
     page.keyboard.press("v")
 
     def at_robot() -> bool:
-        offset = np.array(viewer.state()["position"][:2]) - viewer.stage.origin
+        offset = np.array(state(viewer)["position"][:2]) - viewer.stage.origin
         return bool(np.allclose(np.array(client.camera.look_at)[:2] - TARGET[:2], offset, atol=0.1))
 
     wait_for(lambda: np.allclose(client.camera.position, eye, atol=0.1) and at_robot(), "V looks at the robot")
 
     bring(viewer, page)
     page.keyboard.press("Space")
-    wait_for(lambda: viewer.state()["paused"], "Space pauses")
+    wait_for(lambda: state(viewer)["paused"], "Space pauses")
 
-    steps = viewer.state()["steps"]
+    steps = state(viewer)["steps"]
     page.keyboard.press("n")
-    wait_for(lambda: viewer.state()["steps"] == steps + 1, "N does one step")
+    wait_for(lambda: state(viewer)["steps"] == steps + 1, "N does one step")
 
     page.get_by_role("tab", name="Task").click()
     load(page, pictures / "none.pt")
-    wait_for(
-        lambda: "refused: no checkpoint at" in viewer.state()["message"], "weights that are not there are one line"
-    )
+    wait_for(lambda: "refused: no checkpoint at" in state(viewer)["message"], "weights that are not there are one line")
     load(page, pictures / "still.pt")
-    wait_for(lambda: viewer.state()["checkpoint"] == str(pictures / "still.pt"), "other weights are loaded")
+    wait_for(lambda: state(viewer)["checkpoint"] == str(pictures / "still.pt"), "other weights are loaded")
     page.get_by_role("tab", name="Drive").click()
     for _ in range(3):
         page.keyboard.press("i")
-    wait_for(lambda: viewer.state()["driven"] == (0.6, 0.0, 0.0), "the command is that for other weights")
-    before = viewer.state()
+    wait_for(lambda: state(viewer)["driven"] == (0.6, 0.0, 0.0), "the command is that for other weights")
+    before = state(viewer)
     viewer.ask(lambda: viewer.pause(False))
-    wait_for(lambda: viewer.state()["time_s"] > before["time_s"] + 2.0, "time runs")
-    after = viewer.state()
+    wait_for(lambda: state(viewer)["time_s"] > before["time_s"] + 2.0, "time runs")
+    after = state(viewer)
     heading = np.array([np.cos(before["yaw"]), np.sin(before["yaw"])])
     ahead = (np.array(after["position"][:2]) - before["position"][:2]) @ heading
     commanded = 0.6 * (after["time_s"] - before["time_s"])
@@ -82,11 +106,11 @@ def operate(viewer: Viewer, page: Any, pictures: Path) -> None:
 
 def bring(viewer: Viewer, page: Any) -> int:
     """Brings an obstacle by its key; its number."""
-    there = viewer.state()["present"]
+    there = state(viewer)["present"]
     page.keyboard.press("b")
 
     def brought() -> list[int]:
-        return [k for k, present in enumerate(viewer.state()["present"]) if present and not there[k]]
+        return [k for k, present in enumerate(state(viewer)["present"]) if present and not there[k]]
 
     return wait_for(brought, "B brings an obstacle")[0]
 
@@ -106,7 +130,7 @@ def disturb(viewer: Viewer, page: Any, pictures: Path) -> None:
     second.close()
     wait_for(lambda: len(viewer.server.get_clients()) == 1, "it leaves")
     page.keyboard.press("x")
-    wait_for(lambda: viewer.state()["driven"] == (0.0, 0.0, 0.0), "the first one drives on")
+    wait_for(lambda: state(viewer)["driven"] == (0.0, 0.0, 0.0), "the first one drives on")
 
 
 def load(page: Any, path: Path) -> None:
@@ -117,21 +141,21 @@ def load(page: Any, path: Path) -> None:
 
 def write_still_weights(path: Path) -> None:
     """The run's weights with an actor that always gives 0, which is the default pose."""
-    state = load_checkpoint(latest_checkpoint(RUN))
-    weights = state["actor_state_dict"]
+    whole = load_checkpoint(latest_checkpoint(RUN))
+    weights = whole["actor_state_dict"]
     last = max(name for name in weights if name.startswith("mlp.") and name.endswith(".weight")).removesuffix("weight")
     for name in ("weight", "bias"):
         weights[last + name] = torch.zeros_like(weights[last + name])
-    save_checkpoint(path, {key: value for key, value in state.items() if key not in ("format", "version")})
+    save_checkpoint(path, {key: value for key, value in whole.items() if key not in ("format", "version")})
 
 
 def drag(viewer: Viewer, page: Any, client: Any, obstacle: int) -> None:
     """Pulls an obstacle aside with the mouse; again where the browser's picture was too old to take hold of it."""
-    start = viewer.state()
+    start = state(viewer)
     before = np.array(start["obstacles"][obstacle])
 
     def follows() -> bool:
-        now = viewer.state()
+        now = state(viewer)
         assert now["trials"] == start["trials"]  # a new one would have put it elsewhere
         return bool(np.hypot(*(np.array(now["obstacles"][obstacle]) - before)[:2]) > 0.1)
 

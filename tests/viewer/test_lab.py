@@ -12,7 +12,7 @@ from browser import chromium, control, open_tab, picture, wait_for
 
 from omnilidar import LidarFrame
 from omniperception import build, config
-from omniperception.commands.scan import NO_TASK, lab_room
+from omniperception.commands.scan import NO_TASK
 from omniperception.commands.scan.room import ROOM, DemoClass, demo_scene
 from omniperception.viewer import PageOptions
 from omniperception.viewer.lab import DT, Bench, Knobs, Lab, Walkers
@@ -27,7 +27,7 @@ def task():
 
 @pytest.fixture
 def room(task):
-    return lab_room(task.robot, demo_scene(task.robot, num_threads=1, walkers=2))
+    return demo_scene(task.robot, num_threads=1, walkers=2)
 
 
 def test_people_walk_at_their_speed_and_stay_in_the_room():

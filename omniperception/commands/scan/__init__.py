@@ -23,12 +23,12 @@ from omnilidar import DEVICES, TriangleMesh
 from omnilidar.mesh_files import AXES, read_mesh, unit_hint
 from omniperception import build, config
 from omniperception.commands.scan.pictures import draw_comparison, summary, take_scan, write_scan
-from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene, demo_scene, mesh_scene
+from omniperception.commands.scan.room import DemoScene, demo_scene, mesh_scene
 from omniperception.env.config import EnvConfig
 from omniperception.env.sensing import SensorConfig
 from omniperception.scene import RobotConfig
-from omniperception.viewer import PageOptions, serve_lab
-from omniperception.viewer.options import LOCALHOST, PAGE, PORT, Room
+from omniperception.viewer import serve_lab
+from omniperception.viewer.options import PAGE, PageArguments
 from omnirobot.common.cli import Command, argument, refuse_arguments
 
 NO_TASK = ("~experiment", "perception=none", "observations=walk", "rewards=walk")
@@ -40,7 +40,7 @@ WALKERS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(PageArguments):
     """The command's own arguments."""
 
     lidar: tuple[str, ...] = argument(("mid360",), "presets of conf/lidar")
@@ -57,10 +57,6 @@ class Arguments:
     )
     at: tuple[float, ...] = argument((0.0, 0.0, 0.0), "where in the mesh the robot's feet stand (m, z up)")
     viewer: str = argument("none", "web: the scan lab in the browser", choices=("none", "web"))
-    host: str = argument(
-        LOCALHOST, "address at which viewer=web listens; the default is reached from this machine alone"
-    )
-    port: int = argument(PORT, "port at which viewer=web listens", least=1)
 
 
 def main(arguments: Arguments, overrides: list[str]) -> None:
@@ -101,27 +97,10 @@ def _task(name: str, overrides: list[str]) -> EnvConfig:
 
 def _serve(arguments: Arguments, out: Path, overrides: list[str]) -> None:
     """The scan lab."""
-    robot = _task(arguments.lidar[0], overrides).robot
+    room = _surroundings(arguments, _task(arguments.lidar[0], overrides).robot, walkers=WALKERS)
     names = [name for name in config.presets("lidar", config.search_path(overrides)) if name != "none"]
     sensors = {name: partial(_device, name, arguments, overrides) for name in (*arguments.lidar, *names)}
-    room = lab_room(robot, _surroundings(arguments, robot, walkers=WALKERS))
-    serve_lab(room, sensors, out, PageOptions(arguments.host, arguments.port))
-
-
-def lab_room(robot: RobotConfig, demo: DemoScene) -> Room:
-    """The demonstration scene as the scan lab takes it."""
-    return Room(
-        demo.scene,
-        robot,
-        demo.bodies,
-        demo.robot_geoms,
-        demo.movers,
-        demo.extent[:2],
-        demo.open_side,
-        {int(kind): COLOURS[kind] for kind in DemoClass},
-        {int(kind): value for kind, value in REFLECTIVITY.items()},
-        {int(kind): kind.name.lower() for kind in DemoClass},
-    )
+    serve_lab(room, sensors, out, arguments.page)
 
 
 def _device(name: str, arguments: Arguments, overrides: list[str]) -> SensorConfig:

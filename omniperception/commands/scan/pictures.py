@@ -12,7 +12,7 @@ import torch
 
 from omnilidar import Lidar, ScanPattern, write_points
 from omnilidar.clouds import table_of
-from omniperception.commands.scan.room import COLOURS, REFLECTIVITY, DemoClass, DemoScene
+from omniperception.commands.scan.room import COLOURS, DemoClass, DemoScene
 from omniperception.common.rotations import rotate
 from omniperception.env.sensing import SensorConfig
 from omnirobot.common.figures import new_figure, save_figure
@@ -90,7 +90,7 @@ def take_scan(
         exclude_shapes=[demo.robot_geoms[geom] for geom in excluded],
         seed=seed,
         outputs=OUTPUTS,
-        reflectivity={int(kind): value for kind, value in REFLECTIVITY.items()},
+        reflectivity=demo.reflectivity,
     )
     frame = lidar.cast(torch.full((1,), seconds, dtype=torch.float64))
     assert frame.valid is not None  # asked for
@@ -243,9 +243,9 @@ def _draw_ranges(axis, scan: Scan) -> None:
 
 
 def _draw_from_above(axis, scan: Scan, demo: DemoScene) -> None:
-    (left, right), (back, front), top = demo.extent
+    (left, right), (back, front) = demo.extent
     order = scan.points_w[:, 2].argsort()
-    order = order[scan.points_w[order, 2] < top - 0.01]
+    order = order[scan.points_w[order, 2] < demo.top - 0.01]
     points = scan.points_w[order]
     heights = {"vmin": 0.0, "vmax": 2.0} if demo.mesh is None else {}
     marks = axis.scatter(
@@ -316,7 +316,7 @@ def _class_colours(scan: Scan) -> np.ndarray:
 
 def _height_colours(scan: Scan, demo: DemoScene) -> np.ndarray:
     """Blue at the robot's feet over green to red at the ceiling."""
-    share = (scan.points_w[:, 2:] / max(demo.extent[2], 1e-6)).clip(0.0, 1.0)
+    share = (scan.points_w[:, 2:] / max(demo.top, 1e-6)).clip(0.0, 1.0)
     hue = np.array([0.0, 2.0, 4.0]) + 4.0 * (1.0 - share)  # sixths of the colour circle from red
     return (np.abs((hue + np.array([0.0, 2.0, -2.0])) % 6.0 - 3.0) - 1.0).clip(0.0, 1.0)
 

@@ -14,6 +14,7 @@ import torch
 from omnilidar import HeightField, RayScene, Shape, ShapeKind, TriangleMesh, geom_shapes
 from omniperception.scene import RobotConfig
 from omniperception.scene.rays import robot_geoms
+from omniperception.viewer.options import Room
 
 Vector = tuple[float, float, float]
 
@@ -37,7 +38,7 @@ class DemoClass(IntEnum):
     MESH = 7
 
 
-COLOURS = {
+COLOURS: dict[int, str] = {
     DemoClass.FLOOR: "#8c8f94",
     DemoClass.WALL: "#4f79b5",
     DemoClass.SHELF: "#b5793a",
@@ -47,7 +48,7 @@ COLOURS = {
     DemoClass.ROBOT: "#1d1d29",
     DemoClass.MESH: "#4f79b5",
 }
-REFLECTIVITY = {
+REFLECTIVITY: dict[int, float] = {
     DemoClass.FLOOR: 0.3,
     DemoClass.WALL: 0.8,
     DemoClass.SHELF: 0.5,
@@ -60,30 +61,18 @@ REFLECTIVITY = {
 """Reflectivity of matt surfaces; rough values, chosen by eye."""
 
 
-@dataclass(frozen=True)
-class DemoScene:
+@dataclass(frozen=True, kw_only=True)
+class DemoScene(Room):
     """The room, or a mesh, in a ray scene.
 
     Attributes:
-        scene: One environment with the robot's bodies where its default pose has them.
-        bodies: Index of each of the robot's links by name.
-        robot: Its preset.
-        robot_geoms: Index of each of the robot's shapes by the name of its geom.
-        open_side: Shapes that a picture of the room from outside leaves out: the ceiling and two of the walls.
-        extent: Of the room or the mesh along x and y, and its highest point, metres.
+        top: Its highest point, metres.
         mesh: The mesh; None: it is the room.
-        movers: Bodies of the scene beside the robot's that walk about, after all of its own.
         origin: Where the scene's origin is in the mesh's file, metres, (3,) float64.
     """
 
-    scene: RayScene
-    bodies: dict[str, int]
-    robot: RobotConfig
-    robot_geoms: dict[str, int]
-    open_side: tuple[int, ...]
-    extent: tuple[tuple[float, float], tuple[float, float], float]
+    top: float
     mesh: TriangleMesh | None = None
-    movers: tuple[int, ...] = ()
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
@@ -127,11 +116,8 @@ def _with_robot(
     model = robot.compiled()
     found = geom_shapes(model, geoms=robot_geoms(model, robot))
     bodies = tuple(dict.fromkeys((*found.body_ids, *range(1, model.nbody))))
-    data = mujoco.MjData(model)
+    data = robot.posed(model)
     data.qpos[:3] = np.add(at, (0.0, 0.0, robot.base_height))
-    data.qpos[3:7] = 1.0, 0.0, 0.0, 0.0  # upright, however the file has it
-    for name, angle in robot.default_joint_pos.items():
-        data.joint(name).qpos = angle
     mujoco.mj_kinematics(model, data)
 
     first = len(shapes)
@@ -149,9 +135,13 @@ def _with_robot(
         robot=robot,
         robot_geoms={model.geom(k).name: first + i for i, k in enumerate(found.geom_ids)},
         open_side=open_side,
-        extent=extent,
+        extent=extent[:2],
+        top=extent[2],
         mesh=mesh,
         movers=movers,
+        colours=COLOURS,
+        reflectivity=REFLECTIVITY,
+        names={kind: kind.name.lower() for kind in DemoClass},
     )
 
 

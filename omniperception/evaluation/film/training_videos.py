@@ -10,7 +10,7 @@ from omniperception.evaluation.film.video_options import VideoOptions
 from omniperception.learning import Runner
 
 FOLDER = "videos"
-OPTIONS = VideoOptions(size=(640, 360))
+OPTIONS = VideoOptions((640, 360))
 """Small, since the training waits for each picture."""
 
 

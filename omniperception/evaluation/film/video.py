@@ -82,11 +82,11 @@ class Recorder:
         names = [] if field is None else [field.parts[k].name for k in field.varying]
         self._sized = self._shapes.indices(names)
         self._renderer = self._build_renderer(samples=1)
-        ids = self._options.env_ids
+        ids = self._options.video_envs
         self._cameras = {k: FollowCamera(dt, self._options.camera) for k in ids}
         self._blind_until = dict.fromkeys(ids, 0)
         self._best: tuple[float, list[Moment]] | None = None
-        width, height = self._options.size
+        width, height = self._options.video_size
         self._begun, self._path = False, path.resolve()  # a relative one may look like an option of ffmpeg, or a URL
         with open(path, "ab"):  # ffmpeg would not say why it cannot be
             pass
@@ -152,7 +152,7 @@ class Recorder:
         """The panels side by side, with what is drawn over them."""
         (columns, _), (width, height) = self._options.grid, self._options.panel
         gap = GAP_PX if len(moments) > 1 else 0
-        picture = Image.new("RGB", (self._options.size[0], self._options.size[1]))
+        picture = Image.new("RGB", (self._options.video_size[0], self._options.video_size[1]))
         for k, moment in enumerate(moments):
             panel = Image.fromarray(renderer.render(moment.view).numpy())
             if moment.perceived is not None and self._has_inset:

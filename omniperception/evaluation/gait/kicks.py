@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -14,12 +16,6 @@ from omniperception.evaluation.trials.episodes import run_episodes
 from omniperception.evaluation.trials.statistics import rate
 from omniperception.evaluation.trials.tally import trial_numbers
 from omnirobot.common.figures import new_figure, save_figure
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from matplotlib.projections.polar import PolarAxes
 
 AFTER_S, WATCHED_S = 3.0, 5.0
 """Time (s) of a kick, and for how long falls are counted after it."""
@@ -98,7 +94,7 @@ def kick(env: OmniEnv, policy: Policy, speeds: Sequence[float], num_bearings: in
 def draw_kicks(results: KickResults, speeds: Sequence[float], num_bearings: int, path: Path) -> None:
     """Shares survived by direction, seen from above with ahead up, a line for each size."""
     figure = new_figure(4.6, 4.4)
-    axis = cast("PolarAxes", figure.add_subplot(projection="polar"))
+    axis: Any = figure.add_subplot(projection="polar")
     axis.set_theta_zero_location("N")
     bearing = 2 * math.pi / num_bearings * torch.arange(num_bearings + 1)
     for speed, shares in zip(speeds, results.shares(speeds, num_bearings), strict=True):

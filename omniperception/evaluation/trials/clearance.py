@@ -126,7 +126,7 @@ class Geoms:
 
     def centres(self, pos: torch.Tensor, mat: torch.Tensor) -> torch.Tensor:
         """(n, G, 3) centres of the shapes of geoms at poses (n, G, 3), (n, G, 3, 3)."""
-        return pos + _out_of(mat, self._centre) if bool(self._centre.any()) else pos
+        return pos + (mat * self._centre[:, None]).sum(-1) if bool(self._centre.any()) else pos
 
 
 def _hull(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -150,7 +150,3 @@ def _padded(faces: Sequence[np.ndarray | None], device: torch.device) -> tuple[t
             row[: len(own)] = own
     padded = torch.tensor(rows, dtype=torch.float32, device=device)
     return padded, torch.tensor(counts, dtype=torch.int32, device=device)
-
-
-def _out_of(mat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    return (mat * vec[..., None, :]).sum(-1)

@@ -39,8 +39,6 @@ def paired_difference(ours: torch.Tensor, theirs: torch.Tensor, z: float = Z_95)
         ours, theirs: (n,) bool, in the same order of trials.
         z: quantile of the standard normal distribution; the default gives 95 %.
     """
-    if len(ours) != len(theirs):
-        raise ValueError(f"{len(ours)} and {len(theirs)} trials are no pairs")
     gained, lost, n = int((ours & ~theirs).sum()), int((~ours & theirs).sum()), len(ours)
     b, c, total = gained + 0.5, lost + 0.5, n + 2.0
     centre = (b - c) / total
@@ -49,8 +47,6 @@ def paired_difference(ours: torch.Tensor, theirs: torch.Tensor, z: float = Z_95)
         "difference": (gained - lost) / max(n, 1),
         "low": max(centre - half, -1.0),
         "high": min(centre + half, 1.0),
-        "gained": gained,
-        "lost": lost,
     }
 
 
