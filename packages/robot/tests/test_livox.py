@@ -79,7 +79,7 @@ def test_lost_doubled_and_late_packets_are_counted():
             sensor.sendto(packet([[1.0, 0.0, 0.0]], number=number), ("127.0.0.1", lidar.point_port))
         sensor.sendto(b"something", ("127.0.0.1", lidar.point_port))
     numbers = [each.number for each in lidar.packets()]
-    assert numbers == [65534, 65535, 1, 0, 4] and (lidar.lost, lidar.doubled, lidar.other) == (2, 1, 1)
+    assert numbers == [65534, 65535, 1, 0, 4] and (lidar.lost, lidar.doubled, lidar.others.total()) == (2, 1, 1)
     lidar.close()
 
 

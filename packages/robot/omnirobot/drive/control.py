@@ -185,21 +185,12 @@ class FrameSource(Protocol):
     def new(self) -> list[Frame]: ...
 
 
-class Awaited(Protocol):
-    """What is to come again and again."""
-
-    came: int
-
-    def why_silent(self) -> str:
-        """What is known of why nothing has come since the call before."""
-
-
 class Waiting:
     """Says every few seconds what does not come, and what comes instead."""
 
     SAY_EVERY_S = 3.0
 
-    def __init__(self, awaited: Mapping[str, Awaited]) -> None:
+    def __init__(self, awaited: Mapping[str, StateReader | Frames]) -> None:
         """Args: awaited: by name."""
         self._awaited, self._came = awaited, dict.fromkeys(awaited, 0)
         self._due = dict.fromkeys(awaited, math.inf)
@@ -402,7 +393,8 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
         closing.callback(link.close)
         control = Control(policy, states, frames, operator, link, recorder)
-        awaited: dict[str, Awaited] = {"states of the robot": states} | ({"LiDAR frames": frames} if frames else {})
+        awaited: dict[str, StateReader | Frames] = {"states of the robot": states}
+        awaited |= {"LiDAR frames": frames} if frames else {}
         period_s, waiting = description.control_period_s, Waiting(awaited)
         begins, times, skipped = drive(control, link, period_s, config.seconds, should_end, waiting.look)
         if link.is_closed:

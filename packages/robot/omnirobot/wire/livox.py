@@ -117,19 +117,8 @@ def write_points(points: np.ndarray, time_ns: int, number: int, interval_ns: int
     rows["xyz"] = np.rint(np.asarray(points) * 1e3)
     body = struct.pack("<Q", time_ns) + rows.tobytes()
     length = _POINTS.size - 8 + len(body)
-    head = (
-        0,
-        length,
-        interval_ns // 100,
-        len(points),
-        number & 0xFFFF,
-        0,
-        _CARTESIAN_MM,
-        0,
-        bytes(12),
-        zlib.crc32(body),
-    )
-    return _POINTS.pack(*head, time_ns) + body[8:]
+    head = (0, length, interval_ns // 100, len(points), number & 0xFFFF, 0, _CARTESIAN_MM, 0, bytes(12))
+    return _POINTS.pack(*head, zlib.crc32(body), time_ns) + body[8:]
 
 
 @dataclass(frozen=True)
@@ -244,11 +233,6 @@ class Mid360:
         self._newest: tuple[int, int] | None = None
         self._socket = _socket(host, point_port)
         self.point_port = self._socket.getsockname()[1]
-
-    @property
-    def other(self) -> int:
-        """Datagrams that were no packets of points."""
-        return self.others.total()
 
     def find(self, broadcast: str = "255.255.255.255", port: int = DETECTION_PORT, timeout_s: float = 5.0) -> Sensor:
         """Search, and point the first Mid-360 that answers at this machine.
