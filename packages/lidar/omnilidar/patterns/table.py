@@ -69,14 +69,8 @@ class ScanPattern:
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
             axis=1,
         )
-        return cls(
-            torch.from_numpy(directions.astype(np.float32)),
-            torch.from_numpy(elevation.astype(np.float32)),
-            torch.from_numpy(_one_turn(azimuth)),
-            points_per_second,
-            num_lasers,
-            **fields,
-        )
+        tensors = (torch.from_numpy(a) for a in (_single(directions), _single(elevation), _one_turn(azimuth)))
+        return cls(*tensors, points_per_second, num_lasers, **fields)
 
     @classmethod
     def from_directions(
@@ -85,14 +79,8 @@ class ScanPattern:
         """A pattern from unit vectors in the sensor frame, (M, 3) float64; ``fields`` as in ``from_angles``."""
         x, y, z = np.asarray(directions_s, dtype=np.float64).T
         elevation, azimuth = np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
-        return cls(
-            torch.from_numpy(np.ascontiguousarray(directions_s, dtype=np.float32)),
-            torch.from_numpy(elevation.astype(np.float32)),
-            torch.from_numpy(_one_turn(azimuth)),
-            points_per_second,
-            num_lasers,
-            **fields,
-        )
+        tensors = (torch.from_numpy(a) for a in (_single(directions_s), _single(elevation), _one_turn(azimuth)))
+        return cls(*tensors, points_per_second, num_lasers, **fields)
 
     @property
     def num_rows(self) -> int:
@@ -151,6 +139,10 @@ class ScanPattern:
         rows = torch.sub(time, period_s, out=scratch).mul_(self.points_per_second).sub_(ROW_SLACK).ceil_()
         out = torch.empty_like(rows, dtype=torch.int64) if out is None else out
         return out.copy_(rows).add_(phase_rows).remainder_(self.num_rows)
+
+
+def _single(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def _one_turn(azimuth: np.ndarray) -> np.ndarray:

@@ -191,7 +191,6 @@ class Waiting:
     SAY_EVERY_S = 3.0
 
     def __init__(self, awaited: Mapping[str, StateReader | Frames]) -> None:
-        """Args: awaited: by name."""
         self._awaited, self._came = awaited, dict.fromkeys(awaited, 0)
         self._due = dict.fromkeys(awaited, math.inf)
 
@@ -243,7 +242,6 @@ class Control:
         link: GuardLink,
         listener: Listener | None = None,
     ) -> None:
-        """Args: policy: to run; states, frames, operator: what it hears; link: to the guard; listener: takes down."""
         self.policy, self._states, self._frames, self._operator, self._link = policy, states, frames, operator, link
         self._listener = listener
         self._motors = motor_order(policy.description)

@@ -139,7 +139,6 @@ class Machine:
     """
 
     def __init__(self, config: MachineConfig) -> None:
-        """Args: config: times, gains and limits."""
         self.config = config
         self._stand, self._crouch = np.array(config.stand_pose, float), np.array(config.crouch_pose, float)
         self._lower, self._upper = np.array(config.lower, float), np.array(config.upper, float)
