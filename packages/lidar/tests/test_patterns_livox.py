@@ -38,25 +38,6 @@ def test_a_wedge_bends_light_as_a_prism_in_its_plane():
     assert ray == pytest.approx([math.cos(out), math.sin(out), 0.0], abs=1e-12)
 
 
-def test_equal_wedges_in_opposite_turns_draw_a_line_through_the_centre(models):
-    """Two rotors at f and -f would draw a line; the Mid-40's meet at its centre when they cancel."""
-    scanner = RisleyScanner((Wedge(1.5, 5.0, 600.0, 0.0, True), Wedge(1.5, 5.0, -600.0, 0.0, True)))
-    rays = scanner.directions(np.linspace(0.0, 0.1, 101), np.zeros(101))
-    assert np.abs(rays[:, 2]).max() < 0.05 * np.abs(rays[:, 1]).max()
-    assert np.linalg.norm(rays, axis=1) == pytest.approx(np.ones(101), abs=1e-12)
-    assert torch.rad2deg(torch.acos(models["mid40"].directions_s[:, 0].clamp(max=1.0))).min() < 0.1
-
-
-@pytest.mark.parametrize(
-    ("name", "low", "high"), [("horizon", 0.86, 0.92), ("tele15", 0.31, 0.33), ("avia", 0.85, 1.4)]
-)
-def test_the_six_lasers_of_a_shot_stand_in_a_fan(models, name, low, high):
-    """Uppermost first; the Avia's prisms, steep at the edge of its field, spread the fan there."""
-    shots = torch.rad2deg(models[name].elevation).reshape(-1, 6)
-    steps = shots[:, :-1] - shots[:, 1:]
-    assert steps.min() > low and steps.max() < high
-
-
 def test_the_haps_inner_field_is_scanned_more_finely(models):
     """Across 20 deg of azimuth a laser's steps grow as its clock slows down from 550,002 to 424,998 shots/s."""
     x, y, z = models["hap"].directions_s.T
