@@ -131,10 +131,10 @@ class Message:
     data: bytes
 
 
-def write_message(message: Message, from_sensor: bool = False) -> bytes:
-    """Bytes of a command (to the sensor) or an answer."""
+def write_message(message: Message) -> bytes:
+    """Bytes of a command or an answer."""
     length = _COMMAND.size + len(message.data)
-    parts = (0xAA, 0, length, message.number, message.command, int(message.is_answer), int(from_sensor), bytes(6))
+    parts = (0xAA, 0, length, message.number, message.command, int(message.is_answer), 0, bytes(6))
     head = _COMMAND.pack(*parts, 0, 0)[:18]
     checksum = zlib.crc32(message.data) if message.data else 0
     return head + struct.pack("<HI", binascii.crc_hqx(head, 0xFFFF), checksum) + message.data
@@ -172,13 +172,6 @@ class Sensor:
         return f"{self.name} {self.serial}"
 
 
-def discovery_answer(sensor: Sensor, number: int) -> Message:
-    """What a sensor answers to SEARCH."""
-    packed = ipaddress.IPv4Address(sensor.address).packed
-    data = _DETECTION.pack(0, sensor.kind, sensor.serial.encode()[:15], packed, sensor.command_port)
-    return Message(SEARCH, number, True, data)
-
-
 def read_discovery(message: Message) -> Sensor | None:
     """The sensor that has answered; None for another command."""
     if message.command != SEARCH or not message.is_answer or len(message.data) < _DETECTION.size:
@@ -201,16 +194,6 @@ def configuration(host: str, point_port: int = HOST_POINT_PORT) -> bytes:
         (_WORK_MODE_KEY, bytes([_SAMPLING])),
     )
     return struct.pack("<HH", len(values), 0) + b"".join(struct.pack("<HH", k, len(v)) + v for k, v in values)
-
-
-def read_configuration(data: bytes) -> dict[int, bytes]:
-    """Values by key of a CONFIGURE's data."""
-    (count, _), at, values = struct.unpack_from("<HH", data), 4, {}
-    for _ in range(count):
-        key, length = struct.unpack_from("<HH", data, at)
-        values[key] = data[at + 4 : at + 4 + length]
-        at += 4 + length
-    return values
 
 
 class Mid360:
