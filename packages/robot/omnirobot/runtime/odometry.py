@@ -15,8 +15,6 @@ OLDEST_S = 0.3
 class Odometry:
     """Adds up the velocity from one frame to the next; the first state is where it starts."""
 
-    num_rows = 1
-
     def __init__(self, control_period_s: float) -> None:
         self._dt = control_period_s
         self._travelled_w = np.zeros(2)
