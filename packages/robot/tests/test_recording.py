@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("mcap_ros2", reason="extra robot")
 
 from omnirobot.drive.recording import Recorder, Step, levelled, nearest_by_sector
-from omnirobot.replay import bags
 from omnirobot.replay.bags import Topics, events
 from omnirobot.runtime import DeployError
 from omnirobot.runtime.description import Lidar
@@ -234,9 +233,9 @@ def test_bags_that_do_not_say_enough(tmp_path):
         with pytest.raises(DeployError, match=said):
             list(events(tmp_path / f"lacks{k}", Topics()))
     with pytest.raises(DeployError, match="does not exist"):
-        list(bags.messages(tmp_path / "none.mcap"))
+        list(events(tmp_path / "none.mcap", Topics()))
     (tmp_path / "none.mcap").write_bytes(b"nothing of the kind, at some length")
     with pytest.raises(DeployError, match="is not a readable MCAP file"):
-        list(bags.messages(tmp_path / "none.mcap"))
+        list(events(tmp_path / "none.mcap", Topics()))
     with pytest.raises(DeployError, match="a file ending in .mcap was expected"):
         Recorder(tmp_path / "a.bag", Described)
