@@ -1,4 +1,4 @@
-"""Livox scanners: fields of view, prism optics against Snell's law, closed forms against the manufacturer's tables."""
+"""Livox scanners: prism optics against Snell's law, closed forms against the manufacturer's tables."""
 
 import importlib.util
 import math
