@@ -71,7 +71,7 @@ class Frames:
                 f"points={source.kind}: a Mid-360 measures {measured} points in {lidar.period_s:g} s, the policy was"
                 f" trained with a LiDAR of {lidar.points_per_frame}; train with lidar=mid360, or give its own points="
             )
-        self._source = _Topic(source, network) if is_topic else _Packets(source)
+        self._source: _Topic | _Packets = _Topic(source, network) if is_topic else _Packets(source)
         self._cutter, self._extrinsic = FrameCutter(lidar.period_s), source.extrinsic
         self.received: list[Points] = []
         self.number = self.came = 0
