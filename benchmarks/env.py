@@ -235,8 +235,8 @@ def latency(run_dir: Path, steps: int) -> Table:
     where, rows = use_one_core(), []
     for case, (timed, recorded) in cases.items():
         points = max((len(r.points) for r in recorded if r.points is not None), default=0)
-        for kind, parameters in measure(timed, recorded, steps).summary().items():
-            rows.append({"case": case, "points": points, "step": kind.replace("_", " "), **parameters})
+        for kind, parameters in measure(timed, recorded, steps).items():
+            rows.append({"case": case, "points": points, "step": kind, **parameters})
     return Table.of("latency", f"{policy.description.provenance.get('checkpoint')}, {where}, milliseconds", rows)
 
 

@@ -6,7 +6,7 @@ import mujoco
 import pytest
 import torch
 
-from omnilidar import AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
+from omnilidar import DEVICES, AngularJitter, DistanceNoise, GaussianNoise, MaskNoise
 from omniperception.env.env import OmniEnv
 from omniperception.env.mdp.randomization import RandomizationConfig
 from omniperception.env.mirror import Mirror
@@ -279,8 +279,8 @@ def test_the_devices_own_noise_reaches_the_lidar(make_config, lidar, sigma, angl
 
 
 def test_measured_noise_reaches_the_lidar(make_config):
-    (table,) = make_config("randomization=lidar_measured", "lidar=mid360").env.lidar_noise
-    assert table.dropout_at(0.6) == 0.53 and table.dropout_at(3.0) < 0.01 and table.dropout_at(5.0) == 0.0
+    noise = make_config("randomization=lidar_measured", "lidar=mid360").env.lidar_noise
+    assert noise == DEVICES["mid360"].measured != ()
 
 
 @pytest.mark.parametrize(

@@ -27,37 +27,13 @@ if TYPE_CHECKING:
     from .motion import PoseTrack
     from .mujoco import GeomShapes, MujocoScene, geom_shapes
     from .newton import NewtonScene
-    from .patterns import (
-        LIVOX,
-        ScanPattern,
-        Selection,
-        airy,
-        avia,
-        custom,
-        grid,
-        hap,
-        hdl32e,
-        hdl64e,
-        height_scanner,
-        horizon,
-        make_selection,
-        mid40,
-        mid70,
-        mid360,
-        mid360_measured,
-        os0,
-        os1,
-        os2,
-        ouster,
-        spinning,
-        tele15,
-        unitree_l1,
-        unitree_l2,
-        vlp16,
-        vlp32c,
-        xt16,
-        xt32,
-    )
+    from .patterns.custom import custom
+    from .patterns.grid import grid, height_scanner
+    from .patterns.livox import LIVOX, avia, hap, horizon, mid40, mid70, mid360, mid360_measured, tele15
+    from .patterns.selection import Selection, make_selection
+    from .patterns.spinning import airy, hdl32e, hdl64e, os0, os1, os2, ouster, spinning, vlp16, vlp32c, xt16, xt32
+    from .patterns.table import ScanPattern
+    from .patterns.unitree import unitree_l1, unitree_l2
     from .rotations import quat_from_rpy
     from .scene import RayHits, RayScene
     from .sectors import SectorDistances
@@ -72,12 +48,15 @@ _LOADED_WHEN_USED = {
     "motion": ("PoseTrack",),
     "mujoco": ("GeomShapes", "MujocoScene", "geom_shapes"),
     "newton": ("NewtonScene",),
-    "patterns": (
-        *("LIVOX", "ScanPattern", "Selection", "custom", "grid", "height_scanner", "make_selection"),
-        *("avia", "hap", "horizon", "mid40", "mid70", "mid360", "mid360_measured", "tele15"),
+    "patterns.custom": ("custom",),
+    "patterns.grid": ("grid", "height_scanner"),
+    "patterns.livox": ("LIVOX", "avia", "hap", "horizon", "mid40", "mid70", "mid360", "mid360_measured", "tele15"),
+    "patterns.selection": ("Selection", "make_selection"),
+    "patterns.spinning": (
         *("airy", "hdl32e", "hdl64e", "os0", "os1", "os2", "ouster", "spinning", "vlp16", "vlp32c", "xt16", "xt32"),
-        *("unitree_l1", "unitree_l2"),
     ),
+    "patterns.table": ("ScanPattern",),
+    "patterns.unitree": ("unitree_l1", "unitree_l2"),
     "rotations": ("quat_from_rpy",),
     "scene": ("RayHits", "RayScene"),
     "sectors": ("SectorDistances",),

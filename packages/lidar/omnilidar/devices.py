@@ -7,14 +7,14 @@ commonly quoted datasheet values without the document at hand.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
 from .noise import AngularJitter, GaussianNoise, Noise, TabulatedNoise
 
 if TYPE_CHECKING:
-    from .patterns import ScanPattern
+    from .patterns.table import ScanPattern
 
 
 @dataclass(frozen=True)
@@ -142,23 +142,13 @@ _NAMES_AND_SOURCES = {
 
 def _pattern(preset: str) -> ScanPattern:
     """The scan pattern of a device; PyTorch, which it needs, is loaded here."""
-    from . import patterns
+    import omnilidar
 
     if preset in _OUSTERS:
         k, channels = _OUSTERS[preset]
-        return getattr(patterns, f"os{k}")(channels)
-    return getattr(patterns, preset)()
+        return getattr(omnilidar, f"os{k}")(channels)
+    return getattr(omnilidar, preset)()
 
-
-DEVICES: dict[str, DeviceSpec] = {
-    preset: DeviceSpec(
-        *_NAMES_AND_SOURCES[preset],
-        pattern=partial(_pattern, preset),
-        **dict(zip(_COLUMNS, row, strict=True)),  # type: ignore[arg-type]
-    )
-    for preset, row in _TABLE.items()
-}
-"""Every commercial sensor, by the name of its preset."""
 
 _NO_MISSES = (0.0,)
 """Of recordings that leave misses out: how many there are is not known."""
@@ -181,7 +171,13 @@ _RECORDED: dict[str, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ..
 }
 """Edges of ranges (m), sigma (m) at less than 40 degrees of incidence, share of hits lost (docs/lab/fidelity.md)."""
 
-for _name, _table in _RECORDED.items():
-    DEVICES[_name] = replace(
-        DEVICES[_name], measured=(TabulatedNoise(*_table, sigma_elsewhere=DEVICES[_name].range_sigma),)
+DEVICES: dict[str, DeviceSpec] = {
+    preset: DeviceSpec(
+        *_NAMES_AND_SOURCES[preset],
+        pattern=partial(_pattern, preset),
+        **dict(zip(_COLUMNS, row, strict=True)),  # type: ignore[arg-type]
+        measured=(TabulatedNoise(*_RECORDED[preset], sigma_elsewhere=row[6]),) if preset in _RECORDED else (),
     )
+    for preset, row in _TABLE.items()
+}
+"""Every commercial sensor, by the name of its preset."""

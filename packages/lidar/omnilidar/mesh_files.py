@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from .clouds.ply import ORDERS, TYPES
+from .clouds.ply import read_header
 
 Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (V, 3) float64 and triangles, their indices, (T, 3) int64."""
@@ -181,24 +181,16 @@ def _obj(path: Path, data: bytes) -> Mesh:
 
 def _ply(path: Path, data: bytes) -> Mesh:
     """Elements vertex and face, text or binary, faces of any numbers of corners."""
-    head, mark, body = data.partition(b"end_header")
-    lines = [line.split() for line in head.decode("utf-8", "replace").splitlines()]
-    order = ORDERS.get(next((line[1] for line in lines if line[:1] == ["format"]), ""))
-    if not mark or lines[:1] != [["ply"]] or order is None:
-        raise ValueError(f"mesh {path} is not a PLY file: it does not begin with 'ply', 'format' and 'end_header'")
-    body, at, found = body.partition(b"\n")[2], 0, {}
-    kinds = {name: np.dtype(order + kind) for name, kind in TYPES.items()}
-    starts = [k for k, line in enumerate(lines) if line[:1] == ["element"]]
+    order, elements, body, _ = read_header(path, data)
+    at, found = 0, {}
     try:
-        if order == ORDERS["ascii"]:  # as if it were binary, of float64 alone
+        if order == "ascii":  # as if it were binary, of float64 alone
             body = np.array(body.split(), dtype="S").astype(np.float64).tobytes()
-            kinds = dict.fromkeys(kinds, np.dtype(np.float64))
-        for start, end in zip(starts, [*starts[1:], None], strict=True):
-            fields = [
-                [word for word in line if word != "list"] for line in lines[start:end] if line[:1] == ["property"]
-            ]
-            columns = {name: [kinds[word] for word in words] for _, *words, name in fields}
-            found[lines[start][1]], at = _ply_rows(body, at, int(lines[start][2]), columns)
+        for element in elements:
+            columns = {p.name: [p.kind] if p.length is None else [p.length, p.kind] for p in element.properties}
+            if order == "ascii":
+                columns = {name: [np.dtype(np.float64)] * len(kinds) for name, kinds in columns.items()}
+            found[element.name], at = _ply_rows(body, at, element.count, columns)
         vertices = np.stack([found["vertex"][axis] for axis in "xyz"], -1).astype(np.float64)
         faces = found.get("face", {})
         polygons = faces.get("vertex_indices", faces.get("vertex_index", []))

@@ -146,7 +146,7 @@ class TriangleMesh:
     @property
     def half_extents(self) -> tuple[float, float, float]:
         """Half of the smallest box around the frame's origin that holds the mesh, metres."""
-        x, y, z = self._reach.tolist() if len(self.triangles) else (0.0, 0.0, 0.0)
+        x, y, z = np.abs(self.vertices[self.triangles]).max(axis=(0, 1), initial=0.0).tolist()
         return x, y, z
 
     @property
@@ -154,10 +154,6 @@ class TriangleMesh:
         """Radius of the smallest sphere around the frame's origin that holds the mesh, metres."""
         corners = self.vertices[self.triangles].astype(np.float64)
         return float(np.linalg.norm(corners, axis=-1).max(initial=0.0)) * (1.0 + 1e-6)
-
-    @property
-    def _reach(self) -> np.ndarray:
-        return np.abs(self.vertices[self.triangles]).max(axis=(0, 1))
 
     @cached_property
     def tree(self) -> Tree:

@@ -40,6 +40,7 @@ class PoseTrack:
         self._oldest = torch.zeros(1, dtype=torch.int32, device=scene.device)
         self._newest = torch.full_like(self._oldest, segments)
         self._forget = torch.ones(scene.num_envs, dtype=torch.bool, device=scene.device)
+        self._tensors = (self._pos, self._quat, self._turn, self._oldest, self._newest, self._forget)
         self._num_recorded, self._is_complete = 0, False
         self.arrays = self._as_arrays()
         args = [scene.wp_body_pos, scene.wp_body_quat, wp.from_torch(self._newest), min(jump, 3.0e38)]
@@ -77,14 +78,12 @@ class PoseTrack:
 
     def state_dict(self) -> dict:
         """A copy of the poses."""
-        tensors = (self._pos, self._quat, self._turn, self._oldest, self._newest, self._forget)
         counts = {"num_recorded": self._num_recorded, "is_complete": self._is_complete}
-        return {"tensors": [tensor.clone() for tensor in tensors], **counts}
+        return {"tensors": [tensor.clone() for tensor in self._tensors], **counts}
 
     def load_state_dict(self, state: dict) -> None:
         """Brings back what ``state_dict`` gave."""
-        tensors = (self._pos, self._quat, self._turn, self._oldest, self._newest, self._forget)
-        for own, saved in zip(tensors, state["tensors"], strict=True):
+        for own, saved in zip(self._tensors, state["tensors"], strict=True):
             own.copy_(saved)
         self._num_recorded, self._is_complete = state["num_recorded"], state["is_complete"]
 

@@ -9,7 +9,6 @@ miss into a hit; a ray that jitter turns may hit what the nominal one would have
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -141,11 +140,6 @@ class TabulatedNoise:
             _require_amount("table.sigma", sigma)
         for share in self.dropout:
             _require_share("table.dropout", share)
-
-    def dropout_at(self, distance: float) -> float:
-        """Probability that a hit at a distance (m) is lost."""
-        inside = self.edges[0] <= distance < self.edges[-1]
-        return self.dropout[bisect_right(self.edges, distance) - 1] if inside else 0.0
 
 
 @dataclass(frozen=True)

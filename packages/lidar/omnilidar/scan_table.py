@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from .patterns import ScanPattern
+from .patterns.table import ScanPattern
 
 
 class ScanTable:

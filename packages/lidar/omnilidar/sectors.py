@@ -60,21 +60,17 @@ class SectorDistances:
             raise ValueError(f"num_sectors={num_sectors} must be at least 1")
         if not max_distance > 0.0:
             raise ValueError(f"max_distance={max_distance} must be > 0")
+        out = torch.empty(num_envs, num_sectors, device=true_ranges.device) if out is None else out
+        num_bodies = max(body_quat.shape[1], base + 1)
         for name, given, shape in (
             ("directions_s", directions_s, (num_envs, num_rays, 3)),
-            ("class_id", class_id, true_ranges.shape),
+            ("class_id", class_id, (num_envs, num_rays)),
+            ("body_quat", body_quat, (num_envs, num_bodies, 4)),
+            ("body_pos", body_pos, (num_envs, num_bodies, 3)),
+            ("out", out, (num_envs, num_sectors)),
         ):
             if given.shape != shape:
-                raise ValueError(f"{name} must be {tuple(shape)}, got {tuple(given.shape)}")
-        if body_quat.ndim != 3 or body_quat.shape[::2] != (num_envs, 4) or not 0 <= base < body_quat.shape[1]:
-            raise ValueError(
-                f"body_quat must be ({num_envs}, bodies, 4) with bodies > base={base}, got {tuple(body_quat.shape)}"
-            )
-        if body_pos.shape != (*body_quat.shape[:2], 3):
-            raise ValueError(f"body_pos must be {(*body_quat.shape[:2], 3)}, got {tuple(body_pos.shape)}")
-        if out is not None and out.shape != (num_envs, num_sectors):
-            raise ValueError(f"out must be ({num_envs}, {num_sectors}), got {tuple(out.shape)}")
-        out = torch.empty(num_envs, num_sectors, device=true_ranges.device) if out is None else out
+                raise ValueError(f"{name} must be {shape}, got {tuple(given.shape)}")
         self.distances = out.fill_(max_distance)
         wp.init()  # from_torch does not, and no scene need have been built before
         lanes = LANES[true_ranges.device.type]

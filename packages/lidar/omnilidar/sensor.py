@@ -19,8 +19,8 @@ from .kernels.scan import Labels, Rays, ScanOutputs, scan_kernel
 from .launch import SplitLaunch
 from .motion import PoseTrack, SweptShapes
 from .noise import Noise, max_deviation, noise_by_name
-from .patterns import ROW_SLACK, ScanPattern, make_selection
-from .patterns.selection import Strategy
+from .patterns.selection import Strategy, make_selection
+from .patterns.table import ROW_SLACK, ScanPattern
 from .rotations import quat_from_rpy
 from .scan_table import ScanTable
 from .scene import PlacedShapes, RayScene, SensorView

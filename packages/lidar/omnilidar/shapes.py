@@ -83,14 +83,10 @@ class Shape:
         norm = math.hypot(*self.quat)
         if abs(norm - 1.0) > 1e-3:
             raise ValueError(f"shape.quat={self.quat} must be a unit quaternion (w, x, y, z); its norm is {norm:.6g}")
-        for field in ("body", "class_id"):
+        for field, least, why in (("body", -1, "-1 is a fixed shape"), ("class_id", 0, "-1 is reserved for misses")):
             value = getattr(self, field)
-            if not hasattr(value, "__index__"):
-                raise ValueError(f"shape.{field}={value} must be a whole number")
-        if self.body < -1:
-            raise ValueError(f"shape.body={self.body} must be a body index >= 0, or -1 for a fixed shape")
-        if self.class_id < 0:
-            raise ValueError(f"shape.class_id={self.class_id} must be >= 0; -1 is reserved for misses")
+            if not hasattr(value, "__index__") or value < least:
+                raise ValueError(f"shape.{field}={value} must be a whole number >= {least}; {why}")
         self._check_asset()
 
     def _check_asset(self) -> None:

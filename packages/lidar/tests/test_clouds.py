@@ -1,6 +1,5 @@
 """Point clouds in files: round trips, files written by hand or by other programs' rules, and one-line errors."""
 
-import inspect
 import struct
 import sys
 from dataclasses import replace
@@ -23,7 +22,7 @@ from omnilidar import (
     write_scans,
 )
 from omnilidar.clouds import table_of
-from omnilidar.clouds.pointcloud2 import message_from_table, table_from_message
+from omnilidar.clouds.pointcloud2 import message_from_table
 
 NEEDS = {".pcd": "pypcd4", ".ply": None, ".las": "laspy", ".npz": None, ".mcap": "mcap_ros2"}
 OUTPUTS = ("ranges", "valid", "points_w", "points_s", "normals_w", "intensity", "class_id", "time_s", "row")
@@ -127,27 +126,6 @@ def test_a_binary_ply_is_what_its_description_says(tmp_path):
     assert lines[3:] == ["element vertex 1", *(f"property float {a}" for a in "xyz"), "property uchar ring"]
 
 
-def test_ply_of_other_programs_is_read(tmp_path):
-    head = "ply\nformat {}\ncomment made by hand\nelement vertex 2\nproperty double x\n"
-    head += "property float32 y\nproperty short z\n"
-    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    (tmp_path / "text.ply").write_text(head.format("ascii 1.0") + "1.5 2 3\n-4 5.25 -6\n3 0 1 1\n")
-    rows = struct.pack(">dfhdfh", 1.5, 2.0, 3, -4.0, 5.25, -6)
-    (tmp_path / "big.ply").write_bytes(head.format("binary_big_endian 1.0").encode() + rows + b"\x03\0\0\0\0")
-    for name in ("text.ply", "big.ply"):
-        np.testing.assert_array_equal(read_points(tmp_path / name).xyz, [[1.5, 2.0, 3.0], [-4.0, 5.25, -6.0]])
-
-
-def test_pcd_as_text_is_read(tmp_path):
-    pytest.importorskip("pypcd4")
-    fields = "VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\n"
-    text = f"# .PCD v0.7 - Point Cloud Data file format\n{fields}VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA ascii\n"
-    (tmp_path / "a.pcd").write_text(text + "1 2 3 40\n0 0 0 0\n")
-    table = read_points(tmp_path / "a.pcd")
-    np.testing.assert_array_equal(table.xyz, [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
-    assert table.points["intensity"].tolist() == [40.0, 0.0] and table.frame == ""
-
-
 def test_a_pointcloud2_has_the_layout_of_its_description():
     columns = {"x": np.float32([1.0]), "y": np.float32([2.0]), "z": np.float32([3.0]), "ring": np.uint16([9])}
     message = message_from_table(table_of(columns, "lidar", 7.25))
@@ -169,11 +147,11 @@ def test_a_stamp_just_below_a_second_is_that_second():
 
 def test_a_recording_holds_many_frames(tmp_path):
     pytest.importorskip("mcap_ros2")
-    tables = [table_of({a: np.full(3, k, np.float32) for a in "xyz"}, "lidar", 0.1 * k) for k in range(4)]
+    tables = [table_of({a: np.full(k, k, np.float32) for a in "xyz"}, "lidar", 0.1 * k) for k in range(4)]
     write_scans(tmp_path / "run.mcap", tables)
     found = list(read_scans(tmp_path / "run.mcap"))
     assert [table.time_s for table in found] == pytest.approx([0.0, 0.1, 0.2, 0.3])
-    assert [table.xyz[0, 0] for table in found] == [0.0, 1.0, 2.0, 3.0]
+    assert [table.xyz[:, 0].tolist() for table in found] == [[], [1.0], [2.0, 2.0], [3.0, 3.0, 3.0]]
     assert read_points(tmp_path / "run.mcap", index=2).xyz[0, 0] == 2.0
     with pytest.raises(ValueError, match="holds no frame number 4"):
         read_points(tmp_path / "run.mcap", index=4)
@@ -183,31 +161,6 @@ def test_a_recording_holds_many_frames(tmp_path):
         write_scans(tmp_path / "run.mcap", [tables[0], replace(tables[0], time_s=-1.0)])
     assert len(list(read_scans(tmp_path / "run.mcap"))) == 4  # what was there stays
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
-
-
-def test_a_bag_of_ros_is_read(tmp_path):
-    """Written by rosbags' own serializer."""
-    pytest.importorskip("rosbags")
-    from rosbags.rosbag2 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-    xyz = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
-    fields = [types["sensor_msgs/msg/PointField"](a, 4 * k, 7, 1) for k, a in enumerate("xyz")]
-    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](5, 500_000_000), "velodyne")
-    cloud = types["sensor_msgs/msg/PointCloud2"](
-        header, 1, 2, fields, False, 16, 32, np.hstack([xyz, np.zeros((2, 1), np.float32)]).view(np.uint8).ravel(), True
-    )
-    version = {"version": 8} if "version" in inspect.signature(Writer.__init__).parameters else {}
-    with Writer(tmp_path / "bag", **version) as bag:
-        connection = bag.add_connection("/cloud", cloud.__msgtype__, typestore=store)
-        bag.write(connection, 1, store.serialize_cdr(cloud, cloud.__msgtype__))
-    table = read_points(tmp_path / "bag")
-    np.testing.assert_array_equal(table.xyz, xyz)
-    assert (table.frame, table.time_s) == ("velodyne", 5.5)
-    empty = replace(cloud, height=0, data=np.zeros(0, np.uint8))
-    assert len(table_from_message(empty)) == 0 and table_from_message(empty).names == table.names
 
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\n"

@@ -5,11 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from scan_coverage import selection_coverage
 
 from omnilidar import ScanPattern, avia, grid, make_selection, mid40, mid360, vlp16, xt16
-from omnilidar.patterns.cells import SphereCells
-from omnilidar.patterns.selection import _one_per_cell, field_cells
+from omnilidar.patterns.selection import SphereCells, _one_per_cell, field_cells
 
 STRATEGIES = ("every_kth", "stratified")
 
@@ -65,8 +63,7 @@ class TestVariants:
         first = torch.tensor([0, 2 * selection.phase_step])
         variants = [selection.variants(first, torch.tensor([k])).tolist() for k in range(20)]
         assert variants == [[(k % 16) * starts, (k % 16) * starts + 2] for k in range(20)]
-        (short, _), (long, _) = (selection_coverage(pattern, selection, 0.1, s, cell_deg=5.0) for s in (0.1, 1.0))
-        assert long > 2.0 * short
+        assert len(selection.offsets[::starts].unique(dim=0)) == 16
 
     def test_phases_are_where_the_bank_begins(self, selections):
         for selection in selections.values():
@@ -88,7 +85,8 @@ class TestStratified:
         random = np.random.default_rng(0)
         level, azimuth = random.uniform(-1.0, 1.0, 20_000), random.uniform(0.0, 2.0 * math.pi, 20_000)
         pattern = ScanPattern.from_angles(np.arcsin(level), azimuth, 20_000.0)
-        assert abs(len(np.unique(field_cells(pattern, 256).of(pattern))) - 256) < 15
+        touched = field_cells(pattern, 256).index(np.arcsin(level), azimuth)
+        assert abs(len(np.unique(touched)) - 256) < 15
         selection = make_selection(pattern, 0.1, 256, "stratified", seed=1)
         starts = torch.arange(selection.num_variants)[:, None] * selection.phase_step
         kept = (starts + selection.offsets) % 20_000
@@ -117,15 +115,6 @@ class TestStratified:
         assert below["every_kth"] < 15
         assert 70 <= below["stratified"] <= 110  # some of the 200 share a cell
 
-    @pytest.mark.parametrize("make", [avia, mid360], ids=["avia", "mid360"])
-    def test_it_leaves_smaller_gaps_than_every_kth(self, make):
-        pattern = make()
-        every_kth, stratified = (
-            selection_coverage(pattern, make_selection(pattern, 0.1, 500, s), 0.1, 0.1, cell_deg=4.0)
-            for s in STRATEGIES
-        )
-        assert stratified[1] < every_kth[1] and stratified[0] > every_kth[0]
-
 
 class TestCells:
     @pytest.mark.parametrize("edge_deg", [1.0, 2.5, 7.0, 90.0])
@@ -136,14 +125,13 @@ class TestCells:
         area = 2.0 * math.pi * np.diff(level) / cells.columns
         nominal = (math.pi / rings) ** 2
         assert area[1:-1] == pytest.approx(np.full(len(area[1:-1]), nominal), rel=0.15)
-        assert cells.num_cells == cells.columns.sum()
 
     def test_every_direction_has_a_cell(self):
         cells = SphereCells(3.0)
         random = np.random.default_rng(0)
         elevation = np.append(np.arcsin(random.uniform(-1.0, 1.0, 10_000)), [math.pi / 2.0, -math.pi / 2.0])
         index = cells.index(elevation, np.append(random.uniform(-10.0, 10.0, 10_000), [0.0, 2.0 * math.pi]))
-        assert index.min() >= 0 and index.max() < cells.num_cells
+        assert index.min() >= 0 and index.max() < cells.columns.sum()
         same = cells.index(np.array([0.1, 0.1]), np.array([1.0, 1.0 + 2.0 * math.pi]))
         assert same[0] == same[1]
 

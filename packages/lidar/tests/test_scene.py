@@ -99,25 +99,6 @@ def random_crowd(num_shapes, seed, num_envs=2):
     return scene
 
 
-@pytest.mark.parametrize("num_shapes", [1, 2, 40, 1000])
-def test_a_view_has_everything_in_reach_nearest_first(num_shapes):
-    scene = random_crowd(num_shapes, seed=num_shapes)
-    placed = PlacedShapes(scene, (), SensorView(pos=(0.3, 0.2, 0.1), max_range=4.0))
-    placed.refresh()
-    origin = torch.tensor([0.3, 0.2, 0.1])
-    for env in range(scene.num_envs):
-        count = int(placed.slots.count.numpy()[env])
-        near, shape = placed.slots.near.numpy()[env, :count], placed.slots.shape.numpy()[env, :count]
-        assert (near[1:] >= near[:-1]).all() and len(set(shape)) == count
-        away = (scene.body_pos[env] - origin).norm(dim=-1)
-        radius = torch.tensor([s.bounding_radius for s in scene.shapes])
-        assert set((away < 4.0).nonzero().flatten().tolist()) <= set(shape.tolist())
-        assert (torch.from_numpy(near) <= away[shape] + 1e-6).all()
-        assert (torch.from_numpy(near) >= (away - radius)[shape] - 1e-4).all()
-        centre = torch.from_numpy(placed.slots.bound.numpy()[env, :count, :3])
-        torch.testing.assert_close(centre.norm(dim=-1), away[shape], rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.parametrize("window", [(-0.3, -0.1), (-0.05, 0.9), (1.2, 1.5), (-1.57, -1.1), (-1.5708, 1.5708)])
 def test_what_is_left_out_is_outside_the_elevations(window):
     """A direction within the window that hits a shape proves that the shape must be in the view."""
@@ -136,22 +117,6 @@ def test_what_is_left_out_is_outside_the_elevations(window):
     assert seen and seen <= viewed
     if window[1] - window[0] < 1.0:
         assert len(viewed) < 190  # something is left out
-
-
-def test_general_rays_through_a_thousand_shapes():
-    """Against ten scenes of a hundred each, in which other shapes stand together."""
-    scene = random_crowd(1000, seed=3, num_envs=1)
-    generator = torch.Generator().manual_seed(0)
-    origins = 10.0 * torch.rand(1, 3000, 3, generator=generator) - 5.0
-    directions = torch.randn(1, 3000, 3, generator=generator)
-    hits = scene.cast(origins, directions)
-    best = torch.full_like(hits.ranges, math.inf)
-    for first in range(0, 1000, 100):
-        part = RayScene([replace(s, body=k) for k, s in enumerate(scene.shapes[first : first + 100])], 1, 100)
-        part.body_pos.copy_(scene.body_pos[:, first : first + 100])
-        part.body_quat.copy_(scene.body_quat[:, first : first + 100])
-        best = torch.minimum(best, part.cast(origins, directions).ranges)
-    assert torch.equal(hits.ranges, best)
 
 
 # --- poses -----------------------------------------------------------------------------------------------------

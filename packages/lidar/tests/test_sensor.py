@@ -22,9 +22,9 @@ from omnilidar import (
     Shape,
     ShapeKind,
     grid,
+    make_selection,
     quat_from_rpy,
 )
-from omnilidar.patterns import make_selection
 
 K = ShapeKind
 
@@ -232,26 +232,6 @@ def test_searching_many_shapes_at_once_finds_what_one_by_one_finds(num_bodies):
     assert (frame.shape_id == hits.shape_id).float().mean() > 0.9999
     same = frame.shape_id == hits.shape_id
     torch.testing.assert_close(frame.ranges[same], hits.ranges[same], rtol=2e-5, atol=2e-5)
-
-
-def test_several_sensors_see_one_scene_at_their_own_rates(pattern):
-    scene = RayScene([Shape(K.PLANE), Shape(K.SPHERE, (0.5,), body=1, class_id=3)], 2, 2)
-    front = Lidar(LidarConfig(400, 0.1, mount_pos=(0.2, 0.0, 0.0)), pattern, scene, 0, outputs=("ranges", "row"))
-    down = LidarConfig(16, 1 / 30, 0.1, 5.0, mount_rpy=(0.0, math.pi / 2, 0.0))
-    depth = Lidar(down, grid(4, 4, 60.0), scene, 0, outputs=("points_w",))
-    fixed = Lidar(LidarConfig(1, 1 / 30, 0.0, 50.0, (-4.0, 0.0, 1.0)), grid(1, 1, 10.0), scene, -1)
-    for step in (10, 20, 30):
-        height = 0.01 * step
-        scene.body_pos[:, 0] = torch.tensor([height, 3.0, 1.0])
-        scene.body_pos[:, 1] = torch.tensor([0.0, 0.0, 1.0 + height])
-        below = depth.cast(step / 300.0).points_w
-        assert torch.allclose(below[..., 2], torch.zeros(2, 16), atol=1e-5)  # it looks at the ground
-        assert torch.allclose(below[..., 0].mean(1), scene.body_pos[:, 0, 0], atol=1e-4)
-        ahead = fixed.cast(step / 300.0).ranges
-        assert torch.allclose(ahead, torch.tensor(4.0 - math.sqrt(0.25 - height**2)), atol=1e-4)
-    front.cast(0.1)
-    alone = Lidar(front.config, pattern, scene, 0, outputs=("ranges", "row")).cast(0.1)
-    assert torch.equal(front.frame.ranges, alone.ranges) and torch.equal(front.frame.row, alone.row)
 
 
 def test_keeping_the_first_part_of_each_frame_warns():

@@ -44,15 +44,6 @@ class Robot:
         return self.machine.mode
 
 
-def walking():
-    robot = Robot()
-    robot.run(0.1)
-    robot.ask(Request.STAND).run(2.1)
-    robot.ask(Request.WALK).run(0.1)
-    assert robot.mode is Mode.POLICY
-    return robot
-
-
 def is_damped(command):
     return command.kp == 0.0 and command.kd == CONFIG.damping_kd
 
@@ -89,7 +80,7 @@ def test_a_robot_that_does_not_come_up_is_damped():
 
 
 def test_the_policy_drives_with_its_gains_within_the_limits():
-    robot = walking()
+    robot = in_mode(Mode.POLICY)
     robot.targets = STAND + 0.5
     command = robot.run(TICK)
     assert (command.kp, command.kd) == (25.0, 0.6)
@@ -142,7 +133,7 @@ def test_lying_down_while_it_stands_up_folds_the_legs_from_where_they_are():
 
 
 def test_back_to_standing_and_down():
-    robot = walking()
+    robot = in_mode(Mode.POLICY)
     robot.targets = STAND + 0.2
     robot.run(0.1)
     robot.ask(Request.STAND)
@@ -186,22 +177,12 @@ def hot():
     ],
 )
 def test_watchdogs_damp(fault, reason):
-    robot = walking()
+    robot = in_mode(Mode.POLICY)
     for name, value in fault.items():
         setattr(robot, name, value)
     command = robot.run(0.046)
     assert is_damped(command) and robot.mode is Mode.DAMPING and reason in robot.machine.reason
     assert np.isfinite(command.joint_pos).all()
-
-
-@pytest.mark.parametrize("to", [Request.STAND, Request.LIE])
-def test_watchdogs_act_while_it_moves_by_itself(to):
-    robot = Robot()
-    robot.run(0.1)
-    robot.ask(Request.STAND).run(0.5 if to is Request.STAND else 2.1)
-    robot.ask(to)
-    robot.senses = False
-    assert is_damped(robot.run(0.05))
 
 
 def test_it_does_not_stand_up_into_a_fault():
@@ -212,9 +193,9 @@ def test_it_does_not_stand_up_into_a_fault():
     assert robot.mode is Mode.DAMPING and "not standing up: the base leans" in robot.machine.reason
 
 
-def test_asking_for_damping_damps_at_once():
-    robot = walking()
-    assert is_damped(robot.ask(Request.DAMP).run(TICK))
+def test_a_damped_robot_may_stand_up_again():
+    robot = in_mode(Mode.POLICY).ask(Request.DAMP)
+    robot.run(TICK)
     robot.ask(Request.STAND).run(2.1)
     assert robot.mode is Mode.STANDING
 
@@ -266,8 +247,6 @@ def test_nothing_outvotes_an_e_stop(mode):
 
 
 def test_wrong_settings_are_named():
-    with pytest.raises(DeployError, match="machine.silence_s=0: a number above 0"):
-        MachineConfig(STAND, STAND, STAND, 25.0, 0.6, silence_s=0)
     with pytest.raises(DeployError, match=r"machine.stand_pose=\[0.0, 0.0, 0.0\]: 12 finite numbers were"):
         MachineConfig([0.0] * 3, STAND, STAND, 25.0, 0.6)
     for nothing in (None, float("nan")):

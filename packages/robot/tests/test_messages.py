@@ -55,23 +55,6 @@ def test_bytes_and_checksum_are_the_sdks(struct):
     assert struct.from_cdr(data).tobytes() == record.tobytes()
 
 
-def bitwise(words):
-    """The polynomial division bit by bit."""
-    register = 0xFFFFFFFF
-    for word in words:
-        for bit in range(31, -1, -1):
-            top = register >> 31 ^ (word >> bit & 1)
-            register = (register << 1 & 0xFFFFFFFF) ^ (0x04C11DB7 if top else 0)
-    return register
-
-
-def test_the_checksum_is_the_polynomials():
-    rng = np.random.default_rng(0)
-    record = np.frombuffer(rng.bytes(LOW_STATE.dtype.itemsize), LOW_STATE.dtype)[0]
-    words = np.frombuffer(record.tobytes(), "<u4")[:-1].tolist()
-    assert crc(np.asarray(record)) == bitwise(words)
-
-
 def test_a_command_of_nothing_moves_nothing():
     command = low_cmd()
     assert command["head"].tolist() == [0xFE, 0xEF] and command["level_flag"] == 0xFF

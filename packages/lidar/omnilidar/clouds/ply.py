@@ -54,16 +54,7 @@ def read(path: Path) -> PointTable:
 
     A file that is cut off is read up to there; one line on standard error says so, and what was left out.
     """
-    content = path.read_bytes()
-    head, mark, body = content.partition(b"end_header")
-    texts = head.decode("utf-8", "replace").splitlines()
-    lines = [text.split() for text in texts]
-    if not mark or lines[:1] != [["ply"]]:
-        raise ValueError(f"{path} is not a PLY file: it does not begin with 'ply' and 'end_header'")
-    order = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
-    if order not in ORDERS:
-        raise ValueError(f"{path}: PLY format {order!r} must be one of {', '.join(ORDERS)}")
-    elements = _elements(path, lines, ORDERS[order])
+    order, elements, body, texts = read_header(path, path.read_bytes())
     number = next((k for k, element in enumerate(elements) if element.name == "vertex"), None)
     if number is None:
         raise ValueError(f"{path}: a PLY file with vertices was expected, it has {[e.name for e in elements]}")
@@ -76,7 +67,6 @@ def read(path: Path) -> PointTable:
         raise ValueError(f"{path}: a vertex has a property twice: {', '.join(names)}")
     if vertex.lists:
         print(f"{path}: left out, as lists are no columns: {', '.join(vertex.lists)}", file=sys.stderr, flush=True)
-    body = body.partition(b"\n")[2]
     columns = _of_text(path, body, before, vertex) if order == "ascii" else _of_bytes(path, body, before, vertex)
     comments = [text.removeprefix("comment ").partition(" ") for text in texts if text.startswith("comment ")]
     said = {word: rest for word, _, rest in comments if rest}
@@ -85,6 +75,19 @@ def read(path: Path) -> PointTable:
     except ValueError:
         raise ValueError(f"{path}: its comment says {TIME} {said[TIME]}, a number of seconds was expected") from None
     return table_of(columns, said.get(FRAME, ""), time_s)
+
+
+def read_header(path: Path, content: bytes) -> tuple[str, list[_Element], bytes, list[str]]:
+    """The format, one of `ORDERS`; the elements; what follows the header; and its lines."""
+    head, mark, body = content.partition(b"end_header")
+    texts = head.decode("utf-8", "replace").splitlines()
+    lines = [text.split() for text in texts]
+    if not mark or lines[:1] != [["ply"]]:
+        raise ValueError(f"{path} is not a PLY file: it does not begin with 'ply' and 'end_header'")
+    order = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
+    if order not in ORDERS:
+        raise ValueError(f"{path}: PLY format {order!r} must be one of {', '.join(ORDERS)}")
+    return order, _elements(path, lines, ORDERS[order]), body.partition(b"\n")[2], texts
 
 
 def _elements(path: Path, lines: list[list[str]], order: str) -> list[_Element]:

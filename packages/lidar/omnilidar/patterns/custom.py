@@ -74,13 +74,6 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _has_header(lines: list[str]) -> bool:
-    """Whether the first line's cells all are words."""
-    return all(cell.strip()[:1].isalpha() and not _is_number(cell) for cell in lines[0].split(","))
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)  # nan, too
-    except ValueError:
-        return False
-    return True
+    """Whether the first line's cells all are words, and none says that a number is missing."""
+    cells = [cell.strip().lower() for cell in lines[0].split(",")]
+    return all(cell[:1].isalpha() and cell not in ("nan", "inf", "infinity") for cell in cells)

@@ -119,13 +119,7 @@ def hap(source: Source = "model") -> ScanPattern:
 
 
 LIVOX: dict[str, Callable[[Source], ScanPattern]] = {
-    "mid360": mid360,
-    "avia": avia,
-    "hap": hap,
-    "horizon": horizon,
-    "mid40": mid40,
-    "mid70": mid70,
-    "tele15": tele15,
+    make.__name__: make for make in (mid360, avia, hap, horizon, mid40, mid70, tele15)
 }
 """Every Livox scanner by name."""
 

@@ -54,7 +54,6 @@ class Mid360Motion:
         turn_start, sweep_start: Phases at time 0, rad.
         azimuth_start_deg: Azimuth of turn 0.
         sense: -1 if the azimuth falls, as in the maker's table; 1 if it grows, the mirror image of that.
-        offset_along, offset_across: Of the row of lasers from the mirror's axis, in units of p.
     """
 
     turns_per_second: float
@@ -65,8 +64,6 @@ class Mid360Motion:
     sweep_start: float = 0.0
     azimuth_start_deg: float = 0.0
     sense: float = 1.0
-    offset_along: float = 0.0
-    offset_across: float = 0.0
 
 
 TABLE = Mid360Motion(
@@ -104,7 +101,6 @@ def directions(
     motion: Mid360Motion, turn: np.ndarray, sweep: np.ndarray, laser: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Elevation and azimuth, rad, for phases in rad and lasers p; any shapes that broadcast."""
-    laser = laser + complex(motion.offset_along, motion.offset_across)
     elevation_cos = {(0, 0): motion.elevation_cos, **ELEVATION_COS}
     azimuth_sin = {(0, 0): motion.azimuth_sin, **AZIMUTH_SIN}
     elevation = _sum(elevation_cos, turn, sweep, laser).real + _sum(ELEVATION_SIN, turn, sweep, laser).imag
@@ -113,9 +109,9 @@ def directions(
 
 
 def _sum(terms: Terms, turn: np.ndarray, sweep: np.ndarray, laser: np.ndarray) -> np.ndarray:
-    """Series with cosines as real and sines as imaginary part, rad; a laser's p turns with what it multiplies."""
+    """Series with cosines as real and sines as imaginary part, rad."""
     total = np.zeros(np.broadcast_shapes(turn.shape, sweep.shape, laser.shape), complex)
     for (power, k), amplitudes in terms.items():
         series = sum(a * np.exp(1j * (k * turn + n * sweep)) for n, a in amplitudes.items())
-        total += np.radians(1.0) * series * (laser**power if k == power else laser.real**power)
+        total += np.radians(1.0) * series * laser**power
     return total

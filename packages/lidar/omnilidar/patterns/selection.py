@@ -7,7 +7,6 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from .cells import SphereCells
 from .table import ScanPattern
 
 Strategy = Literal["every_kth", "stratified"]
@@ -19,6 +18,38 @@ MAX_OFFSETS = 1 << 22
 """Bound on variants x points of which a stratified bank is chosen."""
 FIELD_SAMPLE = 50_000
 """Rows of the table from which the size of the field of view is found."""
+
+
+@dataclass(frozen=True)
+class SphereCells:
+    """The sphere in rings of equal height in elevation, each cut into cells about as wide as they are high.
+
+    Attributes:
+        edge_deg: Height of a ring; the next smaller one that divides 180 deg is used.
+    """
+
+    edge_deg: float
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Cells of each ring, from the lowest, (num_rings,) int64."""
+        rings = math.ceil(180.0 / self.edge_deg - 1e-9)
+        middle = math.pi * ((np.arange(rings) + 0.5) / rings - 0.5)
+        return np.maximum(1, np.round(2.0 * rings * np.cos(middle))).astype(np.int64)
+
+    def index(self, elevation: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+        """Cell of each direction given in rad, in 0..columns.sum()-1."""
+        return self.locate(elevation, azimuth)[0]
+
+    def locate(self, elevation: np.ndarray, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cell of each direction given in rad, and its squared distance from the cell's centre in cell widths."""
+        columns = self.columns
+        first = np.cumsum(columns) - columns
+        up = (elevation / math.pi + 0.5) * len(columns)
+        ring = np.clip(np.floor(up), 0, len(columns) - 1).astype(np.int64)
+        along = np.mod(azimuth / (2.0 * math.pi), 1.0) * columns[ring]
+        column = np.minimum(along.astype(np.int64), columns[ring] - 1)
+        return first[ring] + column, (up - ring - 0.5) ** 2 + (along - column - 0.5) ** 2
 
 
 @dataclass(frozen=True)

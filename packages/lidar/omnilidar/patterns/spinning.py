@@ -2,6 +2,7 @@
 
 A ray's azimuth follows from the time at which its laser fires: minus the turning rate times that time, minus the
 laser's own offset. Rows are in order of firing, single return, and the table begins with a column at azimuth 0.
+``frame_hz`` of a device is its turns per second, 5..20.
 The table holds whole turns: one where a turn holds a whole number of columns; otherwise as many, up to ten, as hold
 nearly so, and the turning rate is changed by that little (3e-6 for Velodyne's at 10 Hz) to close the table.
 A device that pauses between cycles has its rows spread evenly over the cycle, so a row's time, i / points_per_second,
@@ -94,48 +95,33 @@ def hdl64e(frame_hz: float = 10.0) -> ScanPattern:
 
     One cycle of all lasers takes 48 us. Laser i of both blocks fires at once, the 32 pairs evenly over the cycle. Each
     unit's own calibration, which shifts lasers by up to some degrees in azimuth, is left out.
-
-    Args:
-        frame_hz: Turns per second, 5..20.
     """
     upper, lower = 2.0 - np.arange(32) / 3.0, -8.83 - 0.5 * np.arange(32)
     cycle = 48.0 * MICROSECOND
     fire = np.repeat(np.arange(32) / 32.0 * cycle, 2)
     elevation = np.stack([upper, lower], axis=1).ravel()
-    return spinning(elevation.tolist(), _spin_rate(frame_hz, 5.0, 20.0), cycle, fire.tolist())
+    return spinning(elevation.tolist(), _spin_rate(frame_hz), cycle, fire.tolist())
 
 
 def hdl32e(frame_hz: float = 10.0) -> ScanPattern:
-    """Velodyne HDL-32E: 4/3 deg apart, +10.67..-30.67 deg, 694,444 points/s; fires from the lowest, two banks in turn.
-
-    Args:
-        frame_hz: Turns per second, 5..20.
-    """
+    """Velodyne HDL-32E: 4/3 deg apart, +10.67..-30.67 deg, 694,444 points/s; from the lowest, two banks in turn."""
     lower = -92.0 / 3.0 + 4.0 / 3.0 * np.arange(16)
     upper = lower + 64.0 / 3.0
     fire = 1.152 * MICROSECOND * np.arange(32)
     elevation = np.stack([lower, upper], axis=1).ravel()
-    return spinning(elevation.tolist(), _spin_rate(frame_hz, 5.0, 20.0), 46.08 * MICROSECOND, fire.tolist())
+    return spinning(elevation.tolist(), _spin_rate(frame_hz), 46.08 * MICROSECOND, fire.tolist())
 
 
 def vlp16(frame_hz: float = 10.0) -> ScanPattern:
-    """Velodyne VLP-16: 16 lasers 2 deg apart, +-15 deg, 289,352 points/s; each fires 2.304 us after the one before.
-
-    Args:
-        frame_hz: Turns per second, 5..20.
-    """
+    """Velodyne VLP-16: 16 lasers 2 deg apart, +-15 deg, 289,352 points/s; each fires 2.304 us after the one before."""
     fire = 2.304 * MICROSECOND * np.arange(16)
-    return spinning(VLP16_ELEVATION_DEG, _spin_rate(frame_hz, 5.0, 20.0), 55.296 * MICROSECOND, fire.tolist())
+    return spinning(VLP16_ELEVATION_DEG, _spin_rate(frame_hz), 55.296 * MICROSECOND, fire.tolist())
 
 
 def vlp32c(frame_hz: float = 10.0) -> ScanPattern:
-    """Velodyne VLP-32C: 32 uneven lasers, -25..+15 deg, in four columns, 578,704 points/s; pairs fire every 2.304 us.
-
-    Args:
-        frame_hz: Turns per second, 5..20.
-    """
+    """Velodyne VLP-32C: 32 uneven lasers, -25..+15 deg, in four columns, 578,704 points/s; a pair every 2.304 us."""
     fire = 2.304 * MICROSECOND * (np.arange(32) // 2)
-    rate = _spin_rate(frame_hz, 5.0, 20.0)
+    rate = _spin_rate(frame_hz)
     return spinning(VLP32C_ELEVATION_DEG, rate, 55.296 * MICROSECOND, fire.tolist(), VLP32C_OFFSET_DEG)
 
 
@@ -181,43 +167,29 @@ def ouster(model: str, channels: int = 128, mode: str = "1024x10") -> ScanPatter
 
 
 def xt32(frame_hz: float = 10.0) -> ScanPattern:
-    """Hesai XT32: 1 deg apart, +15..-16 deg, 640,000 points/s; channels fire 1.512 us apart, from the top.
-
-    Args:
-        frame_hz: Turns per second, 5..20.
-    """
+    """Hesai XT32: 1 deg apart, +15..-16 deg, 640,000 points/s; channels fire 1.512 us apart, from the top."""
     return _hesai_xt(32, frame_hz)
 
 
 def xt16(frame_hz: float = 10.0) -> ScanPattern:
-    """Hesai XT16: 2 deg apart, +-15 deg, 320,000 points/s; channels fire 3.024 us apart, from the top.
-
-    Args:
-        frame_hz: Turns per second, 5..20.
-    """
+    """Hesai XT16: 2 deg apart, +-15 deg, 320,000 points/s; channels fire 3.024 us apart, from the top."""
     return _hesai_xt(16, frame_hz)
 
 
 def airy(frame_hz: float = 10.0) -> ScanPattern:
-    """RoboSense Airy: 96 channels evenly over 0..90 deg, 864,000 points/s; groups of eight fire together.
-
-    Args:
-        frame_hz: Turns per second, 5..20.
-    """
+    """RoboSense Airy: 96 channels evenly over 0..90 deg, 864,000 points/s; groups of eight fire together."""
     fire = MICROSECOND * np.repeat(AIRY_FIRE_US, 8)
-    return spinning(np.linspace(0.0, 90.0, 96).tolist(), _spin_rate(frame_hz, 5.0, 20.0), 1.0 / 9000.0, fire.tolist())
+    return spinning(np.linspace(0.0, 90.0, 96).tolist(), _spin_rate(frame_hz), 1.0 / 9000.0, fire.tolist())
 
 
 def _hesai_xt(channels: int, frame_hz: float) -> ScanPattern:
     step = 32 // channels
     fire = 1.512 * MICROSECOND * step * np.arange(channels)  # Hesai's SDK, firetime corrections of the PandarXT
     elevation = 15.0 - step * np.arange(channels)
-    return spinning(elevation.tolist(), _spin_rate(frame_hz, 5.0, 20.0), 50.0 * MICROSECOND, fire.tolist())
+    return spinning(elevation.tolist(), _spin_rate(frame_hz), 50.0 * MICROSECOND, fire.tolist())
 
 
-def _spin_rate(frame_hz: float, low: float, high: float) -> float:
-    if not low <= frame_hz <= high:
-        raise ValueError(
-            f"lidar.pattern.frame_hz={frame_hz} must be in {low:g}..{high:g}, the turns per second it can do"
-        )
+def _spin_rate(frame_hz: float) -> float:
+    if not 5.0 <= frame_hz <= 20.0:
+        raise ValueError(f"lidar.pattern.frame_hz={frame_hz} must be in 5..20, the turns per second it can do")
     return frame_hz

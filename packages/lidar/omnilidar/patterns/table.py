@@ -69,14 +69,7 @@ class ScanPattern:
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
             axis=1,
         )
-        return cls(
-            torch.from_numpy(directions.astype(np.float32)),
-            torch.from_numpy(elevation.astype(np.float32)),
-            torch.from_numpy(_one_turn(azimuth)),
-            points_per_second,
-            num_lasers,
-            **fields,
-        )
+        return cls(_single(directions), _single(elevation), _one_turn(azimuth), points_per_second, num_lasers, **fields)
 
     @classmethod
     def from_directions(
@@ -86,12 +79,7 @@ class ScanPattern:
         x, y, z = np.asarray(directions_s, dtype=np.float64).T
         elevation, azimuth = np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
         return cls(
-            torch.from_numpy(np.ascontiguousarray(directions_s, dtype=np.float32)),
-            torch.from_numpy(elevation.astype(np.float32)),
-            torch.from_numpy(_one_turn(azimuth)),
-            points_per_second,
-            num_lasers,
-            **fields,
+            _single(directions_s), _single(elevation), _one_turn(azimuth), points_per_second, num_lasers, **fields
         )
 
     @property
@@ -153,8 +141,12 @@ class ScanPattern:
         return out.copy_(rows).add_(phase_rows).remainder_(self.num_rows)
 
 
-def _one_turn(azimuth: np.ndarray) -> np.ndarray:
+def _single(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def _one_turn(azimuth: np.ndarray) -> torch.Tensor:
     """float32 angles in [0, 2 pi), also after rounding."""
     azimuth = np.mod(azimuth, 2.0 * math.pi).astype(np.float32)
     azimuth[azimuth >= np.float32(2.0 * math.pi)] = 0.0
-    return azimuth
+    return torch.from_numpy(azimuth)

@@ -185,22 +185,12 @@ class FrameSource(Protocol):
     def new(self) -> list[Frame]: ...
 
 
-class Awaited(Protocol):
-    """What is to come again and again."""
-
-    came: int
-
-    def why_silent(self) -> str:
-        """What is known of why nothing has come since the call before."""
-
-
 class Waiting:
     """Says every few seconds what does not come, and what comes instead."""
 
     SAY_EVERY_S = 3.0
 
-    def __init__(self, awaited: Mapping[str, Awaited]) -> None:
-        """Args: awaited: by name."""
+    def __init__(self, awaited: Mapping[str, StateReader | Frames]) -> None:
         self._awaited, self._came = awaited, dict.fromkeys(awaited, 0)
         self._due = dict.fromkeys(awaited, math.inf)
 
@@ -252,7 +242,6 @@ class Control:
         link: GuardLink,
         listener: Listener | None = None,
     ) -> None:
-        """Args: policy: to run; states, frames, operator: what it hears; link: to the guard; listener: takes down."""
         self.policy, self._states, self._frames, self._operator, self._link = policy, states, frames, operator, link
         self._listener = listener
         self._motors = motor_order(policy.description)
@@ -402,7 +391,8 @@ def run(config: RobotConfig, should_end: Callable[[], bool] = lambda: False) -> 
         link, guard = start(GuardConfig(machine, config.interface, config.domain, config.check_crc))
         closing.callback(link.close)
         control = Control(policy, states, frames, operator, link, recorder)
-        awaited: dict[str, Awaited] = {"states of the robot": states} | ({"LiDAR frames": frames} if frames else {})
+        awaited: dict[str, StateReader | Frames] = {"states of the robot": states}
+        awaited |= {"LiDAR frames": frames} if frames else {}
         period_s, waiting = description.control_period_s, Waiting(awaited)
         begins, times, skipped = drive(control, link, period_s, config.seconds, should_end, waiting.look)
         if link.is_closed:

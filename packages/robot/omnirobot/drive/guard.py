@@ -216,7 +216,6 @@ class Guard:
     """
 
     def __init__(self, config: GuardConfig, link: socket.socket, network: Network) -> None:
-        """Args: config: what it needs; link: the policy's socket; network: of DDS."""
         self._config, self._link = config, link
         link.setblocking(False)
         self.machine = Machine(config.machine)

@@ -100,8 +100,6 @@ class MachineConfig:
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, int | float) and not (math.isfinite(value) and value > 0):
-                raise DeployError(f"machine.{item.name}={value}: a number above 0 was expected")
             if not isinstance(value, int | float) and not _is_pose(value):
                 raise DeployError(f"machine.{item.name}={list(value)}: 12 finite numbers were expected")
 
@@ -141,7 +139,6 @@ class Machine:
     """
 
     def __init__(self, config: MachineConfig) -> None:
-        """Args: config: times, gains and limits."""
         self.config = config
         self._stand, self._crouch = np.array(config.stand_pose, float), np.array(config.crouch_pose, float)
         self._lower, self._upper = np.array(config.lower, float), np.array(config.upper, float)

@@ -9,7 +9,6 @@ import select
 import socket
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -23,7 +22,7 @@ _SEQUENCE = re.compile("\x1b[\\[O][0-9;]*[A-Za-z~]")
 """What a terminal sends for arrows and function keys, which begin as the Escape key does."""
 
 
-class Operator(Protocol):
+class Operator:
     """Somebody who commands."""
 
     def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
@@ -34,6 +33,7 @@ class Operator(Protocol):
             remote: the robot's.
             pose: (3,) x, y (m) and heading (rad) of the base in its odometry, which begins with the policy.
         """
+        raise NotImplementedError
 
     def close(self) -> None:
         """Ends it."""
@@ -64,7 +64,7 @@ def scaled(shares: Sequence[float], ranges: Mapping[str, Sequence[float]]) -> np
     return np.array([s * (high if s > 0 else -low) for s, low, high in zip(shares, *limits, strict=True)])
 
 
-class Sticks:
+class Sticks(Operator):
     """The remote: left stick ahead and aside, right stick turns. The guard reads its buttons."""
 
     def __init__(self, ranges: Mapping[str, Sequence[float]]) -> None:
@@ -74,11 +74,8 @@ class Sticks:
         shares = [0.0 if abs(s) < 0.05 else s for s in (remote.ly, -remote.lx, -remote.rx)]
         return scaled(shares, self._ranges), []
 
-    def close(self) -> None:
-        """Nothing to end."""
 
-
-class Constant:
+class Constant(Operator):
     """One command; standing up and walking are asked for by the remote."""
 
     def __init__(self, command: Sequence[float]) -> None:
@@ -87,11 +84,8 @@ class Constant:
     def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         return self._command, []
 
-    def close(self) -> None:
-        """Nothing to end."""
 
-
-class Goal:
+class Goal(Operator):
     """Leads to a place in the robot's odometry, facing it, and stays there; slower over the last metre."""
 
     _RADIUS, _SLOW_WITHIN, _YAW_GAIN = 0.3, 1.0, 1.0
@@ -111,11 +105,8 @@ class Goal:
         wanted = np.array([pace * np.cos(error), pace * np.sin(error), self._YAW_GAIN * error])
         return np.clip(wanted, self._low, self._high), []
 
-    def close(self) -> None:
-        """Nothing to end."""
 
-
-class Datagrams:
+class Datagrams(Operator):
     """Text to a UDP port of this machine: 'V_X V_Y YAW_RATE' (holds for 0.5 s), or stand, walk, lie, damp, stop."""
 
     def __init__(self, port: int) -> None:
@@ -149,7 +140,7 @@ class Datagrams:
         self._socket.close()
 
 
-class Keyboard:
+class Keyboard(Operator):
     """w s ahead, a d aside, q e turn, by a fifth each; space stops; 1 stand, 2 walk, 3 lie, 0 damp, Escape e-stop.
 
     When its terminal is gone it commands 0 and asks once to lie down.

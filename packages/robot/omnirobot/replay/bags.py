@@ -67,16 +67,6 @@ class Event:
     targets: np.ndarray | None = None
 
 
-def messages(path: Path) -> Iterator[Message]:
-    """All messages of a recording.
-
-    Raises:
-        DeployError: there is none, it cannot be read, or a library is missing.
-    """
-    with _one_line(path):
-        yield from Recording(path).messages()
-
-
 @contextmanager
 def _one_line(path: Path) -> Iterator[None]:
     """What is wrong with a recording, as a DeployError."""

@@ -11,6 +11,7 @@ import numpy as np
 from omnirobot.common.figures import new_figure
 from omnirobot.drive.control import Control
 from omnirobot.drive.machine import Mode, Request
+from omnirobot.drive.operator import Operator
 from omnirobot.drive.recording import SECTORS, Step, levelled, nearest_by_sector
 from omnirobot.replay.bags import Event
 from omnirobot.runtime import DeployError, ExportedPolicy
@@ -69,7 +70,7 @@ class Replayed:
         return "\n".join(lines)
 
 
-class _Recorded:
+class _Recorded(Operator):
     """Stands in for the robot, its LiDAR and its operator."""
 
     def __init__(self, period_s: float | None, command: np.ndarray | None) -> None:
@@ -97,9 +98,6 @@ class _Recorded:
 
     def poll(self, now: float, remote: Remote, pose: np.ndarray) -> tuple[np.ndarray, list[Request]]:
         return self.command, []
-
-    def close(self) -> None:
-        """Nothing to end."""
 
 
 class _Link:

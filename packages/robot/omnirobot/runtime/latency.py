@@ -22,36 +22,23 @@ class Reading:
     points: np.ndarray | None
 
 
-@dataclass(frozen=True)
-class Latency:
-    """Milliseconds of each timed control step.
+def measure(policy: ExportedPolicy, readings: Sequence[Reading], steps: int) -> dict[str, dict[str, float]]:
+    """Times `steps` control steps through the readings again and again, after a pass that is not timed.
 
-    Attributes:
-        with_frame: (n,) of the steps in which a frame was sampled.
-        without_frame: (m,) of the others.
+    Returns:
+        Number of steps, percentiles and maximum (ms) of those in which a frame was sampled, and of the others.
     """
-
-    with_frame: np.ndarray
-    without_frame: np.ndarray
-
-    def summary(self) -> dict[str, dict[str, float]]:
-        """Number of steps, percentiles and maximum of each kind of step that occurs."""
-        kinds = {"with_frame": self.with_frame, "without_frame": self.without_frame}
-        return {name: _percentiles(times) for name, times in kinds.items() if len(times)}
-
-
-def measure(policy: ExportedPolicy, readings: Sequence[Reading], steps: int) -> Latency:
-    """Times `steps` control steps through the readings again and again, after a pass that is not timed."""
     policy.reset()
     for reading in readings:
         policy.step(reading.state, reading.command, reading.points)
-    times: dict[bool, list[float]] = {True: [], False: []}
+    times: dict[str, list[float]] = {"with frame": [], "without frame": []}
     for k in range(steps):
         reading = readings[k % len(readings)]
         start = time.perf_counter()
         policy.step(reading.state, reading.command, reading.points)
-        times[reading.points is not None].append(1e3 * (time.perf_counter() - start))
-    return Latency(np.array(times[True]), np.array(times[False]))
+        kind = "without frame" if reading.points is None else "with frame"
+        times[kind].append(1e3 * (time.perf_counter() - start))
+    return {kind: _percentiles(np.array(each)) for kind, each in times.items() if each}
 
 
 def _percentiles(times: np.ndarray) -> dict[str, float]:

@@ -6,14 +6,14 @@ from collections import deque
 
 import numpy as np
 
+from omnirobot.runtime.sampling import rotation_matrix
+
 OLDEST_S = 0.3
 """Age (s) of a frame beyond which it is taken as that old."""
 
 
 class Odometry:
     """Adds up the velocity from one frame to the next; the first state is where it starts."""
-
-    num_rows = 1
 
     def __init__(self, control_period_s: float) -> None:
         self._dt = control_period_s
@@ -32,12 +32,10 @@ class Odometry:
 
     def since_last_frame(self) -> np.ndarray:
         """(3,) x, y (m) and yaw (rad) since the call before, in the levelled base of then."""
-        cos, sin = np.cos(self._yaw_before), np.sin(self._yaw_before)
-        dx, dy = self._travelled_w
         yaw = self._yaw_before if self._yaw is None else self._yaw
-        turned = np.remainder(yaw - self._yaw_before + np.pi, 2 * np.pi) - np.pi
+        moved = _seen_from(np.array([0.0, 0.0, self._yaw_before]), np.array([*self._travelled_w, yaw]))
         self._travelled_w, self._yaw_before = np.zeros(2), yaw
-        return np.array([cos * dx + sin * dy, -sin * dx + cos * dy, turned], np.float32)
+        return moved.astype(np.float32)
 
 
 class TimedOdometry:
@@ -87,11 +85,8 @@ class TimedOdometry:
 
 def level_axes(base_quat: np.ndarray) -> tuple[np.ndarray, float]:
     """(2, 3) horizontal parts of the base's axes in the world, and its heading (rad)."""
-    w, x, y, z = base_quat
-    forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z))
-    sideways = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z))
-    upwards = (2 * (x * z + w * y), 2 * (y * z - w * x))
-    return np.array([forward, sideways, upwards]).T, float(np.arctan2(forward[1], forward[0]))
+    axes = rotation_matrix(base_quat)[:2]
+    return axes, float(np.arctan2(axes[1, 0], axes[0, 0]))
 
 
 def _seen_from(start: np.ndarray, end: np.ndarray) -> np.ndarray:

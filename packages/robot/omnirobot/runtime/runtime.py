@@ -83,7 +83,6 @@ class ExportedPolicy:
     def __init__(
         self, description: Description, session: InferenceSession, safety: SafetyConfig | None = DEFAULT_SAFETY
     ) -> None:
-        """Args: description: of the policy; session: its network; safety: limits, None for none."""
         self.description, self._session = description, session
         self.safety = Safety(description, safety) if safety is not None else None
         joints, perception = description.joints, description.perception
@@ -340,7 +339,7 @@ class ExportedPolicy:
     def _velocity(self, state: RobotState) -> np.ndarray:
         """(3,) m/s, base frame: estimated at the step before, or measured."""
         if not self.description.estimated:
-            return _vector("base_lin_vel")(self, state, ())
+            return _reading("base_lin_vel", state.base_lin_vel)
         return np.zeros(3, np.float32) if self.base_lin_vel is None else self.base_lin_vel
 
     def _observe(self, state: RobotState, command: ArrayLike) -> np.ndarray:
@@ -356,14 +355,18 @@ class ExportedPolicy:
         """(width,) the group's terms at this step."""
         values = []
         for term in group.terms:
-            if term.frequency is None:
-                value = (QUANTITIES.get(term.quantity) or _other(term.quantity))(self, state, command)
-            else:
+            name = term.quantity
+            if term.frequency is not None:
                 value = self._phase(term.frequency, term.rest_s, command)
+            elif name in QUANTITIES:
+                value = QUANTITIES[name](self, state, command)
+            else:  # one that only this policy's training knows
+                other = (state.other or {}).get(name)
+                value = _reading(name, other, f"; give RobotState(..., other={{'{name}': ...}})")
             if value.shape != (term.size,):
-                raise DeployError(f"{term.quantity}: shape ({term.size},) was expected, {value.shape} given")
+                raise DeployError(f"{name}: shape ({term.size},) was expected, {value.shape} given")
             if not np.isfinite(value).all():
-                raise DeployError(f"{term.quantity}: finite numbers were expected, {value} given")
+                raise DeployError(f"{name}: finite numbers were expected, {value} given")
             values.append(value * np.float32(term.scale))
         return np.concatenate(values)
 
@@ -426,28 +429,11 @@ def _cloud(points: ArrayLike) -> np.ndarray:
     return cloud
 
 
-def _vector(name: str) -> Quantity:
-    """Reads a field of the state as float32."""
-
-    def read(policy: ExportedPolicy, state: RobotState, command: ArrayLike) -> np.ndarray:
-        value = getattr(state, name)
-        if value is None:
-            raise DeployError(f"{name}: this policy observes it, None was given")
-        return np.asarray(value, np.float32)
-
-    return read
-
-
-def _other(name: str) -> Quantity:
-    """Reads a quantity that only this policy's training knows."""
-
-    def read(policy: ExportedPolicy, state: RobotState, command: ArrayLike) -> np.ndarray:
-        value = (state.other or {}).get(name)
-        if value is None:
-            raise DeployError(f"{name}: this policy observes it; give RobotState(..., other={{'{name}': ...}})")
-        return np.asarray(value, np.float32)
-
-    return read
+def _reading(name: str, value: ArrayLike | None, remedy: str = ", None was given") -> np.ndarray:
+    """float32 of a reading that the policy needs."""
+    if value is None:
+        raise DeployError(f"{name}: this policy observes it{remedy}")
+    return np.asarray(value, np.float32)
 
 
 def _joint_pos_offset(policy: ExportedPolicy, state: RobotState, command: ArrayLike) -> np.ndarray:
@@ -478,9 +464,9 @@ def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 QUANTITIES: dict[str, Quantity] = {
     "joint_pos_offset": _joint_pos_offset,
-    "joint_vel": _vector("joint_vel"),
-    "base_lin_vel": _vector("base_lin_vel"),
-    "base_ang_vel": _vector("base_ang_vel"),
+    "joint_vel": lambda policy, state, command: _reading("joint_vel", state.joint_vel),
+    "base_lin_vel": lambda policy, state, command: _reading("base_lin_vel", state.base_lin_vel),
+    "base_ang_vel": lambda policy, state, command: _reading("base_ang_vel", state.base_ang_vel),
     "projected_gravity": _projected_gravity,
     "command": lambda policy, state, command: policy.reference(np.asarray(command, np.float32)),
     "previous_action": lambda policy, state, command: policy.action,

@@ -73,7 +73,6 @@ class Safety:
     """
 
     def __init__(self, description: Description, config: SafetyConfig) -> None:
-        """Args: description: of the policy; config: its limits."""
         self.config, self._dt = config, description.control_period_s
         joints, lidar = description.joints, description.lidar
         self._names = tuple(joints.names)

@@ -93,6 +93,8 @@ def in_one_time(message: Points) -> Points:
     return message
 
 
+SLACK_NS = 2_000_000
+"""By which messages may be out of order."""
 MOST_HELD = 1_000_000
 """Points that wait for their frame's end; a Mid-360 measures so many in 5 s."""
 
@@ -100,7 +102,7 @@ MOST_HELD = 1_000_000
 class FrameCutter:
     """Cuts frames out of points by their times, whatever the messages are in which they come.
 
-    A frame is given out when a point has come that is `slack_s` younger than its end, so that messages may overtake
+    A frame is given out when a point has come that is `SLACK_NS` younger than its end, so that messages may overtake
     each other by as much. Where time jumps, cutting starts again.
 
     Attributes:
@@ -110,9 +112,8 @@ class FrameCutter:
         dropped: points of frames that such a jump, or times that do not go on, left unfinished.
     """
 
-    def __init__(self, period_s: float, slack_s: float = 0.002) -> None:
-        """Args: period_s: of a frame; slack_s: by which messages may be out of order."""
-        self._period, self._slack = round(period_s * 1e9), round(slack_s * 1e9)
+    def __init__(self, period_s: float) -> None:
+        self._period = round(period_s * 1e9)
         self.clock = SensorClock()
         self.late = self.jumps = self.dropped = self._waiting = 0
         self._has_said = False
@@ -150,7 +151,7 @@ class FrameCutter:
         self._held.append(given)
         self._waiting += len(given.points)
         frames = []
-        while last >= self._start + self._period + self._slack:
+        while last >= self._start + self._period + SLACK_NS:
             frames += self._cut()
         if self._waiting > MOST_HELD:
             if not self._has_said:

@@ -50,7 +50,6 @@ class Network:
     """
 
     def __init__(self, interface: str = "lo", domain: int = 0) -> None:
-        """Args: interface: network interface; domain: 0 on a robot."""
         from cyclonedds.core import DDSException
         from cyclonedds.domain import Domain, DomainParticipant
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -48,22 +47,6 @@ class LidarSource:
 KINDS = ("mid360", "packets", "PointCloud2", "CustomMsg")
 
 
-class Source(Protocol):
-    """Points of a sensor."""
-
-    def read(self) -> list[Points]:
-        """Those that have come since the call before, message by message."""
-
-    def counts(self) -> dict[str, int]:
-        """What went wrong, by name."""
-
-    def why_silent(self) -> str:
-        """What is known of why no points have come since the call before."""
-
-    def close(self) -> None:
-        """Ends it."""
-
-
 POINTS_PER_SECOND = 200_000
 """Of a Mid-360, hits and misses."""
 
@@ -88,7 +71,7 @@ class Frames:
                 f"points={source.kind}: a Mid-360 measures {measured} points in {lidar.period_s:g} s, the policy was"
                 f" trained with a LiDAR of {lidar.points_per_frame}; train with lidar=mid360, or give its own points="
             )
-        self._source: Source = _Topic(source, network) if is_topic else _Packets(source)
+        self._source: _Topic | _Packets = _Topic(source, network) if is_topic else _Packets(source)
         self._cutter, self._extrinsic = FrameCutter(lidar.period_s), source.extrinsic
         self.received: list[Points] = []
         self.number = self.came = 0
@@ -144,13 +127,16 @@ class _Packets:
             self._mid360.find()
 
     def read(self) -> list[Points]:
+        """Those that have come since the call before, message by message."""
         return [Points(without_noise(p.points, p.tags), p.times_ns) for p in self._mid360.packets()]
 
     def counts(self) -> dict[str, int]:
+        """What went wrong, by name."""
         mid360 = self._mid360
         return {"packets lost": mid360.lost, "packets doubled": mid360.doubled, **mid360.others}
 
     def why_silent(self) -> str:
+        """What is known of why no points have come since the call before."""
         sensor, here = self._mid360.sensor, f"{self._mid360.host}:{self._mid360.point_port}"
         if sensor is None:
             return f"a Mid-360 that samples was expected to send points to {here}; points=mid360 tells it to"

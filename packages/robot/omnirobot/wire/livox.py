@@ -117,19 +117,8 @@ def write_points(points: np.ndarray, time_ns: int, number: int, interval_ns: int
     rows["xyz"] = np.rint(np.asarray(points) * 1e3)
     body = struct.pack("<Q", time_ns) + rows.tobytes()
     length = _POINTS.size - 8 + len(body)
-    head = (
-        0,
-        length,
-        interval_ns // 100,
-        len(points),
-        number & 0xFFFF,
-        0,
-        _CARTESIAN_MM,
-        0,
-        bytes(12),
-        zlib.crc32(body),
-    )
-    return _POINTS.pack(*head, time_ns) + body[8:]
+    head = (0, length, interval_ns // 100, len(points), number & 0xFFFF, 0, _CARTESIAN_MM, 0, bytes(12))
+    return _POINTS.pack(*head, zlib.crc32(body), time_ns) + body[8:]
 
 
 @dataclass(frozen=True)
@@ -142,10 +131,10 @@ class Message:
     data: bytes
 
 
-def write_message(message: Message, from_sensor: bool = False) -> bytes:
-    """Bytes of a command (to the sensor) or an answer."""
+def write_message(message: Message) -> bytes:
+    """Bytes of a command or an answer."""
     length = _COMMAND.size + len(message.data)
-    parts = (0xAA, 0, length, message.number, message.command, int(message.is_answer), int(from_sensor), bytes(6))
+    parts = (0xAA, 0, length, message.number, message.command, int(message.is_answer), 0, bytes(6))
     head = _COMMAND.pack(*parts, 0, 0)[:18]
     checksum = zlib.crc32(message.data) if message.data else 0
     return head + struct.pack("<HI", binascii.crc_hqx(head, 0xFFFF), checksum) + message.data
@@ -183,13 +172,6 @@ class Sensor:
         return f"{self.name} {self.serial}"
 
 
-def discovery_answer(sensor: Sensor, number: int) -> Message:
-    """What a sensor answers to SEARCH."""
-    packed = ipaddress.IPv4Address(sensor.address).packed
-    data = _DETECTION.pack(0, sensor.kind, sensor.serial.encode()[:15], packed, sensor.command_port)
-    return Message(SEARCH, number, True, data)
-
-
 def read_discovery(message: Message) -> Sensor | None:
     """The sensor that has answered; None for another command."""
     if message.command != SEARCH or not message.is_answer or len(message.data) < _DETECTION.size:
@@ -214,16 +196,6 @@ def configuration(host: str, point_port: int = HOST_POINT_PORT) -> bytes:
     return struct.pack("<HH", len(values), 0) + b"".join(struct.pack("<HH", k, len(v)) + v for k, v in values)
 
 
-def read_configuration(data: bytes) -> dict[int, bytes]:
-    """Values by key of a CONFIGURE's data."""
-    (count, _), at, values = struct.unpack_from("<HH", data), 4, {}
-    for _ in range(count):
-        key, length = struct.unpack_from("<HH", data, at)
-        values[key] = data[at + 4 : at + 4 + length]
-        at += 4 + length
-    return values
-
-
 class Mid360:
     """A Mid-360 or Mid-360S on the network; :meth:`packets` gives what has come since the call before.
 
@@ -244,11 +216,6 @@ class Mid360:
         self._newest: tuple[int, int] | None = None
         self._socket = _socket(host, point_port)
         self.point_port = self._socket.getsockname()[1]
-
-    @property
-    def other(self) -> int:
-        """Datagrams that were no packets of points."""
-        return self.others.total()
 
     def find(self, broadcast: str = "255.255.255.255", port: int = DETECTION_PORT, timeout_s: float = 5.0) -> Sensor:
         """Search, and point the first Mid-360 that answers at this machine.

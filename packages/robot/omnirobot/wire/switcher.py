@@ -83,7 +83,6 @@ class Switcher:
     """The client's end."""
 
     def __init__(self, network: Network) -> None:
-        """Args: network: of the robot."""
         self._answers = network.reader(RESPONSE_TOPIC, RESPONSE, 8)
         self._requests = network.writer(REQUEST_TOPIC, REQUEST)
         self._numbers = itertools.count(time.monotonic_ns())
@@ -160,7 +159,6 @@ class SwitcherService:
     """
 
     def __init__(self, network: Network, controller: str) -> None:
-        """Args: network: of the robot; controller: that moves it at first."""
         self.controller = controller
         self._requests = network.reader(REQUEST_TOPIC, REQUEST, 8)
         self._answers = network.writer(RESPONSE_TOPIC, RESPONSE)
