@@ -341,7 +341,7 @@ class Control:
                 self.missed += self._mode in DRIVEN
             return None
         self._last_frame = now
-        self._ages.add(1e-9 * frames[-1].start_ns + period, now)
+        self._ages.add(int(frames[-1].start_ns) + round(1e9 * period), now)
         return self.policy.subsample(frames[-1].points, frames[-1].offsets_s)
 
     def _advance_odometry(self, state: np.ndarray) -> None:
