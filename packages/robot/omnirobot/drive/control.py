@@ -316,7 +316,8 @@ class Control:
     ) -> tuple[np.ndarray | None, str]:
         """(12,) rad, in the motors' order; or why the policy stops while it drives: the guard is asked to damp."""
         try:
-            targets = self.policy.step(state, command, points, self._ages.newest_s)
+            slows = self._mode is Mode.SLOWING  # what is told to stand does not step aside instead
+            targets = self.policy.step(state, command, points, self._ages.newest_s, blind=slows)
         except SafetyStop as stop:
             is_driven = self._mode in DRIVEN
             if is_driven or str(stop) != self._stopped:
