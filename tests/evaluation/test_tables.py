@@ -112,6 +112,8 @@ def test_a_terrain_that_an_override_chose_is_told_from_another(data):
     assert [one.place for one in of_each] == ["corridor", "corridor, mixed_easy"]
     with pytest.raises(ConfigError, match="terrain=own shows nothing"):
         rendered(page("third terrain=own"), data)
+    with pytest.raises(ConfigError, match="is there twice, with split=test terrain=flat and with"):
+        rendered(page("third view=conditions"), data)
 
 
 @pytest.mark.parametrize(

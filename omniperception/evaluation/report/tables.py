@@ -50,7 +50,7 @@ def check_apart(records: Iterable[Record]) -> None:
     Raises:
         ConfigError: two are of the same run, policy and world.
     """
-    for _, same in grouped(records, "run", "policy", "condition", "world", "chosen_terrain").items():
+    for _, same in grouped(records, "run", "policy", "condition", "world", "terrain").items():
         if len(same) > 1:
             kinds = [" ".join([f"split={record.split}", *record.changes]) for record in same[:2]]
             raise ConfigError(
