@@ -1,7 +1,7 @@
 """Trains networks, ways of training and seeds against each other, evaluates them, and writes tables with intervals.
 
     ablate study=end_to_end                                  # the paper's ablation, end to end: PPO alone, and taught
-    ablate study=avoider,avoider_ppo sim.num_threads=1       # the avoider from pretrained/gait, and what PPO adds to it
+    ablate study=avoider,avoider_ppo sim.num_threads=1       # avoiders of experiment=avoid, and what PPO adds
     ablate variants=fps_mlp_small,polar_rings seeds=1,2      # of study=perception
     ablate stage=train hydra/launcher=submitit_slurm hydra.launcher.partition=cpu
 

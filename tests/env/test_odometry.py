@@ -143,8 +143,19 @@ def test_the_runtime_says_the_same_of_their_times():
 def test_ages_are_counted_from_the_quickest_frame():
     ages, found = FrameAges(), []
     for number, late in enumerate((0.03, 0.01, 0.09, 0.05)):
-        ages.add(1000.0 + 0.1 * number, 5.0 + 0.1 * number + late)  # clocks that do not agree
+        ages.add(10**12 + 10**8 * number, 5.0 + 0.1 * number + late)  # clocks that do not agree
         found.append(ages.newest_s)
     assert found == pytest.approx([0.0, 0.0, 0.08, 0.04])
-    ages.add(3.0, 5.6)  # the sensor begins anew
+    ages.add(3 * 10**9, 5.6)  # the sensor begins anew
     assert ages.newest_s == 0.0
+
+
+def test_ages_are_the_same_bits_whenever_the_clock_begins():
+    """As in a recording, whose clock begins with it, of a sensor that counts from 1970."""
+    live, replayed = FrameAges(), FrameAges()
+    for number, late in enumerate((0.0412, 0.0131, 0.0873, 0.0514)):
+        end_ns, since_ns = 1_764_500_000_123_456_789 + 10**8 * number, 10**8 * number + round(1e9 * late)
+        live.add(end_ns, 1e-9 * (98_765_432_101_234 + since_ns))
+        replayed.add(end_ns, 1e-9 * since_ns)
+        assert live.newest_s == replayed.newest_s
+    assert live.newest_s == pytest.approx(0.0514 - 0.0131, abs=1e-6)

@@ -99,6 +99,23 @@ def test_trainings_stand_beside_each_other_and_all_worlds_below(data):
     assert table_of("fourth view=trainings", data)[-1] == ["all 2", "12.5 [5.0, 28.1] (0.0 to 25.0)", "–"]
 
 
+def test_a_terrain_that_an_override_chose_is_told_from_another(data):
+    """As `evaluate scenario=all terrain=flat` notes it; of the worlds on uneven ground no trial arrives untouched."""
+    grounds = {"flat": None, "mixed_easy": [1] * 8}
+    of_each = [
+        replace(record(touches=touches), terrain="own", facts=FACTS | {"overrides": [f"terrain={terrain}"]})
+        for terrain, touches in grounds.items()
+    ]
+    write(data / "third.json.gz", of_each)
+    cells = [table_of(f"third view=conditions terrain={terrain}", data)[2][1] for terrain in grounds]
+    assert cells[0].startswith("25.0 [7.1, 59.1]") and cells[1].startswith("0.0 [0.0, 32.4]")
+    assert [one.place for one in of_each] == ["corridor", "corridor, mixed_easy"]
+    with pytest.raises(ConfigError, match="terrain=own shows nothing"):
+        rendered(page("third terrain=own"), data)
+    with pytest.raises(ConfigError, match="is there twice, with split=test terrain=flat and with"):
+        rendered(page("third view=conditions"), data)
+
+
 @pytest.mark.parametrize(
     ("what", "message"),
     [

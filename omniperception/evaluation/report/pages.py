@@ -54,12 +54,13 @@ def _filled(what: str, data: Path) -> str:
     for key, value in given.items():
         if key not in _FILTERS:
             raise ConfigError(f"<!-- table: {what} -->: {key} is unknown; {suggest(key, _FILTERS)}")
-        wanted, there = value.split(","), {str(getattr(record, key)): None for record in records}
+        name = "chosen_terrain" if key == "terrain" else key
+        wanted, there = value.split(","), {str(getattr(record, name)): None for record in records}
         if unknown := [one for one in wanted if one not in there]:
             raise ConfigError(
                 f"<!-- table: {what} -->: {key}={unknown[0]} shows nothing; {suggest(unknown[0], tuple(there))}"
             )
-        records = [record for record in records if getattr(record, key) in wanted]
+        records = [record for record in records if getattr(record, name) in wanted]
     return f"<!-- table: {what} -->\n\n{VIEWS[view](records).strip()}\n\n{source(records)}\n\n<!-- end -->"
 
 

@@ -69,9 +69,16 @@ class Record:
         return training_of(self.run)
 
     @property
+    def chosen_terrain(self) -> str:
+        """The terrain, where an override chose it, too: `evaluate scenario=all terrain=flat` has no suite to say so."""
+        chosen = [text.partition("=")[2] for text in self.facts.get("overrides", ()) if text.startswith("terrain=")]
+        return chosen[-1] if chosen and self.terrain == "own" else self.terrain
+
+    @property
     def place(self) -> str:
         """World and terrain, in words."""
-        return self.world if self.terrain in ("own", "flat") else f"{self.world}, {self.terrain}"
+        terrain = self.chosen_terrain
+        return self.world if terrain in ("own", "flat") else f"{self.world}, {terrain}"
 
     def plain(self) -> dict:
         """As it is written; `of` reads it."""

@@ -305,7 +305,8 @@ class Control:
     ) -> tuple[np.ndarray | None, str]:
         """(12,) rad, in the motors' order; or why the policy stops while it drives: the guard is asked to damp."""
         try:
-            targets = self.policy.step(state, command, points, self._ages.newest_s)
+            slows = self._mode is Mode.SLOWING  # what is told to stand does not step aside instead
+            targets = self.policy.step(state, command, points, self._ages.newest_s, blind=slows)
         except SafetyStop as stop:
             is_driven = self._mode in DRIVEN
             if is_driven or str(stop) != self._stopped:
@@ -330,7 +331,7 @@ class Control:
                 self.missed += self._mode in DRIVEN
             return None
         self._last_frame = now
-        self._ages.add(1e-9 * frames[-1].start_ns + period, now)
+        self._ages.add(int(frames[-1].start_ns) + round(1e9 * period), now)
         return self.policy.subsample(frames[-1].points, frames[-1].offsets_s)
 
     def _advance_odometry(self, state: np.ndarray) -> None:

@@ -255,7 +255,12 @@ class ExportedPolicy:
         self.frame_count = min(self.frame_count + 1, len(frames))
 
     def step(
-        self, state: RobotState, command: ArrayLike, points: np.ndarray | None = None, age_s: float = 0.0
+        self,
+        state: RobotState,
+        command: ArrayLike,
+        points: np.ndarray | None = None,
+        age_s: float = 0.0,
+        blind: bool = False,
     ) -> np.ndarray:
         """One control step.
 
@@ -264,6 +269,7 @@ class ExportedPolicy:
             command: (3,) v_x, v_y (m/s) and yaw rate (rad/s) in the base frame.
             points: (n, 3) m in the sensor frame of a LiDAR frame that has just been completed; None without one.
             age_s: of that frame, see :meth:`add_frame`.
+            blind: whether it acts as if nothing were near, and does as commanded.
 
         Returns:
             (num_joints,) float32 joint targets, rad, in the order of `description.joints`.
@@ -288,7 +294,7 @@ class ExportedPolicy:
         self._follow(command)
         feed = {"observations": self.observation[None]}
         if self.frames is not None:
-            blind = self.safety is not None and self.safety.lidar_status is LidarStatus.STOPPED
+            blind |= self.safety is not None and self.safety.lidar_status is LidarStatus.STOPPED
             feed |= {"frames": self.frames[None], "frame_count": np.array([[0 if blind else self.frame_count]])}
         joints = self.description.joints
         if self.description.max_acceleration is not None:

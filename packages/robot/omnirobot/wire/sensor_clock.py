@@ -34,15 +34,19 @@ class FrameAges:
 
     def __init__(self) -> None:
         self.newest_s = 0.0
-        self._behind: deque[float] = deque(maxlen=_FRAMES)
+        self._behind: deque[int] = deque(maxlen=_FRAMES)
 
-    def add(self, end_s: float, now: float) -> None:
-        """A frame comes `now` whose last point was measured at `end_s`, by the sensor's clock."""
-        behind = now - end_s
-        if self._behind and abs(behind - self._behind[-1]) > _OTHER_TIME_S:
+    def add(self, end_ns: int, now: float) -> None:
+        """A frame comes `now` (s) whose last point was measured at `end_ns`, by the sensor's clock.
+
+        Whole nanoseconds and an age in whole microseconds, so that a recording, whose clock begins elsewhere, has the
+        same.
+        """
+        behind = round(1e9 * now) - end_ns
+        if self._behind and abs(behind - self._behind[-1]) > 1e9 * _OTHER_TIME_S:
             self._behind.clear()  # the sensor has restarted
         self._behind.append(behind)
-        self.newest_s = behind - min(self._behind)
+        self.newest_s = 1e-6 * round(1e-3 * (behind - min(self._behind)))
 
 
 class SensorClock:
