@@ -34,7 +34,11 @@ def compile_model(scene: Shapes, plane_size: float = 0.0) -> mujoco.MjModel:
 
 
 def mujoco_ranges(
-    model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, directions: np.ndarray
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    groups: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ranges (N,), ``inf`` for a miss, and geoms (N,), -1 for a miss, by ``mj_ray``.
 
@@ -42,6 +46,7 @@ def mujoco_ranges(
         model, data: with the geoms' poses.
         origins: one for all rays (3,), or one each (N, 3).
         directions: (N, 3); ranges are in units of their lengths.
+        groups: whether each of MuJoCo's geom groups is there, (6,) uint8; None for all.
     """
     count = len(directions)
     ranges, geoms = np.empty(count), np.full(count, -1, np.int32)
@@ -50,11 +55,11 @@ def mujoco_ranges(
     if np.ndim(origins) == 1:
         along = np.ascontiguousarray(directions, dtype=np.float64).reshape(-1)
         origin = np.asarray(origins, dtype=np.float64)
-        mujoco.mj_multiRay(model, data, origin, along, None, 1, -1, geoms, ranges, None, count, mujoco.mjMAXVAL)
+        mujoco.mj_multiRay(model, data, origin, along, groups, 1, -1, geoms, ranges, None, count, mujoco.mjMAXVAL)
     else:
         geom = np.zeros((1, 1), np.int32)
         for i, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
-            ranges[i] = mujoco.mj_ray(model, data, origin, direction, None, 1, -1, geom)
+            ranges[i] = mujoco.mj_ray(model, data, origin, direction, groups, 1, -1, geom)
             geoms[i] = geom[0, 0]
     return np.where(geoms < 0, math.inf, ranges), geoms
 

@@ -30,6 +30,10 @@ class Timing:
     def median_cpu_s(self) -> float:
         return statistics.median(self.cpu_s)
 
+    def per(self, count: int) -> Timing:
+        """Of one of `count` things that a call does."""
+        return Timing([s / count for s in self.wall_s], [s / count for s in self.cpu_s])
+
     @property
     def least_cpu_s(self) -> float:
         """Of the quickest round: other work on the machine only adds to it."""

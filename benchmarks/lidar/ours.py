@@ -10,6 +10,8 @@ import torch
 
 import omnilidar as lidar
 from benchmarks.harness.memory import buffer_bytes
+from benchmarks.harness.meshes import tessellate_to
+from benchmarks.harness.reference import Shapes
 
 from .methods import Entry
 from .scenes import BenchmarkScene, Scan, Terrain
@@ -111,10 +113,21 @@ def build_rays(scene: BenchmarkScene, num_threads: int, device: str, terrain: st
     shapes = [lidar.Shape(lidar.ShapeKind.PLANE)] if scene.plane else []
     if scene.terrain is not None:
         shapes.append(_height_field(scene.terrain) if terrain == "height field" else _mesh(scene.terrain))
-    for k, (name, size) in enumerate(zip(scene.kinds, scene.sizes.astype(float), strict=True)):
-        kind = lidar.ShapeKind[name.upper()]
-        shapes.append(lidar.Shape(kind, tuple(size[size > 0.0]), body=k + 1))
+    shapes += obstacle_shapes(scene, first_body=1)
     return lidar.RayScene(shapes, scene.num_envs, scene.num_bodies + 1, device, num_threads)
+
+
+def obstacle_shapes(scene: Shapes, triangles: int = 0, first_body: int = 0, class_id: int = 0) -> list[lidar.Shape]:
+    """A scene's obstacles, each on a body of its own: exact, or of about so many triangles."""
+    shapes = []
+    for body, (kind, size) in enumerate(zip(scene.kinds, scene.sizes.astype(float), strict=True), first_body):
+        if triangles:
+            mesh = lidar.TriangleMesh(*tessellate_to(kind, size, triangles))
+            shapes.append(lidar.Shape(lidar.ShapeKind.MESH, asset=mesh, body=body, class_id=class_id))
+        else:
+            exact = lidar.ShapeKind[kind.upper()]
+            shapes.append(lidar.Shape(exact, tuple(size[size > 0.0]), body=body, class_id=class_id))
+    return shapes
 
 
 def _mesh(terrain: Terrain) -> lidar.Shape:
