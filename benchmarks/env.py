@@ -58,15 +58,10 @@ class Timed:
     env: OmniEnv | None = None
 
 
-def environment(run: RunConfig) -> OmniEnv:
-    """A task with all obstacles, so that the LiDAR is awake, whose stages no report drains meanwhile."""
-    seed_everything(run.env.seed)
-    return OmniEnv(replace(run.env, log_interval=10**9, skip_curricula=True))
-
-
 def step_of(run: RunConfig) -> Timed:
-    """A block of `env.step` with random actions."""
-    env = environment(run)
+    """A block of `env.step` with random actions, with all obstacles, so that the LiDAR is awake."""
+    seed_everything(run.env.seed)
+    env = OmniEnv(replace(run.env, log_interval=10**9, skip_curricula=True))  # no report drains its stages
     actions = 0.4 * torch.randn(BLOCK, env.num_envs, env.num_actions, device=env.device)
 
     def block(_: int) -> None:
