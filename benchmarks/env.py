@@ -7,7 +7,6 @@
 step       a control step, beside bare `Batch.step` (same model, states, decimation and threads), and its stages
 iteration  a whole PPO iteration, beside the bare physics of its rollout
 update     the update of a PPO iteration alone, on the same rollout again and again
-gain       what it would cost to have what a scene leaves out: each thing forced in, with no effect on the task
 inference  an exported policy on one core, from sensor readings to joint targets, preprocessing included: the points
            that training kept, the device's whole frame thinned to them, and the whole frame
 
@@ -18,7 +17,7 @@ overrides with commas between them, times the task in turn with the one to which
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -44,18 +43,6 @@ RECORDED = 250
 """Control steps whose readings an exported policy is timed with."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Arguments:
-    """The command line."""
-
-    what: str = argument("step", "what is timed", choices=("step", "iteration", "update", "gain", "inference"))
-    repeats: int = argument(7, "rounds in which both are timed", least=1)
-    against: tuple[str, ...] = argument((), "overrides of a task that takes the place of bare physics")
-    run: str = argument("latest", "inference: run directory with an exported policy")
-    steps: int = argument(5000, "inference: control steps that are timed", least=1)
-    out: Path = argument(Path("outputs/benchmark_env"), "folder of the results")
-
-
 @dataclass(frozen=True)
 class Timed:
     """Something to time.
@@ -71,15 +58,10 @@ class Timed:
     env: OmniEnv | None = None
 
 
-def environment(run: RunConfig) -> OmniEnv:
-    """A task with all obstacles, so that the LiDAR is awake, whose stages no report drains meanwhile."""
-    seed_everything(run.env.seed)
-    return OmniEnv(replace(run.env, log_interval=10**9, skip_curricula=True))
-
-
 def step_of(run: RunConfig) -> Timed:
-    """A block of `env.step` with random actions."""
-    env = environment(run)
+    """A block of `env.step` with random actions, with all obstacles, so that the LiDAR is awake."""
+    seed_everything(run.env.seed)
+    env = OmniEnv(replace(run.env, log_interval=10**9, skip_curricula=True))  # no report drains its stages
     actions = 0.4 * torch.randn(BLOCK, env.num_envs, env.num_actions, device=env.device)
 
     def block(_: int) -> None:
@@ -120,8 +102,19 @@ def physics_of(env: OmniEnv, num_steps: int) -> Timed:
     return Timed(block, num_steps * env.num_envs)
 
 
-_RATIOS = ("time to the first", "CPU time to it")
 TIMED = {"step": step_of, "iteration": iteration_of, "update": update_of}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command line."""
+
+    what: str = argument("step", "what is timed", choices=(*TIMED, "inference"))
+    repeats: int = argument(7, "rounds in which both are timed", least=1)
+    against: tuple[str, ...] = argument((), "overrides of a task that takes the place of bare physics")
+    run: str = argument("latest", "inference: run directory with an exported policy")
+    steps: int = argument(5000, "inference: control steps that are timed", least=1)
+    out: Path = argument(Path("outputs/benchmark_env"), "folder of the results")
 
 
 def compare(what: str, run: RunConfig, repeats: int, against: RunConfig | None = None) -> list[Table]:
@@ -142,11 +135,11 @@ def compare(what: str, run: RunConfig, repeats: int, against: RunConfig | None =
 
 
 def _rates(what: str, subjects: dict[str, Timed], timings: dict[str, Timing]) -> Table:
-    columns = ("timed", "env steps/s", "us per env step", "CPU us per env step", *_RATIOS)
+    ratios = ("time to the first", "CPU time to it")
+    columns = ("timed", "env steps/s", "us per env step", "CPU us per env step", *ratios)
     table = Table(f"env_{what}", f"{what}: rates, and times to that of {what} (median, smallest, largest)", columns)
-    per_step = {name: Timing(*([s / subjects[name].steps for s in t] for t in (timing.wall_s, timing.cpu_s)))
-                for name, timing in timings.items()}  # fmt: skip
-    first = next(iter(per_step.values()))
+    per_step = {name: timing.per(subjects[name].steps) for name, timing in timings.items()}
+    first = per_step[what]
     for name, timing in per_step.items():
         ratios = (str(paired_ratio(timing, first, clock)) for clock in ("wall", "cpu"))
         table.rows.append((name, 1.0 / timing.median_s, 1e6 * timing.median_s, 1e6 * timing.median_cpu_s, *ratios))
@@ -163,46 +156,6 @@ def _stages(what: str, subjects: dict[str, Timed], repeats: int) -> list[Table]:
     names = dict.fromkeys(name for times in stages.values() for name in times)
     rows = [{"stage": name} | {n: times.get(name, 0.0) for n, times in stages.items()} for name in names]
     return [Table.of(f"env_{what}_stages", "stages of env.step, us per environment and step", rows)]
-
-
-# ---- what is left out ------------------------------------------------------------------------------------------------
-
-FORCED_IN = {
-    "LiDAR and sector distances for a reward of weight 1e-30": (
-        "lidar=mid360",
-        "+rewards.terms.velocity_tracking_with_avoidance={weight: 1e-30, beta: 4.0}",
-    ),
-    "reward terms of weight 1e-30": (
-        "+rewards.terms.foot_stumble={weight: 1e-30, ratio: 5.0, unit: 1.0}",
-        "+rewards.terms.link_collision={weight: 1e-30, unit: 1.0}",
-        "+rewards.terms.joint_velocity_squared={weight: 1e-30}",
-        "+rewards.terms.action_acceleration_squared={weight: 1e-30}",
-        "+rewards.terms.alive={weight: 1e-30}",
-    ),
-    "physical randomization of size 0": (
-        *(f"randomization.{name}=[0,0]" for name in ("added_mass", "payload_mass", "com_x", "com_y", "com_z")),
-        *(f"randomization.{name}=[0,0]" for name in ("joint_offset", "gravity_offset", "latency_s")),
-        "randomization.motor_strength=[1,1]",
-    ),
-}
-"""What a scene may leave out, as overrides that have it without an effect on the task."""
-SCENES = {"walk": tuple(FORCED_IN), "quickstart": tuple(FORCED_IN)[1:]}
-"""Experiments, and what they leave out."""
-
-
-def gains(repeats: int, overrides: Sequence[str] = (), scenes: Mapping[str, Sequence[str]] = SCENES) -> Table:
-    """Steps of each scene with one thing more, and with all of them, in turn with those of the scene as it is."""
-    columns = ("scene", "forced in", "time", "CPU time")
-    table = Table("env_gain", "steps with something forced in, over those without", columns)
-    for scene, items in scenes.items():
-        plain = (f"experiment={scene}", "sim.num_threads=1", *overrides)
-        run = build.assemble(config.compose(plain))
-        choices = {item: FORCED_IN[item] for item in items}
-        for item, forced in {**choices, "all of them": sum(choices.values(), ())}.items():
-            other = build.assemble(config.compose([*plain, *forced]))
-            rates = compare("step", run, repeats, other)[0]
-            table.rows.append((scene, item, *rates.rows[1][-2:]))
-    return table
 
 
 # ---- exported policies -----------------------------------------------------------------------------------------------
@@ -257,9 +210,6 @@ def main(given: Arguments, overrides: list[str]) -> None:
             raise ConfigError(f"{overrides[0]}: what=inference takes a run as it was trained; leave overrides out")
         run_dir = config.find_run(given.run)
         report([latency(run_dir, given.steps)], about(1), given.out)
-        return
-    if given.what == "gain":
-        report([gains(given.repeats, overrides)], about(1), given.out)
         return
     overrides = overrides or ["experiment=quickstart"]
     run = build.assemble(config.compose(overrides))

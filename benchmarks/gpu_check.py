@@ -59,32 +59,6 @@ SYNCS_PER_STEP = 3
 drawn again, and those with an approaching obstacle that has passed."""
 PERCEPTION_STAGES = ("rays", "sampling", "sectors")
 NEEDS_GPU = "left out: it needs a GPU"
-PART_NAMES = ("tests", "lidar", "steps", "syncs", "rays", "env", "training")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Arguments:
-    """The command line."""
-
-    device: str = argument("cuda:0", "cuda:<index> or cpu")
-    size: str = argument("full", "small: tiny sizes, to see that everything works", choices=("full", "small"))
-    only: tuple[str, ...] = argument(PART_NAMES, "parts to run", choices=PART_NAMES)
-    minutes: float = argument(8.0, "parts that would begin later are left out", positive=True)
-    out: Path = argument(Path("outputs/gpu_check"), "folder of the results")
-
-    @property
-    def small(self) -> bool:
-        return self.size == "small"
-
-    @property
-    def on_gpu(self) -> bool:
-        return self.device.startswith("cuda")
-
-    def run(self, *overrides: str) -> build.RunConfig:
-        """The paper's recipe on this device, at the paper's size or a tiny one."""
-        sizes = ("num_envs=8", "lidar.num_rays=200", "ppo.num_steps_per_env=8") if self.small else ()
-        recipe = ("experiment=paper", "sim=mujoco_warp", f"sim.device={self.device}", *sizes, *overrides)
-        return build.assemble(config.compose(recipe))
 
 
 def check_tests(given: Arguments) -> list[Table]:
@@ -181,11 +155,8 @@ def measure_rays(given: Arguments) -> list[Table]:
 
 def measure_env(given: Arguments) -> list[Table]:
     """Environment steps per second at the paper's setting, and with every point of the sensor; shares of the stages."""
-    whole = 300 if given.small else 20_000
-    return [
-        _measure_steps(given, "env_stages"),
-        _measure_steps(given, "env_stages_whole_clouds", f"lidar.num_rays={whole}"),
-    ]
+    whole = f"lidar.num_rays={300 if given.small else 20_000}"
+    return [_measure_steps(given, "env_stages"), _measure_steps(given, "env_stages_whole_clouds", whole)]
 
 
 def _measure_steps(given: Arguments, name: str, *overrides: str) -> Table:
@@ -232,14 +203,41 @@ def measure_training(given: Arguments) -> list[Table]:
     return [table]
 
 
-PARTS: dict[str, Callable[[Arguments], list[Table]]] = dict(
-    zip(
-        PART_NAMES,
-        (check_tests, check_lidar, check_steps, check_syncs, measure_rays, measure_env, measure_training),
-        strict=True,
-    )
-)
+PARTS: dict[str, Callable[[Arguments], list[Table]]] = {
+    "tests": check_tests,
+    "lidar": check_lidar,
+    "steps": check_steps,
+    "syncs": check_syncs,
+    "rays": measure_rays,
+    "env": measure_env,
+    "training": measure_training,
+}
 """In the order in which they run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """The command line."""
+
+    device: str = argument("cuda:0", "cuda:<index> or cpu")
+    size: str = argument("full", "small: tiny sizes, to see that everything works", choices=("full", "small"))
+    only: tuple[str, ...] = argument(tuple(PARTS), "parts to run", choices=tuple(PARTS))
+    minutes: float = argument(8.0, "parts that would begin later are left out", positive=True)
+    out: Path = argument(Path("outputs/gpu_check"), "folder of the results")
+
+    @property
+    def small(self) -> bool:
+        return self.size == "small"
+
+    @property
+    def on_gpu(self) -> bool:
+        return self.device.startswith("cuda")
+
+    def run(self, *overrides: str) -> build.RunConfig:
+        """The paper's recipe on this device, at the paper's size or a tiny one."""
+        sizes = ("num_envs=8", "lidar.num_rays=200", "ppo.num_steps_per_env=8") if self.small else ()
+        recipe = ("experiment=paper", "sim=mujoco_warp", f"sim.device={self.device}", *sizes, *overrides)
+        return build.assemble(config.compose(recipe))
 
 
 def execute(given: Arguments) -> bool:

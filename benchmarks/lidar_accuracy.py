@@ -17,20 +17,12 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
+import trimesh
 
 from benchmarks.harness.reference import mujoco_ranges
 from benchmarks.harness.rotations import matrices, random_unit
 from benchmarks.harness.table import Table, about, report
-from omnilidar import (
-    HeightField,
-    Lidar,
-    LidarConfig,
-    RayScene,
-    ScanPattern,
-    Shape,
-    ShapeKind,
-    TriangleMesh,
-)
+from omnilidar import HeightField, Lidar, LidarConfig, RayScene, ScanPattern, Shape, ShapeKind, TriangleMesh
 from omnilidar.mujoco import MujocoScene
 from omnirobot.common.cli import Command, argument
 from omnirobot.common.errors import ConfigError
@@ -54,6 +46,8 @@ SIZES: dict[mujoco.mjtGeom, Callable[[np.random.Generator], np.ndarray]] = {
     GEOMS.mjGEOM_CAPSULE: lambda rng: np.array([*rng.uniform(0.1, 1.0, 2), 0.0]),
     GEOMS.mjGEOM_ELLIPSOID: lambda rng: rng.uniform(0.1, 1.0, 3),
 }
+OCTAHEDRON = np.array([(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)])
+"""Of the axes' unit vectors and their opposites."""
 SHAPES = (*SIZES, GEOMS.mjGEOM_MESH, GEOMS.mjGEOM_HFIELD)
 
 
@@ -193,27 +187,12 @@ def random_model(case: Case, rng: np.random.Generator) -> mujoco.MjModel:
 
 def random_mesh(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A closed bumpy ball, (V, 3) and (T, 3): an octahedron divided three times, with noise on the radii."""
-    vertices = [*np.eye(3), *-np.eye(3)]
-    faces = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
+    points, faces = np.concatenate([np.eye(3), -np.eye(3)]), OCTAHEDRON
     for _ in range(3):
-        middles: dict[tuple[int, int], int] = {}
-
-        def middle(a: int, b: int, known: dict[tuple[int, int], int] = middles) -> int:
-            key = (min(a, b), max(a, b))
-            if key not in known:
-                known[key] = len(vertices)
-                vertices.append((vertices[a] + vertices[b]) / 2)
-            return known[key]
-
-        split = []
-        for a, b, c in faces:
-            ab, bc, ca = middle(a, b), middle(b, c), middle(c, a)
-            split += [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-        faces = split
-    points = np.array(vertices)
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+        points, faces = trimesh.remesh.subdivide(points, faces)
+    points = points / np.linalg.norm(points, axis=1, keepdims=True)
     radii = rng.uniform(0.4, 1.0, (len(points), 1)) * rng.uniform(0.5, 1.0)
-    return points * radii * rng.uniform(0.5, 1.0, 3), np.array(faces)
+    return points * radii * rng.uniform(0.5, 1.0, 3), faces
 
 
 def random_state(case: Case, model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjData:

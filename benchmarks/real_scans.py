@@ -132,20 +132,17 @@ def summary(frame: Frame, spec: DeviceSpec, pattern: ScanPattern) -> list[dict]:
     whole = pattern.points_per_frame(spec.period_s)
     turn, model_turn = _steps(frame), _model_steps(pattern)
     kept = bool((~frame.seen).any())
+    lowest, highest = np.percentile(frame.elevation[frame.seen], (0.1, 99.9)).tolist()
     return [
         {"figure": "rows of the frame", "recording": len(frame.seen), "preset": whole},
         {"figure": "returns", "recording": int(frame.seen.sum()), "preset": None},
         {"figure": "misses, %", "recording": 100.0 * float((~frame.seen).mean()) if kept else None, "preset": None},
         {"figure": "azimuth from shot to shot of a laser, deg", "recording": turn, "preset": model_turn},
-        {"figure": "lowest elevation, deg", "recording": _edge(frame, 0.1), "preset": spec.elevation_deg[0]},
-        {"figure": "highest elevation, deg", "recording": _edge(frame, 99.9), "preset": spec.elevation_deg[1]},
+        {"figure": "lowest elevation, deg", "recording": lowest, "preset": spec.elevation_deg[0]},
+        {"figure": "highest elevation, deg", "recording": highest, "preset": spec.elevation_deg[1]},
         *_channel_errors(frame, pattern),
         *(against_grid(frame, pattern) if len(channel_elevations(pattern)) else against_order(frame, pattern)),
     ]
-
-
-def _edge(frame: Frame, percent: float) -> float:
-    return float(np.percentile(frame.elevation[frame.seen], percent))
 
 
 def _steps(frame: Frame) -> float:

@@ -11,7 +11,7 @@ what primitives see otherwise than meshes do.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,9 +19,11 @@ import mujoco
 import numpy as np
 import torch
 
+from benchmarks.harness.reference import mujoco_ranges
+from benchmarks.harness.rotations import matrices
 from benchmarks.harness.table import Table, about, report
 from benchmarks.harness.timing import paired_ratio, paired_timings
-from omnilidar import Lidar, RayScene
+from omnilidar import Lidar, LidarFrame, RayScene
 from omniperception import build, config
 from omniperception.commands.robot_check import NO_TASK
 from omniperception.env.sensing import SensorConfig
@@ -67,27 +69,53 @@ class Form:
         wanted = [] if groups is None else [f"+robot.ray_groups=[{','.join(map(str, groups))}]"]
         task = [*NO_TASK, f"robot={given.robot}", f"lidar={given.lidar}", f"obstacles={given.obstacles}"]
         env = build.assemble(config.compose([*task, f"lidar.num_rays={given.rays}", *wanted, *overrides])).env
-        assert env.lidar is not None  # asked for
         begin = time.perf_counter()
         world = build_world(env.robot, env.terrain, env.obstacles)
         shapes = ray_shapes(world, env.lidar.exclude_geoms, env.lidar.mount_body)
         for shape in shapes.shapes:
-            if shape.asset is not None and hasattr(shape.asset, "tree"):
-                _ = shape.asset.tree
+            getattr(shape.asset, "tree", None)  # is built when it is asked for
         seconds = time.perf_counter() - begin
         return cls(world, shapes, env.lidar, _states(world, POSES), seconds)
 
-    def frames(self, num_envs: int, threads: int) -> tuple[Lidar, RayScene, list[tuple[torch.Tensor, torch.Tensor]]]:
-        """The sensor in many environments, and sets of poses."""
-        scene = RayScene(self.shapes.shapes, num_envs, len(self.shapes.bodies), num_threads=threads)
-        body, bodies = self.sensor.mount_body, list(self.shapes.bodies)
+    def caster(self, num_envs: int, threads: int = 1) -> Callable[[int], LidarFrame]:
+        """Casts a frame in many environments, the robot in the next of the poses."""
+        bodies = list(self.shapes.bodies)
+        scene = RayScene(self.shapes.shapes, num_envs, len(bodies), num_threads=threads)
+        body = self.sensor.mount_body
         carrier = self.shapes.base if body is None else bodies.index(self.world.model.body(body).id)
         lidar = Lidar(self.sensor, self.sensor.scan_pattern(), scene, carrier, outputs=OUTPUTS)
         poses = [
             tuple(torch.from_numpy(value[bodies]).float().expand(num_envs, -1, -1) for value in (data.xpos, data.xquat))
             for data in self.states
         ]
-        return lidar, scene, poses
+
+        def cast(k: int) -> LidarFrame:
+            scene.set_poses(*poses[k % POSES])
+            return lidar.cast(0.1 * (k + 1))
+
+        return cast
+
+    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ranges, those by mj_ray of the geoms that rays can hit, and whether the robot is hit, (R,) of all poses."""
+        cast, columns = self.caster(1), []
+        for k, data in enumerate(self.states):
+            frame = cast(k)
+            true = self._true_ranges(data, frame.directions_s[0].numpy().astype(np.float64))
+            own = (frame.class_id[0] == HitClass.ROBOT).numpy()
+            columns.append((frame.true_ranges[0].numpy().astype(np.float64), true, own))
+        return tuple(np.concatenate(column) for column in zip(*columns, strict=True))
+
+    def _true_ranges(self, data: mujoco.MjData, directions_s: np.ndarray) -> np.ndarray:
+        """(R,) ranges from the sensor, infinite beyond its range."""
+        model, sensor, kept = self.world.model, self.sensor, set(self.shapes.geom_names)
+        carrier = self.world.base_body if sensor.mount_body is None else model.body(sensor.mount_body).id
+        for k in range(model.ngeom):
+            model.geom_group[k] = 0 if model.geom(k).name in kept else 5
+        turn = data.xmat[carrier].reshape(3, 3)
+        origin = data.xpos[carrier] + turn @ np.array(sensor.mount_pos, np.float64)
+        rays = directions_s @ (turn @ matrices(np.array(sensor.quat))).T
+        ranges, _ = mujoco_ranges(model, data, origin, rays, np.array([1, 0, 0, 0, 0, 0], np.uint8))
+        return np.where(ranges > sensor.max_range, np.inf, ranges)
 
 
 def _states(world: World, count: int) -> list[mujoco.MjData]:
@@ -110,17 +138,8 @@ def speed(given: Arguments, forms: dict[str, Form]) -> list[dict[str, object]]:
     """Time of a frame of both forms, and their ratio, by number of environments."""
     rows = []
     for num_envs in given.num_envs:
-        calls = {}
-        for name, form in forms.items():
-            lidar, scene, poses = form.frames(num_envs, given.threads)
-
-            def call(k: int, lidar=lidar, scene=scene, poses=poses) -> None:
-                scene.body_pos.copy_(poses[k % POSES][0])
-                scene.body_quat.copy_(poses[k % POSES][1])
-                lidar.cast(0.1 * (k + 1))
-
-            calls[name] = call
-        times = paired_timings(calls, given.rounds)
+        casts = {name: form.caster(num_envs, given.threads) for name, form in forms.items()}
+        times = paired_timings(casts, given.rounds)
         row: dict[str, object] = {"environments": num_envs}
         row |= {f"{name}, ms": 1e3 * times[name].median_cpu_s for name in forms}
         rows.append(row | {"meshes / primitives": str(paired_ratio(times["meshes"], times["primitives"], "cpu"))})
@@ -131,79 +150,33 @@ def errors(forms: dict[str, Form]) -> list[dict[str, object]]:
     """Each form against mj_ray on the geoms that its rays can hit."""
     rows = []
     for name, form in forms.items():
-        lidar, scene, poses = form.frames(1, 1)
-        wrong, rays, own, worst = 0, 0, 0, 0.0
-        for k, data in enumerate(form.states):
-            scene.body_pos.copy_(poses[k][0])
-            scene.body_quat.copy_(poses[k][1])
-            frame = lidar.cast(0.1 * (k + 1))
-            assert frame.true_ranges is not None and frame.directions_s is not None and frame.class_id is not None
-            expected = _mj_rays(form, data, frame.directions_s[0].numpy())
-            found = frame.true_ranges[0].numpy().astype(np.float64)
-            counted = ~(expected < form.sensor.min_range)  # nearer surfaces block a ray and return nothing
-            found, expected = found[counted], expected[counted]
-            both = np.isfinite(found) & np.isfinite(expected)
-            off = np.abs(found[both] - expected[both])
-            wrong += int((np.isfinite(found) != np.isfinite(expected)).sum() + (off > 1e-3).sum())
-            worst = max(worst, float(off[off <= 1e-3].max(initial=0.0)))
-            rays, own = rays + len(found), own + int((frame.class_id[0] == HitClass.ROBOT).sum())
-        if not rays:
+        found, expected, own = form.seen()
+        counted = ~(expected < form.sensor.min_range)  # nearer surfaces block a ray and return nothing
+        if not counted.any():
             raise ValueError(f"lidar.mount: with {name} all rays end at once, inside of a geom; choose another mount")
+        found, expected = found[counted], expected[counted]
+        both = np.isfinite(found) & np.isfinite(expected)
+        off = np.abs(found[both] - expected[both])
+        wrong = (np.isfinite(found) != np.isfinite(expected)).sum() + (off > 1e-3).sum()
         rows.append(
-            {
-                "form": name,
-                "shapes": len(form.shapes.shapes),
-                "built in, s": form.seconds,
-                "on the robot, %": 100 * own / rays,
-                "other surface than mj_ray, %": 100 * wrong / rays,
-                "largest error of the others, m": worst,
-            }
+            {"form": name, "shapes": len(form.shapes.shapes), "built in, s": form.seconds}
+            | {"on the robot, %": 100.0 * own.sum() / len(found)}
+            | {"other surface than mj_ray, %": 100.0 * wrong / len(found)}
+            | {"largest error of the others, m": float(off[off <= 1e-3].max(initial=0.0))}
         )
     return rows
 
 
-def _mj_rays(form: Form, data: mujoco.MjData, directions_s: np.ndarray) -> np.ndarray:
-    """(R,) ranges by mj_ray from the sensor, infinite beyond its range."""
-    model, sensor = form.world.model, form.sensor
-    carrier = form.world.base_body if sensor.mount_body is None else model.body(sensor.mount_body).id
-    kept = set(form.shapes.geom_names)
-    for k in range(model.ngeom):
-        model.geom_group[k] = 0 if model.geom(k).name in kept else 5
-    turn, origin = data.xmat[carrier].reshape(3, 3), np.empty(3)
-    mount = np.empty(9)
-    mujoco.mju_quat2Mat(mount, np.array(sensor.quat, np.float64))
-    origin = data.xpos[carrier] + turn @ np.array(sensor.mount_pos, np.float64)
-    rays = directions_s.astype(np.float64) @ (turn @ mount.reshape(3, 3)).T
-    groups, geom = np.array([1, 0, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
-    ranges = np.array([mujoco.mj_ray(model, data, origin, ray, groups, 1, -1, geom) for ray in rays])
-    return np.where((ranges < 0) | (ranges > sensor.max_range), np.inf, ranges)
-
-
 def differences(forms: dict[str, Form]) -> list[dict[str, object]]:
     """What the same rays see with primitives and with meshes."""
-    seen = {}
-    for name, form in forms.items():
-        lidar, scene, poses = form.frames(1, 1)
-        ranges, own = [], []
-        for k in range(POSES):
-            scene.body_pos.copy_(poses[k][0])
-            scene.body_quat.copy_(poses[k][1])
-            frame = lidar.cast(0.1 * (k + 1))
-            assert frame.true_ranges is not None and frame.class_id is not None
-            ranges.append(frame.true_ranges[0].clone())
-            own.append(frame.class_id[0] == HitClass.ROBOT)
-        seen[name] = torch.cat(ranges), torch.cat(own)
-    (ranges, own), (others, others_own) = seen["meshes"], seen["primitives"]
+    (ranges, _, own), (others, _, others_own) = (forms[name].seen() for name in ("meshes", "primitives"))
     both = own & others_own
-    off = (ranges - others)[both].abs()
+    off = np.abs(ranges[both] - others[both])
     return [
-        {
-            "robot in both, %": 100 * float(both.float().mean()),
-            "in meshes alone, %": 100 * float((own & ~others_own).float().mean()),
-            "in primitives alone, %": 100 * float((others_own & ~own).float().mean()),
-            "median difference, m": float(off.median()) if len(off) else 0.0,
-            "largest, m": float(off.max()) if len(off) else 0.0,
-        }
+        {"robot in both, %": 100.0 * both.mean(), "in meshes alone, %": 100.0 * (own & ~others_own).mean()}
+        | {"in primitives alone, %": 100.0 * (others_own & ~own).mean()}
+        | {"median difference, m": float(np.median(off)) if len(off) else 0.0}
+        | {"largest, m": float(off.max(initial=0.0))}
     ]
 
 

@@ -37,12 +37,12 @@ class StepErrors:
 
     def table(self) -> list[tuple[str, float, float, float]]:
         """(what, median, 99 %, largest) rows."""
-        rows = {
-            "velocity (m/s, rad/s)": self.velocity,
-            "position (m, rad)": self.position,
-            "solver's limit of iterations, velocity": self.unsolved,
-        }
-        return [(name, *np.quantile(values, (0.5, 0.99, 1.0)).tolist()) for name, values in rows.items()]
+        quantiles = (0.5, 0.99, 1.0)
+        return [
+            ("velocity (m/s, rad/s)", *np.quantile(self.velocity, quantiles).tolist()),
+            ("position (m, rad)", *np.quantile(self.position, quantiles).tolist()),
+            ("solver's limit of iterations, velocity", *np.quantile(self.unsolved, quantiles).tolist()),
+        ]
 
 
 def step_errors(sim: Simulator, seed: int = 0) -> StepErrors:

@@ -1,4 +1,4 @@
-"""Exact ranges of rays in float64: MuJoCo's rays, closed forms and triangles one by one; and errors against them."""
+"""Exact ranges of rays in float64: MuJoCo's rays and triangles one by one; and errors against them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,11 @@ def compile_model(scene: Shapes, plane_size: float = 0.0) -> mujoco.MjModel:
 
 
 def mujoco_ranges(
-    model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, directions: np.ndarray
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    groups: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ranges (N,), ``inf`` for a miss, and geoms (N,), -1 for a miss, by ``mj_ray``.
 
@@ -42,6 +46,7 @@ def mujoco_ranges(
         model, data: with the geoms' poses.
         origins: one for all rays (3,), or one each (N, 3).
         directions: (N, 3); ranges are in units of their lengths.
+        groups: whether each of MuJoCo's geom groups is there, (6,) uint8; None for all.
     """
     count = len(directions)
     ranges, geoms = np.empty(count), np.full(count, -1, np.int32)
@@ -50,33 +55,13 @@ def mujoco_ranges(
     if np.ndim(origins) == 1:
         along = np.ascontiguousarray(directions, dtype=np.float64).reshape(-1)
         origin = np.asarray(origins, dtype=np.float64)
-        mujoco.mj_multiRay(model, data, origin, along, None, 1, -1, geoms, ranges, None, count, mujoco.mjMAXVAL)
+        mujoco.mj_multiRay(model, data, origin, along, groups, 1, -1, geoms, ranges, None, count, mujoco.mjMAXVAL)
     else:
         geom = np.zeros((1, 1), np.int32)
         for i, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
-            ranges[i] = mujoco.mj_ray(model, data, origin, direction, None, 1, -1, geom)
+            ranges[i] = mujoco.mj_ray(model, data, origin, direction, groups, 1, -1, geom)
             geoms[i] = geom[0, 0]
     return np.where(geoms < 0, math.inf, ranges), geoms
-
-
-def sphere_ranges(origins: np.ndarray, directions: np.ndarray, radius: float) -> np.ndarray:
-    """Smallest non-negative root of |o + t d| = radius for unit directions, (N,); ``inf`` without one."""
-    along = (origins * directions).sum(1)
-    foot = origins - along[:, None] * directions
-    half = radius**2 - (foot**2).sum(1)
-    root = np.sqrt(np.maximum(half, 0.0))
-    first, second = -along - root, -along + root
-    nearest = np.where(first >= 0, first, second)
-    return np.where((half >= 0) & (nearest >= 0), nearest, math.inf)
-
-
-def box_ranges(origins: np.ndarray, directions: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Ranges to a box of half extents (3,) at the origin, by slabs, (N,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (-half - origins) / directions, (half - origins) / directions
-    low, high = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-    nearest = np.where(low >= 0, low, high)
-    return np.where((low <= high) & (nearest >= 0), nearest, math.inf)
 
 
 def triangle_ranges(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray, chunk: int = 64) -> np.ndarray:

@@ -30,6 +30,10 @@ class Timing:
     def median_cpu_s(self) -> float:
         return statistics.median(self.cpu_s)
 
+    def per(self, count: int) -> Timing:
+        """Of one of `count` things that a call does."""
+        return Timing([s / count for s in self.wall_s], [s / count for s in self.cpu_s])
+
     @property
     def least_cpu_s(self) -> float:
         """Of the quickest round: other work on the machine only adds to it."""
@@ -65,12 +69,12 @@ def paired_timings(
         calls_per_block: calls that are timed at once, instead of as many as fill ``block_s``.
     """
     synchronise = device_barrier(device)
-    if calls_per_block:
-        sizes = dict.fromkeys(calls, calls_per_block)
-        for call in calls.values():
-            _seconds(call, calls_per_block, synchronise)
-    else:
-        sizes = {name: _calls_per_block(call, block_s, synchronise) for name, call in calls.items()}
+    sizes = {}
+    for name, call in calls.items():
+        _seconds(call, calls_per_block or 1, synchronise)  # compiles and warms up
+        if calls_per_block is None:
+            seconds, _ = _seconds(call, 1, synchronise)
+        sizes[name] = calls_per_block or min(1000, max(1, math.ceil(block_s / seconds)))
     timings, names = {name: Timing() for name in calls}, list(calls)
     for k in range(rounds):
         for name in names[k % len(names) :] + names[: k % len(names)]:
@@ -97,13 +101,6 @@ def device_barrier(device: str) -> Callable[[], None]:
         wp.synchronize_device(device)
 
     return synchronise
-
-
-def _calls_per_block(call: Callable[[int], object], block_s: float, synchronise: Callable[[], None]) -> int:
-    """Compiles and warms up, then finds how many calls fill a block."""
-    _seconds(call, 1, synchronise)
-    seconds, _ = _seconds(call, 1, synchronise)
-    return min(1000, max(1, math.ceil(block_s / seconds)))
 
 
 def _seconds(call: Callable[[int], object], count: int, synchronise: Callable[[], None]) -> tuple[float, float]:

@@ -92,10 +92,33 @@ class SplitMethod:
         return np.concatenate([part.ranges() for part in self.parts])
 
 
-def finite_ranges(distances: np.ndarray, max_range: float) -> np.ndarray:
-    """Distances of which negative ones and those beyond the range are misses, as float64 with ``inf``."""
-    distances = np.asarray(distances, dtype=np.float64)
-    return np.where((distances < 0.0) | (distances > max_range), np.inf, distances)
+class Baseline:
+    """What adapters of others share: poses taken over where something moves, and misses as `inf`.
+
+    An adapter has `_place(pose)` and `_cast(pose)`, which leaves `_distances`: negative or beyond the range for a miss.
+    """
+
+    rotates_rays = False
+    sees_terrain = False
+
+    def __init__(self, scene: BenchmarkScene) -> None:
+        if scene.terrain is not None and not self.sees_terrain:
+            raise NotForThisScene("triangles are not compared here")
+        self.scene = scene
+
+    def cast(self, frame: int) -> None:
+        pose = frame % self.scene.num_frames
+        if self.scene.moving:
+            self._place(pose)
+        self._cast(pose)
+
+    def ranges(self) -> np.ndarray:
+        found = self._distances.numpy() if hasattr(self._distances, "numpy") else self._distances
+        distances = np.asarray(found, dtype=np.float64).reshape(self.scene.num_envs, -1)
+        return np.where((distances < 0.0) | (distances > self.scene.max_range), np.inf, distances)
+
+    def _place(self, pose: int) -> None:
+        pass
 
 
 def build_all(

@@ -10,6 +10,8 @@ import torch
 
 import omnilidar as lidar
 from benchmarks.harness.memory import buffer_bytes
+from benchmarks.harness.meshes import tessellate_to
+from benchmarks.harness.reference import Shapes
 
 from .methods import Entry
 from .scenes import BenchmarkScene, Scan, Terrain
@@ -51,8 +53,9 @@ class Ours:
     def __init__(self, scene: BenchmarkScene, num_threads: int, device: str, terrain: str = "mesh", **features) -> None:
         self.scene = scene
         self.rays = build_rays(scene, num_threads, device, terrain)
-        poses = (_with_sensor(scene.sensor_pos, scene.positions), _with_sensor(scene.sensor_quat, scene.quats))
-        self._pos, self._quat = (torch.from_numpy(pose).to(device) for pose in poses)
+        poses = ((scene.sensor_pos, scene.positions), (scene.sensor_quat, scene.quats))
+        joined = (np.concatenate([sensor[:, :, None], obstacles], axis=2) for sensor, obstacles in poses)
+        self._pos, self._quat = (torch.from_numpy(pose).to(device) for pose in joined)
         self.lidar = build_lidar(self.rays, scene, **features)
         self._place(0)
 
@@ -110,19 +113,28 @@ def build_rays(scene: BenchmarkScene, num_threads: int, device: str, terrain: st
     """The shapes of a scene: ground first, then obstacle k on body k + 1."""
     shapes = [lidar.Shape(lidar.ShapeKind.PLANE)] if scene.plane else []
     if scene.terrain is not None:
-        shapes.append(_height_field(scene.terrain) if terrain == "height field" else _mesh(scene.terrain))
-    for k, (name, size) in enumerate(zip(scene.kinds, scene.sizes.astype(float), strict=True)):
-        kind = lidar.ShapeKind[name.upper()]
-        shapes.append(lidar.Shape(kind, tuple(size[size > 0.0]), body=k + 1))
+        shapes.append(_ground(scene.terrain, terrain))
+    shapes += obstacle_shapes(scene, first_body=1)
     return lidar.RayScene(shapes, scene.num_envs, scene.num_bodies + 1, device, num_threads)
 
 
-def _mesh(terrain: Terrain) -> lidar.Shape:
-    return lidar.Shape(lidar.ShapeKind.MESH, asset=lidar.TriangleMesh(terrain.vertices, terrain.faces))
+def obstacle_shapes(scene: Shapes, triangles: int = 0, first_body: int = 0, class_id: int = 0) -> list[lidar.Shape]:
+    """A scene's obstacles, each on a body of its own: exact, or of about so many triangles."""
+    shapes = []
+    for body, (kind, size) in enumerate(zip(scene.kinds, scene.sizes.astype(float), strict=True), first_body):
+        if triangles:
+            mesh = lidar.TriangleMesh(*tessellate_to(kind, size, triangles))
+            shapes.append(lidar.Shape(lidar.ShapeKind.MESH, asset=mesh, body=body, class_id=class_id))
+        else:
+            exact = lidar.ShapeKind[kind.upper()]
+            shapes.append(lidar.Shape(exact, tuple(size[size > 0.0]), body=body, class_id=class_id))
+    return shapes
 
 
-def _height_field(terrain: Terrain) -> lidar.Shape:
-    """Its rows go along y; its heights start at 0."""
+def _ground(terrain: Terrain, form: str) -> lidar.Shape:
+    """A mesh or a height field, whose rows go along y and whose heights start at 0."""
+    if form == "mesh":
+        return lidar.Shape(lidar.ShapeKind.MESH, asset=lidar.TriangleMesh(terrain.vertices, terrain.faces))
     lowest = float(terrain.heights.min())
     field = lidar.HeightField(terrain.heights.T.astype(np.float64) - lowest, *terrain.size)
     return lidar.Shape(lidar.ShapeKind.HEIGHTFIELD, asset=field, pos=(0.0, 0.0, lowest))
@@ -152,7 +164,3 @@ def buffer_sizes(scene: BenchmarkScene, **features) -> tuple[int, int]:
         sizes.append(buffer_bytes(ours.rays, ours.lidar))
     per_env = sizes[1] - sizes[0]
     return per_env, sizes[0] - per_env
-
-
-def _with_sensor(sensor: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
-    return np.concatenate([sensor[:, :, None], obstacles], axis=2)

@@ -146,6 +146,14 @@ class BenchmarkScene:
         turn = matrices(self.sensor_quat[frame])
         return np.einsum("eij,erj->eri", turn, self.scan.directions_s(frame).astype(np.float64)).astype(dtype)
 
+    def rays_w(self, dtype: type = np.float32) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Origins and directions of each frame in the environments' frames, (E, R, 3) each."""
+        directions = [self.directions_w(frame).astype(dtype) for frame in range(self.num_frames)]
+        return [
+            (np.broadcast_to(o[:, None].astype(dtype), d.shape), d)
+            for o, d in zip(self.sensor_pos, directions, strict=True)
+        ]
+
     def environments(self, low: int, high: int) -> BenchmarkScene:
         """The same scene with environments ``low`` to ``high - 1`` only."""
         return self._of(lambda poses: poses[:, low:high], self.scan.phase_rows[low:high])

@@ -3,13 +3,11 @@
     python scripts/work_precision.py subject=lidar only=shapes,rays lidar=avia
     python scripts/work_precision.py subject=policy runs=<run directory>,<run directory>
 
-lidar       shapes, updates, poses, rays, rates, motion, precision: shapes or triangles, updates of moving bodies, stale
-            poses, rays kept, frames per second, motion within a frame, precision of the ranges
-physics     steps, solver, order: time step and integrator, PD law in the engine or outside, iterations and friction
-            cone, and the order of convergence of smooth motion
-perception  farthest, heights, sectors, history: points kept and how, and how many frames of them a network sees
-policy      what scripts/evaluate.py measured against the time of the policy that scripts/export.py wrote; by default of
-            all runs under outputs/ that have both
+lidar    shapes, poses, rays, rates, motion: shapes or triangles, stale poses, rays kept, frames per second, motion
+         within a frame
+physics  steps, solver: time step and integrator, PD law in the engine or outside, iterations and friction cone
+policy   what scripts/evaluate.py measured against the time of the policy that scripts/export.py wrote; by default of
+         all runs under outputs/ that have both
 
 Everything runs on one thread, choices in turn; a cost is this process's CPU time in the quickest round. Writes a table
 (CSV, JSON, Markdown) for each study and one plot with all fronts, the default marked, into <out>/<subject>/. The
@@ -28,18 +26,17 @@ from benchmarks.harness.pareto import Study, plot
 from benchmarks.harness.table import about, machine_line, report
 from omniperception import build, config
 from omniperception.config import ConfigError
-from omniperception.perception import PdSampler
 from omnirobot.common.cli import Command, argument, refuse_arguments
 from omnirobot.common.figures import new_figure
 
-from . import lidar, perception, physics, policy
+from . import lidar, physics, policy
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
     """The command line."""
 
-    subject: str = argument(doc="what is compared", choices=("lidar", "physics", "perception", "policy"))
+    subject: str = argument(doc="what is compared", choices=("lidar", "physics", "policy"))
     only: tuple[str, ...] = argument((), "studies to run; all if not given")
     size: str = argument("full", "small: in seconds, to see that everything works", choices=("full", "small"))
     out: Path = argument(Path("outputs/work_precision"), "folder of the results of all subjects")
@@ -63,14 +60,6 @@ def _physics(given: Arguments, overrides: list[str]) -> Iterator[Study]:
     return physics.measure(run, physics.SMALL if given.small else physics.Sizes(), given.only)
 
 
-def _perception(given: Arguments, overrides: list[str]) -> Iterator[Study]:
-    overrides = _with("experiment=quickstart", overrides)
-    run = build.assemble(config.compose(overrides))
-    if run.perception is None or not isinstance(run.perception.sampler(), PdSampler):
-        raise ConfigError("the perception must sample a proximal and a distal half; use perception=pd_risknet")
-    return perception.measure(overrides, perception.SMALL if given.small else perception.Sizes(), given.only)
-
-
 def _policy(given: Arguments, overrides: list[str]) -> Iterator[Study]:
     if overrides:
         raise ConfigError(f"{overrides[0]}: policies are taken as they were trained; leave overrides out")
@@ -79,8 +68,7 @@ def _policy(given: Arguments, overrides: list[str]) -> Iterator[Study]:
 
 SUBJECTS: dict[str, tuple[Callable[[Arguments, list[str]], Iterator[Study]], tuple[str, ...]]] = {
     "lidar": (_lidar, tuple(lidar.STUDIES)),
-    "physics": (_physics, physics.STUDIES),
-    "perception": (_perception, tuple(perception.STUDIES)),
+    "physics": (_physics, tuple(physics.STUDIES)),
     "policy": (_policy, ()),
 }
 """How a subject is measured, and its studies by name."""

@@ -1,30 +1,19 @@
-"""Work and precision of the LiDAR: shapes, updates, rays, rates, motion within a frame, and precision of the output."""
+"""Work and precision of the LiDAR: shapes, stale poses, rays, rates and motion within a frame."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 import torch
 
-from benchmarks.harness.meshes import join, tessellate_to
 from benchmarks.harness.pareto import Choice, Study
-from benchmarks.harness.rotations import matrices
 from benchmarks.harness.timing import paired_timings
-from omnilidar import (
-    Lidar,
-    LidarConfig,
-    LidarFrame,
-    RayScene,
-    ScanPattern,
-    SectorDistances,
-    Shape,
-    ShapeKind,
-    TriangleMesh,
-)
+from benchmarks.lidar.ours import obstacle_shapes
+from omnilidar import Lidar, LidarFrame, RayScene, ScanPattern, SectorDistances, Shape, ShapeKind
 from omniperception.build import RunConfig
 
 from .scene import GROUND, OBSTACLE, MovingScene, Truth, dense_directions, moving_scene
@@ -66,51 +55,48 @@ class Bench:
     """The moving scene of a configuration, its sensor and the truth about both."""
 
     def __init__(self, run: RunConfig, sizes: Sizes) -> None:
-        self.sizes, self.sensor = sizes, run.env.lidar
+        self.sizes, self.motion_segments = sizes, run.env.lidar.motion_segments
+        self.sensor = replace(run.env.lidar, motion_segments=0)
         self.pattern: ScanPattern = run.env.lidar.scan_pattern()
         self.num_sectors = run.env.rewards.avoidance.num_sectors
         self.scene: MovingScene = moving_scene(run.env.obstacles, sizes.num_envs)
         self.truth = Truth(self.scene, self.sensor)
         self.times = [(k + 1) * self.sensor.period_s for k in range(sizes.num_frames)]
 
-    @cached_property
-    def dense(self) -> np.ndarray:
-        """Directions of the dense reference, (N, 3)."""
-        return self.dense_at(self.sizes.dense_deg)
-
-    def dense_at(self, step_deg: float) -> np.ndarray:
+    def dense(self, step_deg: float) -> np.ndarray:
         """Directions over the sensor's field of view, (N, 3)."""
         elevation = self.pattern.elevation
         return dense_directions((float(elevation.min()), float(elevation.max())), step_deg)
 
-    def true_ranges(self, time_s: float, directions_s: np.ndarray) -> np.ndarray:
-        """Of rays (E, N, 3) in the sensors' frames, (E, N)."""
-        return np.stack([self.truth.scan(time_s, env, d)[0] for env, d in enumerate(directions_s)])
+    def true_sectors(self, times: Sequence[float], step_deg: float) -> np.ndarray:
+        """By dense rays at each time, (T, E, num_sectors)."""
+        rays = [self.dense(step_deg)] * self.scene.num_envs
+        return np.stack([self.truth.sectors(t, rays, self.num_sectors, NEAR) for t in times])
 
-    def true_sectors(self, time_s: float, step_deg: float | None = None) -> np.ndarray:
-        """By the dense reference, (E, num_sectors)."""
-        directions = self.dense if step_deg is None else self.dense_at(step_deg)
-        return self.truth.sectors(time_s, [directions] * self.scene.num_envs, self.num_sectors, NEAR)
-
-    def costs(self, casts: Mapping[str, Callable[[int], None]]) -> dict[str, float]:
+    def costs(self, casts: Mapping[str, Callable[[int], object]]) -> dict[str, float]:
         """CPU time of a call, us per environment, timed in turn."""
         timings = paired_timings(casts, self.sizes.rounds, block_s=self.sizes.block_s)
         return {name: 1e6 * timing.least_cpu_s / self.scene.num_envs for name, timing in timings.items()}
 
+    def reference(self) -> str:
+        frames, envs = self.sizes.num_frames, self.scene.num_envs
+        return f"Reference: mj_ray in float64 along the same rays; {frames} frames, {envs} environments."
+
 
 class Caster:
-    """The sensor in a ray scene of the moving scene, on one thread; body k is obstacle k, the last one the base."""
+    """The sensor in a ray scene of the moving scene, on one thread; body k is obstacle k, the last one the base.
 
-    def __init__(
-        self, bench: Bench, config: LidarConfig | None = None, triangles: int = 0, outputs: Sequence[str] = OUTPUTS
-    ) -> None:
-        self.bench, self.config = bench, config or bench.sensor
-        scene = bench.scene
-        self.rays = RayScene(ray_shapes(scene, triangles), scene.num_envs, len(scene.kinds) + 1, num_threads=1)
-        self.lidar = Lidar(self.config, bench.pattern, self.rays, mount_body=len(scene.kinds), outputs=outputs)
-        frame, base = self.lidar.frame, len(scene.kinds)
+    Obstacles are exact, or of about so many `triangles` each.
+    """
+
+    def __init__(self, bench: Bench, triangles: int = 0, outputs: Sequence[str] = OUTPUTS, **changes: object) -> None:
+        self.bench, self.config = bench, replace(bench.sensor, **changes)
+        scene, base = bench.scene, len(bench.scene.kinds)
+        shapes = [Shape(ShapeKind.PLANE, class_id=GROUND), *obstacle_shapes(scene, triangles, class_id=OBSTACLE)]
+        self.rays = RayScene(shapes, scene.num_envs, base + 1, num_threads=1)
+        self.lidar = Lidar(self.config, bench.pattern, self.rays, mount_body=base, outputs=outputs)
         place = (self.rays.body_pos, self.rays.body_quat, base, self.config.mount_pos, self.config.quat)
-        rays = (frame.true_ranges, frame.directions_s, frame.class_id)
+        rays = (self.lidar.frame.true_ranges, self.lidar.frame.directions_s, self.lidar.frame.class_id)
         self.sectors = SectorDistances(*rays, *place, OBSTACLE, NEAR, bench.num_sectors, num_threads=1)
         self._poses: dict[float, tuple[torch.Tensor, torch.Tensor]] = {}
 
@@ -124,35 +110,23 @@ class Caster:
         return self._poses[key]
 
     def cast(self, time_s: float) -> LidarFrame:
-        """The frame that ends at ``time_s``, with the poses of that time."""
-        self.rays.set_poses(*self.poses(time_s))
-        return self.lidar.cast(time_s)
-
-    def distorted(self, time_s: float) -> LidarFrame:
-        """The frame that ends at ``time_s``, with the poses at the ends of all its segments."""
+        """The frame that ends at ``time_s``, with the poses of that time, or those at the ends of all its segments."""
         period, segments = self.config.period_s, self.config.motion_segments
-        self.lidar.reset()
+        if segments:
+            self.lidar.reset()
         for k in range(segments):
             self.rays.set_poses(*self.poses(time_s - period + k * period / segments))
             self.lidar.record_poses()
-        return self.cast(time_s)
+        self.rays.set_poses(*self.poses(time_s))
+        return self.lidar.cast(time_s)
 
     def frame(self, number: int) -> LidarFrame:
         """The frame of a given number, again and again those of the bench."""
         return self.cast(self.bench.times[number % len(self.bench.times)])
 
-
-def ray_shapes(scene: MovingScene, triangles: int = 0) -> list[Shape]:
-    """The ground and the obstacles: exact, or of about so many triangles each."""
-    obstacles = []
-    for k, (kind, size) in enumerate(zip(scene.kinds, scene.sizes, strict=True)):
-        if triangles:
-            mesh = TriangleMesh(*tessellate_to(kind, size, triangles))
-            obstacles.append(Shape(ShapeKind.MESH, asset=mesh, body=k, class_id=OBSTACLE))
-        else:
-            sizes = tuple(size[size > 0.0])
-            obstacles.append(Shape(ShapeKind[kind.upper()], sizes, body=k, class_id=OBSTACLE))
-    return [Shape(ShapeKind.PLANE, class_id=GROUND), *obstacles]
+    def sectors_at(self, times: Sequence[float]) -> np.ndarray:
+        """Sector distances of the frames that end at these times, (T, E, num_sectors)."""
+        return np.stack([(self.cast(time_s), self.sectors().numpy().copy())[1] for time_s in times])
 
 
 def range_errors(ranges: np.ndarray, truth: np.ndarray) -> dict[str, float]:
@@ -187,51 +161,23 @@ def frame_errors(
         frame = cast(k)
         directions = frame.directions_s.numpy()
         found.append(frame.true_ranges.double().numpy())
-        true.append(bench.true_ranges(time_s, directions))
+        true.append([bench.truth.scan(time_s, env, d)[0] for env, d in enumerate(directions)])
         sectors.append(caster.sectors().numpy().copy())
         true_sectors.append(bench.truth.sectors(time_s, directions, bench.num_sectors, NEAR))
     errors = sector_errors(np.stack(sectors), np.stack(true_sectors))
-    return range_errors(np.stack(found), np.stack(true)) | {SECTOR: errors[SECTOR]}
+    return range_errors(np.stack(found), np.array(true)) | {SECTOR: errors[SECTOR]}
 
 
 def shapes_study(bench: Bench, triangles: Sequence[int] = (8, 32, 128, 512, 2048, 4096)) -> Study:
     """Exact shapes against tessellations."""
-    casters = {"exact": Caster(bench)} | {f"{n} triangles": Caster(bench, triangles=n) for n in triangles}
+    casters = {"exact": Caster(bench)} | {f"{n} triangles": Caster(bench, n) for n in triangles}
     costs = bench.costs({name: caster.frame for name, caster in casters.items()})
     choices = [
         Choice(name, costs[name], frame_errors(bench, caster, caster.frame), name == "exact", name.split(" ")[-1])
         for name, caster in casters.items()
     ]
     note = "Corners of a tessellation lie on the true surface. Boxes have 12 triangles, which are exact."
-    return Study("shapes", "Exact shapes against triangles", COST, RANGE, choices, 1e-6, (note, _reference(bench)))
-
-
-def updates_study(bench: Bench, triangles: int = 128) -> Study:
-    """Bodies that move as instances with a pose, against one mesh that is refitted, against trees that are rebuilt."""
-    methods = {"exact shapes": Instances(bench, 0), "instances": Instances(bench, triangles)}
-    methods |= {"refit": Refitted(bench, triangles), "rebuild": Rebuilt(bench, triangles)}
-    rays = [_general_rays(bench, time_s) for time_s in bench.times]
-
-    def cast(method: Instances | Refitted | Rebuilt, frame: int) -> torch.Tensor:
-        k = frame % len(bench.times)
-        return method(bench.times[k], *rays[k])
-
-    costs = bench.costs({name: lambda frame, m=method: cast(m, frame) for name, method in methods.items()})
-    directions = _scan_directions(bench)
-    choices = []
-    for name, method in methods.items():
-        pairs = [
-            (cast(method, k).double().numpy(), bench.true_ranges(time_s, directions[k]))
-            for k, time_s in enumerate(bench.times)
-        ]
-        errors = range_errors(*(np.stack(column) for column in zip(*pairs, strict=True)))
-        choices.append(Choice(name, costs[name], errors, name == "exact shapes"))
-    notes = (
-        f"{triangles} triangles per body; poses or vertices are new in every frame and their making is counted;"
-        " `refit` and `rebuild` have one mesh per environment. All cast the same general rays.",
-        _reference(bench),
-    )
-    return Study("updates", "How moving bodies are brought up to date", COST, RANGE, choices, 1e-6, notes)
+    return Study("shapes", "Exact shapes against triangles", COST, RANGE, choices, 1e-6, (note, bench.reference()))
 
 
 def staleness_study(bench: Bench, every: Sequence[int] = (1, 2, 5, 10)) -> Study:
@@ -243,13 +189,14 @@ def staleness_study(bench: Bench, every: Sequence[int] = (1, 2, 5, 10)) -> Study
         time_s = times[k % num_frames]
         return caster.lidar.cast(time_s) if k % num_frames % n else caster.cast(time_s)
 
-    costs = bench.costs({f"every {n}": partial(cast, n) for n in every})
+    casts = {f"every {n}": partial(cast, n) for n in every}
+    costs = bench.costs(casts)
     choices = [
-        Choice(f"every {n}", costs[f"every {n}"], frame_errors(bench, caster, partial(cast, n), times), n == 1)
-        for n in every
+        Choice(name, costs[name], frame_errors(bench, caster, cast, times), name == "every 1")
+        for name, cast in casts.items()
     ]
     note = f"Frames of {period:g} s; the robot walks at 0.8 m/s. The cost includes copying the poses."
-    return Study("poses", "Poses updated in every n-th frame", COST, SECTOR, choices, 1e-6, (note, _reference(bench)))
+    return Study("poses", "Poses updated in every n-th frame", COST, SECTOR, choices, 1e-6, (note, bench.reference()))
 
 
 def rays_study(
@@ -262,22 +209,16 @@ def rays_study(
     casters = {}
     for count in sorted({min(count, points) for count in (*counts, bench.sensor.num_rays)}):
         for strategy in strategies[:1] if count == points else strategies:
-            config = replace(bench.sensor, num_rays=count, selection=strategy, motion_segments=0)
-            casters[f"{count} {strategy}"] = Caster(bench, config)
+            casters[f"{count} {strategy}"] = Caster(bench, num_rays=count, selection=strategy)
     costs = bench.costs({name: caster.frame for name, caster in casters.items()})
-    true = np.stack([bench.true_sectors(time_s) for time_s in bench.times])
-    choices = []
+    true, choices = bench.true_sectors(bench.times, bench.sizes.dense_deg), []
     for name, caster in casters.items():
-        sectors = []
-        for time_s in bench.times:
-            caster.cast(time_s)
-            sectors.append(caster.sectors().numpy().copy())
-        errors, config = sector_errors(np.stack(sectors), true), caster.config
+        errors, config = sector_errors(caster.sectors_at(bench.times), true), caster.config
         default = (config.num_rays, config.selection) == (bench.sensor.num_rays, bench.sensor.selection)
         choices.append(Choice(name, costs[name], errors, default, config.selection, {"rays": config.num_rays}))
     note = (
-        f"Reference: {len(bench.dense):,} rays {bench.sizes.dense_deg:g} degrees apart over the field of view, mj_ray"
-        " in float64. One frame; a later one fills gaps."
+        f"Reference: {len(bench.dense(bench.sizes.dense_deg)):,} rays {bench.sizes.dense_deg:g} degrees apart over the"
+        " field of view, mj_ray in float64. One frame; a later one fills gaps."
     )
     return Study("rays", "Rays kept of a frame, and which", COST, SECTOR, choices, 1e-4, (note,))
 
@@ -287,34 +228,22 @@ def rates_study(
 ) -> Study:
     """Frames per second: what the newest frame says against what is there, at the control steps in between."""
     instants = [7 * k * control_dt for k in range(2, 2 + 5 * bench.sizes.num_frames)]  # every seventh: all ages occur
-    true = np.stack([bench.true_sectors(t, 2.0 * bench.sizes.dense_deg) for t in instants])
-    coarse: dict[float, np.ndarray] = {}
-
-    def still_true(time_s: float) -> np.ndarray:
-        key = round(time_s, 9)
-        if key not in coarse:
-            coarse[key] = bench.true_sectors(time_s, 4.0 * bench.sizes.dense_deg)
-        return coarse[key]
-
-    casters = {p: Caster(bench, replace(bench.sensor, period_s=p, motion_segments=0)) for p in periods_s}
+    apart = bench.sizes.dense_deg
+    true, coarse = bench.true_sectors(instants, 2.0 * apart), bench.true_sectors(instants, 4.0 * apart)
+    casters = {p: Caster(bench, period_s=p, motion_segments=0) for p in periods_s}
     costs = bench.costs({str(p): caster.frame for p, caster in casters.items()})
     choices = []
     for period, caster in casters.items():
-        sectors, stale = [], []
-        for now in instants:
-            newest = math.floor(now / period + 1e-6) * period
-            caster.cast(newest)
-            sectors.append(caster.sectors().numpy().copy())
-            stale.append(still_true(newest) - still_true(now))
-        errors = sector_errors(np.stack(sectors), true)
-        errors["staleness alone, RMSE (m)"] = math.sqrt(float(np.mean(np.stack(stale) ** 2)))
-        name = f"{1.0 / period:.3g} Hz"
+        newest = [math.floor(now / period + 1e-6) * period for now in instants]
+        errors = sector_errors(caster.sectors_at(newest), true)
+        stale = bench.true_sectors(newest, 4.0 * apart) - coarse
+        errors["staleness alone, RMSE (m)"] = math.sqrt(float(np.mean(stale**2)))
         default = math.isclose(period, bench.sensor.period_s)
-        choices.append(Choice(name, costs[str(period)] / period, errors, default))
+        choices.append(Choice(f"{1.0 / period:.3g} Hz", costs[str(period)] / period, errors, default))
     notes = (
-        f"{bench.sensor.num_rays} rays of every frame, whatever the rate. Reference: rays {2 * bench.sizes.dense_deg:g}"
-        f" degrees apart at each of {len(instants)} control steps; staleness alone: the reference at the newest frame"
-        " against the reference now.",
+        f"{bench.sensor.num_rays} rays of every frame, whatever the rate. Reference: rays {2 * apart:g} degrees apart"
+        f" at each of {len(instants)} control steps; staleness alone: the reference at the newest frame against the"
+        " reference now.",
         "Obstacles and robot move; the newest frame serves until the next one.",
     )
     cost = "CPU time per second (us per environment)"
@@ -323,24 +252,20 @@ def rates_study(
 
 def motion_study(bench: Bench, segments: Sequence[int] = (0, 1, 2, 5, 10)) -> Study:
     """Each point cast from the poses at its own time, against all from those at the frame's end."""
-    casters = {
-        n: Caster(bench, replace(bench.sensor, motion_segments=n), outputs=(*OUTPUTS, "time_s")) for n in segments
-    }
-    cast = {n: caster.distorted if n else caster.cast for n, caster in casters.items()}
-    times = bench.times
-    costs = bench.costs({str(n): lambda k, n=n: cast[n](times[k % len(times)]) for n in casters})
+    casters = {n: Caster(bench, outputs=(*OUTPUTS, "time_s"), motion_segments=n) for n in segments}
+    costs = bench.costs({str(n): caster.frame for n, caster in casters.items()})
     choices = []
     for n, caster in casters.items():
         found, true = [], []
         for time_s in bench.times[: max(1, bench.sizes.num_frames // 2)]:
-            frame = cast[n](time_s)
+            frame = caster.cast(time_s)
             emitted = time_s - caster.config.period_s + frame.time_s.double().numpy()
             found.append(frame.true_ranges.double().numpy())
             directions = frame.directions_s.numpy()
             true.append([bench.truth.distorted(emitted[e], e, directions[e]) for e in range(len(emitted))])
         name = f"{n} pieces" if n > 1 else ("1 piece" if n else "off")
         errors = range_errors(np.stack(found), np.array(true))
-        choices.append(Choice(name, costs[str(n)], errors, n == bench.sensor.motion_segments))
+        choices.append(Choice(name, costs[str(n)], errors, n == bench.motion_segments))
     notes = (
         "Reference: every ray from the poses at its own moment, mj_ray in float64. The cost includes recording the"
         " poses at the ends of the pieces.",
@@ -348,34 +273,12 @@ def motion_study(bench: Bench, segments: Sequence[int] = (0, 1, 2, 5, 10)) -> St
     return Study("motion", "Motion within a frame", COST, RANGE, choices, 1e-6, notes)
 
 
-def precision_study(bench: Bench) -> Study:
-    """Ranges kept in float32 against a copy in half precision."""
-    caster = Caster(bench)
-    half = torch.empty_like(caster.lidar.frame.ranges, dtype=torch.float16)
-    costs = bench.costs({"float32": caster.frame, "float16": lambda k: half.copy_(caster.frame(k).ranges)})
-    found, true = [], []
-    for time_s in bench.times:
-        frame = caster.cast(time_s)
-        found.append(frame.true_ranges.clone())
-        true.append(bench.true_ranges(time_s, frame.directions_s.numpy()))
-    choices = []
-    for name, dtype in (("float32", torch.float32), ("float16", torch.float16)):
-        ranges = torch.stack(found).to(dtype)
-        facts = {"bytes per environment": ranges.element_size() * caster.config.num_rays}
-        errors = range_errors(ranges.double().numpy(), np.stack(true))
-        choices.append(Choice(name, costs[name], errors, name == "float32", facts=facts))
-    note = "float16 is a copy: the sensor itself writes float32 only. It halves what a stored frame takes."
-    return Study("precision", "Precision of the ranges", COST, RANGE, choices, 1e-6, (note, _reference(bench)))
-
-
 STUDIES: dict[str, Callable[[Bench], Study]] = {
     "shapes": shapes_study,
-    "updates": updates_study,
     "poses": staleness_study,
     "rays": rays_study,
     "rates": rates_study,
     "motion": motion_study,
-    "precision": precision_study,
 }
 
 
@@ -383,82 +286,3 @@ def measure(run: RunConfig, sizes: Sizes, only: Sequence[str] = ()) -> Iterator[
     """All studies, or some by name, as they are done."""
     bench = Bench(run, sizes)
     yield from (study(bench) for name, study in STUDIES.items() if not only or name in only)
-
-
-class Instances:
-    """Bodies with a pose each: exact shapes, or rigid meshes."""
-
-    def __init__(self, bench: Bench, triangles: int) -> None:
-        self._scene, self._reach, num_bodies = bench.scene, bench.sensor.max_range, len(bench.scene.kinds)
-        self._rays = RayScene(ray_shapes(bench.scene, triangles), bench.scene.num_envs, num_bodies, num_threads=1)
-
-    def __call__(self, time_s: float, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """Ranges (E, N), m."""
-        self._rays.set_poses(*self._scene.obstacles(time_s))
-        return self._rays.cast(origins, directions, self._reach).ranges
-
-
-class Refitted:
-    """All bodies of an environment as one mesh, whose vertices are moved and whose tree is refitted."""
-
-    def __init__(self, bench: Bench, triangles: int) -> None:
-        self._bodies, self._reach = Vertices(bench.scene, triangles), bench.sensor.max_range
-        mesh = TriangleMesh(self._bodies.at(0.0)[0], self._bodies.faces)
-        shapes = [Shape(ShapeKind.PLANE), Shape(ShapeKind.DEFORMABLE, asset=mesh)]
-        self._rays = RayScene(shapes, bench.scene.num_envs, 0, num_threads=1)
-
-    def __call__(self, time_s: float, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """Ranges (E, N), m."""
-        self._rays.update_vertices(1, torch.from_numpy(self._bodies.at(time_s)))
-        return self._rays.cast(origins, directions, self._reach).ranges
-
-
-class Rebuilt:
-    """All bodies of an environment as one mesh, whose tree is rebuilt for every frame."""
-
-    def __init__(self, bench: Bench, triangles: int) -> None:
-        self._bodies, self._reach = Vertices(bench.scene, triangles), bench.sensor.max_range
-
-    def __call__(self, time_s: float, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """Ranges (E, N), m."""
-        ranges = []
-        for env, vertices in enumerate(self._bodies.at(time_s)):
-            mesh = Shape(ShapeKind.MESH, asset=TriangleMesh(vertices, self._bodies.faces))
-            rays = RayScene([Shape(ShapeKind.PLANE), mesh], 1, 0, num_threads=1)
-            ranges.append(rays.cast(origins[env : env + 1], directions[env : env + 1], self._reach).ranges)
-        return torch.cat(ranges)
-
-
-class Vertices:
-    """The triangles of all bodies of a scene and where their vertices are."""
-
-    def __init__(self, scene: MovingScene, triangles: int) -> None:
-        parts = [tessellate_to(kind, size, triangles) for kind, size in zip(scene.kinds, scene.sizes, strict=True)]
-        self._scene, self._parts = scene, [vertices for vertices, _ in parts]
-        self.faces = join(parts)[1]
-
-    def at(self, time_s: float) -> np.ndarray:
-        """(E, V, 3) float32, metres."""
-        pos, quat = self._scene.obstacles(time_s)
-        turn = matrices(quat)
-        moved = [v @ turn[:, k].transpose(0, 2, 1) + pos[:, k, None] for k, v in enumerate(self._parts)]
-        return np.concatenate(moved, axis=1).astype(np.float32)
-
-
-def _scan_directions(bench: Bench) -> list[np.ndarray]:
-    """The sensor's own rays of each frame, (E, N, 3) in its frame."""
-    caster = Caster(bench)
-    return [caster.cast(time_s).directions_s.numpy().copy() for time_s in bench.times]
-
-
-def _general_rays(bench: Bench, time_s: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """The sensor's rays of a frame in the environments' frames: origins and directions, (E, N, 3) float32."""
-    directions = Caster(bench).cast(time_s).directions_s.numpy().astype(np.float64)
-    pos, turn = bench.scene.sensor(time_s, bench.sensor)
-    turned = torch.from_numpy(np.einsum("eij,enj->eni", turn, directions)).float()
-    return torch.from_numpy(pos).float()[:, None].expand_as(turned).contiguous(), turned
-
-
-def _reference(bench: Bench) -> str:
-    envs = bench.scene.num_envs
-    return f"Reference: mj_ray in float64 along the same rays; {bench.sizes.num_frames} frames, {envs} environments."

@@ -35,12 +35,7 @@ AS_IT_STANDS = re.compile(r"dev-ideal-.*-run-(?P<trials>\d+)\.json")
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
-
-    Attributes:
-        rounds: How often each policy is timed, in turn.
-        block_s: About how long at once, s.
-    """
+    """How often each policy is timed, in turn, and about how long at once, s."""
 
     rounds: int = 7
     block_s: float = 0.1

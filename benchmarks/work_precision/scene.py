@@ -123,9 +123,13 @@ class Truth:
             env: The environment.
             directions_s: Unit directions in the sensor's frame, (N, 3).
         """
-        pos, quat = (poses[env] for poses in self.scene.obstacles(time_s))
-        origin, turn = (poses[env] for poses in self.scene.sensor(time_s, self.config))
-        return self._cast(pos, quat, origin, directions_s.astype(np.float64) @ turn.T)
+        model, data, config = self._model, self._data, self.config
+        data.mocap_pos[:], data.mocap_quat[:] = (poses[env] for poses in self.scene.obstacles(time_s))
+        mujoco.mj_kinematics(model, data)
+        origin, turn = (poses[env] for poses in self.scene.sensor(time_s, config))
+        ranges, geom = mujoco_ranges(model, data, origin, directions_s.astype(np.float64) @ turn.T)
+        seen = (ranges >= config.min_range) & (ranges <= config.max_range)
+        return np.where(seen, ranges, math.inf), seen & (geom > 0)
 
     def distorted(self, times: np.ndarray, env: int, directions_s: np.ndarray) -> np.ndarray:
         """Ranges of rays (N, 3) each of which leaves at a time of its own, s, (N,)."""
@@ -149,16 +153,6 @@ class Truth:
             sector = np.floor(np.mod(bearing + math.pi, 2.0 * math.pi) * num_sectors / (2.0 * math.pi)).astype(int)
             np.minimum.at(distances[env], np.minimum(sector, num_sectors - 1), np.linalg.norm(away, axis=1))
         return distances
-
-    def _cast(
-        self, pos: np.ndarray, quat: np.ndarray, origin: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        model, data, config = self._model, self._data, self.config
-        data.mocap_pos[:], data.mocap_quat[:] = pos, quat
-        mujoco.mj_kinematics(model, data)
-        ranges, geom = mujoco_ranges(model, data, origin, directions)
-        seen = (ranges >= config.min_range) & (ranges <= config.max_range)
-        return np.where(seen, ranges, math.inf), seen & (geom > 0)
 
 
 def dense_directions(elevation: Sequence[float], step_deg: float) -> np.ndarray:

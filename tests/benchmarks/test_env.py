@@ -1,7 +1,6 @@
 """Rates of the environment: what is timed is what is reported, and a slower task is found slower."""
 
 import pytest
-import torch
 from mujoco.batch import Batch
 
 from benchmarks import env as benchmark
@@ -44,26 +43,3 @@ def test_a_task_with_more_physics_is_slower(make_config):
     fast, slow = rates.column("CPU us per env step")
     assert rates.column("timed") == ["step", "against"] and slow > 1.5 * fast
     assert stages.columns == ["stage", "step", "against"]
-
-
-@pytest.mark.parametrize("item", benchmark.FORCED_IN)
-def test_what_is_forced_in_exists_and_changes_nothing(make_config, item):
-    plain, forced = (benchmark.environment(make_config(*WALK, *more)) for more in ((), benchmark.FORCED_IN[item]))
-    if "LiDAR" in item:
-        assert plain.sensing is None and forced.sensing is not None
-    elif "reward" in item:
-        assert len(forced.config.rewards.terms) == len(plain.config.rewards.terms) + 5
-    else:
-        assert forced.config.randomization != plain.config.randomization
-    torch.manual_seed(0)
-    for action in 0.3 * torch.randn(6, plain.num_envs, plain.num_actions):
-        (seen, rewards, *_), (other_seen, other_rewards, *_) = plain.step(action), forced.step(action)
-        assert torch.allclose(seen["proprioception"], other_seen["proprioception"], atol=1e-5)
-        assert torch.allclose(rewards, other_rewards, atol=1e-5)
-
-
-def test_gains_have_a_row_for_each_item():
-    item = "reward terms of weight 1e-30"
-    table = benchmark.gains(1, WALK[1:3], {"walk": (item,)})
-    assert [row[:2] for row in table.rows] == [("walk", item), ("walk", "all of them")]
-    assert all("(" in ratio for ratio in table.column("CPU time"))

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from benchmarks.work_precision import lidar, perception, physics, policy
+from benchmarks.work_precision import lidar, physics, policy
 from benchmarks.work_precision.__main__ import command
 from benchmarks.work_precision.scene import MovingScene, Truth, dense_directions, moving_scene
 from omnilidar import LidarConfig
@@ -19,7 +18,6 @@ from omniperception.config import ConfigError
 from omniperception.env.metrics import OUTCOMES
 from omniperception.evaluation.report.records import Record, write
 from omniperception.evaluation.trials.outcomes import Episodes
-from omniperception.perception import ProximitySampler
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -65,7 +63,7 @@ def test_tessellations_converge_to_exact_shapes(lidar_bench):
 
 def test_a_sensor_that_is_mounted_elsewhere_errs(lidar_bench):
     x, y, z = lidar_bench.sensor.mount_pos
-    moved = lidar.Caster(lidar_bench, replace(lidar_bench.sensor, mount_pos=(x, y, z + 0.01)))
+    moved = lidar.Caster(lidar_bench, mount_pos=(x, y, z + 0.01))
     assert lidar.frame_errors(lidar_bench, moved, moved.frame)[lidar.RANGE] > 5e-3
 
 
@@ -111,53 +109,6 @@ def test_the_reference_is_settled_before_chaos(physics_bench):
     for trajectory in physics_bench.trajectories:
         assert physics_bench.growths[trajectory.name] < physics.GROWTH
         assert physics_bench.doubts[trajectory.name] < 1e-4  # RK4 at the same step says the same
-
-
-def test_orders_of_convergence(make_config):
-    found = {o.integrator: o for o in physics.orders(make_config("experiment=walk"), (0.001, 0.002, 0.004))}
-    assert found["rk4"].observed == pytest.approx(4.0, abs=0.2)
-    for name in ("euler", "implicitfast", "implicit", "discrete"):
-        assert found[name].observed == pytest.approx(1.0, abs=0.1)
-    assert max(found["rk4"].energy.values()) < 1e-10 < 1e-6 < min(found["euler"].energy.values())
-
-
-def test_decoders_by_hand():
-    points = torch.tensor([[[1.0, 0.02, -0.3], [1.0, -2.0, 0.2], [0.3, 0.0, 0.1], [0.7, 0.3, -0.25], [0.0, 0.0, 0.0]]])
-    used = points.abs().sum(-1) > 0
-    sectors = perception.read_sectors(points.double(), used, torch.tensor([0.3]))[0]
-    assert sectors[11] == pytest.approx(math.hypot(1.0, 2.0))  # -63 degrees; the others are ground, body, unused
-    assert (torch.cat((sectors[:11], sectors[12:])) == 4.0).all()
-    heights = perception.read_heights(points.double(), used).reshape(17, 11)
-    assert heights[15, 8] == 0.25 and heights[16, 5] == pytest.approx(0.3)
-
-
-def test_proximities_are_read_as_distances():
-    sampler = ProximitySampler(
-        0, 36, max_range=6.0, split_deg=20.0, band_edges=(-0.3, 0.0, 1.0), decay=0.5, blind=0.3, body=(0.5, 0.28)
-    )
-    grid = torch.zeros(1, 2, 36, 3)
-    grid[0, 1, 4, 2] = math.exp(-1.5 / 0.5)
-    grid[0, 0, 9, 2] = 1.0  # below what counts as above the ground
-    read = perception.read_proximity(grid.flatten(1, 2), sampler, torch.tensor([0.3]))[0]
-    assert read[4] == pytest.approx(1.5, abs=1e-6) and (read[9], read[0]) == (4.0, 4.0)
-
-
-TINY = replace(perception.SMALL, num_envs=16, rounds=1)
-
-
-def test_farthest_points_cover_best():
-    measured = perception.farthest_study(("experiment=quickstart",), TINY, counts=(64, 256))
-    errors = {c.name: c.errors[perception.COVERAGE] for c in measured.choices}
-    assert errors["256 farthest"] < errors["64 farthest"] < errors["64 random"]
-    assert errors["64 farthest"] < errors["64 farthest of 4 times as many"] < errors["64 every k-th"]
-    assert sum(c.default for c in measured.choices) == 1
-
-
-def test_more_sectors_err_less():
-    measured = perception.sectors_study(("experiment=quickstart",), TINY, counts=(32, 216))
-    errors = {c.name: c.errors["against all rays kept (m)"] for c in measured.choices}
-    assert errors["36 x 6 proximity"] < errors["18 x 6 proximity"] and errors["216 average"] < errors["32 average"]
-    assert sum(c.default for c in measured.choices) == 1
 
 
 @pytest.mark.parametrize(
@@ -219,9 +170,9 @@ def test_trained_policies_are_timed_as_they_were_exported(tmp_path, capsys):
 
 
 def test_the_command_writes_tables_and_plot(tmp_path, capsys):
-    command(["subject=lidar", "only=shapes,precision", "size=small", f"out={tmp_path}"])
+    command(["subject=lidar", "only=shapes,poses", "size=small", f"out={tmp_path}"])
     assert "The default, exact," in capsys.readouterr().out
     written = {path.name for path in (tmp_path / "lidar").iterdir()}
-    assert written >= {"fronts.png", "shapes.csv", "shapes.json", "precision.csv", "precision.json"}
+    assert written >= {"fronts.png", "shapes.csv", "shapes.json", "poses.csv", "poses.json"}
     content = json.loads((tmp_path / "lidar" / "shapes.json").read_text())
     assert {row["choice"] for row in content["rows"]} >= {"exact", "4096 triangles"}

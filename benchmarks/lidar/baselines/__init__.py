@@ -26,47 +26,20 @@ ANY = ("cpu", "cuda")
 BATCH_RAY, EMBREE, ONE_MESH = "mujoco.batch Batch.ray", "Embree (embreex)", "paper's scheme"
 MUJOCO_LIDAR, NEWTON, OPEN3D = "mujoco-lidar", "Newton intersect_ray", "Open3D"
 
+
+def _mujoco_lidar(name: str, adapter: str, *modules: str, package: str = MUJOCO_LIDAR, **options) -> Entry:
+    """A backend of mujoco-lidar, which takes the same rays for all environments."""
+    build = _later("mujoco_lidar", adapter, **({"tree": False} if name == "warp" else {}))
+    return Entry(f"{MUJOCO_LIDAR} {name}", build, ("mujoco_lidar", *modules), package, shared_scan=True, **options)
+
+
 BASELINES = (
     Entry(BATCH_RAY, _later("mujoco_native", "BatchRay"), ("mujoco",), "mujoco-core", own_threads=True),
-    Entry(
-        f"{MUJOCO_LIDAR} warp tree",
-        _later("mujoco_lidar", "WarpBackend"),
-        ("mujoco_lidar",),
-        "mujoco-lidar",
-        shared_scan=True,
-        devices=ANY,
-    ),
-    Entry(
-        f"{MUJOCO_LIDAR} warp",
-        _later("mujoco_lidar", "WarpBackend", tree=False),
-        ("mujoco_lidar",),
-        "mujoco-lidar",
-        shared_scan=True,
-        devices=ANY,
-    ),
-    Entry(
-        f"{MUJOCO_LIDAR} cpu",
-        _later("mujoco_lidar", "CpuBackend"),
-        ("mujoco_lidar",),
-        "mujoco-lidar",
-        shared_scan=True,
-    ),
-    Entry(
-        f"{MUJOCO_LIDAR} taichi",
-        _later("mujoco_lidar", "TaichiBackend"),
-        ("mujoco_lidar", "taichi", "tibvh"),
-        "mujoco-lidar[taichi]",
-        own_threads=True,
-        shared_scan=True,
-    ),
-    Entry(
-        f"{MUJOCO_LIDAR} jax",
-        _later("mujoco_lidar", "JaxBackend"),
-        ("mujoco_lidar", "jax"),
-        "mujoco-lidar jax",
-        own_threads=True,
-        shared_scan=True,
-    ),
+    _mujoco_lidar("warp tree", "WarpBackend", devices=ANY),
+    _mujoco_lidar("warp", "WarpBackend", devices=ANY),
+    _mujoco_lidar("cpu", "CpuBackend"),
+    _mujoco_lidar("taichi", "TaichiBackend", "taichi", "tibvh", package="mujoco-lidar[taichi]", own_threads=True),
+    _mujoco_lidar("jax", "JaxBackend", "jax", package="mujoco-lidar jax", own_threads=True),
     Entry(NEWTON, _later("warp_worlds", "Newton"), ("newton",), "newton", devices=ANY),
     Entry("mujoco_warp rays", _later("warp_worlds", "MujocoWarp"), ("mujoco_warp",), "mujoco-warp", devices=ANY),
     Entry(ONE_MESH, _later("one_mesh", "OneMesh"), devices=ANY),

@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..methods import NotForThisScene, finite_ranges
+from ..methods import Baseline, NotForThisScene
 from ..scenes import BenchmarkScene, environment_mesh
 
 
-class Embree:
-    """One Embree scene of triangles per environment, built once and not counted: for scenes that stand still."""
+class _Triangles(Baseline):
+    """One scene of triangles per environment; environments that see nothing but the ground share one."""
 
-    rotates_rays = False
+    sees_terrain = True
+
+    def __init__(self, scene: BenchmarkScene) -> None:
+        super().__init__(scene)
+        self._count = scene.num_envs if scene.num_bodies else 1
+        self._distances = np.zeros((self._count, scene.num_envs * scene.num_rays // self._count), dtype=np.float32)
+
+    def _meshes(self, frame: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        meshes = [environment_mesh(self.scene, frame, env) for env in range(self._count)]
+        return [(vertices.astype(np.float32), faces) for vertices, faces in meshes]
+
+
+class Embree(_Triangles):
+    """Built once and not counted: for scenes that stand still."""
 
     def __init__(self, scene: BenchmarkScene, num_threads: int, device: str) -> None:
         from embreex.mesh_construction import TriangleMesh
@@ -19,64 +32,39 @@ class Embree:
 
         if scene.moving:
             raise NotForThisScene("only for scenes that stand still")
-        self.scene = scene
-        self._scenes, self._meshes = [], []
-        for env in range(scene.num_envs if scene.num_bodies else 1):
-            self._scenes.append(EmbreeScene())
-            vertices, faces = environment_mesh(scene, 0, env)
-            self._meshes.append(TriangleMesh(self._scenes[-1], vertices.astype(np.float32), faces))
-        # One call for each Embree scene; a scene that all environments share takes all their rays at once.
-        count = len(self._scenes)
-        self._rays = []
-        for frame in range(scene.num_frames):
-            directions = scene.directions_w(frame)
-            origins = np.broadcast_to(scene.sensor_pos[frame, :, None], directions.shape)
-            self._rays.append([np.ascontiguousarray(rays).reshape(count, -1, 3) for rays in (origins, directions)])
-        self._distances = np.zeros((count, scene.num_envs * scene.num_rays // count), dtype=np.float32)
+        super().__init__(scene)
+        self._scenes = [EmbreeScene() for _ in range(self._count)]
+        self._kept = [TriangleMesh(s, *mesh) for s, mesh in zip(self._scenes, self._meshes(0), strict=True)]
+        self._rays = [
+            [np.ascontiguousarray(vectors).reshape(self._count, -1, 3) for vectors in rays] for rays in scene.rays_w()
+        ]
 
-    def cast(self, frame: int) -> None:
-        origins, directions = self._rays[frame % self.scene.num_frames]
+    def _cast(self, pose: int) -> None:
+        origins, directions = self._rays[pose]
         for k, scene in enumerate(self._scenes):
             self._distances[k] = scene.run(origins[k], directions[k], query="DISTANCE")
 
-    def ranges(self) -> np.ndarray:
-        return finite_ranges(self._distances.reshape(self.scene.num_envs, -1), self.scene.max_range)
 
-
-class Open3D:
+class Open3D(_Triangles):
     """Open3D's ``RaycastingScene``, which cannot be updated: built again for each frame where something moves."""
-
-    rotates_rays = False
 
     def __init__(self, scene: BenchmarkScene, num_threads: int, device: str) -> None:
         import open3d
 
-        self.scene, self._o3d, self._num_threads = scene, open3d, num_threads
-        self._rays = []
-        for frame in range(scene.num_frames):
-            directions = scene.directions_w(frame)
-            origins = np.broadcast_to(scene.sensor_pos[frame, :, None], directions.shape)
-            self._rays.append(np.concatenate([origins, directions], axis=-1))
-        envs = range(scene.num_envs if scene.num_bodies else 1)
-        self._triangles = [[environment_mesh(scene, frame, env) for env in envs] for frame in range(scene.num_frames)]
-        self._scenes = None if scene.moving else self._build(0)
-        self._distances = np.zeros(self._rays[0].shape[:2], dtype=np.float32)
+        super().__init__(scene)
+        self._o3d, self._num_threads = open3d, num_threads
+        self._rays = [np.concatenate(rays, axis=-1).reshape(self._count, -1, 6) for rays in scene.rays_w()]
+        self._triangles = [self._meshes(frame) for frame in range(scene.num_frames if scene.moving else 1)]
+        self._place(0)
 
-    def cast(self, frame: int) -> None:
-        pose = frame % self.scene.num_frames
-        rays = self._rays[pose].reshape(len(self._triangles[pose]), -1, 6)
-        out = self._distances.reshape(rays.shape[:2])
-        for k, scene in enumerate(self._scenes or self._build(pose)):
-            out[k] = scene.cast_rays(self._o3d.core.Tensor(rays[k]), self._num_threads)["t_hit"].numpy()
+    def _cast(self, pose: int) -> None:
+        for k, scene in enumerate(self._scenes):
+            rays = self._o3d.core.Tensor(self._rays[pose][k])
+            self._distances[k] = scene.cast_rays(rays, self._num_threads)["t_hit"].numpy()
 
-    def ranges(self) -> np.ndarray:
-        return finite_ranges(self._distances, self.scene.max_range)
-
-    def _build(self, frame: int) -> list:
-        scenes = []
-        for vertices, faces in self._triangles[frame]:
+    def _place(self, pose: int) -> None:
+        self._scenes = []
+        for vertices, faces in self._triangles[pose]:
             scene = self._o3d.t.geometry.RaycastingScene(nthreads=self._num_threads)
-            arrays = vertices.astype(np.float32), faces.astype(np.uint32)
-            scene.add_triangles(*(self._o3d.core.Tensor(array) for array in arrays))
-            scenes.append(scene)
-        return scenes
+            scene.add_triangles(self._o3d.core.Tensor(vertices), self._o3d.core.Tensor(faces.astype(np.uint32)))
+            self._scenes.append(scene)

@@ -13,7 +13,7 @@ import warp as wp
 
 from benchmarks.harness.meshes import join, tessellate
 
-from ..methods import finite_ranges
+from ..methods import Baseline
 from ..scenes import AREA, BenchmarkScene, ground_mesh
 
 wp.set_module_options({"enable_backward": False})
@@ -59,47 +59,33 @@ def cast_rays(
     ranges_out[ray] = wp.where(found, best, -1.0)
 
 
-class OneMesh:
+class OneMesh(Baseline):
     """One refitted mesh, on one thread or with the rays split over several."""
 
-    rotates_rays = False
+    sees_terrain = True
 
     def __init__(self, scene: BenchmarkScene, num_threads: int, device: str) -> None:
-        self.scene, self._device = scene, device
+        super().__init__(scene)
+        self._device = device
         offsets = self._environment_offsets()
         self._static = self._static_mesh(offsets)
         self._poses = [self._world_poses(frame, offsets) for frame in range(scene.num_frames)]
         self._dynamic = self._dynamic_mesh() if scene.num_bodies else None
-        self._origins, self._directions = [], []
-        for frame in range(scene.num_frames):
-            directions = scene.directions_w(frame)
-            origins = np.broadcast_to((scene.sensor_pos[frame] + offsets)[:, None], directions.shape)
-            self._origins.append(self._upload(origins.reshape(-1, 3), wp.vec3))
-            self._directions.append(self._upload(directions.reshape(-1, 3), wp.vec3))
-        self._ranges = wp.zeros(scene.num_envs * scene.num_rays, dtype=wp.float32, device=device)
+        self._rays = [
+            [self._upload(vectors.reshape(-1, 3), wp.vec3) for vectors in (origins + offsets[:, None], directions)]
+            for origins, directions in scene.rays_w()
+        ]
+        self._distances = wp.zeros(scene.num_envs * scene.num_rays, dtype=wp.float32, device=device)
 
-    def cast(self, frame: int) -> None:
-        pose = frame % self.scene.num_frames
-        if self._dynamic is not None and self.scene.moving:
+    def _cast(self, pose: int) -> None:
+        meshes = [mesh.id if mesh else wp.uint64(0) for mesh in (self._static, self._dynamic)]
+        inputs = [*meshes, *self._rays[pose], self.scene.max_range, self._distances]
+        wp.launch(cast_rays, dim=len(self._distances), inputs=inputs, device=self._device)
+
+    def _place(self, pose: int) -> None:
+        if self._dynamic is not None:
             self._move(pose)
             self._dynamic.refit()
-        wp.launch(
-            cast_rays,
-            dim=len(self._ranges),
-            inputs=[
-                self._static.id if self._static else wp.uint64(0),
-                self._dynamic.id if self._dynamic else wp.uint64(0),
-                self._origins[pose],
-                self._directions[pose],
-                self.scene.max_range,
-                self._ranges,
-            ],
-            device=self._device,
-        )
-
-    def ranges(self) -> np.ndarray:
-        ranges = self._ranges.numpy().reshape(self.scene.num_envs, self.scene.num_rays)
-        return finite_ranges(ranges, self.scene.max_range)
 
     def _environment_offsets(self) -> np.ndarray:
         """Origins of the environments in the common world, (num_envs, 3) float32; all the same over one terrain."""
@@ -121,7 +107,7 @@ class OneMesh:
         if self.scene.plane:  # one square under all environments
             low, high = offsets.min(axis=0), offsets.max(axis=0)
             vertices = vertices + np.where(vertices > 0.0, high, low) * (1.0, 1.0, 0.0)
-        return self._mesh(vertices, faces)
+        return wp.Mesh(self._upload(vertices, wp.vec3), self._upload(faces.ravel(), wp.int32))
 
     def _dynamic_mesh(self) -> wp.Mesh:
         scene = self.scene
@@ -142,9 +128,6 @@ class OneMesh:
         positions = self.scene.positions[frame] + offsets[:, None]
         poses = np.concatenate([positions, np.roll(self.scene.quats[frame], -1, axis=-1)], axis=-1)
         return self._upload(poses.reshape(-1, 7), wp.transform)
-
-    def _mesh(self, vertices: np.ndarray, faces: np.ndarray) -> wp.Mesh:
-        return wp.Mesh(points=self._upload(vertices, wp.vec3), indices=self._upload(faces.ravel(), wp.int32))
 
     def _upload(self, values: np.ndarray, dtype: type) -> wp.array:
         values = np.ascontiguousarray(values, dtype=np.int32 if dtype is wp.int32 else np.float32)
