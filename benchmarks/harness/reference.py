@@ -1,4 +1,4 @@
-"""Exact ranges of rays in float64: MuJoCo's rays and triangles one by one; and errors against them."""
+"""Exact ranges of rays in float64: MuJoCo's rays, closed forms and triangles one by one; and errors against them."""
 
 from __future__ import annotations
 
@@ -62,6 +62,26 @@ def mujoco_ranges(
             ranges[i] = mujoco.mj_ray(model, data, origin, direction, groups, 1, -1, geom)
             geoms[i] = geom[0, 0]
     return np.where(geoms < 0, math.inf, ranges), geoms
+
+
+def sphere_ranges(origins: np.ndarray, directions: np.ndarray, radius: float) -> np.ndarray:
+    """Smallest non-negative root of |o + t d| = radius for unit directions, (N,); ``inf`` without one."""
+    along = (origins * directions).sum(1)
+    foot = origins - along[:, None] * directions
+    half = radius**2 - (foot**2).sum(1)
+    root = np.sqrt(np.maximum(half, 0.0))
+    first, second = -along - root, -along + root
+    nearest = np.where(first >= 0, first, second)
+    return np.where((half >= 0) & (nearest >= 0), nearest, math.inf)
+
+
+def box_ranges(origins: np.ndarray, directions: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Ranges to a box of half extents (3,) at the origin, by slabs, (N,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (-half - origins) / directions, (half - origins) / directions
+    low, high = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+    nearest = np.where(low >= 0, low, high)
+    return np.where((low <= high) & (nearest >= 0), nearest, math.inf)
 
 
 def triangle_ranges(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray, chunk: int = 64) -> np.ndarray:
