@@ -123,7 +123,7 @@ class TestNames:
             ("lidar.mount=had", "lidar.mount=had is unknown; robot.mounts has head"),
             ("+lidar.mount_pos=[0,0,0]", "lidar.mount_pos is unknown; a mount has it"),
             ("lidar.device=mid306", "lidar.device=mid306 is unknown; known: mid360"),
-            ("obstacles.groups.walker.size=[1,2]", "obstacles.groups.walker.size=[1, 2] must be a list of lists"),
+            ("obstacles.groups.walker.size=[1,2]", "walker.size=[1, 2] must be ranges 0 < low <= high"),
             ("obstacles.groups.walker.kind=null", "obstacles.groups.walker.kind=null must be text"),
         ],
     )

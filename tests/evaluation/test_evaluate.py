@@ -196,7 +196,8 @@ def test_commands_are_clipped_only_for_a_policy_without_v_avoid(monkeypatch):
     monkeypatch.setattr(suite, "baseline", spy)
     run, walker = ROOT / "pretrained/avoider", ROOT / "pretrained/gait"
     for walks in (None, walker):
-        changed = evaluation(run, "static", walker=walks, overrides=("rewards.avoidance.risk.weight=3.0",))
+        heavy = ("rewards.avoidance.risk.weight=3.0", "navigation.risk.weight=3.0")
+        changed = evaluation(run, "static", walker=walks, overrides=heavy)
         Task(changed, run, "oracle", World("static"))._contender()
     assert given == [None, ((-1.0, 2.0), (-1.5, 1.5))]
     assert [controller.risk.weight for controller in controllers] == [3.0, 3.0]
