@@ -61,7 +61,7 @@ class NewtonScene(RayScene):
         shapes: Sequence[int] | None = None,
         num_threads: int | None = None,
     ) -> None:
-        self._model, num_envs = model, max(model.world_count, 1)
+        num_envs = max(model.world_count, 1)
         of_shape = _Shapes(model)
         taken = range(model.shape_count) if shapes is None else sorted(shapes)
         columns = of_shape.by_world([k for k in taken if shapes is not None or of_shape.visible[k]], num_envs)
@@ -95,9 +95,10 @@ class NewtonScene(RayScene):
     def copy_state(self, state: newton.State) -> None:
         """Takes the bodies' poses, and the particles' places, from a state of the model."""
         if self._rows.shape[1]:
-            poses = wp.to_torch(state.body_q)[self._rows]
-            self._write(slice(0, self._rows.shape[1]), poses)
+            assert state.body_q is not None
+            self._write(slice(0, self._rows.shape[1]), wp.to_torch(state.body_q)[self._rows])
         if self._surface.mesh is not None:
+            assert state.particle_q is not None
             particles = wp.to_torch(state.particle_q)[torch.as_tensor(self._surface.particles, device=self.device)]
             self.update_vertices(len(self.shapes) - 1, particles)
 
@@ -117,7 +118,7 @@ class NewtonScene(RayScene):
 class _Shapes:
     """A model's shapes as arrays, by Newton's id."""
 
-    def __init__(self, model: newton.Model) -> None:
+    def __init__(self, model: Any) -> None:
         from newton import GeoType, ShapeFlags
 
         self.model, self.assets = model, dict[tuple, TriangleMesh | HeightField]()
@@ -208,7 +209,7 @@ class _Surface:
         particles: (num_envs, V) Newton's particle of each vertex.
     """
 
-    def __init__(self, model: newton.Model, num_envs: int) -> None:
+    def __init__(self, model: Any, num_envs: int) -> None:
         self.mesh: TriangleMesh | None = None
         self.particles = np.zeros((num_envs, 0), np.int64)
         if not model.tri_count:
