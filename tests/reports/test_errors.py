@@ -110,9 +110,9 @@ def test_a_full_disk_at_the_log_is_one_line_too(run_dir, one_line):
 
 @pytest.mark.slow
 def test_a_disk_without_room_is_no_traceback(here):
-    """A real one, of 3 MB, in a namespace of its own."""
+    """A real one, of 2 MB, in a namespace of its own."""
     words = [*PROGRAM, "train", *WIDE, "ppo.max_iterations=9", "hydra.run.dir=full/run"]
-    script = f"mount -t tmpfs -o size=3m none full && {shlex.join(words)}; code=$?; ls full/run/checkpoints; exit $code"
+    script = f"mount -t tmpfs -o size=2m none full && {shlex.join(words)}; code=$?; ls full/run/checkpoints; exit $code"
     (here / "full").mkdir()
     unshare = ["unshare", *(() if os.geteuid() == 0 else ("--user", "--map-root-user")), "--mount", "sh", "-c"]
     if subprocess.run([*unshare, "mount -t tmpfs none full"], capture_output=True).returncode:

@@ -78,8 +78,9 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         assert env.lidar is not None  # only lidar=none has none
         demo = _surroundings(arguments, env.robot)
         rays = env.lidar.num_rays if of_preset else arguments.rays
-        scans.append(take_scan(name, env.lidar, demo, arguments.seconds, rays, arguments.seed))
         folder = out if arguments.out and len(arguments.lidar) == 1 else out / name
+        folder.mkdir(parents=True, exist_ok=True)  # a place that cannot be written is refused before anything is compiled
+        scans.append(take_scan(name, env.lidar, demo, arguments.seconds, rays, arguments.seed))
         if demo.mesh is not None and demo.mesh.encloses(scans[-1].sensor_w):
             print(f"{name}: the sensor is inside {arguments.mesh}, a closed surface, and sees it from within")
         write_scan(scans[-1], env.lidar, demo, folder, arguments.colour, arguments.cloud)

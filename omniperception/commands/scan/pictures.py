@@ -115,7 +115,6 @@ def write_scan(
     scan: Scan, sensor: SensorConfig, demo: DemoScene, out: Path, colour: str = "class", suffix: str = "ply"
 ) -> None:
     """Writes ``pattern.png``, ``scan.png`` and the points, coloured by "class" or by "height", into ``out``."""
-    out.mkdir(parents=True, exist_ok=True)
     draw_pattern(scan.name, sensor.scan_pattern(), out / "pattern.png")
     draw_scan(scan, demo, out / "scan.png")
     rgb = _class_colours(scan) if colour == "class" else _height_colours(scan, demo)
