@@ -13,7 +13,8 @@ from omniperception.build import assemble, build_runner
 from omniperception.config import compose
 
 ROOT = Path(__file__).resolve().parents[1]
-LIDAR = ROOT / "docs" / "guide" / "lidar.md"
+GUIDE = ROOT / "docs" / "guide"
+LIDAR = GUIDE / "lidar.md"
 PAGES = sorted((*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/**/*.md")))
 MAX_LINES = 15
 
@@ -46,11 +47,15 @@ FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
 
 
 def blocks() -> dict[str, str]:
-    """The blocks of Python of the LiDAR's page, by what is in and out of them."""
-    found = re.findall(r"```python\n(.*?)```", LIDAR.read_text(), flags=re.DOTALL)
-    return dict(
-        zip(("numpy", "torch", "mujoco", "newton", "simulators", "mesh", "sizes", "table", "files"), found, strict=True)
-    )
+    """The blocks of Python of the pages of the LiDAR and of simulators, by what is in and out of them."""
+    found = dict[str, str]()
+    for page, names in (
+        (LIDAR, ("numpy", "torch", "mesh", "sizes", "table", "files")),
+        (GUIDE / "simulators.md", ("mujoco", "mujoco_warp", "newton", "genesis", "tensors")),
+    ):
+        codes = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+        found |= dict(zip(names, codes, strict=True))
+    return found
 
 
 @pytest.fixture
@@ -68,7 +73,7 @@ def run(tmp_path, monkeypatch):
 
     def execute(name: str) -> dict:
         names: dict = {}
-        exec(compile(blocks()[name], f"lidar.md, {name}", "exec"), names)
+        exec(compile(blocks()[name], f"block {name}", "exec"), names)
         return names
 
     return execute
@@ -190,6 +195,24 @@ def test_torch(run):
     assert (box[:, :2].median(0).values - torch.tensor([2.0, 1.0])).abs().max() < 0.4
 
 
+def test_a_batch_of_mujoco_warp(run):
+    pytest.importorskip("mujoco_warp")
+    names = run("mujoco_warp")
+    assert names["ranges"].shape == (16, 2000)
+    start = names["model"].qpos0[2]  # kinematics of the reference configuration
+    assert np.allclose(names["scene"].body_pos[:, names["trunk"], 2], start)
+    assert 0.05 < float(names["ranges"].isfinite().float().mean()) < 0.9
+
+
+def test_a_genesis_scene(run):
+    gs = pytest.importorskip("genesis")
+    if gs._initialized:  # by another test of this process
+        gs.destroy()
+    names = run("genesis")
+    below = names["ranges"].isfinite().float().mean(1)  # the ground, under scans that begin elsewhere
+    assert names["ranges"].shape == (4, 2000) and float(below.min()) > 0.02 and float(below.max()) < 0.4, below
+
+
 def test_a_newton_model(run):
     pytest.importorskip("newton")
     names = run("newton")
@@ -222,7 +245,7 @@ def test_a_compiled_mujoco_model(run):
 
 
 def test_pose_tensors_of_a_simulator(run):
-    names = run("simulators")
+    names = run("tensors")
     time_s = torch.full((8,), 0.1, dtype=torch.float64)
     names["link_pos_w"][:, 0, 2] += 3.0  # the sensor, which must not be inside of a leg
     names["link_pos_w"][:, 1:, 2] += 1.0

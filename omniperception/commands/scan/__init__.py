@@ -3,6 +3,7 @@
     scan lidar=avia rays=20000 lidar.max_range=30
     scan lidar=mid360,avia,os0_128,vlp16        # each of them, and comparison.png
     scan mesh=hall.stl scale=0.001 at=12,3,0    # in a mesh of your own, in coordinates of a map too
+    scan mesh=world.xml                         # a robot or a world: URDF, MJCF, USD (extra `newton`)
     scan lidar=mid360 viewer=web                # the scan lab: in the browser, among people, with sliders
 
 The room holds people, thin rods, a shelf without legs, a rock, rubble and the robot, which carries the sensor. Writes
@@ -79,7 +80,7 @@ def main(arguments: Arguments, overrides: list[str]) -> None:
         demo = _surroundings(arguments, env.robot)
         rays = env.lidar.num_rays if of_preset else arguments.rays
         folder = out if arguments.out and len(arguments.lidar) == 1 else out / name
-        folder.mkdir(parents=True, exist_ok=True)  # a place that cannot be written is refused before anything is compiled
+        folder.mkdir(parents=True, exist_ok=True)  # refused before anything is compiled
         scans.append(take_scan(name, env.lidar, demo, arguments.seconds, rays, arguments.seed))
         if demo.mesh is not None and demo.mesh.encloses(scans[-1].sensor_w):
             print(f"{name}: the sensor is inside {arguments.mesh}, a closed surface, and sees it from within")

@@ -22,6 +22,7 @@ from .noise import (
 if TYPE_CHECKING:
     from .clouds import PointTable, read_points, read_scans, write_points, write_scans
     from .frame import OUTPUTS, LidarFrame
+    from .genesis import GenesisScene
     from .heightfield import HeightField
     from .meshes import TriangleMesh
     from .motion import PoseTrack
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 _LOADED_WHEN_USED = {
     "clouds": ("PointTable", "read_points", "read_scans", "write_points", "write_scans"),
     "frame": ("OUTPUTS", "LidarFrame"),
+    "genesis": ("GenesisScene",),
     "heightfield": ("HeightField",),
     "meshes": ("TriangleMesh",),
     "motion": ("PoseTrack",),
@@ -73,6 +75,7 @@ __all__ = [
     "DistanceNoise",
     "Dropout",
     "GaussianNoise",
+    "GenesisScene",
     "GeomShapes",
     "HeightField",
     "Lidar",

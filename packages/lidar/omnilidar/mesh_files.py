@@ -32,6 +32,8 @@ _CORNER = re.compile(rb"\bvertex" + 3 * _NUMBER + rb"(?!\S)", re.IGNORECASE)
 _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 AXES = {"z": ((0, 1, 2), (1, 1, 1)), "y": ((0, 2, 1), (1, -1, 1)), "x": ((1, 2, 0), (-1, -1, 1))}
 """Which coordinates become x, y, z, and their signs, by the axis that points up."""
+MODELS = (".urdf", ".xml", ".usd", ".usda", ".usdc", ".usdz")
+"""Files of robots and worlds, which Newton reads."""
 _NOT_READ, _DRACO = ("EXT_mesh_gpu_instancing", "EXT_meshopt_compression"), "KHR_draco_mesh_compression"
 """Extensions of glTF in which a mesh may lie."""
 
@@ -42,7 +44,8 @@ def read_mesh(path: str | Path, scale: float = 1.0, up: str | None = None) -> Me
     Polygons become triangles. Warns of coordinates that the file keeps too coarsely.
 
     Args:
-        path: .stl, .obj or .ply; with the extra ``meshes`` .glb, .gltf, .dae and what else trimesh reads.
+        path: .stl, .obj or .ply; with the extra ``meshes`` .glb, .gltf, .dae and what else trimesh reads; with the
+            extra ``newton`` a robot or a world as one of ``MODELS``.
         scale: What coordinates are multiplied by, beside the unit that the format states (COLLADA, 3MF).
         up: Axis of the file that points up, one of ``AXES``; None: the format's, see ``up_of``.
 
@@ -58,10 +61,10 @@ def read_mesh(path: str | Path, scale: float = 1.0, up: str | None = None) -> Me
         raise ValueError(f"up={up} of mesh {path} must be {', '.join(AXES)}, or None for what its format says")
     own = _READERS.get(path.suffix.lower())
     if own is None:
-        _import("trimesh", path)
+        _import(*(("newton", "newton") if path.suffix.lower() in MODELS else ("trimesh", "meshes")), path)
     if not path.is_file():
         raise FileNotFoundError(f"mesh {path} does not exist")
-    vertices, triangles = own(path, path.read_bytes()) if own else _by_trimesh(path)
+    vertices, triangles = own(path, path.read_bytes()) if own else _by_library(path)
     if not len(triangles):
         raise ValueError(f"mesh {path} holds no triangles")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
@@ -280,21 +283,25 @@ def _ears(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
 # --- trimesh ----------------------------------------------------------------------------------------------------------
 
 
-def _import(module: str, path: Path) -> None:
+def _import(module: str, extra: str, path: Path) -> None:
     try:
         import_module(module)
     except ImportError:
-        raise ImportError(f"reading {path} needs {module}: pip install 'omnilidar[meshes]'") from None
+        raise ImportError(f"reading {path} needs {module}: pip install 'omnilidar[{extra}]'") from None
 
 
-def _by_trimesh(path: Path) -> Mesh:
+def _by_library(path: Path) -> Mesh:
     """All parts of a scene, metres; mirrored parts keep their outsides, as glTF says."""
+    if path.suffix.lower() in MODELS:
+        from .newton import model_triangles
+
+        return model_triangles(path)
     import trimesh
 
     suffix = path.suffix.lower()
     is_gltf = suffix in (".glb", ".gltf")
     if suffix == ".dae":
-        _import("collada", path)
+        _import("collada", "meshes", path)
     try:
         refused = _not_read(path) if is_gltf else []
         mesh = None if refused else trimesh.load(path, force="mesh", process=False)

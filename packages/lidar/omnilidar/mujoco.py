@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from .shapes import SIZE_NAMES, Shape, ShapeKind
 if TYPE_CHECKING:
     import mujoco
 
+_SIZED = (ShapeKind.SPHERE, ShapeKind.CAPSULE, ShapeKind.CYLINDER, ShapeKind.ELLIPSOID, ShapeKind.BOX)
 Assets = dict[tuple[ShapeKind, int, bool], TriangleMesh | HeightField]
 
 
@@ -112,22 +113,23 @@ class MujocoScene(RayScene):
         found = geom_shapes(model, class_of, geoms)
         self.geom_ids, self.body_ids = found.geom_ids, found.body_ids
         self.body_names = tuple(model.body(k).name for k in found.body_ids)
-        self._nbody = model.nbody
+        self._nbody, self._ngeom = model.nbody, model.ngeom
         self._rows = torch.tensor(found.body_ids, dtype=torch.int64, device=device)
         super().__init__(found.shapes, num_envs, len(found.body_ids), device, num_threads, pose_dtype)
 
-    def copy_poses(self, xpos: np.ndarray | torch.Tensor, xquat: np.ndarray | torch.Tensor) -> None:
+    def copy_poses(self, xpos: Any, xquat: Any) -> None:
         """Takes the bodies' poses from those of all bodies of the model.
 
         Args:
-            xpos: Positions, metres, (nbody, 3), or (num_envs, nbody, 3).
+            xpos: Positions, metres, (nbody, 3), or (num_envs, nbody, 3): of NumPy, PyTorch, Warp or JAX, of which all
+                but NumPy's are read where they are.
             xquat: Orientations, (w, x, y, z), (nbody, 4), or (num_envs, nbody, 4).
 
         Raises:
             ValueError: They are not of this model's bodies, or of another number of environments.
         """
         for name, own, given in (("xpos", self.body_pos, xpos), ("xquat", self.body_quat, xquat)):
-            rows, width = torch.as_tensor(given, device=self.device), own.shape[-1]
+            rows, width = _tensor(given, self.device), own.shape[-1]
             if tuple(rows.shape) not in ((self._nbody, width), (self.num_envs, self._nbody, width)):
                 raise ValueError(
                     f"{name} must be ({self._nbody}, {width}) or ({self.num_envs}, {self._nbody}, {width}),"
@@ -137,9 +139,28 @@ class MujocoScene(RayScene):
                 check_kept(rows, own.dtype)
             own.copy_(rows[..., self._rows, :])
 
-    def copy_data(self, data: mujoco.MjData) -> None:
-        """Takes the bodies' poses from a simulation, the same for all environments."""
+    def copy_data(self, data: Any) -> None:
+        """Takes the bodies' poses from a simulation: an ``MjData``, the same for all environments, or one of
+        ``mujoco_warp`` or of a batch of ``mujoco.mjx``, whose worlds are the environments."""
         self.copy_poses(data.xpos, data.xquat)
+
+    def copy_sizes(self, geom_size: Any) -> None:
+        """Gives primitives the sizes that worlds have of their own.
+
+        Args:
+            geom_size: (ngeom, 3), or (num_envs or 1, ngeom, 3): ``geom_size`` of a model of ``mujoco_warp`` or ``mjx``.
+
+        Raises:
+            ValueError: It is not of this model's geoms, or of another number of environments.
+        """
+        sizes = _tensor(geom_size, self.device)
+        if tuple(sizes.shape) not in [(*worlds, self._ngeom, 3) for worlds in ((), (1,), (self.num_envs,))]:
+            raise ValueError(
+                f"geom_size must be ({self._ngeom}, 3) or ({self.num_envs}, {self._ngeom}, 3), got {tuple(sizes.shape)}"
+            )
+        sizes = sizes.expand(self.num_envs, self._ngeom, 3)
+        own = [k for k, shape in enumerate(self.shapes) if shape.kind in _SIZED]
+        self.set_sizes(own, sizes[:, [self.geom_ids[k] for k in own]].float())
 
 
 def convex_hull(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
@@ -163,6 +184,13 @@ def convex_hull(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarra
     vertices = model.mesh_vert[int(model.mesh_vertadr[mesh]) + ids]
     place = {int(k): row for row, k in enumerate(ids)}
     return vertices, np.array([[place[int(k)] for k in corner] for corner in corners], np.int32)
+
+
+def _tensor(given: Any, device: torch.device) -> torch.Tensor:
+    """An array of any library, without a copy where it is on the device already."""
+    if isinstance(given, np.ndarray | torch.Tensor | list):
+        return torch.as_tensor(given, device=device)
+    return torch.from_dlpack(given).to(device)
 
 
 def _is_seen(model: mujoco.MjModel, geom: int) -> bool:

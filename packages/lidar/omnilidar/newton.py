@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import warp as wp
 
 from .heightfield import HeightField
 from .meshes import TriangleMesh
+from .rotations import quat_rotated
 from .scene import RayScene
 from .shapes import Shape, ShapeKind
 
@@ -182,7 +184,8 @@ class _Shapes:
         asset = self._asset(k, kind) if kind in (ShapeKind.MESH, ShapeKind.HEIGHTFIELD) else None
         if kind == ShapeKind.HEIGHTFIELD:
             low = float(self.model.shape_source[k].min_z * scale[2])
-            x, y, z = np.array([x, y, z]) + _rotated(quat, low)
+            turn = np.array([quat[3], *quat[:3]])
+            x, y, z = np.array([x, y, z]) + quat_rotated(turn, np.array([0.0, 0.0, low]))
         body = int(np.searchsorted(rows, self.body[k])) if self.body[k] >= 0 else -1
         class_id = class_of(k) if class_of is not None else 0
         return Shape(kind, size, body, (x, y, z), (quat[3], quat[0], quat[1], quat[2]), class_id, asset)
@@ -225,7 +228,82 @@ class _Surface:
         self.mesh = TriangleMesh(model.particle_q.numpy()[used[0]], local[0])
 
 
-def _rotated(quat: Sequence[float], up: float) -> np.ndarray:
-    """A vector (0, 0, up) turned by a quaternion (x, y, z, w)."""
-    x, y, z, w = quat
-    return up * np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+FLOOR = 40.0
+"""Width (m) of what a plane without an end becomes as triangles."""
+
+
+def model_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64, metres, and triangles (T, 3) of all that is visible in a robot or a world.
+
+    Joints are at zero; round shapes become polygons of 32 sides, planes without an end squares of 40 m.
+
+    Args:
+        path: .urdf, .xml (MJCF), or .usd, .usda, .usdc, .usdz, which need newton[importers].
+
+    Raises:
+        ImportError: Newton, or what it reads the file with, is not installed.
+        ValueError: Newton cannot read it.
+    """
+    import newton
+
+    builder: Any = newton.ModelBuilder()
+    readers = {".urdf": builder.add_urdf, ".xml": builder.add_mjcf}
+    try:
+        readers.get(path.suffix.lower(), builder.add_usd)(str(path))
+    except ImportError as missing:
+        raise ImportError(f"reading {path} needs more of Newton: pip install 'newton[importers]'") from missing
+    except Exception as wrong:  # whatever a parser meets in a file that it was not written for
+        raise ValueError(f"model {path} cannot be read by Newton: {str(wrong).splitlines()[0]}") from wrong
+    model = builder.finalize(device="cpu")
+    state, of_shape = model.state(), _Shapes(model)
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    places = np.zeros((0, 7)) if state.body_q is None else state.body_q.numpy().astype(np.float64)
+    vertices, triangles, first = [], [], 0
+    for k in np.flatnonzero(of_shape.visible):
+        corners, own = _surface_of(newton, of_shape, int(k))
+        for place in (of_shape.transform[k], *([] if of_shape.body[k] < 0 else [places[of_shape.body[k]]])):
+            corners = _turned(place, corners)
+        vertices.append(corners)
+        triangles.append(own + first)
+        first += len(corners)
+    if not vertices:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    return np.concatenate(vertices), np.concatenate(triangles)
+
+
+def _surface_of(newton: Any, of_shape: _Shapes, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a shape in its own frame."""
+    name, scale = of_shape.names[of_shape.type[k]], of_shape.scale[k]
+    mesh, bare = newton.Mesh, {"compute_inertia": False, "compute_uvs": False, "compute_normals": False}
+    stretch = 1.0
+    if name in ("MESH", "CONVEX_MESH"):
+        made, stretch = of_shape.model.shape_source[k], scale
+    elif name == "PLANE":
+        made = mesh.create_plane(*(float(x) or FLOOR for x in scale[:2]), **bare)
+    elif name == "HFIELD":
+        field = of_shape.model.shape_source[k]
+        heights = np.asarray(field.data).reshape(field.nrow, field.ncol)
+        heights = field.min_z + heights * (field.max_z - field.min_z)
+        x, y = np.meshgrid(np.linspace(-field.hx, field.hx, field.ncol), np.linspace(-field.hy, field.hy, field.nrow))
+        corner = (np.arange(field.nrow - 1)[:, None] * field.ncol + np.arange(field.ncol - 1)).reshape(-1, 1)
+        steps = np.array([[0, 1, field.ncol + 1], [0, field.ncol + 1, field.ncol]])
+        return np.stack((x, y, heights), -1).reshape(-1, 3) * scale, (corner[:, None] + steps).reshape(-1, 3)
+    else:
+        create = {
+            "BOX": (mesh.create_box, 3),
+            "SPHERE": (mesh.create_sphere, 1),
+            "ELLIPSOID": (mesh.create_ellipsoid, 3),
+            "CAPSULE": (mesh.create_capsule, 2),
+            "CYLINDER": (mesh.create_cylinder, 2),
+            "CONE": (mesh.create_cone, 2),
+        }[name]
+        up = {} if name in ("BOX", "SPHERE", "ELLIPSOID") else {"up_axis": newton.Axis.Z}
+        made = create[0](*(float(x) for x in scale[: create[1]]), **up, **bare)
+    triangles = np.asarray(made.indices, np.int64).reshape(-1, 3)
+    return np.asarray(made.vertices, np.float64) * stretch, triangles
+
+
+def _turned(place: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (V, 3) by a transform (x, y, z, qx, qy, qz, qw)."""
+    axis, w = place[3:6].astype(np.float64), float(place[6])
+    return points + 2.0 * np.cross(axis, np.cross(axis, points) + w * points) + place[:3]

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 
 def quat_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     """(w, x, y, z) of a turn about x by roll, then about fixed y by pitch, then about fixed z by yaw."""
@@ -12,3 +14,20 @@ def quat_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, 
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
     )
+
+
+def quat_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The turn (w, x, y, z) that is b's and then a's."""
+    return np.array([a[0] * b[0] - a[1:] @ b[1:], *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
+
+
+def quat_rotated(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """A vector turned by (w, x, y, z)."""
+    return vector + 2.0 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector)
+
+
+def quat_from_z(normal: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of the shortest turn of the z axis into a direction."""
+    x, y, z = normal / np.linalg.norm(normal)
+    quat = np.array([1.0 + z, -y, x, 0.0]) if z > -1.0 + 1e-12 else np.array([0.0, 1.0, 0.0, 0.0])
+    return quat / np.linalg.norm(quat)

@@ -106,6 +106,87 @@ def test_poses_of_environments_come_from_arrays(model):
     np.testing.assert_array_equal(scene.body_quat.numpy(), xquat[:, list(scene.body_ids)])
 
 
+def worlds_of(model, count):
+    """Simulations that differ, rays, and the ranges that mj_ray finds in each."""
+    datas = [random_data(model, seed)[0] for seed in range(count)]
+    rng = np.random.default_rng(9)
+    origins, directions = rng.uniform((-5, -5, 0.3), (5, 5, 3), (count, 500, 3)), rng.normal(size=(count, 500, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return datas, origins, directions
+
+
+def ranges_of(models, datas, origins, directions):
+    return np.stack(
+        [mujoco_ranges(model, *rest)[0] for model, *rest in zip(models, datas, origins, directions, strict=True)]
+    )
+
+
+def test_worlds_of_mujoco_warp_are_environments_with_sizes_of_their_own(model):
+    """Against mj_ray in a model of each world."""
+    mjw = pytest.importorskip("mujoco_warp")
+    wp = pytest.importorskip("warp")
+    datas, origins, directions = worlds_of(model, 3)
+    batch = mjw.make_data(model, nworld=3)
+    for name in ("xpos", "xquat"):
+        getattr(batch, name).assign(np.stack([getattr(data, name) for data in datas]).astype(np.float32))
+    sizes = np.repeat(model.geom_size[None], 3, 0) * np.array([1.0, 1.3, 0.8])[:, None, None]
+    others = [mujoco.MjModel.from_xml_string(XML) for _ in datas]
+    primitives = [k for k in range(model.ngeom) if int(model.geom_type[k]) in range(2, 7)]
+    for own, size in zip(others, sizes, strict=True):
+        own.geom_size[primitives] = size[primitives]
+        own.geom_rbound[primitives], own.geom_aabb[primitives, 3:] = 5.0, 5.0
+    scene = MujocoScene(model, num_envs=3)
+    scene.copy_data(batch)
+    scene.copy_sizes(wp.array(sizes.astype(np.float32), dtype=wp.vec3))
+    got = scene.cast(origins.astype(np.float32), directions.astype(np.float32), max_range=50.0).ranges.numpy()
+    wanted = ranges_of(others, datas, origins, directions)
+    wanted[(wanted < 0) | (wanted > 50.0)] = np.inf
+    assert np.isfinite(wanted).mean() > 0.4 and (np.isfinite(got) == np.isfinite(wanted)).mean() > 0.998
+    both = np.isfinite(got) & np.isfinite(wanted)
+    assert np.quantile(np.abs(got[both] - wanted[both]), 0.998) < 1e-3
+    with pytest.raises(ValueError, match=r"geom_size must be \(11, 3\) or \(3, 11, 3\), got \(2, 11, 3\)"):
+        scene.copy_sizes(sizes[:2])
+
+
+def test_a_batch_of_mjx_is_read_as_it_is(model):
+    mjx = pytest.importorskip("mujoco.mjx")
+    jax = pytest.importorskip("jax")
+    simple = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom type='plane' size='0 0 1'/><body pos='0 0 1'><freejoint/><geom size='0.3'/></body>"
+        "</worldbody></mujoco>"
+    )
+    heights = np.array([1.0, 2.0, 3.0])
+    qpos = np.tile(simple.qpos0, (3, 1))
+    qpos[:, 2] = heights
+    on_device, data = mjx.put_model(simple), mjx.make_data(simple)
+    batch = jax.vmap(lambda q: mjx.kinematics(on_device, data.replace(qpos=q)))(qpos)
+    scene = MujocoScene(simple, num_envs=3)
+    scene.copy_data(batch)
+    start = np.broadcast_to(np.array([0.0, 0.0, 10.0]), (3, 1, 3))
+    hits = scene.cast(start, np.broadcast_to(np.array([0.0, 0.0, -1.0]), (3, 1, 3)), max_range=20.0)
+    assert np.allclose(hits.ranges.numpy()[:, 0], 10.0 - heights - 0.3, atol=1e-5)
+
+
+def test_a_state_tensor_of_isaac_gyms_layout_goes_in_as_it_is(model):
+    """A row of 13 for each body of each environment, (x, y, z, w), environments beside each other."""
+    datas, origins, directions = worlds_of(model, 3)
+    state = torch.zeros(3 * model.nbody, 13)
+    spread = torch.tensor([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0], [0.0, 20.0, 0.0]])
+    for env, rows in enumerate(state.view(3, model.nbody, 13)):
+        rows[:, :3] = torch.from_numpy(datas[env].xpos) + spread[env]
+        rows[:, 3:7] = torch.from_numpy(datas[env].xquat)[:, [1, 2, 3, 0]]
+    found = geom_shapes(model)
+    scene = RayScene(found.shapes, 3, len(found.body_ids))
+    bodies = state.view(3, -1, 13)[:, list(found.body_ids)]
+    scene.set_poses(bodies[..., :3] - spread[:, None], bodies[..., 3:7], order="xyzw")
+    got = scene.cast(origins.astype(np.float32), directions.astype(np.float32), max_range=50.0).ranges.numpy()
+    wanted = ranges_of([model] * 3, datas, origins, directions)
+    wanted[(wanted < 0) | (wanted > 50.0)] = np.inf
+    assert np.isfinite(wanted).mean() > 0.4 and (np.isfinite(got) == np.isfinite(wanted)).mean() > 0.998
+    both = np.isfinite(got) & np.isfinite(wanted)
+    assert np.quantile(np.abs(got[both] - wanted[both]), 0.998) < 1e-3
+
+
 def test_a_signed_distance_field_is_refused(model):
     copy = mujoco.MjModel.from_xml_string(XML)
     copy.geom_type[copy.geom("ball").id] = mujoco.mjtGeom.mjGEOM_SDF

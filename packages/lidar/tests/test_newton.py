@@ -178,3 +178,68 @@ def test_a_model_without_worlds_is_one_environment():
     scene = NewtonScene(builder.finalize(device="cpu"))
     assert scene.num_envs == 1
     assert float(scene.cast(np.array([[[0, 0, 1.0]]]), np.array([[[1.0, 0, 0]]])).ranges) == pytest.approx(1.5)
+
+
+MODEL = """
+<mujoco><worldbody>
+  <geom type="plane" size="0 0 1"/><geom type="box" size="0.5 0.4 1" pos="3 1 1" euler="0 0 30"/>
+  <body pos="2 -1 1.5" euler="20 30 0"><freejoint/><geom type="capsule" size="0.2 0.4"/></body>
+  <geom type="cylinder" size="0.3 0.5" pos="-2 0 0.5"/><geom type="sphere" size="0.4" pos="0 2 1"/>
+</worldbody></mujoco>
+"""
+
+
+def test_a_file_of_a_world_becomes_the_mesh_of_what_mj_ray_hits(tmp_path):
+    """But for the polygons of what is round."""
+    import mujoco
+
+    (tmp_path / "world.xml").write_text(MODEL)
+    mesh = TriangleMesh.from_file(tmp_path / "world.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "world.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    origins, directions = (rays[0].astype(np.float64) for rays in random_rays(1, 400, low=0.3))
+    scene = RayScene([Shape(ShapeKind.MESH, asset=mesh)], 1, 0)
+    got = scene.cast(origins[None], directions[None], max_range=15.0).ranges.numpy()[0]
+    geom = np.zeros(1, np.int32)
+    rays = zip(origins, directions, strict=True)
+    wanted = np.array([mujoco.mj_ray(model, data, origin, way, None, 1, -1, geom) for origin, way in rays])
+    wanted[(wanted < 0.0) | (wanted > 15.0)] = np.inf
+    both = np.isfinite(got) & np.isfinite(wanted)
+    assert both.mean() > 0.3 and (np.isfinite(got) == np.isfinite(wanted)).mean() > 0.99
+    assert np.quantile(np.abs(got[both] - wanted[both]), 0.97) < 0.02
+
+
+def test_a_file_that_is_no_model_is_one_line(tmp_path):
+    (tmp_path / "broken.urdf").write_text("<robot>")
+    with pytest.raises(ValueError, match=r"model .*broken.urdf cannot be read by Newton: ") as refused:
+        TriangleMesh.from_file(tmp_path / "broken.urdf")
+    assert "\n" not in str(refused.value)
+
+
+USD = """#usda 1.0
+(
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Cube "Block" ( prepend apiSchemas = ["PhysicsCollisionAPI"] )
+{
+    double size = 1
+    double3 xformOp:translate = (2, 0, 0.5)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+"""
+
+
+def test_usd_is_read_where_its_importers_are(tmp_path):
+    path = tmp_path / "block.usda"
+    path.write_text(USD)
+    try:
+        import newton_usd_schemas  # noqa: F401
+        import pxr  # noqa: F401
+    except ImportError:
+        with pytest.raises(ImportError, match=r"needs more of Newton: pip install 'newton\[importers\]'"):
+            TriangleMesh.from_file(path)
+    else:
+        vertices = TriangleMesh.from_file(path).vertices
+        np.testing.assert_allclose([vertices.min(0), vertices.max(0)], [[1.5, -0.5, 0.0], [2.5, 0.5, 1.0]], atol=1e-6)
