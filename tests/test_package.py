@@ -54,6 +54,8 @@ EXTRAS = {
     "trimesh",
 }
 CAST = """
+import sys
+
 import numpy as np
 from omnilidar import Lidar, LidarConfig, RayScene, Shape, ShapeKind, vlp16
 
@@ -195,7 +197,7 @@ def test_no_distribution_takes_private_names_of_another():
 
 
 ALONE = {
-    "lidar": CAST + "\nimport sys\nassert not {'hydra', 'mujoco', 'onnxruntime', 'cyclonedds'} & set(sys.modules)\n",
+    "lidar": CAST + "\nassert not {'hydra', 'mujoco', 'onnxruntime', 'cyclonedds'} & set(sys.modules)\n",
     "robot": """
 import sys
 import omnirobot.commands.replay, omnirobot.drive.control, omnirobot.drive.guard, omnirobot.wire.dds
