@@ -449,7 +449,7 @@ def test_the_extras_that_messages_name_are_installed_by_the_line_that_is_shown(p
         assert done.returncode == 0 and "already satisfied" in done.stdout, done.stderr
     assert found == {
         "omniperception": ["export", "gpu", "gym", "viewer"],
-        "omnilidar": ["meshes", "tables"],
+        "omnilidar": ["meshes", "newton", "tables"],
         "omnirobot": ["recordings"],
     }
 

@@ -61,7 +61,7 @@ def read_mesh(path: str | Path, scale: float = 1.0, up: str | None = None) -> Me
         raise ValueError(f"up={up} of mesh {path} must be {', '.join(AXES)}, or None for what its format says")
     own = _READERS.get(path.suffix.lower())
     if own is None:
-        _import(*(("newton", "newton") if path.suffix.lower() in MODELS else ("trimesh", "meshes")), path)
+        _import("newton" if path.suffix.lower() in MODELS else "trimesh", path)
     if not path.is_file():
         raise FileNotFoundError(f"mesh {path} does not exist")
     vertices, triangles = own(path, path.read_bytes()) if own else _by_library(path)
@@ -283,11 +283,12 @@ def _ears(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
 # --- trimesh ----------------------------------------------------------------------------------------------------------
 
 
-def _import(module: str, extra: str, path: Path) -> None:
+def _import(module: str, path: Path) -> None:
     try:
         import_module(module)
     except ImportError:
-        raise ImportError(f"reading {path} needs {module}: pip install 'omnilidar[{extra}]'") from None
+        line = "pip install 'omnilidar[newton]'" if module == "newton" else "pip install 'omnilidar[meshes]'"
+        raise ImportError(f"reading {path} needs {module}: {line}") from None
 
 
 def _by_library(path: Path) -> Mesh:
@@ -301,7 +302,7 @@ def _by_library(path: Path) -> Mesh:
     suffix = path.suffix.lower()
     is_gltf = suffix in (".glb", ".gltf")
     if suffix == ".dae":
-        _import("collada", "meshes", path)
+        _import("collada", path)
     try:
         refused = _not_read(path) if is_gltf else []
         mesh = None if refused else trimesh.load(path, force="mesh", process=False)
