@@ -10,7 +10,7 @@ import torch
 
 from .meshes import TriangleMesh
 from .rotations import quat_from_z, quat_product, quat_rotated
-from .scene import RayScene
+from .scene import RayScene, body_named
 from .shapes import Shape, ShapeKind
 
 _SIZES: dict[str, tuple[ShapeKind, tuple[float, ...]]] = {
@@ -54,6 +54,10 @@ class GenesisScene(RayScene):
     ) -> None:
         if not scene.is_built:
             raise ValueError("the Genesis scene has no environments yet: call scene.build(n_envs=...) before")
+        if scene.rigid_solver._enable_heterogeneous:
+            raise ValueError(
+                "an entity of several morphs is another in each environment: make a Genesis scene for each"
+            )
         taken = list(scene.entities if entities is None else entities)
         rigid = [entity for entity in taken if hasattr(entity, "links")]
         self._soft = [_Surface(entity) for entity in taken if not hasattr(entity, "links")]
@@ -61,8 +65,8 @@ class GenesisScene(RayScene):
         num_envs = max(scene.n_envs, 1)
         links = [link for entity in rigid for link in entity.links if link.geoms]
         pos, quat = self._link_poses(num_envs)
-        stands = {link.idx for link in links if link.is_fixed and bool((pos[:, link.idx] == pos[:1, link.idx]).all())}
-        stands = {k for k in stands if bool((quat[:, k] == quat[:1, k]).all())}
+        alike = ((pos == pos[:1]).all(2) & (quat == quat[:1]).all(2)).all(0).tolist()
+        stands = {link.idx for link in links if link.is_fixed and alike[link.idx]}
         moving = [link for link in links if link.idx not in stands]
         self.body_names = tuple(f"{link.entity.name}/{link.name}" for link in moving)
         body_of = {link.idx: body for body, link in enumerate(moving)}
@@ -90,10 +94,7 @@ class GenesisScene(RayScene):
 
     def link(self, name: str) -> int:
         """Index among the bodies of the link so named, alone or as "<entity>/<link>"."""
-        found = [k for k, label in enumerate(self.body_names) if name in (label, label.rpartition("/")[2])]
-        if len(found) != 1:
-            raise ValueError(f"link {name!r} must be one of the bodies {', '.join(self.body_names)}")
-        return found[0]
+        return body_named(name, self.body_names)
 
     def _link_poses(self, num_envs: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions (num_envs, links, 3) and quaternions (w, x, y, z) of all links."""
@@ -111,11 +112,12 @@ class _Surface:
     """
 
     def __init__(self, entity: Any) -> None:
-        self._entity, self._used = entity, None
+        self._entity = entity
+        self._used: torch.Tensor | None = None  # the vertices outside; all if None
         if hasattr(entity, "surface_triangles"):  # FEM: elements are tetrahedra, whose outside is hit
             corners = np.asarray(entity.surface_triangles)
-            self._used, triangles = np.unique(corners, return_inverse=True)
-            triangles = triangles.reshape(corners.shape)
+            used, triangles = np.unique(corners, return_inverse=True)
+            self._used, triangles = torch.as_tensor(used), triangles.reshape(corners.shape)
         elif getattr(entity, "mesh", None) is not None and len(entity.mesh.verts) == entity.n_particles:
             triangles = np.asarray(entity.mesh.faces)  # PBD cloth: a particle for each vertex
         else:
@@ -130,7 +132,7 @@ class _Surface:
         if self._used is None:
             pos = self._entity.get_particles_pos()
         else:
-            pos = self._entity.get_state().pos[..., torch.as_tensor(self._used), :]
+            pos = self._entity.get_state().pos[..., self._used, :]
         return pos.reshape(-1, *pos.shape[-2:])
 
 

@@ -13,7 +13,7 @@ import warp as wp
 from .heightfield import HeightField
 from .meshes import TriangleMesh
 from .rotations import quat_rotated
-from .scene import RayScene
+from .scene import RayScene, body_named
 from .shapes import Shape, ShapeKind
 
 if TYPE_CHECKING:
@@ -31,6 +31,10 @@ _KINDS = {
     "CONVEX_MESH": ShapeKind.MESH,
 }
 _LENGTHS = {ShapeKind.SPHERE: 1, ShapeKind.CAPSULE: 2, ShapeKind.CYLINDER: 2, ShapeKind.ELLIPSOID: 3, ShapeKind.BOX: 3}
+FLOOR = 40.0
+"""Width (m) of what a plane without an end becomes as triangles."""
+_NUMBERS = {"PLANE": 2, "SPHERE": 1, "CAPSULE": 2, "ELLIPSOID": 3, "CYLINDER": 2, "BOX": 3, "CONE": 2}
+"""How many of a shape's numbers its surface is made of."""
 
 
 class NewtonScene(RayScene):
@@ -106,10 +110,7 @@ class NewtonScene(RayScene):
 
     def link(self, name: str) -> int:
         """Index among the bodies of the one so labelled, or whose label's last part is that."""
-        found = [k for k, label in enumerate(self.body_names) if name in (label, label.rsplit("/", 1)[-1])]
-        if len(found) != 1:
-            raise ValueError(f"link {name!r} must be one of the bodies {', '.join(self.body_names)}")
-        return found[0]
+        return body_named(name, self.body_names)
 
     def _write(self, bodies: slice, poses: torch.Tensor) -> None:
         """Poses (num_envs, n, 7) of bodies, positions and quaternions (x, y, z, w)."""
@@ -228,10 +229,6 @@ class _Surface:
         self.mesh = TriangleMesh(model.particle_q.numpy()[used[0]], local[0])
 
 
-FLOOR = 40.0
-"""Width (m) of what a plane without an end becomes as triangles."""
-
-
 def model_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64, metres, and triangles (T, 3) of all that is visible in a robot or a world.
 
@@ -241,7 +238,7 @@ def model_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
         path: .urdf, .xml (MJCF), or .usd, .usda, .usdc, .usdz, which need newton[importers].
 
     Raises:
-        ImportError: Newton, or what it reads the file with, is not installed.
+        ImportError: What Newton reads the file with is not installed.
         ValueError: Newton cannot read it.
     """
     import newton
@@ -252,58 +249,57 @@ def model_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
         readers.get(path.suffix.lower(), builder.add_usd)(str(path))
     except ImportError as missing:
         raise ImportError(f"reading {path} needs more of Newton: pip install 'newton[importers]'") from missing
-    except Exception as wrong:  # whatever a parser meets in a file that it was not written for
-        raise ValueError(f"model {path} cannot be read by Newton: {str(wrong).splitlines()[0]}") from wrong
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        OSError,
+        RuntimeError,
+        SyntaxError,
+        TypeError,
+        ValueError,
+    ) as e:
+        said = str(e).partition("\n")[0] or type(e).__name__
+        raise ValueError(f"model {path} cannot be read by Newton: {said}") from e
     model = builder.finalize(device="cpu")
     state, of_shape = model.state(), _Shapes(model)
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
-    places = np.zeros((0, 7)) if state.body_q is None else state.body_q.numpy().astype(np.float64)
-    vertices, triangles, first = [], [], 0
+    vertices, triangles, first = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for k in np.flatnonzero(of_shape.visible):
         corners, own = _surface_of(newton, of_shape, int(k))
-        for place in (of_shape.transform[k], *([] if of_shape.body[k] < 0 else [places[of_shape.body[k]]])):
-            corners = _turned(place, corners)
+        corners = _placed(of_shape.transform[k], corners)
+        if of_shape.body[k] >= 0:
+            corners = _placed(state.body_q.numpy()[of_shape.body[k]], corners)
         vertices.append(corners)
         triangles.append(own + first)
         first += len(corners)
-    if not vertices:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     return np.concatenate(vertices), np.concatenate(triangles)
 
 
 def _surface_of(newton: Any, of_shape: _Shapes, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of a shape in its own frame."""
     name, scale = of_shape.names[of_shape.type[k]], of_shape.scale[k]
-    mesh, bare = newton.Mesh, {"compute_inertia": False, "compute_uvs": False, "compute_normals": False}
-    stretch = 1.0
+    source, size = of_shape.model.shape_source[k], [float(x) for x in scale]
+    if name == "HFIELD":
+        heights = source.min_z + np.reshape(source.data, (source.nrow, source.ncol)) * (source.max_z - source.min_z)
+        rows, cols = (np.linspace(-half, half, n) for half, n in ((source.hy, source.nrow), (source.hx, source.ncol)))
+        x, y = np.meshgrid(cols, rows)
+        corner = (np.arange(source.nrow - 1)[:, None] * source.ncol + np.arange(source.ncol - 1)).reshape(-1, 1, 1)
+        steps = np.array([[0, 1, source.ncol + 1], [0, source.ncol + 1, source.ncol]])
+        return np.stack((x, y, heights), -1).reshape(-1, 3) * scale, (corner + steps).reshape(-1, 3)
     if name in ("MESH", "CONVEX_MESH"):
-        made, stretch = of_shape.model.shape_source[k], scale
-    elif name == "PLANE":
-        made = mesh.create_plane(*(float(x) or FLOOR for x in scale[:2]), **bare)
-    elif name == "HFIELD":
-        field = of_shape.model.shape_source[k]
-        heights = np.asarray(field.data).reshape(field.nrow, field.ncol)
-        heights = field.min_z + heights * (field.max_z - field.min_z)
-        x, y = np.meshgrid(np.linspace(-field.hx, field.hx, field.ncol), np.linspace(-field.hy, field.hy, field.nrow))
-        corner = (np.arange(field.nrow - 1)[:, None] * field.ncol + np.arange(field.ncol - 1)).reshape(-1, 1)
-        steps = np.array([[0, 1, field.ncol + 1], [0, field.ncol + 1, field.ncol]])
-        return np.stack((x, y, heights), -1).reshape(-1, 3) * scale, (corner[:, None] + steps).reshape(-1, 3)
+        made = source
     else:
-        create = {
-            "BOX": (mesh.create_box, 3),
-            "SPHERE": (mesh.create_sphere, 1),
-            "ELLIPSOID": (mesh.create_ellipsoid, 3),
-            "CAPSULE": (mesh.create_capsule, 2),
-            "CYLINDER": (mesh.create_cylinder, 2),
-            "CONE": (mesh.create_cone, 2),
-        }[name]
-        up = {} if name in ("BOX", "SPHERE", "ELLIPSOID") else {"up_axis": newton.Axis.Z}
-        made = create[0](*(float(x) for x in scale[: create[1]]), **up, **bare)
-    triangles = np.asarray(made.indices, np.int64).reshape(-1, 3)
-    return np.asarray(made.vertices, np.float64) * stretch, triangles
+        bare = {"compute_inertia": False, "compute_uvs": False, "compute_normals": False}
+        if name in ("CAPSULE", "CYLINDER", "CONE"):
+            bare["up_axis"] = newton.Axis.Z
+        if name == "PLANE":
+            size = [width or FLOOR for width in size]
+        made = getattr(newton.Mesh, f"create_{name.lower()}")(*size[: _NUMBERS[name]], **bare)
+        scale = 1.0
+    return np.asarray(made.vertices, np.float64) * scale, np.asarray(made.indices, np.int64).reshape(-1, 3)
 
 
-def _turned(place: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _placed(place: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (V, 3) by a transform (x, y, z, qx, qy, qz, qw)."""
-    axis, w = place[3:6].astype(np.float64), float(place[6])
-    return points + 2.0 * np.cross(axis, np.cross(axis, points) + w * points) + place[:3]
+    return quat_rotated(place[[6, 3, 4, 5]].astype(np.float64), points) + place[:3]

@@ -142,6 +142,18 @@ def check_kept(pos: torch.Tensor, dtype: torch.dtype) -> None:
             )
 
 
+def body_named(name: str, labels: Sequence[str]) -> int:
+    """Index of the one body with that label, or whose label ends in it after a "/".
+
+    Raises:
+        ValueError: There is none, or more than one.
+    """
+    found = [k for k, label in enumerate(labels) if name in (label, label.rpartition("/")[2])]
+    if len(found) != 1:
+        raise ValueError(f"link {name!r} must be one of the bodies {', '.join(labels)}")
+    return found[0]
+
+
 def empty_slots(scene: "RayScene", exclude_shapes: Sequence[int], view: SensorView) -> tuple[Slots, list[int]]:
     """Slots for the shapes of a scene that are not excluded, and the indices of these shapes."""
     excluded = scene.check_shape_ids(exclude_shapes)

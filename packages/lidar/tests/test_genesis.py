@@ -82,7 +82,7 @@ def test_rays_hit_what_genesis_hits(built):
 def test_bodies_move_and_are_found_by_name(built):
     scene, *_ = built
     rays = GenesisScene(scene)
-    box = rays.link("box/box_baselink") if "box/box_baselink" in rays.body_names else rays.link("box")
+    box = rays.link("box_baselink")
     entity = next(entity for entity in scene.entities if entity.name == "box")
     assert torch.allclose(rays.body_pos[:, box].cpu().float(), entity.get_pos().cpu(), atol=1e-6)
     with pytest.raises(ValueError, match="link 'wheel' must be one of the bodies"):
@@ -104,6 +104,14 @@ def test_soft_bodies_are_hit_where_their_vertices_are(built):
         k = len(rays.shapes) - (2 if name == "soft" else 1)
         assert (hits.shape_id == k).all(), name
         assert np.abs(start[:, 0, 2] - hits.ranges.numpy()[:, 0] - above[:, 2]).max() < tolerance, name
+
+
+def test_entities_that_differ_between_environments_are_refused(built):
+    scene = gs.Scene(show_viewer=False)
+    scene.add_entity([gs.morphs.Box(size=(0.4, 0.4, 0.4)), gs.morphs.Sphere(radius=0.2)])
+    scene.build(n_envs=2)
+    with pytest.raises(ValueError, match="make a Genesis scene for each"):
+        GenesisScene(scene)
 
 
 def test_a_scene_that_is_not_built_is_refused(built):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.harness.reference import mujoco_ranges
 from omnilidar import NewtonScene, RayScene, Shape, ShapeKind, TriangleMesh
 
 newton = pytest.importorskip("newton")
@@ -189,25 +190,42 @@ MODEL = """
 """
 
 
-def test_a_file_of_a_world_becomes_the_mesh_of_what_mj_ray_hits(tmp_path):
-    """But for the polygons of what is round."""
+HILLS = """
+<mujoco><asset>
+  <hfield name="hills" nrow="3" ncol="4" size="1 2 0.8 0.1" elevation="0 1 0 2  1 0 3 0  0 1 2 0"/>
+</asset><worldbody><geom type="hfield" hfield="hills" pos="1 4 0.4" euler="20 10 30"/></worldbody></mujoco>
+"""
+
+
+def ranges_of_file(path, xml, origins, directions):
+    """Of the mesh that a file becomes, and by mj_ray; inf for a miss or beyond 15 m."""
     import mujoco
 
-    (tmp_path / "world.xml").write_text(MODEL)
-    mesh = TriangleMesh.from_file(tmp_path / "world.xml")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "world.xml"))
+    path.write_text(xml)
+    scene = RayScene([Shape(ShapeKind.MESH, asset=TriangleMesh.from_file(path))], 1, 0)
+    got = scene.cast(origins[None], directions[None], max_range=15.0).ranges.numpy()[0]
+    model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    wanted, _ = mujoco_ranges(model, data, origins, directions)
+    return got, np.where(wanted > 15.0, np.inf, wanted)
+
+
+def test_a_file_of_a_world_becomes_the_mesh_of_what_mj_ray_hits(tmp_path):
+    """But for the polygons of what is round."""
     origins, directions = (rays[0].astype(np.float64) for rays in random_rays(1, 400, low=0.3))
-    scene = RayScene([Shape(ShapeKind.MESH, asset=mesh)], 1, 0)
-    got = scene.cast(origins[None], directions[None], max_range=15.0).ranges.numpy()[0]
-    geom = np.zeros(1, np.int32)
-    rays = zip(origins, directions, strict=True)
-    wanted = np.array([mujoco.mj_ray(model, data, origin, way, None, 1, -1, geom) for origin, way in rays])
-    wanted[(wanted < 0.0) | (wanted > 15.0)] = np.inf
+    got, wanted = ranges_of_file(tmp_path / "world.xml", MODEL, origins, directions)
     both = np.isfinite(got) & np.isfinite(wanted)
     assert both.mean() > 0.3 and (np.isfinite(got) == np.isfinite(wanted)).mean() > 0.99
     assert np.quantile(np.abs(got[both] - wanted[both]), 0.97) < 0.02
+
+
+def test_a_file_with_a_height_field_becomes_its_upper_side(tmp_path):
+    """Of MuJoCo's, which is a solid, seen from above."""
+    origins = np.random.default_rng(4).uniform((0.6, 3.0, 4.0), (1.4, 5.0, 4.0), (300, 3))
+    got, wanted = ranges_of_file(tmp_path / "hills.xml", HILLS, origins, np.tile((0.0, 0.0, -1.0), (300, 1)))
+    np.testing.assert_allclose(got, wanted, atol=1e-5)
+    assert np.isfinite(got).all() and got.std() > 0.1
 
 
 def test_a_file_that_is_no_model_is_one_line(tmp_path):
