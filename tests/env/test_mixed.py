@@ -209,7 +209,9 @@ def test_shares(num_envs, numbers):
 
 
 def test_seeds_and_shares_of_a_run():
-    run = compose(*BLIND, "family=[crossing,hold]", "families.hold.share=3", "seed=7", num_envs=8)
+    run = compose(
+        *BLIND, "family=[crossing,hold]", "families.crossing.share=1", "families.hold.share=3", "seed=7", num_envs=8
+    )
     tasks = run.family_envs()
     assert [own.num_envs for own in tasks.values()] == [2, 6]
     assert [own.seed for own in tasks.values()] == [7, 7 + build.FAMILY_STRIDE]
